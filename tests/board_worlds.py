@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -73,8 +73,7 @@ def make_board(
 
 def make_tab(split: str, size: str, *, entries: int, nodes: int, seed: int, skill: bool) -> Tab:
     """Return one tab."""
-    kind = "box" if split in ("cavity", "curl-noise") else "free"
-    described = load().size(split, size)
+    kind, described = "box" if split in ("cavity", "curl-noise") else "free", load().size(split, size)
     frames = tuple(frames_to_predict(described))
     shown = frames if len(frames) <= 120 else frames[:: len(frames) // 100]
     world = _World(kind, shown, nodes, seed, reported_frames(described), len(described.subsets["test"]))
@@ -86,8 +85,6 @@ def make_tab(split: str, size: str, *, entries: int, nodes: int, seed: int, skil
     ranked = [
         replace(row, rank=i + 1, tied=i == 1, p=np.nan if i == 0 else row.p) for i, row in enumerate(live)
     ]
-    f = np.linspace(0, 1, len(shown))
-    energy = 3.1e-3 * (1 - 0.3 * f)
     return Tab(
         size=described,
         title={"cavity": "Lid-driven cavity", "fluid": "Free-surface liquid"}.get(split, split),
@@ -98,7 +95,7 @@ def make_tab(split: str, size: str, *, entries: int, nodes: int, seed: int, skil
         decided=True,
         columns=COLUMNS[kind],
         curves=CURVES[kind],
-        energy=Curve(frames=shown, mean=energy, low=0.9 * energy, high=1.1 * energy),
+        energy=world.banded(3.1e-3 * (1 - 0.3 * world.share), 0.1),
         truth=world.truth,
         rows=(*ranked, *gone),
         floors=tuple(world.floor(name) for name in FLOORS),
@@ -110,52 +107,47 @@ def with_entry(row: Row, **changes: Any) -> Row:
     return replace(row, entry=row.entry.model_copy(update=changes))
 
 
+@dataclass
 class _World:
     """What all rows of a tab share."""
 
-    def __init__(
-        self,
-        kind: str,
-        frames: tuple[int, ...],
-        nodes: int,
-        seed: int,
-        marked: tuple[int, ...],
-        scenarios: int,
-    ) -> None:
-        self.kind, self.frames, self.nodes, self.seed = kind, frames, nodes, seed
-        self.marked, self.scenarios = marked, scenarios
+    kind: str
+    frames: tuple[int, ...]
+    nodes: int
+    seed: int
+    marked: tuple[int, ...]
+    scenarios: int
+
+    def __post_init__(self) -> None:
+        self.share = np.linspace(0, 1, len(self.frames))  # of the horizon
         self.truth = self.pictures(strength=1.0, noise=0.0)
 
-    def pictures(self, *, strength: float, noise: float) -> Pictures:
-        """Return maps and a film."""
-        ends = self.frames[0], self.frames[-1]
-        return pictures(self.kind, self.nodes, self.seed, self.marked, ends, strength=strength, noise=noise)
+    def banded(self, mean: Floats, width: float) -> Curve:
+        """Return a curve with its band."""
+        return Curve(frames=self.frames, mean=mean, low=(1 - width) * mean, high=(1 + width) * mean)
 
     def floor(self, name: str) -> Floor:
         """Return a floor."""
-        still = name == FLOORS[0]
-        values, curves, energy = self.scores(name, 6.0, still)
-        return Floor(name=name, definition=f"What {name} says.", values=values, curves=curves, energy=energy)
+        return Floor(name=name, definition=f"What {name} says.", **self.scores(name, 6.0, name == FLOORS[0]))
 
-    def scores(self, name: str, bad: float, still: bool) -> tuple[dict[str, Value], dict[str, Curve], Curve]:
+    def scores(self, name: str, bad: float, still: bool) -> dict[str, Any]:
         """Return values, curves and energy of a method that is so bad."""
-        rng = np.random.Generator(np.random.PCG64([self.seed, int(100 * bad), len(name)]))
-        f = np.linspace(0, 1, len(self.frames))
-        values = {m: _value(m, bad, still, rng, self.scenarios, self.marked) for m in _metrics(self.kind)}
-        curves = {metric: _curve(metric, self.frames, f, bad, still, rng) for metric in CURVES[self.kind]}
-        energy = (
-            np.full(len(f), 1e-9) if still else 3.1e-3 * (1 - 0.3 * f) * (1 + 0.03 * bad * f * np.sin(9 * f))
-        )
-        return values, curves, Curve(frames=self.frames, mean=energy, low=0.9 * energy, high=1.1 * energy)
+        rng, f = np.random.Generator(np.random.PCG64([self.seed, int(100 * bad), len(name)])), self.share
+        values = {metric: self.value(metric, bad, still, rng) for metric in _metrics(self.kind)}
+        curves = {metric: self.curve(metric, bad, still, rng) for metric in CURVES[self.kind]}
+        moved = 3.1e-3 * (1 - 0.3 * f) * (1 + 0.03 * bad * f * np.sin(9 * f))
+        energy = self.banded(np.full(len(f), 1e-9) if still else moved, 0.1)
+        return {"values": values, "curves": curves, "energy": energy}
 
     def row(self, name: str, place: int, split: str, size: str, *, skill: bool) -> Row:
         """Return the row of the method in a place."""
         bad = 1.0 + 0.35 * place
         rng = np.random.Generator(np.random.PCG64([self.seed, place]))
-        values, curves, energy = self.scores(name, bad, still=False)
+        scores = self.scores(name, bad, still=False)
         drawn = self.pictures(strength=1.0 - 0.03 * bad, noise=0.03 * bad)
         residual = [p - t for p, t in zip(drawn.vorticity, self.truth.vorticity, strict=True)]
         mean = 1.0 - 0.1 * bad
+        known = replace(scores["values"]["position_rmse"], mean=mean, low=mean - 0.1, high=mean + 0.1)
         return Row(
             entry=make_entry(name, place, split, size, None if place % 7 == 6 else _cost(bad, rng)),
             current=True,
@@ -163,15 +155,65 @@ class _World:
             tied=False,
             p=0.03125 * bad,
             verified=Verification(scores=(HASH,), lagbench="0.2.0", date=DAY) if place % 3 == 0 else None,
-            skill=replace(values["position_rmse"], mean=mean, low=mean - 0.1, high=mean + 0.1)
-            if skill
-            else None,
-            values=values,
+            skill=known if skill else None,
             seed_means=(4e-3 * bad,) * (3 if place % 2 == 0 else 1),
-            curves=curves,
-            energy=energy,
             pictures=drawn,
             residuals=tuple(_histogram(r, float(np.nanmax(np.abs(r))) or 1.0) for r in residual),
+            **scores,
+        )
+
+    def value(self, name: str, bad: float, still: bool, rng: np.random.Generator) -> Value:
+        """Return a metric of a method that is so bad."""
+        nothing = still and "pearson" in name
+        base = {
+            "vorticity_pearson": 1 - 0.03 * bad,
+            "stable_frames": 95 - 6 * bad,
+            "energy_ratio": 1 + 0.1 * bad,
+        }
+        middle = np.nan if nothing else base.get(name, 4e-3 * bad)
+        per = middle * (0.7 + 0.6 * rng.random(self.scenarios))
+        mean, spread = float(np.mean(per)), 0.2 * abs(middle)
+        return Value(
+            mean=mean,
+            std=0.01 * abs(middle) if rng.random() < 0.5 else np.nan,
+            low=mean - spread,
+            high=mean + spread,
+            per_scenario=tuple(per.tolist()),
+            at=dict.fromkeys(self.marked if METRICS[name].per_frame else (), middle),
+            undefined=90 if nothing else (3 if name == "vorticity_pearson" and bad > 4 else 0),
+        )
+
+    def curve(self, metric: str, bad: float, still: bool, rng: np.random.Generator) -> Curve:
+        """Return the curve of a metric of a method that is so bad."""
+        f = self.share
+        wobble = 1 + 0.05 * np.cumsum(rng.random(len(f)) - 0.5)
+        if metric == "vorticity_pearson":
+            mean = np.full(len(f), np.nan) if still else np.exp(-0.1 * bad * f) * wobble.clip(0.9, 1.0)
+            high = np.minimum(1.0, mean + 0.05 * f)
+            return Curve(frames=self.frames, mean=mean, low=mean - 0.1 * f, high=high)
+        mean = 2e-3 * bad * (0.02 + f) * wobble
+        if metric == "energy_ratio":
+            mean = np.zeros(len(f)) if still else 1 + 0.03 * bad * f * np.sin(9 * f)
+        return Curve(frames=self.frames, mean=mean, low=0.7 * mean, high=1.4 * mean)
+
+    def pictures(self, *, strength: float, noise: float) -> Pictures:
+        """Return maps and a film of four eddies, or of a falling, turning block."""
+        film_frames = tuple(np.linspace(self.frames[0], self.frames[-1], 45).astype(int).tolist())
+        x, y = np.meshgrid(*[np.linspace(0, 2 * np.pi, self.nodes)] * 2, indexing="ij")
+        rng, again = (np.random.Generator(np.random.PCG64(self.seed)) for _ in range(2))
+        eddies = [_eddies(x, y, frame, strength, noise, rng) for frame in self.marked]
+        maps = np.stack(eddies).astype(np.float32)
+        maps[:, :2] = maps[:, -2:] = np.nan
+        maps[:, :, :2] = maps[:, :, -2:] = np.nan
+        top = float(np.nanmax(np.abs(maps))) or 1.0
+        return Pictures(
+            scenario=54,
+            map_frames=self.marked,
+            vorticity=maps,
+            histograms=tuple(_histogram(m, top) for m in maps),
+            film_frames=film_frames,
+            material=(np.arange(200) % 4 if self.kind == "free" else np.zeros(200)).astype(np.int8),
+            film=_film(self.kind, len(film_frames), strength, noise, again).astype(np.float32),
         )
 
 
@@ -242,73 +284,6 @@ def _metrics(kind: str) -> list[str]:
         for name in METRICS
         if not any(word in name for word in elastic) and (kind == "free" or not name.endswith("_liquid"))
     ]
-
-
-def _value(
-    name: str, bad: float, still: bool, rng: np.random.Generator, scenarios: int, marked: tuple[int, ...]
-) -> Value:
-    nothing = still and "pearson" in name
-    base = {
-        "vorticity_pearson": 1.0 - 0.03 * bad,
-        "stable_frames": 95 - 6 * bad,
-        "energy_ratio": 1 + 0.1 * bad,
-    }
-    middle = np.nan if nothing else base.get(name, 4e-3 * bad)
-    per = middle * (0.7 + 0.6 * rng.random(scenarios))
-    spread = 0.2 * abs(middle)
-    return Value(
-        mean=float(np.mean(per)),
-        std=0.01 * abs(middle) if rng.random() < 0.5 else np.nan,
-        low=float(np.mean(per)) - spread,
-        high=float(np.mean(per)) + spread,
-        per_scenario=tuple(per.tolist()),
-        at=dict.fromkeys(marked if METRICS[name].per_frame else (), middle),
-        undefined=90 if nothing else (3 if name == "vorticity_pearson" and bad > 4 else 0),
-    )
-
-
-def _curve(
-    metric: str, frames: tuple[int, ...], f: Floats, bad: float, still: bool, rng: np.random.Generator
-) -> Curve:
-    wobble = 1 + 0.05 * np.cumsum(rng.random(len(f)) - 0.5)
-    if metric == "vorticity_pearson":
-        mean = np.full(len(f), np.nan) if still else np.exp(-0.1 * bad * f) * wobble.clip(0.9, 1.0)
-        return Curve(frames=frames, mean=mean, low=mean - 0.1 * f, high=np.minimum(1.0, mean + 0.05 * f))
-    if metric == "energy_ratio":
-        mean = np.zeros(len(f)) if still else 1 + 0.03 * bad * f * np.sin(9 * f)
-    else:
-        mean = 2e-3 * bad * (0.02 + f) * wobble
-    return Curve(frames=frames, mean=mean, low=0.7 * mean, high=1.4 * mean)
-
-
-def pictures(
-    kind: str,
-    nodes: int,
-    seed: int,
-    frames: tuple[int, ...],
-    ends: tuple[int, int],
-    *,
-    strength: float,
-    noise: float,
-) -> Pictures:
-    """Return maps and a film of four eddies, or of a falling, turning block."""
-    film_frames = tuple(np.linspace(*ends, 45).astype(int).tolist())
-    x, y = np.meshgrid(*[np.linspace(0, 2 * np.pi, nodes)] * 2, indexing="ij")
-    rng = np.random.Generator(np.random.PCG64(seed))
-    maps = np.stack([_eddies(x, y, frame, strength, noise, rng) for frame in frames]).astype(np.float32)
-    maps[:, :2] = maps[:, -2:] = np.nan
-    maps[:, :, :2] = maps[:, :, -2:] = np.nan
-    film = _film(kind, len(film_frames), strength, noise, np.random.Generator(np.random.PCG64(seed)))
-    top = float(np.nanmax(np.abs(maps))) or 1.0
-    return Pictures(
-        scenario=54,
-        map_frames=frames,
-        vorticity=maps,
-        histograms=tuple(_histogram(m, top) for m in maps),
-        film_frames=film_frames,
-        material=(np.arange(200) % 4 if kind == "free" else np.zeros(200)).astype(np.int8),
-        film=film.astype(np.float32),
-    )
 
 
 def _eddies(

@@ -83,12 +83,8 @@ def test_long_author_lines_clip_no_column(running: Browser, board: Board, tmp_pa
     """At 1280 pixels all main columns are in view, whatever the names; the title has the whole line."""
     authors = tuple(f"A. Rather Long Name of Somebody {i}" for i in range(4))
     tab = board.tabs[0]
-    said = {
-        "authors": authors,
-        "affiliation": "An institute " * 12,
-        "name": "A name as long as names may be " * 3,
-    }
-    rows = tuple(with_entry(row, **said) for row in tab.rows)
+    said = {"affiliation": "An institute " * 12, "name": "A name as long as names may be " * 3}
+    rows = tuple(with_entry(row, authors=authors, **said) for row in tab.rows)
     columns = (*tab.columns, "velocity_rmse", "mse_avg")
     path = tmp_path / "long.html"
     path.write_text(render(replace(board, tabs=(replace(tab, rows=rows, columns=columns),))), "utf-8")
@@ -111,10 +107,8 @@ def test_badges_say_what_is_wrong(page: Page, board: Board) -> None:
     chips = dict(page.value(f"[...{flags}].map(e => [e.textContent, e.title])"))
     assert chips["leaves the box: 5.9 %"].startswith("Predicted particles lie outside the box")
     assert chips["unphysical"].endswith("14 times the truth's kinetic energy.")
-    run(
-        page,
-        "document.querySelector('section:not([hidden]) tr[data-entry] .flag.warn').closest('tr').click()",
-    )
+    warning = "document.querySelector('section:not([hidden]) tr[data-entry] .flag.warn')"
+    run(page, f"{warning}.closest('tr').click()")
     until(page, "document.getElementById('panel').open")
     assert "leaves the box" in page.value("document.querySelector('#panel .flags').textContent")
 
@@ -390,11 +384,9 @@ def test_csv_equals_the_table(page: Page, board: Board, tmp_path: Path, preset: 
 def test_scheme_can_be_chosen(page: Page) -> None:
     """The button goes from the system's scheme to light, dark, and back."""
     paper = "getComputedStyle(document.body).backgroundColor"
-    seen_papers = []
+    scheme, seen_papers = "document.documentElement.dataset.theme ?? 'auto'", []
     for _ in range(3):
         run(page, "document.getElementById('theme').click()")
-        seen_papers.append(
-            (page.value("document.documentElement.dataset.theme ?? 'auto'"), page.value(paper))
-        )
+        seen_papers.append((page.value(scheme), page.value(paper)))
     light, dark = "rgb(255, 255, 255)", "rgb(16, 20, 27)"
     assert seen_papers == [("light", light), ("dark", dark), ("auto", light)]

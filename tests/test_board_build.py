@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from made_up import PLACE, BoardBench, copied, master, noisy
+from numpy.typing import NDArray
 
 from lagbench.board.build import CURVE_FRAMES, RESIDUAL_BINS, build, collect, curve, residuals
 from lagbench.board.folder import Folder
 from lagbench.board.model import Board, Row
-from lagbench.board.ranking import Combined, combine
+from lagbench.board.ranking import combine
 from lagbench.board.show import as_plain, chosen_data_sets, tables
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
@@ -98,19 +98,6 @@ def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
     assert row.seed_means == pytest.approx((first["vorticity_nrmse"].mean, second["vorticity_nrmse"].mean))
 
 
-def made_up(values: list[float], per_frame: Any = None) -> Score:
-    """Return a score of the ranking metric with given values per scenario."""
-    frames = np.empty((len(values), 0)) if per_frame is None else np.asarray(per_frame, float)
-    return Score(
-        metric=METRICS["vorticity_rmse"],
-        scenarios=tuple(range(len(values))),
-        frames=tuple(range(10, 10 + frames.shape[1])),
-        per_frame=frames,
-        values=np.array(values),
-        undefined=(0,) * len(values),
-    )
-
-
 def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
     """The entry is named: a package that describes its split is missing."""
     with pytest.raises(DataError) as caught:
@@ -147,8 +134,8 @@ def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) 
     names = ("flipping", "noisy")
     coarse, fine = (read_stored(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in names)
     assert coarse.precision > 5.0 * fine.precision
-    step = fine.precision
-    np.testing.assert_allclose(board.tabs[0].truth.vorticity, fine.preview.vorticity[0], atol=step)
+    truth = board.tabs[0].truth.vorticity
+    np.testing.assert_allclose(truth, fine.preview.vorticity[0], atol=fine.precision)
 
 
 def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
@@ -176,11 +163,24 @@ def test_residual_histograms(card: ScoreCard) -> None:
         assert found.shares == pytest.approx(counts / r.size)
 
 
+def made_up(per_frame: NDArray[np.float64]) -> Score:
+    """Return a score of the ranking metric with given values, shape [scenario, frame]."""
+    count, frames = per_frame.shape
+    return Score(
+        metric=METRICS["vorticity_rmse"],
+        scenarios=tuple(range(count)),
+        frames=tuple(range(10, 10 + frames)),
+        per_frame=per_frame,
+        values=np.zeros(count),
+        undefined=(0,) * count,
+    )
+
+
 def test_curves_keep_the_ends() -> None:
     """At most 120 frames, first and last among them; mean, lowest and highest of the scenarios."""
     frames = np.stack([np.arange(598.0), 3.0 * np.arange(598.0)])
     frames[0, 0] = np.nan
-    found = curve(made_up([0.0, 0.0], frames))
+    found = curve(made_up(frames))
     assert len(found.frames) == CURVE_FRAMES
     assert (found.frames[0], found.frames[-1]) == (10, 607)
     assert found.mean[0] == 0.0
@@ -193,33 +193,29 @@ def test_curves_of_sampled_metrics_are_lines() -> None:
     """A metric that is measured at every tenth frame has these frames, and no gaps between them."""
     frames = np.full((2, 298), np.nan)
     frames[:, 9::10] = np.arange(29.0)
-    found = curve(made_up([0.0, 0.0], frames))
+    found = curve(made_up(frames))
     assert found.frames == tuple(range(19, 308, 10))
     assert list(found.mean) == list(range(29))
 
 
 def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """A scenario that one seed has no value for takes the other's; none stays undefined."""
-    held = [
-        read_statistics(bench.folder / path)
-        for path in ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
-    ]
-    found: dict[str, Combined] = combine(held)
-    alone = held[0].scores()["vorticity_pearson"]
-    assert np.array_equal(found["vorticity_pearson"].score.values, alone.values)
-    assert math.isnan(found["vorticity_pearson"].std)
+    paths = ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
+    held = [read_statistics(bench.folder / path) for path in paths]
+    found = combine(held)["vorticity_pearson"]
+    assert np.array_equal(found.score.values, held[0].scores()["vorticity_pearson"].values)
+    assert math.isnan(found.std)
 
 
 def test_the_order_of_files_does_not_matter(bench: BoardBench, tmp_path: Path) -> None:
     """The same submissions, copied in another order and time, give the same bytes of the page."""
     pages = []
-    for name, reverse in (("one", False), ("two", True)):
-        target = tmp_path / name
-        for path in sorted(bench.folder.rglob("*.*"), reverse=reverse):
-            if path.is_file():
-                copy = target / path.relative_to(bench.folder)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(path, copy)
+    for reverse in (False, True):
+        target = tmp_path / str(reverse)
+        for path in sorted(filter(Path.is_file, bench.folder.rglob("*.*")), reverse=reverse):
+            copy = target / path.relative_to(bench.folder)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
         pages.append(build(target, registry=bench.registry).page.read_bytes())
     assert pages[0] == pages[1]
 

@@ -93,8 +93,8 @@ def test_names_do_not_meet_names_or_dots() -> None:
     dots = [(float(e.attrib["cx"]), float(e.attrib["cy"])) for e in svg.iter("circle")]
     assert len(texts) > 5
     for number, one in enumerate(texts):
-        assert all(apart(one, other) for other in texts[:number])
-        assert all(apart(one, (x - 3, y - 3, x + 3, y + 3)) for x, y in dots)
+        circles = [(x - 3, y - 3, x + 3, y + 3) for x, y in dots]
+        assert all(apart(one, other) for other in (*texts[:number], *circles))
 
 
 def test_a_name_in_a_crowd_has_a_line_to_its_dot() -> None:

@@ -87,14 +87,10 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
     maps = min(4, len(tab.truth.map_frames))
     assert len(fields) == maps * 3 + 2
     assert min(fields) > 4
-    run(page, "document.querySelector('#panel [data-figure=errors] select').value = 'vorticity_pearson'")
-    run(
-        page,
-        "document.querySelector('#panel [data-figure=errors] select').dispatchEvent(new Event('change'))",
-    )
-    assert "stable above 0.95" in page.value(
-        "document.querySelector('#panel [data-figure=errors]').textContent"
-    )
+    errors = "document.querySelector('#panel [data-figure=errors]')"
+    run(page, f"{errors}.querySelector('select').value = 'vorticity_pearson'")
+    run(page, f"{errors}.querySelector('select').dispatchEvent(new Event('change'))")
+    assert "stable above 0.95" in page.value(f"{errors}.textContent")
 
 
 def test_map_shows_the_field(page: Page, board: Board) -> None:
@@ -153,12 +149,8 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     )
     rows = [row for row in board.tabs[0].rows if row.active and row.entry.cost is not None]
     assert len(dots) == len(rows)
-    points = {
-        row.id: (mark.seconds, mark.error)
-        for row in rows
-        for mark in marks_of(board.tabs[0])
-        if mark.name == row.entry.name
-    }
+    marks = {mark.name: (mark.seconds, mark.error) for mark in marks_of(board.tabs[0])}
+    points = {row.id: marks[row.entry.name] for row in rows}
     best = {
         i
         for i, (x, y) in points.items()
@@ -186,10 +178,8 @@ def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Pat
         code="javascript:console.error(3)",
         paper="data:text/html,<script>console.error(4)</script>",
     )
-    first = bad.entry.score.files[0]
-    odd = first.model_copy(
-        update={"flags": (Flag.model_construct(name="__proto__", reasons=(HOSTILE,), share=None),)}
-    )
+    flag = Flag.model_construct(name="__proto__", reasons=(HOSTILE,), share=None)
+    odd = bad.entry.score.files[0].model_copy(update={"flags": (flag,)})
     bad = with_entry(bad, score=bad.entry.score.model_copy(update={"files": (odd,)}))
     long = with_entry(tab.rows[1], name="=1+1" + "W" * 10_000)
     path = tmp_path / "index.html"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -36,19 +37,28 @@ def predictions(own: BoardBench) -> Path:
     return own.predict(nearer, "my-model", **labels)
 
 
+@pytest.fixture
+def unscored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where anything is scored."""
+    monkeypatch.setattr(submitting, "score", pytest.fail)
+
+
+def well(bench: BoardBench) -> bool:
+    """Tell whether the check of the folder finds nothing."""
+    return not check_board(bench.folder, registry=bench.registry, isolated=False).findings
+
+
 @pytest.mark.usefixtures("as_shipped")
 def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
     """Labels of the predictions, what the submitter adds, data set, hashes, scores and their origin."""
-    result = own.submit(predictions, name="My model", code="https://a.org/x", solver_seconds_per_frame=0.5)
+    said = {"name": "My model", "code": "https://a.org/x", "solver_seconds_per_frame": 0.5}
+    result = own.submit(predictions, **said)
     entry = read_entry(own.entry("my-model"))
     assert (entry.name, entry.code, entry.date) == ("My model", "https://a.org/x", DAY)
     assert (entry.parameters, entry.training) == (9, "train")
     assert entry.cost is not None
-    assert entry.cost.model_dump() == {
-        "seconds_per_frame": 0.25,
-        "device": "a laptop",
-        "solver_seconds_per_frame": 0.5,
-    }
+    cost = {"seconds_per_frame": 0.25, "device": "a laptop", "solver_seconds_per_frame": 0.5}
+    assert entry.cost.model_dump() == cost
     with open_predictions(predictions) as opened:
         assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
         assert entry.dataset.sha256 == opened.header.dataset_sha256
@@ -60,20 +70,16 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
     assert result.mean == pytest.approx(card.submission[card.ranking].mean, rel=1e-8)
     assert [path.name for path in result.files] == ["my-model.yaml", "my-model.nc"]
     assert all(path.stat().st_size <= 1_000_000 for path in result.files)
-    assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+    assert well(own)
     before = own.state()
-    own.submit(
-        predictions, replace=True, name="My model", code="https://a.org/x", solver_seconds_per_frame=0.5
-    )
+    own.submit(predictions, replace=True, **said)
     assert own.state() == before
 
 
 def test_replacing_leaves_no_score_file_over(own: BoardBench) -> None:
     """Two seeds that become one: the score files of both are gone, the new one is there."""
     own.submit(own.predict(damped, "damped"), replace=True)
-    names = {path.name for path in (own.folder / "scores/cavity/tiny").iterdir()}
-    assert "damped.nc" in names
-    assert not names & {"damped_0.nc", "damped_3.nc"}
+    assert [path.name for path in (own.folder / "scores/cavity/tiny").glob("damped*")] == ["damped.nc"]
 
 
 def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
@@ -84,22 +90,15 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
     own.submit(inside)
     assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
     assert read_entry(own.entry("noisy")).predictions[0].path is None
-    assert not check_board(own.folder, registry=own.registry, page=False, isolated=False).findings
+    assert well(own)
 
 
-def test_no_entry_is_of_a_day_to_come(own: BoardBench, predictions: Path) -> None:
-    """What `check` would refuse is refused at once."""
-    with pytest.raises(UsageError) as caught:
-        own.submit(predictions, replace=True, date=datetime.date(2999, 1, 1))
-    assert caught.value.where == "date"
-
-
-def test_a_name_that_no_entry_can_hold(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("unscored")
+def test_a_name_that_no_entry_can_hold(own: BoardBench) -> None:
     """A path inside the folder that the schema refuses is told before anything is scored."""
     inside = own.folder / ("p" * 150) / f"{'q' * 100}.nc"
     inside.parent.mkdir()
     own.data.submit(inside, nearer, "inside")
-    monkeypatch.setattr(submitting, "score", pytest.fail)
     with pytest.raises(ChecksFailedError):
         own.submit(inside)
     assert not own.entry("inside").exists()
@@ -112,10 +111,7 @@ def tree(folder: Path) -> set[str]:
 
 @pytest.mark.usefixtures("as_shipped")
 def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of another entry or of another seed are refused under any label; its own entry is replaced.
-
-    One file under two names, or for two seeds, is told before the work.
-    """
+    """Those of another entry or seed are refused under any label; one file twice is told before the work."""
     first = own.predict(nearer, "first")
     own.submit(first)
     before = tree(own.folder)
@@ -123,7 +119,7 @@ def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.Mon
     with pytest.raises(UsageError):
         own.submit(again)
     with monkeypatch.context() as patch:
-        patch.setattr(submitting, "score", _never)
+        patch.setattr(submitting, "score", pytest.fail)
         for files in ((first,), tuple(own.predict(still, "third", seed=seed) for seed in (0, 1))):
             with pytest.raises(UsageError):
                 own.submit(*files, method="other", name="Other")
@@ -131,23 +127,24 @@ def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.Mon
     assert own.submit(again, method="first", replace=True).method == "first"
 
 
+@pytest.mark.usefixtures("unscored")
 @pytest.mark.parametrize(
     "keys",
     [
         *({"authors": ()}, {"command": ""}, {"method": "noisy"}, {"method": "persistence"}),
         *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
-        {"urls": ("https://a.org/1", "https://a.org/2")},
+        *({"urls": ("https://a.org/1", "https://a.org/2")}, {"date": datetime.date(2999, 1, 1)}),
+        {"budget": {"track": "converged"}},
     ],
 )
-def test_refused_before_the_work(
-    keys: dict[str, Any], own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What is missing or taken is said before anything is scored, and nothing is written."""
-    monkeypatch.setattr(submitting, "score", _never)
+def test_refused_before_the_work(keys: dict[str, Any], own: BoardBench, predictions: Path) -> None:
+    """What is missing, taken, of a day to come or nobody's to say, before anything is scored or written."""
     before = tree(own.folder)
-    with pytest.raises(UsageError):
+    with pytest.raises(UsageError) as caught:
         own.submit(predictions, **keys)
     assert tree(own.folder) == before
+    where = {"date": "date", "budget": "budget.track"}
+    assert all(caught.value.where == where.get(key, caught.value.where) for key in keys)
 
 
 @pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
@@ -159,6 +156,7 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
     assert {path for path in tree(own.folder) if "odd" in path} <= before
 
 
+@pytest.mark.usefixtures("unscored")
 @pytest.mark.parametrize(
     ("key", "labels"),
     [
@@ -169,10 +167,9 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
     ],
 )
 def test_a_cost_of_predictions_that_no_entry_can_hold(
-    own: BoardBench, key: str, labels: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    own: BoardBench, key: str, labels: dict[str, Any]
 ) -> None:
     """Valid predictions may tell a cost beyond what the board takes: the key is named before the work."""
-    monkeypatch.setattr(submitting, "score", _never)
     path = own.predict(nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels})
     with pytest.raises(ChecksFailedError) as told:
         own.submit(path)
@@ -194,13 +191,9 @@ def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     assert own.submit(predictions, **mended).method == "fine"
 
 
-def _never(*_: object, **__: object) -> None:
-    raise AssertionError
-
-
-def test_files_that_do_not_belong_together(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("unscored")
+def test_files_that_do_not_belong_together(own: BoardBench) -> None:
     """Several files need seeds that differ; a label that is no id needs --method; no file is no entry."""
-    monkeypatch.setattr(submitting, "score", _never)
     plain, other = own.predict(still, "plain"), own.predict(noisy, "other")
     same = own.predict(still, "same", seed=4)
     two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
@@ -238,9 +231,7 @@ def test_an_interruption_is_found(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Score files come first, the entry last: what a kill leaves is a score file without an entry."""
-    before = own.state()
-
-    move = os.replace
+    before, move = own.state(), os.replace
 
     def killed(source: Path, target: Path) -> None:
         if target.suffix == ".yaml":
@@ -251,13 +242,12 @@ def test_an_interruption_is_found(
         patch.setattr(os, "replace", killed)
         with pytest.raises(KeyboardInterrupt):
             own.submit(predictions)
-    assert own.state() == before | {
-        "scores/cavity/tiny/my-model.nc": own.state()["scores/cavity/tiny/my-model.nc"]
-    }
+    left = "scores/cavity/tiny/my-model.nc"
+    assert own.state() == before | {left: own.state()[left]}
     result = check_board(own.folder, registry=own.registry, isolated=False)
     assert [finding.check for finding in result.findings] == ["stray"]
     own.submit(predictions)
-    assert not check_board(own.folder, registry=own.registry, isolated=False).findings
+    assert well(own)
 
 
 def test_a_score_file_that_is_too_long_is_not_published(
@@ -285,9 +275,8 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
     assert set(result.files) >= {folder / first, folder / max(before)}
     assert {path.name for path in folder.iterdir()} == set(before)
     for path in folder.iterdir():
-        scores = read_stored(path).scores
-        assert scores.identity["method"] == path.stem
-    assert not check_board(own.folder, registry=own.registry, isolated=False).findings
+        assert read_stored(path).scores.identity["method"] == path.stem
+    assert well(own)
 
 
 def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
@@ -299,14 +288,11 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
         return guess
 
     own.submit(own.predict(leaving, "leaving"))
-    (warning,) = (
-        w for w in read_entry(own.entry("leaving")).score.files[0].warnings if w.name == "in_domain"
-    )
-    size = own.data.size
+    told = read_entry(own.entry("leaving")).score.files[0].warnings
+    (warning,) = (one for one in told if one.name == "in_domain")
+    size, task, outside = own.data.size, own.data.size.task, 0
     room = size.bounds[0][1] + 1.0 / size.grid
-    outside = 0
     for scenario in size.subsets["test"]:
-        task = size.task
         guess = leaving(motion(size, scenario), task.input_frames, task.horizon)
         outside += int((guess.astype(np.float32)[..., 0] > room).sum())
     count = len(size.subsets["test"]) * task.horizon * size.particles
@@ -315,37 +301,25 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
 
 
 def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
-    """Where there is no leaderboard one has to be asked for."""
-    meta = Meta(authors=("A. Author",), command="make", date=DAY)
-    where = own.where | {"board": tmp_path / "elsewhere"}
+    """It has to be asked for, and not among other files; what git and a README put there is no obstacle."""
+    meta, board = Meta(authors=("A. Author",), command="make", date=DAY), tmp_path / "site"
+    where = own.where | {"board": board}
     with pytest.raises(UsageError) as error:
         submitting.submit([predictions], meta, **where)
     assert "--new-board" in str(error.value.fix)
-    assert not (tmp_path / "elsewhere").exists()
-    assert submitting.submit([predictions], meta, new_board=True, **where).board == tmp_path / "elsewhere"
-
-
-def test_no_board_is_begun_among_other_files(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
-    """A page of one's own would be replaced; what git and a README put there is no obstacle."""
-    meta = Meta(authors=("A. Author",), command="make", date=DAY)
-    board = tmp_path / "site"
+    assert not board.exists()
+    where["new_board"] = True
+    assert submitting.submit([predictions], meta, **where).board == board
+    shutil.rmtree(board)
     (board / ".git").mkdir(parents=True)
-    (board / "README.md").write_text("mine")
-    where = own.where | {"board": board, "new_board": True}
-    (board / "index.html").write_text("mine")
+    for name in ("README.md", "index.html"):
+        (board / name).write_text("mine")
     with pytest.raises(UsageError) as error:
         submitting.submit([predictions], meta, **where)
     assert (error.value.where, error.value.got) == (str(board), "'index.html'")
     assert sorted(path.name for path in board.iterdir()) == [".git", "README.md", "index.html"]
     (board / "index.html").unlink()
     assert submitting.submit([predictions], meta, **where).board == board
-
-
-def test_a_missing_file_is_told_before_what_nobody_said(own: BoardBench, tmp_path: Path) -> None:
-    """Authors are not asked for on behalf of a file that is not there."""
-    with pytest.raises(UnreadableFileError) as error:
-        submitting.submit([tmp_path / "none.nc"], Meta(), **own.where)
-    assert error.value.where == str(tmp_path / "none.nc")
 
 
 def test_what_is_not_given(own: BoardBench) -> None:

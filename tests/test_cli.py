@@ -30,10 +30,7 @@ Run = Callable[..., Result]
 
 
 def test_help_lists_commands_in_the_order_of_use_with_examples_that_parse(run: Run) -> None:
-    """Every command stands in the help, from looking around to cleaning up.
-
-    The help of a command ends with an example whose words the command accepts.
-    """
+    """All commands stand there; the help of each ends with an example whose words the command accepts."""
     text = run("--help").stdout
     names = ["list", "info", "generate", "verify", "plot", "animate", "cite", "doctor", "clean"]
     places = [re.search(rf"^\W*{name} ", text, re.MULTILINE) for name in names]
@@ -67,8 +64,8 @@ def test_list_shows_every_size(run: Run, generated: GenerationResult) -> None:
 
 def test_info_shows_parameters_with_units_and_state(run: Run, generated: GenerationResult) -> None:
     """By argument or by option; what is generated has a folder and a picture."""
-    by_argument = run("info", SPLIT, "--size", SIZE, "--root", generated.root)
-    by_option = run("info", "--split", SPLIT, "--size", SIZE, "--root", generated.root)
+    options = ["--size", SIZE, "--root", generated.root]
+    by_argument, by_option = run("info", SPLIT, *options), run("info", "--split", SPLIT, *options)
     assert by_argument.exit_code == 0
     assert by_argument.stdout == by_option.stdout
     assert re.search(r"velocity_scale +\S+ +\S+ +\S+ +\[length/s\]", by_argument.stdout)
@@ -228,10 +225,7 @@ def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:
 def test_clean_removes_ours_only(
     run: Run, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A dry run says what would go, and takes no lock: it works where nobody may write, and beside a writer.
-
-    Then all is gone but a stranger's files, PNG files beside our cards and among our pictures too.
-    """
+    """A dry run says what would go and takes no lock; then all is gone but a stranger's files, PNG too."""
     root = copied()
     folder = root / SPLIT / SIZE / "v2"
     mine = {f"{SPLIT}/{SIZE}/v2/{name}" for name in ("notes.txt", "mine.png", "pictures/mine.png")}
@@ -270,10 +264,10 @@ def test_clean_leaves_links(run: Run, copied: Callable[[], Path], tmp_path: Path
 
 def test_a_broken_local_split_hides_no_other(run: Run, tmp_path: Path) -> None:
     """One description that cannot be read is told; all other splits are listed."""
-    for name, text in (("mine", "splits: ["), ("pipe", None)):
+    for name in ("mine", "pipe"):
         (tmp_path / name).mkdir()
-        description = tmp_path / name / "split.yaml"
-        os.mkfifo(description) if text is None else description.write_text(text)
+    (tmp_path / "mine" / "split.yaml").write_text("splits: [")
+    os.mkfifo(tmp_path / "pipe" / "split.yaml")
     result = run("list", "--root", tmp_path)
     assert result.exit_code == 0
     assert {"mine", "pipe"} <= {line.split()[1] for line in result.stderr.splitlines() if "left out" in line}
@@ -291,9 +285,8 @@ def test_plot_and_animate_name_their_files(
     assert (tmp_path / "curl-noise-tiny-0003-frame5.png").read_bytes()[:4] == b"\x89PNG"
     assert run("plot", SPLIT, *options, "--kind", "speed").exit_code == 0  # the last of 26 frames
     assert (tmp_path / "curl-noise-tiny-0003-frame25.png").is_file()
-    source = generated.folder / "test" / "0003.nc"
-    second = generated.folder / "test" / "0004.nc"
-    film = run("animate", source, second, "--every", 13, "-o", "two.gif", "--json")
+    sources = [generated.folder / "test" / name for name in ("0003.nc", "0004.nc")]
+    film = run("animate", *sources, "--every", 13, "-o", "two.gif", "--json")
     assert film.exit_code == 0, film.output
     assert json.loads(film.stdout) == {"output": "two.gif"}
     assert (tmp_path / "two.gif").read_bytes()[:3] == b"GIF"
@@ -307,18 +300,11 @@ def test_progress_goes_to_a_file_in_lines(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """A line after every pause says the count and what is left; quick work and --quiet leave none.
-
-    Trajectories of a file that is read one by one are counted, without a total, share or time left.
-    """
+    """A line after every pause has the count, and what is left where it is known; quick work leaves none."""
     monkeypatch.setattr("lagbench.cli.output.SECONDS_PER_LINE", pause)
     with progress_bar(quiet=False, counted="steps") as tell:
-        for done in (60, 200):
-            tell(
-                Progress(
-                    stage="loss 1", done=done, total=240, scenarios_done=done, scenarios=240, seconds=done
-                )
-            )
+        for n in (60, 200):
+            tell(Progress(stage="loss 1", done=n, total=240, scenarios_done=n, scenarios=240, seconds=n))
     said = capsys.readouterr()
     assert said.out == ""
     counts = [re.search(r"(\d+)/240 steps, 1.00/s, (.+) left", line) for line in said.err.splitlines()]
@@ -328,9 +314,6 @@ def test_progress_goes_to_a_file_in_lines(
     assert capsys.readouterr().err == ("" if pause else "writing train: 2 scenarios, 2.00/s\n")
     with progress_bar(quiet=True) as silent:
         assert silent is None
-
-
-Run = Callable[..., Result]
 
 
 def files_below(folder: Path) -> set[str]:

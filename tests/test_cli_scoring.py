@@ -88,8 +88,7 @@ def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> 
     shutil.copy(predictions, other)
     with h5py.File(other, "a") as file:
         file.attrs["method"] = "gns"
-    assert run("score", predictions).exit_code == 0
-    assert run("score", predictions).exit_code == 0
+    assert [run("score", predictions).exit_code for _ in range(2)] == [0, 0]
     kept = predictions.with_name("scores.json").read_bytes()
     assert run("score", other).exit_code == 0
     assert (predictions.parent / "gns" / "scores.nc").is_file()
@@ -161,10 +160,7 @@ def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) ->
 
 
 def test_unreadable_files(run: Run, predictions: Path, generated: GenerationResult) -> None:
-    """Score and validate agree on the exit code of a bad file, and say what to do, not where it broke.
-
-    Of files of ours that are no predictions one finding says what they are.
-    """
+    """Score and validate agree on the exit code and say what to do; one finding tells files of ours."""
     run("score", predictions)
     for path in (predictions.with_name("scores.nc"), next(generated.folder.glob("test/*.nc"))):
         assert [finding.check for finding in submission.validate(path).findings] == ["readable"]
@@ -233,11 +229,12 @@ def test_where_a_metric_of_a_package_fails(run: Run, predictions: Path, package:
 
 
 def test_several_files_keep_their_scores(run: Run, two: list[Path], tmp_path: Path) -> None:
-    """Equal names in two folders: scores go beside each file, the page alone into the report folder."""
-    result = run("score", *two, "--report", tmp_path / "rep")
-    assert result.exit_code == 0, result.stderr
-    for path in two:
+    """Scores go beside each file, the page into the report folder; namesakes are compared as (1) and (2)."""
+    result, compared = run("score", *two, "--report", tmp_path / "rep"), run("compare", *two)
+    assert (result.exit_code, compared.exit_code) == (0, 0), result.stderr + compared.stderr
+    for number, path in enumerate(two, start=1):
         assert {held.name for held in (path.parent / "p").iterdir()} == {"scores.json", "scores.nc"}
+        assert f"({number}): {path}" in compared.stdout
     assert [path.name for path in (tmp_path / "rep").iterdir()] == ["index.html"]
 
 
@@ -252,14 +249,6 @@ def test_a_reader_that_leaves_early_leaves_the_report(
     monkeypatch.setattr(typer, "echo", gone)
     assert run("score", predictions, "--report", predictions.parent / "rep").exit_code == 141
     assert (predictions.parent / "rep" / "index.html").is_file()
-
-
-def test_namesakes_are_told_apart(run: Run, two: list[Path]) -> None:
-    """Two files of one method are (1) and (2), and a line says which is which."""
-    result = run("compare", *two)
-    assert result.exit_code == 0, result.stderr
-    for number, path in enumerate(two, start=1):
-        assert f"({number}): {path}" in result.stdout
 
 
 def test_scores_never_share_a_folder(run: Run, two: list[Path], tmp_path: Path) -> None:

@@ -28,9 +28,8 @@ FLOORS = [floor.name for floor in floors_of(load().size(SPLIT, SIZE))]
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """A function that runs lagbench in an empty folder, with our splits and no recorded hashes."""
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    monkeypatch.chdir(empty)
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
     return run
 
 
@@ -50,20 +49,17 @@ def only_one(run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, t
     return load(path)
 
 
-def made_by(result: Result) -> dict[str, Any]:
-    """Return what the demo printed with --json."""
+def made_in(root: Path, run: Run) -> Any:
+    """Return what the demo prints with --json."""
+    result = run("demo", "--root", root, "--json")
     assert result.exit_code == 0, result.output
-    found: dict[str, Any] = json.loads(result.stdout)
-    return found
+    return json.loads(result.stdout)
 
 
 def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
     run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Exit code 0, the command that installs it, no leaderboard, and null in the JSON object.
-
-    A split without a tiny size is left out.
-    """
+    """It says how to install it; no leaderboard, null in JSON; a split without a tiny size is left out."""
 
     def no_torch(name: str, *, extra: str) -> None:
         raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
@@ -85,7 +81,7 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     line = "no model, no leaderboard: torch is not installed; pip install 'lagbench[baselines]'"
     assert line in result.stdout.splitlines()
     assert not (root / "leaderboard").exists()
-    made = made_by(run("demo", "--root", root, "--json"))
+    made = made_in(root, run)
     assert made["model"] is None
     assert made["model_left_out"] in line
     assert list(made["splits"]) == [SPLIT]
@@ -96,12 +92,9 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 @pytest.mark.usefixtures("only_one")
 @pytest.mark.slow
 def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[[], Path]) -> None:
-    """Model and floors are on the page that it names; nothing is written in the current folder.
-
-    A second run has the same weights, predictions and scores, and still one entry.
-    """
+    """Model and floors are on its page, nothing in the current folder; a second run gives the same entry."""
     root = copied()
-    first = made_by(run("demo", "--root", root, "--json"))["model"]
+    first = made_in(root, run)["model"]
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
     page = root / "leaderboard" / "index.html"
@@ -112,7 +105,7 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[
     assert entry["cost"]["solver_seconds_per_frame"] == 0.5
     checked = run("leaderboard", "check", "--board", root / "leaderboard", "--page")
     assert checked.exit_code == 0, checked.output
-    second = made_by(run("demo", "--root", root, "--json"))["model"]
+    second = made_in(root, run)["model"]
     assert second["training"] == {**first["training"], "first_step": first["training"]["step"]}
     assert second["card"]["predictions_sha256"] == first["card"]["predictions_sha256"]
     assert second["card"]["rows"] == first["card"]["rows"]
@@ -128,7 +121,7 @@ def test_what_another_version_left_is_trained_anew(
 ) -> None:
     """A damaged checkpoint, and one of another recipe, cost a training and no error."""
     root = copied()
-    made_by(run("demo", "--root", root, "--json"))
+    made_in(root, run)
     (root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.pt").write_bytes(b"damaged")
     assert demo.demo_model(root=root).training.state == "finished"
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.width=4"))
@@ -151,7 +144,7 @@ def test_anothers_leaderboard_is_refused_before_the_work(run: Run, tmp_path: Pat
 @pytest.mark.slow
 def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
     """Four verified data sets, and a model that beats what costs no learning."""
-    made = made_by(run("demo", "--root", tmp_path / "demo", "--json"))
+    made = made_in(tmp_path / "demo", run)
     assert list(made["splits"]) == ["cavity", "curl-noise", "fluid", "multimaterial"]
     assert [one["verification"]["problems"] for one in made["splits"].values()] == [[], [], [], []]
     model = made["model"]

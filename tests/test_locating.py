@@ -25,10 +25,7 @@ from lagbench.make.verify import verify
 
 
 def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An option beats LAGBENCH_ROOT, which beats the user data folder; an empty one counts as unset.
-
-    Commands print the root, so a relative one is made absolute; ~ is the home folder.
-    """
+    """Option, LAGBENCH_ROOT unless empty, user data folder; a root is made absolute, ~ is the home folder."""
     monkeypatch.setenv("LAGBENCH_ROOT", str(tmp_path / "b"))
     assert resolve_root(tmp_path / "a") == tmp_path / "a"
     assert resolve_root() == tmp_path / "b"
@@ -74,10 +71,7 @@ def own(made: LocalSplit, tmp_path: Path) -> Path:
 
 
 def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """An absolute path, a relative one, a name with its root, LAGBENCH_ROOT, and the current folder.
-
-    A path names its root; the same one beside it is fine, another is refused.
-    """
+    """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is in no other root."""
     monkeypatch.chdir(own.parent)
     by_path = [(name, None) for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
@@ -141,10 +135,7 @@ def test_a_folder_may_be_moved_but_not_renamed(own: Path, made: LocalSplit, tmp_
 
 
 def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> None:
-    """It is told when it is asked for, and only then.
-
-    A generator in a local description, which would be imported, is refused.
-    """
+    """It is told only when it is asked for; a generator in it, which would be imported, is refused."""
     path = own / "split.yaml"
     path.write_text(path.read_text().replace("generator: none", "generator: antigravity"))
     with pytest.raises(UnreadableFileError, match="cannot name a generator"):

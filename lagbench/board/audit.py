@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,18 +16,15 @@ from typing import Any
 import numpy as np
 import yaml
 
-from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.card import SUBMISSION, ScoreCard
-from lagbench.scoring.score import score
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
 from lagbench.submission.findings import Finding
-from lagbench.work.progress import Progress
 
-from .entry import Entry, ScoredFile
+from .entry import Entry, Prediction, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
 from .findings import FLOORS_ANEW, finding
 from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
@@ -56,20 +53,14 @@ class Rescoring:
     folder: Folder
     entries: Sequence[Entry]
     sound: Collection[Path]  # score files that can be read
-    registry: Registry
-    root: str | Path | None = None  # folder of all data sets
-    progress: Callable[[Progress], None] | None = None
+    card: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmed: list[Confirmation] = field(default_factory=list)
 
     def of_file(self, path: str | Path) -> Iterator[Finding]:
-        """Yield where predictions differ from what the leaderboard says of them.
-
-        A file that cannot be read or is not valid is a finding: it is opened by the scorer
-        alone, after its checks in a child process.
-        """
+        """Yield where predictions differ from what the leaderboard says, or that they are not valid."""
         where = str(path)
         try:
-            card = self._card(path)
+            card = self.card(path)  # the scorer alone opens them, after its checks in a child process
         except (UnreadableFileError, ChecksFailedError) as error:
             got = f"{error.what}: {error.got}"
             fix = "lagbench validate says what is wrong"
@@ -79,45 +70,32 @@ class Rescoring:
             if inner.stem not in card.tallies or inner.stem == SUBMISSION:
                 continue
             kept = read_stored(self.folder.path / inner).scores
-            if kept.identity["dataset_sha256"] == card.header.dataset_sha256:
-                unlike, _ = _unlike(dict(card.tallies[inner.stem]), kept)
-                if unlike:
-                    yield finding("rescored", inner, _listed(unlike), fix=FLOORS_ANEW)
+            same = kept.identity["dataset_sha256"] == card.header.dataset_sha256
+            if same and (unlike := _unlike(card.tallies[inner.stem], kept)[0]):
+                yield finding("rescored", inner, _listed(unlike), fix=FLOORS_ANEW)
         known = [
-            (entry, inner, said)
+            (entry, made, inner, said)
             for entry in self.entries
-            for inner, said in zip(entry.score_paths, entry.score.files, strict=True)
+            for made, inner, said in zip(entry.predictions, entry.score_paths, entry.score.files, strict=True)
             if said.predictions_sha256 == card.predictions_sha256
         ]
         if not known:
-            yield finding(
-                "rescored", where, card.predictions_sha256, expected="an entry with these predictions"
-            )
-        for entry, inner, said in known:
-            yield from self._compared(path, card, entry, inner, said)
-
-    def entries_confirmed(self) -> list[Entry]:
-        """Return the entries of which every score file was confirmed."""
-        found = {one.score_file for one in self.confirmed}
-        return [entry for entry in self.entries if found.issuperset(entry.score_paths)]
-
-    def _card(self, path: str | Path, extras: Collection[str] = ()) -> ScoreCard:
-        return score(
-            path, root=self.root, registry=self.registry, progress=self.progress, extras=extras, write=False
-        )
+            expected = "an entry with these predictions"
+            yield finding("rescored", where, card.predictions_sha256, expected=expected)
+        for entry, made, inner, said in known:
+            if inner in self.sound:  # of others the checks of score files tell
+                yield from self._compared(path, card, entry, made, inner, said)
 
     def _compared(
-        self, path: str | Path, card: ScoreCard, entry: Entry, inner: Path, said: ScoredFile
+        self, path: str | Path, card: ScoreCard, entry: Entry, made: Prediction, inner: Path, said: ScoredFile
     ) -> Iterator[Finding]:
         """Yield where a score card differs from a score file and what the entry says of it."""
-        if inner not in self.sound:
-            return  # told by the checks of the score file
         where, theirs = str(path), read_stored(self.folder.path / inner)
         statistics = next(iter(theirs.scores.tallies.values())).names
         measured = {METRICS[name].extra for name in statistics if name in METRICS}
         if extras := sorted(extra for extra in measured if extra is not None):
             try:
-                card = self._card(path, extras)
+                card = self.card(path, extras=extras)
             except UsageError as error:
                 got = f"{error.what}, which measures some of them"
                 yield finding("rescored", where, got, expected=f"the statistics of {inner}")
@@ -126,7 +104,7 @@ class Rescoring:
             file = Path(scratch) / "scores.nc"
             write_statistics(card, file)
             ours, stored = scored_file(card, file), read_stored(file)
-        differing, difference = _unlike(dict(stored.scores.tallies), theirs.scores)
+        differing, difference = _unlike(stored.scores.tallies, theirs.scores)
         step = max(stored.precision, theirs.precision)
         for name, room in {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}.items():
             a, b = (np.asarray(getattr(held.preview, name), np.float64) for held in (stored, theirs))
@@ -135,25 +113,21 @@ class Rescoring:
                 differing.append(f"{name} pictures")
         if differing:
             yield finding("rescored", where, _listed(differing), expected=f"what {inner} holds")
-        for name in ("flags", "warnings", "diverged_at"):
-            one, other = _named(getattr(ours, name)), _named(getattr(said, name))
+        told = {
+            name: (getattr(ours, name), getattr(said, name)) for name in ("flags", "warnings", "diverged_at")
+        }
+        for name, pair in {**told, "budget": (card.header.budget, made.budget)}.items():
+            one, other = map(_named, pair)
             if one != other:
                 differing.append(name)
                 yield finding("rescored", where, one, expected=f"{name} {other}")
-        made = entry.predictions[entry.score_paths.index(inner)]
-        if made.budget != card.header.budget:
-            differing.append("budget")
-            yield finding("rescored", where, card.header.budget, expected=f"budget {made.budget}")
         if not differing:
-            confirmed = Confirmation(Path(path), entry.yaml_path, inner, difference)
-            self.confirmed.append(confirmed)
+            self.confirmed.append(Confirmation(Path(path), entry.yaml_path, inner, difference))
 
 
-def _unlike(ours: dict[int, Tally], theirs: StoredScores) -> tuple[list[str], float]:
+def _unlike(ours: Mapping[int, Tally], theirs: StoredScores) -> tuple[list[str], float]:
     """Return the names of statistics that differ, and the greatest relative difference of the others."""
-    if set(ours) != set(theirs.tallies) or any(
-        tally.frames != theirs.tallies[i].frames for i, tally in ours.items()
-    ):
+    if {i: tally.frames for i, tally in ours.items()} != {i: t.frames for i, t in theirs.tallies.items()}:
         return ["scenarios or frames"], np.inf
     first = next(iter(theirs.tallies.values()))
     # of a long rollout the last bits may have pushed a value over to the next step of its rounding
@@ -207,23 +181,22 @@ def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Find
     untracked = _git(folder, "ls-files", "--others", "-z", ".").decode("utf-8", "replace").split("\0")
     changes |= {Path(name): "A" for name in untracked if name}
     for path, how in sorted(changes.items()):
+        verb = {"A": "added", "D": "removed", "T": "replaced by a link"}.get(how[:1], "changed")
         if path == Path(VERIFIED) or path.parts[0] == FLOORS:
-            if path == Path(VERIFIED) and _only_own_lines_left(folder, start, own):
-                continue
-            if path.as_posix() in before or path == Path(VERIFIED):
-                yield finding("base", path, _verb(how), expected="what the maintainers keep, unchanged")
+            lost = path.as_posix() in before
+            if not _only_own_lines_left(folder, start, own) if path == Path(VERIFIED) else lost:
+                yield finding("base", path, verb, expected="what the maintainers keep, unchanged")
         elif path.parts[0] in (SUBMISSIONS, SCORES, WEIGHTS) and len(path.parts) == 4:
             method = path.stem.partition("_")[0]
             entry = Path(SUBMISSIONS, *path.parts[1:3], f"{method}.yaml")
             if entry.as_posix() not in before or method in own:
                 continue
-            got = _verb(how)
             if path == entry and how == "M":
                 now, file = None, folder.path / entry
                 if folder.oddity(entry) is None and file.stat().st_size <= MAX_ENTRY_BYTES:
                     now = _plain(file.read_bytes())
-                got = _altered(_plain(_git(folder, "show", f"{start}:./{entry.as_posix()}")), now)
-            yield finding("base", path, got, expected=f"{entry} and its score files, unchanged")
+                verb = _altered(_plain(_git(folder, "show", f"{start}:./{entry.as_posix()}")), now)
+            yield finding("base", path, verb, expected=f"{entry} and its score files, unchanged")
 
 
 def _only_own_lines_left(folder: Folder, start: str, own: Collection[str]) -> bool:
@@ -238,12 +211,8 @@ def _only_own_lines_left(folder: Folder, start: str, own: Collection[str]) -> bo
     if not isinstance(before, dict) or not isinstance(now, dict):
         return False
     gone = before.keys() - now.keys()
-    kept = {name: line for name, line in before.items() if name not in gone}
-    return now == kept and bool(gone) and all(Path(str(name)).stem in own for name in gone)
-
-
-def _verb(how: str) -> str:
-    return {"A": "added", "D": "removed", "T": "replaced by a link"}.get(how[:1], "changed")
+    left = {name: line for name, line in before.items() if name in now}
+    return now == left and bool(gone) and all(Path(str(name)).stem in own for name in gone)
 
 
 def _altered(before: Any, now: Any) -> str:  # noqa: ANN401

@@ -29,6 +29,7 @@ from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
 from .entry_file import read_entry, read_verified, schema_bytes, verification_of
+from .findings import CHECKS
 from .folder import PAGE, SCHEMA, Folder
 from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
 from .page import LINKS, render
@@ -68,24 +69,9 @@ class _Held:
 
 
 def collect(
-    folder: str | Path,
-    *,
-    only: Collection[tuple[str, str]] | None = None,
-    registry: Registry | None = None,
+    folder: str | Path, *, only: Collection[tuple[str, str]] | None = None, registry: Registry | None = None
 ) -> Board:
-    """Return the board of a leaderboard's folder.
-
-    Args:
-        folder: the leaderboard's folder.
-        only: the (split, size) to read; all when None.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: no leaderboard there.
-        UnreadableFileError: an entry or a score file cannot be read.
-        ChecksFailedError: an entry does not fit the schema or lies in another place.
-        DataError: an entry is of a split that is not known here.
-    """
+    """Return the board of a leaderboard's folder; of some (split, size) ``only``, or of all."""
     place, described = Folder(folder), registry or load()
     place.require()
     found: dict[tuple[str, str], list[_Held]] = {}
@@ -94,21 +80,14 @@ def collect(
             continue
         entry = read_entry(place.path / path)
         if entry.yaml_path != path:
-            raise ChecksFailedError(
-                "an entry lies in another place than it says",
-                where=str(path),
-                expected=str(entry.yaml_path),
-                fix="let split, size and method be those of the path",
-            )
+            what, expected = "an entry lies in another place than it says", str(entry.yaml_path)
+            raise ChecksFailedError(what, where=str(path), expected=expected, fix=CHECKS["place"].fix)
         try:
             size = described.size(entry.split, entry.size)
         except UsageError as error:
-            fix = error.fix
-            if entry.split not in described.splits:
-                fix = "install the package that adds the split; lagbench list names those that are known"
-            raise DataError(
-                error.what, where=str(place.path / path), expected=error.expected, fix=fix
-            ) from error
+            missing = "install the package that adds the split; lagbench list names those that are known"
+            fix, where = error.fix if entry.split in described.splits else missing, str(place.path / path)
+            raise DataError(error.what, where=where, expected=error.expected, fix=fix) from error
         current = is_current(entry.dataset, size)
         try:
             stored = [read_stored(place.path / path, size) for path in entry.score_paths]
@@ -117,14 +96,10 @@ def collect(
                 raise
             continue  # old scores that do not fit the task of today
         scores = combine([held.scores for held in stored])
-        lacking = [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]
-        if lacking:
-            raise UnreadableFileError(
-                "a score file lacks metrics that every one has",
-                where=str(place.path / entry.score_paths[0]),
-                expected=", ".join(lacking),
-                fix="score the predictions again: lagbench submit",
-            )
+        if lacking := [name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores]:
+            what, file = "a score file lacks metrics that every one has", place.path / entry.score_paths[0]
+            fix = "score the predictions again: lagbench submit"
+            raise UnreadableFileError(what, where=str(file), expected=", ".join(lacking), fix=fix)
         held = _Held(entry=entry, current=current, stored=stored, scores=scores)
         found.setdefault((entry.split, entry.size), []).append(held)
     verified, tabs, empty = read_verified(place), [], []
@@ -328,25 +303,8 @@ class BuildResult:
     written: tuple[Path, ...]  # files that were missing or had other bytes
 
 
-def build(
-    board: str | Path,
-    *,
-    check: bool = False,
-    registry: Registry | None = None,
-) -> BuildResult:
-    """Write the page and schema.json of a leaderboard's folder; files that are right stay untouched.
-
-    Args:
-        board: the leaderboard's folder.
-        check: write nothing, fail where a file would change.
-        registry: where splits are described; ours when None.
-
-    Raises:
-        UsageError: no leaderboard there.
-        UnreadableFileError: an entry or a score file cannot be read.
-        ChecksFailedError: an entry does not fit, or with ``check`` a file is stale.
-        WorkFailedError: the disk is full or not writable.
-    """
+def build(board: str | Path, *, check: bool = False, registry: Registry | None = None) -> BuildResult:
+    """Write page and schema.json where they are stale; with ``check`` nothing: what is stale is an error."""
     folder, held = Folder(board), collect(board, registry=registry)
     links = {label: path for label, path in LINKS.items() if (folder.path / path).exists()}
     page = folder.path / PAGE
@@ -357,10 +315,7 @@ def build(
     stale = [
         path
         for path, data in wanted.items()
-        if path.is_symlink()
-        or not path.is_file()
-        or path.stat().st_size != len(data)
-        or path.read_bytes() != data
+        if path.is_symlink() or not path.is_file() or path.read_bytes() != data
     ]
     if stale and check:
         raise ChecksFailedError(

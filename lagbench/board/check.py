@@ -8,11 +8,11 @@ predictions again, and by nothing else: that is what verified.yaml says of an en
 
 from __future__ import annotations
 
-import datetime
 import math
 import stat
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.floors.shipped import shipped_path
 from lagbench.floors.table import FLOORS
 from lagbench.scoring.floors import measured_again
+from lagbench.scoring.score import score
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored, unreadable_in_child
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
@@ -72,30 +73,17 @@ def check_board(
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> CheckResult:
-    """Check entries, score files and aggregates of a leaderboard's folder.
+    """Check entries, score files and aggregates of a leaderboard's folder; the page once all else is well.
 
-    Args:
-        board: the leaderboard's folder.
-        registry: where splits are described; ours when None.
-        page: whether to compare the page too, once nothing else is wrong.
-        base: git revision; entries that were there and that the folder alters are findings.
-        own: methods that may be altered all the same.
-        isolated: whether to read score files in a child process first.
-        predictions: predictions of entries to score again.
-        recording: whether to note entries thus confirmed in verified.yaml.
-        floors: sizes whose shipped floors are measured again.
-        root: folder of all data sets, for both.
-        progress: told how far that scoring is.
-
-    Raises:
-        UsageError: no leaderboard there, or git does not know the base.
-        DataError: the test subset is missing, or predictions were made from another data set.
+    Entries of the git revision ``base`` that the folder alters are findings, unless of methods in ``own``.
+    With ``isolated`` a child process reads score files first. Scored again are ``predictions`` of entries,
+    noted in verified.yaml with ``recording``, and the shipped floors of the sizes ``floors``.
     """
     folder, described = Folder(board), registry or load()
     folder.require()
     files = [folder.path / path for path in (*folder.score_files(), *folder.floor_files())]
     broken = unreadable_in_child(files) if isolated else {}
-    look = _Look(folder=folder, registry=described, broken=broken, last=last_day())
+    look = _Look(folder=folder, registry=described, broken=broken)
     for path in folder.entries():
         look.guarded(path, look.entry)
     for path in folder.floor_files():
@@ -103,21 +91,22 @@ def check_board(
     look.together()
     if base is not None:
         look.found += check_base(folder, base, own)
-    again = Rescoring(
-        folder=folder,
-        entries=look.known,
-        sound=look.sound,
-        registry=described,
-        root=root,
-        progress=progress,
-    )
+    card = partial(score, root=root, registry=described, progress=progress, write=False)
+    again = Rescoring(folder=folder, entries=look.known, sound=look.sound, card=card)
     for one in predictions:
         look.found += again.of_file(one)
-    measured = {f"{size.split} {size.name}": look.measured(size, root, progress) for size in floors}
-    confirmed = again.entries_confirmed()
-    whole = {entry.yaml_path.as_posix() for entry in confirmed}
-    recorded = confirmed if recording and not look.found else []
-    record(folder, recorded, datetime.datetime.now(datetime.UTC).date())
+    measured = {}
+    for size in floors:
+        names, unlike = measured_again(size, resolve_root(root), progress=progress)
+        measured[f"{size.split} {size.name}"] = names
+        for name, metrics in unlike.items():
+            more = f" and {len(metrics) - 3} more metrics" if len(metrics) > 3 else ""
+            where = f"{shipped_path(size).name}, {name}"
+            look.add("measured", where, f"other {', '.join(metrics[:3])}{more}")
+    confirmed = {one.score_file for one in again.confirmed}
+    whole = {entry.yaml_path: entry for entry in look.known if confirmed.issuperset(entry.score_paths)}
+    recorded = [*whole.values()] if recording and not look.found else []
+    record(folder, recorded)
     looked = page and not look.found
     if looked:
         try:
@@ -131,7 +120,7 @@ def check_board(
         page_checked=looked,
         confirmed=tuple(again.confirmed),
         recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
-        partly=tuple(sorted({one.entry.as_posix() for one in again.confirmed} - whole)),
+        partly=tuple(sorted({one.entry.as_posix() for one in again.confirmed if one.entry not in whole})),
         floors=measured,
     )
 
@@ -143,7 +132,6 @@ class _Look:
     folder: Folder
     registry: Registry
     broken: Mapping[Path, str]  # files that cannot be read, and why, as a child process found
-    last: datetime.date
     found: list[Finding] = field(default_factory=list)
     known: list[Entry] = field(default_factory=list)
     sound: set[Path] = field(default_factory=set)  # score files that were read
@@ -183,8 +171,8 @@ class _Look:
             recorded = size.measured.dataset_sha256[:16] if size.measured else "no recorded hash"
             other = f"version {entry.dataset.version}, {entry.dataset.sha256[:16]}"
             self.add("version", path, other, expected=f"version {size.version}, {recorded}")
-        if entry.date > self.last:
-            self.add("date", path, entry.date, expected=f"at most {self.last}")
+        if entry.date > (last := last_day()):
+            self.add("date", path, entry.date, expected=f"at most {last}")
         for number, made in enumerate(entry.predictions):
             if made.path is not None and (got := self._length(Path(made.path))) != made.bytes:
                 expected = f"{made.path}, a file of {made.bytes} bytes"
@@ -211,21 +199,15 @@ class _Look:
         task = size if is_current(entry.dataset, size) else None
         stored = []
         for inner, said, made in zip(entry.score_paths, entry.score.files, entry.predictions, strict=True):
-            one = self._read(inner, said.sha256, task)
-            if one is None:
+            if (one := self._read(inner, said.sha256, task)) is None:
                 continue
-            expected = {
-                "split": entry.split,
-                "size": entry.size,
-                "dataset_version": entry.dataset.version,
-                "dataset_sha256": entry.dataset.sha256,
-                "predictions_sha256": made.sha256,
-            }
+            expected = {"split": entry.split, "size": entry.size, "dataset_version": entry.dataset.version}
+            expected |= {"dataset_sha256": entry.dataset.sha256, "predictions_sha256": made.sha256}
             found = {**one.scores.identity, "predictions_sha256": one.scores.predictions_sha256}
-            for name in (name for name, wanted in expected.items() if found[name] != wanted):
-                self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {expected[name]!a}")
-            wrong = list(impossible(one))
-            if wrong:
+            for name, wanted in expected.items():
+                if found[name] != wanted:
+                    self.add("score_file", inner, f"{name} {ascii(found[name])[:80]}, not {wanted!a}")
+            if wrong := list(impossible(one)):
                 self.add("values", inner, wrong[0] + f" and {len(wrong) - 1} more" * (len(wrong) > 1))
             else:
                 stored.append(one)
@@ -288,17 +270,6 @@ class _Look:
         except LagbenchError as error:
             self.found.append(finding_of("floor", error, path))
 
-    def measured(
-        self, size: Size, root: str | Path | None, progress: Callable[[Progress], None] | None
-    ) -> tuple[str, ...]:
-        """Measure the shipped floors of a data set again; return which were."""
-        names, unlike = measured_again(size, resolve_root(root), progress=progress)
-        for name, metrics in unlike.items():
-            more = f" and {len(metrics) - 3} more metrics" if len(metrics) > 3 else ""
-            where = f"{shipped_path(size).name}, {name}"
-            self.add("measured", where, f"other {', '.join(metrics[:3])}{more}")
-        return names
-
     def together(self) -> None:
         """Check what entries are to each other, and what else lies in the folder."""
         entries = self.known
@@ -325,12 +296,11 @@ class _Look:
                 if path not in told and path.parts[1:3] == files[0].parts[1:3]:
                     told.add(path)
                     self.add("twin", path, f"those of {files[0]}")
+        floors = {skeleton(floor): f"that of the floor {floor}" for floor in FLOORS}
         seen: dict[tuple[str, str, str], str] = {}
         for entry in (entry for entry in entries if entry.status is Status.ACTIVE):
-            for floor in FLOORS:
-                seen[entry.split, entry.size, skeleton(floor)] = f"that of the floor {floor}"
-            own = f"that of {entry.method}, {entry.name!a}"
-            other = seen.setdefault((entry.split, entry.size, skeleton(entry.name)), own)
+            name, own = skeleton(entry.name), f"that of {entry.method}, {entry.name!a}"
+            other = floors.get(name) or seen.setdefault((entry.split, entry.size, name), own)
             if other != own:
                 self.add("name", entry.yaml_path, other)
         scored = {path for entry in entries for path in entry.score_paths}
@@ -343,25 +313,22 @@ class _Look:
             lines = read_verified(self.folder)
         except LagbenchError as error:
             self.found.append(finding_of("verified", error, VERIFIED))
-            return
-        sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
-        for named_path in sorted(lines.keys() - sound):
-            self.add("verified", VERIFIED, ascii(named_path)[:120])
+        else:
+            sound = {entry.yaml_path.as_posix() for entry in entries if verification_of(entry, lines)}
+            for named_path in sorted(lines.keys() - sound):
+                self.add("verified", VERIFIED, ascii(named_path)[:120])
 
 
 def _same(first: Summary | None, second: Summary | None) -> bool:
     if first is None or second is None:
         return False
-    pairs = zip(first.model_dump().values(), second.model_dump().values(), strict=True)
     return all(
-        one is two
-        if one is None or two is None
-        else math.isclose(one, two, rel_tol=TOLERANCE, abs_tol=1e-300)
-        for one, two in pairs
+        one is two if None in (one, two) else math.isclose(one, two, rel_tol=TOLERANCE, abs_tol=1e-300)
+        for (_, one), (_, two) in zip(first, second, strict=True)
     )
 
 
 def _spelt(summary: Summary | None) -> str:
     if summary is None:
         return "no such metric"
-    return ", ".join(f"{key} {value}" for key, value in summary.model_dump().items())
+    return ", ".join(f"{key} {value}" for key, value in summary)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,30 +18,28 @@ from .model import Floor, Row, Tab, Value
 MAIN_METRICS = 5
 """Metrics of the first table, the ranking one among them; with more it would be wider than a screen."""
 
-PRESETS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "position": (
-            *("cloud_distance", "position_rmse_20", "position_rmse", "position_mae", "velocity_rmse"),
-            *("velocity_mae", "attribute_mse", "mse_avg", "mse_end", "sliced_w2", "sinkhorn", "sinkhorn_pot"),
-            *(f"position_rmse_{material}" for material in ("liquid", "jelly", "snow", "rope")),
-        ),
-        "vorticity": (
-            *("vorticity_nrmse", "vorticity_rmse", "vorticity_mae", "vorticity_pearson", "stable_frames"),
-            *("spectrum_error", "vorticity_residual_std", "vorticity_residual_max"),
-            *("vorticity_residual_slope", "vorticity_kl", "vorticity_kl_hist", "vorticity_w1"),
-        ),
-        "energy": (
-            *("energy_error", "energy_ratio", "energy_retention", "energy_retention_true"),
-            *("energy_predicted", "energy_true"),
-        ),
-        "conservation": (
-            *("momentum_error", "angular_momentum_error", "density_rmse"),
-            *("divergence_rms", "divergence_rms_true", "shape_error", "connectivity"),
-        ),
-        "training": ("track", "windows", "epochs", "cpu_hours", "gpu_hours", "parameters", "seeds"),
-        "cost": ("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
-    }
-)
+PRESETS: Mapping[str, tuple[str, ...]] = {
+    "position": (
+        *("cloud_distance", "position_rmse_20", "position_rmse", "position_mae", "velocity_rmse"),
+        *("velocity_mae", "attribute_mse", "mse_avg", "mse_end", "sliced_w2", "sinkhorn", "sinkhorn_pot"),
+        *(f"position_rmse_{material}" for material in ("liquid", "jelly", "snow", "rope")),
+    ),
+    "vorticity": (
+        *("vorticity_nrmse", "vorticity_rmse", "vorticity_mae", "vorticity_pearson", "stable_frames"),
+        *("spectrum_error", "vorticity_residual_std", "vorticity_residual_max"),
+        *("vorticity_residual_slope", "vorticity_kl", "vorticity_kl_hist", "vorticity_w1"),
+    ),
+    "energy": (
+        *("energy_error", "energy_ratio", "energy_retention", "energy_retention_true"),
+        *("energy_predicted", "energy_true"),
+    ),
+    "conservation": (
+        *("momentum_error", "angular_momentum_error", "density_rmse"),
+        *("divergence_rms", "divergence_rms_true", "shape_error", "connectivity"),
+    ),
+    "training": ("track", "windows", "epochs", "cpu_hours", "gpu_hours", "parameters", "seeds"),
+    "cost": ("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
+}
 """Columns by preset; those that a data set lacks are left out, the ranking one stands first."""
 
 
@@ -141,8 +138,7 @@ def _budget(budget: EntryBudget | None) -> str:
         return ""
     hours = {"CPU": budget.cpu_hours, "GPU": budget.gpu_hours}
     said = [f"{text(value)} {kind} h" for kind, value in hours.items() if value]
-    weights = f"{_count(float(budget.windows))} windows" if budget.windows else ""
-    return " + ".join(said) or weights
+    return " + ".join(said) or (f"{_count(float(budget.windows))} windows" if budget.windows else "")
 
 
 def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:

@@ -124,8 +124,7 @@ def cost_figure(tab: Tab) -> Markup:
     said = (
         "Further left is cheaper, further down more accurate; the line joins those that no other beats in"
         " both. The upright line is what the solver itself takes."
-        " Costs of entries are self-reported, brought to the machine of the solver by their"
-        " speed-up."
+        " Costs of entries are self-reported, brought to the machine of the solver by their speed-up."
     )
     if any(mark.kind == "coarse" for mark in marks):
         said += " Filled grey is the solver on a coarser grid."
@@ -133,22 +132,12 @@ def cost_figure(tab: Tab) -> Markup:
         said += f" {without} {'entry says' if without == 1 else 'entries say'} nothing about cost."
     title = "Accuracy against cost"
     body = draw(marks, tab.solver_seconds, tab.ranking, title) if marks else tag("p", "No costs are known.")
-    return tag(
-        "figure",
-        tag("div", tag("h3", title), class_="figure-head"),
-        body,
-        tag("figcaption", tag("p", said)),
-        class_="figure",
-        data_figure="cost",
-    )
+    head, foot = tag("div", tag("h3", title), class_="figure-head"), tag("figcaption", tag("p", said))
+    return tag("figure", head, body, foot, class_="figure", data_figure="cost")
 
 
 def picture(board: Board, size: Size) -> str:
-    """Return the figure of a data set as an SVG file of its own; without entries, that of the floors.
-
-    Raises:
-        DataError: neither entries nor floors are known.
-    """
+    """Return the figure of a data set as an SVG file of its own; without entries, that of the floors."""
     tab = next((tab for tab in board.tabs if tab.id == f"{size.split}-{size.name}"), None)
     ranking, solver = ranking_metric(size), solver_seconds(size)
     if tab is not None:
@@ -160,13 +149,5 @@ def picture(board: Board, size: Size) -> str:
         what, where = "nothing to draw: neither entries nor floors with a cost", f"{size.split} {size.name}"
         raise DataError(what, where=where, fix="`lagbench predict` labels what a frame takes")
     drawn = draw(marks, solver, ranking, f"{size.split} {size.name}: accuracy against cost")
-    whole = tag(
-        "svg",
-        tag("style", STYLE),
-        drawn,
-        xmlns="http://www.w3.org/2000/svg",
-        viewBox=f"0 0 {WIDTH} {HEIGHT}",
-        width=2 * WIDTH,
-        height=2 * HEIGHT,
-    )
-    return f"{whole}\n"
+    box = {"viewBox": f"0 0 {WIDTH} {HEIGHT}", "width": 2 * WIDTH, "height": 2 * HEIGHT}
+    return f"{tag('svg', tag('style', STYLE), drawn, xmlns='http://www.w3.org/2000/svg', **box)}\n"

@@ -13,8 +13,8 @@ import enum
 import ipaddress
 import unicodedata
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal, Self
 from urllib.parse import urlsplit
 
@@ -40,15 +40,13 @@ SHA256 = r"^[0-9a-f]{64}$"
 RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
 LABEL = r"^[a-z0-9_]+$"
 
-PATTERNS: Mapping[str, str] = MappingProxyType(
-    {
-        ID: "small letters, digits and single hyphens, as in my-model",
-        WEB: "an http:// or https:// address, without spaces and quotes",
-        SHA256: "64 hexadecimal digits",
-        RELEASE: "a version, as in 1.0.0",
-        LABEL: "small letters, digits and underscores",
-    }
-)
+PATTERNS: Mapping[str, str] = {
+    ID: "small letters, digits and single hyphens, as in my-model",
+    WEB: "an http:// or https:// address, without spaces and quotes",
+    SHA256: "64 hexadecimal digits",
+    RELEASE: "a version, as in 1.0.0",
+    LABEL: "small letters, digits and underscores",
+}
 """What texts have to be, in words; people do not read regular expressions."""
 
 LONGEST_ID = 60
@@ -92,22 +90,14 @@ def _visible(text: str) -> str:
 
 def _named_host(address: str) -> str:
     """Refuse hosts that read as another one, or that are no name that anybody could look up."""
-    try:
+    labels: list[str] = []
+    with suppress(ValueError):  # of what is no address, and of a name, which is no number
         host = urlsplit(address).hostname or ""
-    except ValueError:
-        host = ""
-    labels = host.split(".")
-    try:
+        labels = host.split(".")
         ipaddress.ip_address(host.strip("[]"))
         labels = []
-    except ValueError:
-        pass
-    if (
-        "@" in address
-        or "" in labels[:-1]
-        or len(labels) < 2
-        or any(part.startswith("xn--") for part in labels)
-    ):
+    puny = any(part.startswith("xn--") for part in labels)
+    if "@" in address or "" in labels[:-1] or len(labels) < 2 or puny:
         raise ValueError("is not the address of a named host, without user and punycode")
     return address
 

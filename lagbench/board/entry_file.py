@@ -27,7 +27,7 @@ from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
 from lagbench.submission.findings import quoted
 
-from .entry import PATTERNS, Entry, Meta, Status, Verification, Weights
+from .entry import PATTERNS, Entry, Meta, Status, Verification
 from .folder import VERIFIED, Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
@@ -98,21 +98,11 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
-    """Return what a YAML file and options say; options win.
-
-    Args:
-        path: a YAML file, or None.
-        options: keys of :class:`Meta` to values; None and empty ones are not given.
-
-    Raises:
-        UnreadableFileError: no regular file, too long, or no plain YAML.
-        UsageError: an unknown key or a value that does not fit.
-    """
+    """Return what a YAML file and options say; options win, None and empty ones are not given."""
     held = {} if path is None else load_plain(path)
     if not isinstance(held, dict):
-        raise UsageError(
-            "the file does not describe a method", where=str(path), expected="lines of key: value"
-        )
+        expected = "lines of key: value"
+        raise UsageError("the file does not describe a method", where=str(path), expected=expected)
     given = {key: value for key, value in options.items() if value not in (None, "", (), [])}
     meta, mistakes = examine(Meta, {**held, **given})
     if meta is None:
@@ -127,11 +117,8 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
 
 def schema_bytes() -> bytes:
     """Return the JSON schema of an entry as the bytes of leaderboard/schema.json."""
-    schema = Entry.model_json_schema()
-    schema |= {
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-        "title": "Entry of the lagbench leaderboard",
-    }
+    schema = {**Entry.model_json_schema(), "$schema": "https://json-schema.org/draft/2020-12/schema"}
+    schema["title"] = "Entry of the lagbench leaderboard"
     return f"{json.dumps(schema, indent=1, ensure_ascii=False)}\n".encode()
 
 
@@ -155,24 +142,17 @@ def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
     place, given = item["loc"], quoted(item["input"])
     where = quoted(".".join(map(str, place)))[1:-1] or "the file"
     if item["type"] == "extra_forbidden":
-        fix = nearest(str(place[-1])[:100], _fields(kind, place[:-1]))
+        for key in place[:-1]:
+            if isinstance(key, str) and key in kind.model_fields:  # else a position, or a name in a mapping
+                kind = _model_in(kind.model_fields[key].annotation) or kind
+        fix = nearest(str(place[-1])[:100], list(kind.model_fields))
         return Mistake(where=where, what="unknown key", got=given, fix=fix)
     if item["type"] == "missing":
         return Mistake(where=where, what="this key is missing", got="no such key")
-    wanted = PATTERNS.get(item.get("ctx", {}).get("pattern", ""))
-    if item["type"] == "tuple_type":
-        wanted = "a list"
+    pattern = item.get("ctx", {}).get("pattern", "")
+    wanted = "a list" if item["type"] == "tuple_type" else PATTERNS.get(pattern)
     what = item["msg"].removeprefix("Value error, ") if wanted is None else f"is not {wanted}"
     return Mistake(where=where, what=what, got=given)
-
-
-def _fields(kind: type[BaseModel], place: tuple[int | str, ...]) -> list[str]:
-    """Return the keys known at a place of the schema."""
-    for key in place:
-        if isinstance(key, int) or key not in kind.model_fields:
-            continue  # a position in a list, or a name in a mapping: the model is known already
-        kind = _model_in(kind.model_fields[key].annotation) or kind
-    return list(kind.model_fields)
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
@@ -189,12 +169,10 @@ def readable(path: Path) -> Entry | None:
     return None
 
 
-def is_there(folder: Folder, weights: Weights) -> bool:
-    """Tell whether weights lie where their entry says, as it says, and not behind a link."""
-    file = folder.path / weights.path
-    return (
-        file.is_file() and folder.link_in(Path(weights.path)) is None and file_sha256(file) == weights.sha256
-    )
+def is_there(folder: Folder, path: Path, sha256: str) -> bool:
+    """Tell whether a file lies where its entry says, as it says, and not behind a link."""
+    file = folder.path / path
+    return file.is_file() and folder.link_in(path) is None and file_sha256(file) == sha256
 
 
 def active_beside(folder: Folder, place: Place) -> dict[Path, Entry]:
@@ -240,17 +218,15 @@ def unverified(folder: Folder, entry: Entry) -> bytes | None:
     return spell({path: line.model_dump() for path, line in known.items() if path != name})
 
 
-def record(folder: Folder, entries: Sequence[Entry], date: datetime.date) -> Path | None:
-    """Add entries to the list, or renew their lines; return its path, None without any."""
+def record(folder: Folder, entries: Sequence[Entry]) -> None:
+    """Add entries to the list, or renew their lines; without any the list stays as it is."""
     if not entries:
-        return None
+        return
     held: dict[str, object] = {path: line.model_dump() for path, line in read_verified(folder).items()}
     for entry in entries:
         held[entry.yaml_path.as_posix()] = {
             "scores": tuple(file.sha256 for file in entry.score.files),
             "lagbench": version("lagbench"),
-            "date": date,
+            "date": datetime.datetime.now(datetime.UTC).date(),
         }
-    path = folder.path / VERIFIED
-    write_atomically(path, spell({name: held[name] for name in sorted(held)}), option="--board")
-    return path
+    write_atomically(folder.path / VERIFIED, spell(dict(sorted(held.items()))), option="--board")

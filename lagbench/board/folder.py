@@ -77,12 +77,8 @@ class Folder:
     ) -> None:
         """Refuse a folder that is no leaderboard."""
         if not (self.path / SUBMISSIONS).is_dir():
-            raise UsageError(
-                "no leaderboard here",
-                where=str(self.path),
-                expected=f"a folder that holds {SUBMISSIONS}/",
-                fix=fix,
-            )
+            expected = f"a folder that holds {SUBMISSIONS}/"
+            raise UsageError("no leaderboard here", where=str(self.path), expected=expected, fix=fix)
 
     def require_room(self) -> None:
         """Refuse to begin a leaderboard among other files, which its page could replace."""
@@ -137,8 +133,7 @@ class Folder:
 
     def oddity(self, path: Path) -> str | None:
         """Return why a relative path cannot be an entry or a score file, None if it can."""
-        link = self.link_in(path)
-        if link is not None:
+        if (link := self.link_in(path)) is not None:
             return f"{link} is a symbolic link"
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"

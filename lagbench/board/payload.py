@@ -108,16 +108,15 @@ class _Writer:
 
     def _series(self, row: Row | Floor, tab: Tab) -> dict[str, Any]:
         """Return curves of a row, and the means of each scenario of the main metrics."""
-        values, energy = row.values, row.energy
+        values = row.values
         return {
             "curves": {name: self._curve(curve) for name, curve in row.curves.items()},
-            "energy": None if energy is None else self._curve(energy),
+            "energy": row.energy and self._curve(row.energy),
             "spread": {name: _numbers(values[name].per_scenario) for name in tab.columns if name in values},
         }
 
     def _row(self, row: Row, tab: Tab, scale: float) -> dict[str, Any]:
-        entry, line = row.entry, row.verified
-        verified = "as submitted"
+        entry, line, verified = row.entry, row.verified, "as submitted"
         if line:
             verified = f"verified by the maintainers, lagbench {line.lagbench}, {line.date}"
         about = {
@@ -165,12 +164,12 @@ class _Writer:
     def _curve(self, curve: Curve) -> dict[str, int]:
         return {
             "frames": self._pooled(list(curve.frames)),
-            **{name: self._packed(getattr(curve, name), log=True) for name in ("mean", "low", "high")},
+            **{end: self._pooled(pack(getattr(curve, end), log=True)) for end in ("mean", "low", "high")},
         }
 
     def _histogram(self, histogram: Histogram) -> list[Any]:
         low, high = round_digits(histogram.low, 6), round_digits(histogram.high, 6)
-        return [low, high, self._packed(histogram.shares)]
+        return [low, high, self._pooled(pack(histogram.shares))]
 
     def _pictures(self, pictures: Pictures, scale: float) -> dict[str, Any]:
         """Return maps and film; values beyond four times the truth's greatest are cut off."""
@@ -183,7 +182,7 @@ class _Writer:
             "scenario": pictures.scenario,
             "mapFrames": self._pooled([pictures.map_frames[i] for i in maps]),
             "nodes": fields.shape[-1],
-            "maps": [self._packed(np.clip(one, *limits)) for one in fields],
+            "maps": [self._pooled(pack(np.clip(one, *limits))) for one in fields],
             "histograms": [self._histogram(pictures.histograms[i]) for i in maps],
             "filmFrames": self._pooled([pictures.film_frames[i] for i in film]),
             "material": self._pooled(pictures.material[particles].tolist()),
@@ -192,9 +191,6 @@ class _Writer:
 
     def _shown(self, frames: Sequence[int]) -> list[int]:
         return spaced(len(frames), self.fineness.maps)
-
-    def _packed(self, values: ArrayLike, **options: Any) -> int:  # noqa: ANN401
-        return self._pooled(pack(values, **options))
 
     def _pooled(self, value: list[Any]) -> int:
         said = json.dumps(value)
@@ -259,10 +255,8 @@ def spaced(length: int, count: int) -> list[int]:
     >>> spaced(10, 4), spaced(3, 5), spaced(7, 1)
     ([0, 3, 6, 9], [0, 1, 2], [6])
     """
-    if length <= count:
-        return list(range(length))
-    if count == 1:
-        return [length - 1]
+    if length <= count or count == 1:
+        return list(range(length))[-count:]
     return [i * (length - 1) // (count - 1) for i in range(count)]
 
 

@@ -46,42 +46,34 @@ class Combined:
 
 
 def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
-    """Return the scores of a method by metric, in the table's order.
-
-    Metrics are ours, whatever other packages are installed here, and those that all seeds have.
-    """
+    """Return the scores of a method by metric: those of ours, not of packages, that all seeds have."""
     names = set.intersection(*(set(next(iter(held.tallies.values())).names) for held in seeds))
     metrics = [metric for metric in METRICS.values() if names.issuperset(metric.of)]
     scores = [aggregate(metrics, held.tallies) for held in seeds]
     common = [m.name for m in metrics if all(m.name in held for held in scores)]
-    return {name: _combined([held[name] for held in scores]) for name in common}
+    return {name: _combined(tuple(held[name] for held in scores)) for name in common}
 
 
-def _combined(scores: Sequence[Score]) -> Combined:
-    first, means = scores[0], tuple(held.mean for held in scores)
-    if len(scores) == 1:
-        return Combined(score=first, std=math.nan, means=means, seeds=tuple(scores))
-    score = Score(
-        metric=first.metric,
-        scenarios=first.scenarios,
-        frames=first.frames,
-        per_frame=mean_over_seeds([held.per_frame for held in scores]),
-        values=mean_over_seeds([held.values for held in scores]),
-        undefined=tuple(sum(counts) for counts in zip(*(held.undefined for held in scores), strict=True)),
-    )
+def _combined(seeds: tuple[Score, ...]) -> Combined:
+    score, means = seeds[0], tuple(held.mean for held in seeds)
+    if len(seeds) > 1:
+        score = replace(
+            score,
+            per_frame=mean_over_seeds([held.per_frame for held in seeds]),
+            values=mean_over_seeds([held.values for held in seeds]),
+            undefined=tuple(map(sum, zip(*(held.undefined for held in seeds), strict=True))),
+        )
     defined = [value for value in means if not math.isnan(value)]
     std = float(np.std(defined, ddof=1)) if len(defined) > 1 else math.nan
-    return Combined(score=score, std=std, means=means, seeds=tuple(scores))
+    return Combined(score=score, std=std, means=means, seeds=seeds)
 
 
 def summarise(scores: Mapping[str, Combined]) -> dict[str, Summary]:
     """Return what the score block of an entry says of the metrics: nine digits, null where undefined."""
     found = {}
     for name, held in scores.items():
-        low, high = held.interval
-        found[name] = Summary(
-            mean=digits(held.score.mean), std=digits(held.std), low=digits(low), high=digits(high)
-        )
+        mean, std, low, high = map(digits, (held.score.mean, held.std, *held.interval))
+        found[name] = Summary(mean=mean, std=std, low=low, high=high)
     return found
 
 
@@ -118,12 +110,8 @@ def dataset_of(identity: Mapping[str, str]) -> DataSet:
 
 
 def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
-    """Write the floors that a score card has and the folder lacks, as score files; return their paths.
-
-    Their pictures show the truth alone.
-    """
-    written = []
-    header, preview = card.header, card.preview
+    """Write the floors of a card that the folder lacks, pictures of the truth alone; return their paths."""
+    written, header, preview = [], card.header, card.preview
     nothing = np.full_like(preview.vorticity[0], np.nan)
     truth = replace(
         preview,
@@ -146,10 +134,7 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
 
 
 def scored_file(card: ScoreCard, path: Path, outside: float | None = None) -> ScoredFile:
-    """Return what an entry says of the score file that was written from a card.
-
-    ``outside`` is the share of positions beyond the box [1], where the scorer warns of them.
-    """
+    """Return what an entry says of a card's score file; ``outside``: share of positions beyond the box."""
 
     def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
         return Flag(name=name, reasons=tuple(said[:LONGEST_TEXT] for said in reasons), share=share)

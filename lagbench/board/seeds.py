@@ -6,7 +6,6 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.scoring.stored import read_stored
 from lagbench.submission.findings import quoted
@@ -48,11 +47,7 @@ def _alike(trainings: Sequence[str]) -> list[str]:
 
 
 def extendable(folder: Folder, place: Place, headers: Sequence[Header], meta: Meta) -> Entry:
-    """Return the entry that gets more seeds; refuse one that files of other seeds do not belong to.
-
-    Its own predictions need not be at hand: what they were called and scored is read from its score files,
-    which must be those that it names. What ``meta`` says of parameters or training is not compared.
-    """
+    """Return the entry that gets more seeds, its predictions perhaps gone; refuse what does not belong."""
     path, first = folder.path / entry_path(place), headers[0]
     anew = "or submit all seeds anew: --replace"
     if not path.exists():
@@ -77,22 +72,17 @@ def extendable(folder: Folder, place: Place, headers: Sequence[Header], meta: Me
         raise UsageError("the entry has such a seed already", where=str(path), got=got, fix=fix)
     if (count := len(own) + len(seeds)) > MOST_SEEDS:
         raise UsageError("too many seeds", where=str(path), expected=f"at most {MOST_SEEDS}", got=count)
-    for inner, said in zip(entry.score_paths, entry.score.files, strict=True):
-        file = folder.path / inner
-        if folder.link_in(inner) is not None or not file.is_file() or file_sha256(file) != said.sha256:
+    files = zip(entry.score_paths, entry.score.files, strict=True)
+    named = [(path, said.sha256, "a score file of the entry is not the one") for path, said in files]
+    weights = [made.weights for made in entry.predictions if made.weights]
+    named += [(Path(its.path), its.sha256, "weights of the entry are not those") for its in weights]
+    for inner, sha256, what in named:
+        if not is_there(folder, inner, sha256):
             raise ChecksFailedError(
-                "a score file of the entry is not the one that it names",
-                where=str(file),
-                expected=f"SHA-256 {said.sha256[:16]}",
-                fix=f"restore it, as `git checkout` does, {anew}",
-            )
-    for made in entry.predictions:
-        if made.weights is not None and not is_there(folder, made.weights):
-            raise ChecksFailedError(
-                "weights of the entry are not those that it names",
-                where=str(folder.path / made.weights.path),
-                expected=f"SHA-256 {made.weights.sha256[:16]}",
-                fix=f"restore them, as `git checkout` does, {anew}",
+                f"{what} that it names",
+                where=str(folder.path / inner),
+                expected=f"SHA-256 {sha256[:16]}",
+                fix=f"restore {'it' if inner.suffix == '.nc' else 'them'}, as `git checkout` does, {anew}",
             )
     label = read_stored(folder.path / entry.score_paths[0]).scores.identity["method"]
     told: dict[str, tuple[object, object]] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from lagbench.draw.tables import Table
@@ -17,11 +17,7 @@ from .model import Board, Floor, Row, Value
 def chosen_data_sets(
     known: Collection[tuple[str, str]], split: str | None, size: str | None
 ) -> tuple[tuple[str, str], ...]:
-    """Return those of a split, of a size, or all of the (split, size) that have entries.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """Return those of a split, of a size, or all of the (split, size) that have entries; refuse none."""
     found = tuple(one for one in known if split in (None, one[0]) and size in (None, one[1]))
     if found or (split is None and size is None):
         return found
@@ -31,16 +27,7 @@ def chosen_data_sets(
 
 
 def tables(board: Board, metrics: Collection[str] = (), *, wide: bool = False) -> Iterator[Table]:
-    """Yield a table per tab: ranked rows, then floors, then what is not ranked.
-
-    Args:
-        board: the board.
-        metrics: names of metrics to show beside skill and the ranking one.
-        wide: whether to show the tab's first metrics too.
-
-    Raises:
-        UsageError: a metric that the board does not have.
-    """
+    """Yield a table per tab: ranked rows, floors, the rest; with ``wide`` the tab's first metrics too."""
     for name in metrics:
         if name not in board.metrics:
             raise UsageError(f"no metric {name!r} here", where="--metric", fix=nearest(name, board.metrics))
@@ -71,7 +58,9 @@ def as_plain(board: Board) -> dict[str, Any]:
                 "dataset_version": tab.size.version,
                 "ranking_metric": tab.ranking,
                 "rows": [_plain_row(row) for row in tab.rows],
-                "floors": [{"id": floor.name, "metrics": _plain_values(floor)} for floor in tab.floors],
+                "floors": [
+                    {"id": floor.name, "metrics": _plain_values(floor.values)} for floor in tab.floors
+                ],
             }
             for tab in board.tabs
         ]
@@ -90,26 +79,22 @@ def _plain_row(row: Row) -> dict[str, Any]:
         "flags": [flag.name for flag in row.flags],
         "cost": entry.cost and {**entry.cost.model_dump(), "speed_up": entry.cost.speed_up},
         "budget": entry.budget and entry.budget.model_dump(),
-        "skill": _plain_value(row.skill) if row.skill else None,
-        "metrics": _plain_values(row),
+        "skill": _plain_values({"skill": row.skill})["skill"] if row.skill else None,
+        "metrics": _plain_values(row.values),
     }
 
 
-def _plain_values(row: Row | Floor) -> dict[str, Any]:
-    return {name: _plain_value(value) for name, value in row.values.items()}
-
-
-def _plain_value(value: Value) -> dict[str, float | None]:
-    return {key: digits(getattr(value, key)) for key in ("mean", "std", "low", "high")}
+def _plain_values(values: Mapping[str, Value]) -> dict[str, Any]:
+    keys = ("mean", "std", "low", "high")
+    return {name: {key: digits(getattr(value, key)) for key in keys} for name, value in values.items()}
 
 
 def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
-    found = [held(row, name) for name in names]
     values = [
         "-"
-        if value is None or math.isnan(value.mean)
+        if (value := held(row, name)) is None or math.isnan(value.mean)
         else f"{value.mean:.4g}" + ("" if math.isnan(value.std) else f" ± {value.std:.2g}")
-        for value in found
+        for name in names
     ]
     cost = row.cost if isinstance(row, Floor) else row.entry.cost
     time = f"{cost.seconds_per_frame:.3g}" if cost else ""

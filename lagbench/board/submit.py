@@ -15,8 +15,10 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
+from typing import NamedTuple
 
 from lagbench.atomic import move_together, refuse_folders
 from lagbench.data.hdf5 import check_file
@@ -35,8 +37,6 @@ from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
 from .entry import (
-    ID,
-    LONGEST_ID,
     LONGEST_TEXT,
     MOST_SEEDS,
     OUTSIDE,
@@ -94,22 +94,11 @@ def submit(
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
 ) -> SubmitResult:
-    """Score predictions and write their entry and score files, and those of the floors beside them.
+    """Score predictions, a file per seed; write entry and score files, and those of floors beside them.
 
-    Args:
-        predictions: one predictions.nc per seed.
-        meta: what is said of the method.
-        weights: weights that made the predictions, to keep beside the entry: at most one per seed.
-        board: the leaderboard's folder.
-        root: folder of all data sets.
-        replace: whether an entry of that name may be replaced.
-        add: whether the files are further seeds of the entry of that name, whose other predictions need not
-            be at hand. What it says of the method stays, but for what ``meta`` says.
-        new_board: whether to begin a leaderboard where there is none.
-        workers: worker processes of the scorer.
-        registry: where splits are described; ours when None.
-        progress: told how far the scoring is.
-        examined: told what the validation of each file found.
+    ``weights`` made the predictions and are kept beside the entry: at most one file per seed. With ``add``
+    the files are further seeds of the entry of that name, whose other predictions need not be at hand; what
+    it says of the method stays, but for what ``meta`` says. ``examined`` is told what each validation found.
 
     Raises:
         UsageError: a key is missing, the entry is there already or, with ``add``, is not or has changed
@@ -125,15 +114,76 @@ def submit(
         if add and replace:
             raise UsageError("an entry is added to or replaced", where="--add, --replace", fix="give one")
         if not add:
-            _require_said(meta)
+            # what readers need
+            needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
+            if missing := [option for key, option in needed.items() if not getattr(meta, key)]:
+                fix = "give them as options, or authors and command in a file: --from meta.yaml"
+                raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
     with mistakes:
         if new_board:
             folder.require_room()
         else:
             folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
     with mistakes:
-        _require_files(paths)
+        for path in paths:
+            check_file(path, fix=WRITE)
+        if not 1 <= len(paths) <= MOST_SEEDS:
+            what = "too many files" if paths else "no predictions"
+            raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
     mistakes.tell()
+    plan = _planned(
+        folder,
+        paths,
+        meta,
+        weights,
+        replace=replace,
+        add=add,
+        examined=examined,
+        root=root,
+        registry=registry,
+    )
+    scored = partial(score, root=root, workers=workers, registry=registry, progress=progress, write=False)
+    cards = [scored(path, validated=result) for path, result in zip(paths, plan.results, strict=True)]
+    prints = [print_of(card.tallies[SUBMISSION]) for card in cards]
+    require_new(prints, paths, prints_of(folder, plan.rivals))
+    try:
+        return _publish(plan, cards, folder)
+    except OSError as error:
+        raise WorkFailedError(
+            "cannot write there",
+            where=str(error.filename or folder.path),
+            got=error.strerror or error,
+            fix="free disk space, or name a folder that you may write to: --board",
+        ) from error
+
+
+class _Plan(NamedTuple):
+    """What is known of an entry before its predictions are scored."""
+
+    place: Place
+    about: About
+    made: Sequence[Prediction]  # what it says of each file
+    results: Sequence[ValidationResult]
+    outside: Sequence[float | None]  # share of positions beyond the box, where the validation warns
+    sources: Sequence[Path | None]  # weights of each file
+    others: Mapping[Path, Entry]  # active entries of the same data set
+    rivals: Mapping[Path, Entry]  # entries whose predictions it cannot have: others, and added_to
+    added_to: Entry | None
+
+
+def _planned(
+    folder: Folder,
+    paths: Sequence[Path],
+    meta: Meta,
+    weights: Sequence[str | Path],
+    *,
+    root: str | Path | None,
+    registry: Registry | None,
+    replace: bool,
+    add: bool,
+    examined: Callable[[ValidationResult], None] | None,
+) -> _Plan:
+    """Refuse invalid files, then together what they must be for; return what the entry will say of them."""
     headers, hashes, outside, results, described = [], [], [], [], registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
@@ -149,6 +199,7 @@ def submit(
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(outside_share(opened, size) if warned else None)
+    others, before, mistakes = dict[Path, Entry](), None, Mistakes()
     with mistakes:
         seeds = seeds_of(headers)
     with mistakes:
@@ -156,15 +207,23 @@ def submit(
             fix = f"give {len(headers)}, one per file in their order, or none"
             raise UsageError("addresses do not match the files", where="--url", got=len(meta.urls), fix=fix)
         urls = meta.urls or (None,) * len(headers)
-    others: dict[Path, Entry] = {}
-    before: Entry | None = None
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
         others = active_beside(folder, place)
         if add:
             before = extendable(folder, place, headers, meta)
-        label = before.name if before and not meta.name else _name(headers[0], meta)
-        _require_free(folder, place, label, others, replace=replace or add)
+        label = meta.name or (before.name if before else headers[0].method[:100])
+        own = folder.path / entry_path(place)
+        if own.exists() and not replace and not add:
+            name = "another --method, and name: in meta.yaml"
+            fix = f"a further seed: --add; instead of it: --replace; else {name}"
+            raise UsageError("there is such an entry already", where=str(own), fix=fix)
+        names = {floor: f"the floor {floor}" for floor in KNOWN_FLOORS}
+        names |= {entry.name: str(path) for path, entry in others.items()}
+        for name, holder in names.items():
+            if skeleton(name) == skeleton(label):
+                fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
+                raise UsageError("the name looks like another's", where=holder, got=ascii(label), fix=fix)
         read_verified(folder)  # a line of it may have to go
     with mistakes:
         about = _about(headers, meta, before)
@@ -174,59 +233,20 @@ def submit(
     rivals = others | ({} if before is None else {before.yaml_path: before})
     taken = {made.sha256: str(where) for where, entry in rivals.items() for made in entry.predictions}
     require_new(hashes, paths, taken)
-    made = []
+    made, whole = [], folder.path.resolve()
     for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
-        inside, whole = path.resolve(), folder.path.resolve()
+        inside = path.resolve()
         kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
         said: dict[str, object] = {"seed": seed, "sha256": sha256, "url": url, "path": kept}
         said |= {"bytes": path.stat().st_size, "budget": header.budget}
         made.append(_fitting(Prediction, said, where=path, fix="name the file otherwise, or move it"))
-    cards = [
-        score(
-            path,
-            root=root,
-            workers=workers,
-            registry=registry,
-            progress=progress,
-            write=False,
-            validated=result,
-        )
-        for path, result in zip(paths, results, strict=True)
-    ]
-    require_new([print_of(card.tallies[SUBMISSION]) for card in cards], paths, prints_of(folder, rivals))
-    try:
-        return _publish(place, about, cards, made, folder, outside, sources, others, before)
-    except OSError as error:
-        raise WorkFailedError(
-            "cannot write there",
-            where=str(error.filename or folder.path),
-            got=error.strerror or error,
-            fix="free disk space, or name a folder that you may write to: --board",
-        ) from error
-
-
-def _require_said(meta: Meta) -> None:
-    """Refuse an entry that lacks what readers need."""
-    needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
-    missing = [option for key, option in needed.items() if not getattr(meta, key)]
-    if missing:
-        fix = "give them as options, or authors and command in a file: --from meta.yaml"
-        raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
-
-
-def _require_files(paths: Sequence[Path]) -> None:
-    """Refuse no files, more than an entry may have, and what is no file of predictions."""
-    for path in paths:
-        check_file(path, fix=WRITE)
-    if not 1 <= len(paths) <= MOST_SEEDS:
-        what = "too many files" if paths else "no predictions"
-        raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
+    return _Plan(place, about, made, results, outside, sources, others, rivals, before)
 
 
 def _method(header: Header, meta: Meta) -> str:
     """Return the id of the method: the one given, else the label of the predictions if it can be one."""
     name = meta.method or header.method
-    if not re.fullmatch(ID, name) or len(name) > LONGEST_ID:
+    if examine(Meta, {"method": name})[1]:
         raise UsageError(
             "the label of the predictions cannot name an entry",
             expected="small letters, digits and single hyphens",
@@ -239,27 +259,6 @@ def _method(header: Header, meta: Meta) -> str:
     return name
 
 
-def _name(header: Header, meta: Meta) -> str:
-    """Return what the board calls the method."""
-    return meta.name or header.method[:100]
-
-
-def _require_free(
-    folder: Folder, place: Place, label: str, others: Mapping[Path, Entry], *, replace: bool
-) -> None:
-    """Refuse the place of another entry, unless that is to be replaced, and a name like another's."""
-    own = entry_path(place)
-    if (folder.path / own).exists() and not replace:
-        fix = "a further seed: --add; instead of it: --replace; else another --method, and name: in meta.yaml"
-        raise UsageError("there is such an entry already", where=str(folder.path / own), fix=fix)
-    names = {floor: f"the floor {floor}" for floor in KNOWN_FLOORS}
-    names |= {entry.name: str(path) for path, entry in others.items()}
-    for name, holder in names.items():
-        if skeleton(name) == skeleton(label):
-            fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
-            raise UsageError("the name looks like another's", where=holder, got=ascii(label), fix=fix)
-
-
 def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About:
     """Return what is said of the method: by ``meta``, else by the entry before, else by the predictions."""
     first, budgets = headers[0], [header.budget for header in headers]
@@ -269,7 +268,7 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
         stays = {name: getattr(before, name) for name in About.model_fields if name not in ("budget", "date")}
         meta = meta.model_copy(update=stays | said)
     held = {name: getattr(meta, name) for name in About.model_fields}
-    held["name"] = _name(first, meta)
+    held["name"] = meta.name or first.method[:100]
     held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
     if held["date"] > (last := last_day()):
         raise UsageError("a day to come", where="date", expected=f"at most {last}", got=meta.date)
@@ -279,8 +278,8 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
     if before is None:
         held["cost"] = meta.cost or Cost.told(headers, meta.solver_seconds_per_frame)
     elif meta.cost is not None and meta.solver_seconds_per_frame is not None:
-        solver = {"solver_seconds_per_frame": meta.solver_seconds_per_frame}
-        held["cost"] = meta.cost.model_copy(update=solver)
+        timed = {"solver_seconds_per_frame": meta.solver_seconds_per_frame}
+        held["cost"] = meta.cost.model_copy(update=timed)
     if meta.budget is not None and meta.budget.track is not None:
         raise UsageError(
             "a track is not stated",
@@ -308,24 +307,16 @@ def _fitting(
     return found
 
 
-def _publish(
-    place: Place,
-    about: About,
-    cards: Sequence[ScoreCard],
-    made: Sequence[Prediction],
-    folder: Folder,
-    outside: Sequence[float | None],
-    sources: Sequence[Path | None],
-    others: Mapping[Path, Entry],
-    added_to: Entry | None,
-) -> SubmitResult:
+def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitResult:
     """Write all files beside their places, then move them there, the entry last; remove the old one's others.
 
     A full disk is met before anything of the old entry is touched. An entry that is added to keeps its
     score files, under new names where it had but one.
     """
-    staying = added_to.predictions if added_to else ()
-    made, sources = [*staying, *made], [*(None for _ in staying), *sources]
+    place, added_to, header = plan.place, plan.added_to, cards[0].header
+    split, size, method = place
+    staying, lying = (added_to.predictions, added_to.score_paths) if added_to else ((), ())
+    made, sources = [*staying, *plan.made], [*(None for _ in staying), *plan.sources]
     names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
     before = readable(folder.path / yaml_path)
     if added_to is not None and before != added_to:
@@ -334,24 +325,22 @@ def _publish(
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
-        for path, target in zip(added_to.score_paths if added_to else (), staged, strict=False):
+        for path, target in zip(lying, staged, strict=False):
             shutil.copyfile(folder.path / path, target)
         for card, target in zip(cards, staged[len(staying) :], strict=True):
             write_statistics(card, target, option="--board")
-            length = target.stat().st_size
-            if length > MAX_SCORE_BYTES:
+            if (length := target.stat().st_size) > MAX_SCORE_BYTES:
                 raise WorkFailedError(
                     "the score file is too long",
-                    where=f"{place[0]} {place[1]}",
+                    where=f"{split} {size}",
                     expected=f"at most {MAX_SCORE_BYTES} bytes",
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
         files = added_to.score.files if added_to else ()
-        files += tuple(map(scored_file, cards, staged[len(staying) :], outside))
-        kept = named_weights(folder, place, made, sources, before, others)
+        files += tuple(map(scored_file, cards, staged[len(staying) :], plan.outside))
+        kept = named_weights(folder, place, made, sources, before, plan.others)
         made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
-        header = cards[0].header
         block = ScoreBlock(
             lagbench=version("lagbench"),
             dataset_sha256=header.dataset_sha256,
@@ -359,12 +348,11 @@ def _publish(
             files=files,
             metrics=summarise(combine([read_stored(target).scores for target in staged])),
         )
-        held = {name: getattr(about, name) for name in About.model_fields}
-        held["reason"] = added_to.reason if added_to else ""
-        held |= dict(zip(("format", "split", "size", "method"), (2, *place), strict=True))
-        held["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
-        entry = _fitting(Entry, {**held, "predictions": tuple(made), "score": block})
-        lying = added_to.score_paths if added_to else ()  # the same bytes as staged
+        said = dict(plan.about) | {"format": 2, "split": split, "size": size, "method": method}
+        said |= {"predictions": tuple(made), "score": block, "reason": added_to.reason if added_to else ""}
+        said["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
+        entry = _fitting(Entry, said)
+        # score files that lie there are the same bytes as staged
         moves = {name: path for name, path in zip(names, staged, strict=True) if name not in lying}
         moves |= stage_weights(Path(stage), kept, sources)
         texts = {Path(VERIFIED): unverified(folder, entry), yaml_path: spell(entry)}  # the entry last
@@ -374,25 +362,24 @@ def _publish(
                 moves[name].write_bytes(text)
         records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
         idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
-        folder.require_unlinked([*moves, *(name.parent for name in idle), Path(FLOORS, *place[:2])])
+        folder.require_unlinked([*moves, *(name.parent for name in idle), Path(FLOORS, split, size)])
         removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
         refuse_folders(removed)
         floors = write_floors(cards[0], folder)
         move_together([(source, folder.path / name) for name, source in moves.items()])
     for path in removed:
         path.unlink()
-    summary = entry.score.metrics[entry.score.ranking_metric]
-    split, size, method = place
+    summary = block.metrics[block.ranking_metric]
     return SubmitResult(
         split=split,
         size=size,
         method=method,
-        ranking=entry.score.ranking_metric,
+        ranking=block.ranking_metric,
         mean=summary.mean,
         std=summary.std,
-        flags=tuple(dict.fromkeys(flag.name for file in entry.score.files for flag in file.flags)),
+        flags=tuple(dict.fromkeys(flag.name for file in files for flag in file.flags)),
         board=folder.path,
         files=(*(folder.path / name for name in reversed(moves)), *floors),
-        kept=tuple(folder.path / said.path for said in kept if said and Path(said.path) not in moves),
+        kept=tuple(folder.path / held.path for held in kept if held and Path(held.path) not in moves),
         removed=tuple(removed),
     )

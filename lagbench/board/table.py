@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 
 from lagbench.data.checksums import round_digits
 from lagbench.metrics.metric import Direction, Metric
@@ -28,25 +27,23 @@ ARROWS = {Direction.LOWER: "↓", Direction.HIGHER: "↑", Direction.TARGET: "�
 REPORTED = "Self-reported: said by the submitter, computed again by nobody."
 REPORTED_MARK = "self\u2011reported"
 
-EXPLAINED: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "copy_suspect": (
-            "copy suspected",
-            "The error moves from frame to frame as that of no rollout does.",
-        ),
-        "below_twin_floor": (
-            "closer than a twin",
-            "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
-        ),
-        "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
-        "in_domain": (
-            "leaves the box",
-            "Predicted particles lie outside the box; there they carry no weight on the grid.",
-        ),
-        "max_displacement": ("jumps", "Predicted particles move farther in a frame than any of the truth."),
-        "discontinuous_start": ("jumps at the start", "The first frame is far from the last given."),
-    }
-)
+EXPLAINED: Mapping[str, tuple[str, str]] = {
+    "copy_suspect": (
+        "copy suspected",
+        "The error moves from frame to frame as that of no rollout does.",
+    ),
+    "below_twin_floor": (
+        "closer than a twin",
+        "Closer to the truth than the solver itself after a nudge of 2⁻²⁰.",
+    ),
+    "physics": ("unphysical", "Kinetic energy or filled area are far from the truth's."),
+    "in_domain": (
+        "leaves the box",
+        "Predicted particles lie outside the box; there they carry no weight on the grid.",
+    ),
+    "max_displacement": ("jumps", "Predicted particles move farther in a frame than any of the truth."),
+    "discontinuous_start": ("jumps at the start", "The first frame is far from the last given."),
+}
 """What flags and warnings are called on the page, which shows what is wrong, and what they mean."""
 
 
@@ -131,7 +128,7 @@ def _cell(row: Row | Floor, column: Column, shades: _Shades, *, main: bool, rank
     plain = round_digits(value) if isinstance(value, float) else value
     ends = (found.low, found.high) if found else (math.nan, math.nan)
     bounds = interval(ends)
-    title = [] if not bounds else [f"95 %: {text(ends[0])} … {text(ends[1])}"]
+    title = [f"95 %: {text(ends[0])} … {text(ends[1])}"] if bounds else []
     if found is not None and not math.isnan(found.std):
         title.append(f"± {text(found.std)} over seeds")
     undefined = found.undefined if found else 0
@@ -175,16 +172,10 @@ def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> M
         for name in ("code", "paper", "weights")
         if (address := getattr(entry, name)) and address.startswith(("http://", "https://"))
     ]
-    kept = [made for made in entry.predictions if made.weights]
-    links += [
-        tag(
-            "a",
-            "weights" if len(kept) == 1 else f"weights {made.seed}",
-            href=weights_path(entry.place, made.seed).as_posix(),
-        )
-        for made in kept
-        if not entry.weights
-    ]
+    kept = [made.seed for made in entry.predictions if made.weights and not entry.weights]
+    for seed in kept:
+        label = "weights" if len(kept) == 1 else f"weights {seed}"
+        links.append(tag("a", label, href=weights_path(entry.place, seed).as_posix()))
     method = tag(
         "th",
         tag("a", entry.name, href=f"#tab={tab.id}&entry={row.id}", class_="name"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,20 +57,15 @@ def require_weights(
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import load
 
-    seeds = [header.seed or 0 for header in headers]
-    lying = _holders(others)
+    seeds, lying = [header.seed or 0 for header in headers], _holders(others)
     for path in map(Path, weights):
         held = load(path)
         if held.optimizer is not None:
-            raise UsageError(
-                "a state to go on from, not the weights of a model",
-                where=str(path),
-                fix="give weights.pt beside it, and predictions that were made with that",
-            )
+            fix = "give weights.pt beside it, and predictions that were made with that"
+            raise UsageError("a state to go on from, not the weights of a model", where=str(path), fix=fix)
         seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
-        facts, first = held.facts, headers[0]
-        got = (facts.split, facts.size, facts.dataset_sha256)
-        expected = (first.split, first.size, first.dataset_sha256)
+        belong = attrgetter("split", "size", "dataset_sha256")
+        got, expected = belong(held.facts), belong(headers[0])
         if got != expected or seed not in seeds:
             raise UsageError(
                 "the weights do not belong to these predictions",
@@ -80,16 +76,12 @@ def require_weights(
             )
         number = seeds.index(seed)
         if found[number] is not None:
-            raise UsageError(
-                f"two files of weights of seed {seed}", where=str(path), fix="give one of each seed at most"
-            )
+            fix = "give one of each seed at most"
+            raise UsageError(f"two files of weights of seed {seed}", where=str(path), fix=fix)
         if (holder := lying.get(file_sha256(path))) is not None:
-            raise UsageError(
-                "these weights lie beside another entry",
-                where=str(path),
-                got=f"those of {holder}",
-                fix="leave them out, and name them in --command; or give those of this method",
-            )
+            fix = "leave them out, and name them in --command; or give those of this method"
+            what, theirs = "these weights lie beside another entry", f"those of {holder}"
+            raise UsageError(what, where=str(path), got=theirs, fix=fix)
         _require_made_by(path, held, headers[number])
         found[number] = path
     return tuple(found)
@@ -127,10 +119,7 @@ def named_weights(
     before: Entry | None,
     others: Mapping[Path, Entry],
 ) -> tuple[Weights | None, ...]:
-    """Return what an entry says of its weights, seed by seed; None where there are none.
-
-    Those of the entry that it replaces stay where the predictions stay and nothing is wrong with them.
-    """
+    """Return what an entry says of each seed's weights; those of before stay unless something is wrong."""
     lying = _holders(others)
     kept = {
         (one.seed, one.sha256): one.weights
@@ -138,7 +127,7 @@ def named_weights(
         if one.weights is not None
         and one.weights.sha256 not in lying
         and one.weights.path == weights_path(place, one.seed).as_posix()
-        and is_there(folder, one.weights)
+        and is_there(folder, weights_path(place, one.seed), one.weights.sha256)
     }
     return tuple(
         kept.get((one.seed, one.sha256))
@@ -154,11 +143,6 @@ def _holders(entries: Mapping[Path, Entry]) -> dict[str, str]:
     return {weights.sha256: str(where) for weights, where in held if weights is not None}
 
 
-def _is_record(path: Path) -> bool:
-    """Tell whether a file is the record of a training, and not what predictions cost."""
-    return path.is_file() and unfit_record(path) is None and "step" in json.loads(path.read_bytes())
-
-
 def stage_weights(
     stage: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
 ) -> Iterator[tuple[Path, Path]]:
@@ -166,12 +150,11 @@ def stage_weights(
     for number, (said, path) in enumerate(zip(named, paths, strict=True)):
         if said is None or path is None:
             continue
-        target = Path(said.path)
-        sources = {target: path}
-        records = (path.with_name(RECORD), path.with_suffix(".json"))  # of a run; of weights on a board
-        fit = (one for one in records if _is_record(one))
-        if (record := next(fit, None)) is not None:
-            sources[target.with_suffix(".json")] = record
+        sources = {Path(said.path): path}
+        for record in (path.with_suffix(".json"), path.with_name(RECORD)):  # of weights on a board; of a run
+            # what predictions cost has no step
+            if record.is_file() and not unfit_record(record) and "step" in json.loads(record.read_bytes()):
+                sources[Path(said.path).with_suffix(".json")] = record
         for place, source in sources.items():
             yield place, Path(shutil.copyfile(source, stage / f"{number}{place.suffix}"))
 
@@ -198,8 +181,9 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
                 continue
             where = f"{entry.yaml_path}, predictions.{number}.weights"
             path = weights_path(entry.place, made.seed)
-            known |= {path, path.with_suffix(".json")}
-            file = folder.path / path
+            record = path.with_suffix(".json")  # its absence is no finding
+            known |= {path, record}
+            file, kept = folder.path / path, folder.path / record
             if made.weights.path != path.as_posix():
                 yield finding("weights", where, ascii(made.weights.path)[1:-1], expected=path)
             elif not file.is_file() or folder.link_in(path) is not None:
@@ -207,18 +191,11 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
             elif (found := file_sha256(file)) != made.weights.sha256:
                 said = made.weights.sha256[:16]
                 yield finding("weights", path, f"SHA-256 {found[:16]}", expected=f"{said} as the entry says")
-            elif entry.status is Status.ACTIVE:
-                holder = holders.setdefault(found, path)
-                if holder != path:
-                    got = f"the same file as {holder}"
-                    yield finding("weights", path, got, what="the same weights twice", expected="one place")
-            record = path.with_suffix(".json")  # its absence is no finding
-            kept = folder.path / record
-            if (
-                kept.exists()
-                and folder.link_in(record) is None
-                and (reason := unfit_record(kept)) is not None
-            ):
+            elif entry.status is Status.ACTIVE and (holder := holders.setdefault(found, path)) != path:
+                got = f"the same file as {holder}"
+                yield finding("weights", path, got, what="the same weights twice", expected="one place")
+            linked = folder.link_in(record) is not None
+            if kept.exists() and not linked and (reason := unfit_record(kept)) is not None:
                 most = f"a JSON object of at most {MOST_RECORD} bytes, or no file"
                 yield finding("weights", record, reason, what="no record of a training", expected=most)
     held = folder.weight_files()

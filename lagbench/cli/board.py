@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from .options import (
     SplitOption,
     WorkersOption,
     chosen,
+    option,
     root_of,
 )
 from .output import complain, counted, print_blocks, print_json, progress_bar, say, spell_bytes
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
     from lagbench.board.submit import SubmitResult
 
-BoardOption = Annotated[Path, typer.Option("--board", metavar="FOLDER", help="The leaderboard's folder.")]
+BoardOption = Annotated[Path, option("--board FOLDER", "The leaderboard's folder.")]
 BOARD = Path("leaderboard")
 
 
@@ -37,35 +39,20 @@ def submit(
     ],
     source: Annotated[
         Path | None,
-        typer.Option(
-            "--from",
-            metavar="FILE",
-            help="YAML that describes the method, see docs/submitting.md; options win.",
-        ),
+        option("--from FILE", "YAML that describes the method, see docs/submitting.md; options win."),
     ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", metavar="ID", help="Names the entry, as in my-model.")
-    ] = None,
-    authors: Annotated[list[str] | None, typer.Option("--author", metavar="NAME", help="Repeatable.")] = None,
-    command: Annotated[
-        str | None, typer.Option("--command", metavar="TEXT", help="What makes the predictions again.")
-    ] = None,
-    urls: Annotated[
-        list[str] | None,
-        typer.Option("--url", metavar="URL", help="Where FILE can be had; one per FILE."),
-    ] = None,
+    method: Annotated[str | None, option("--method ID", "Names the entry, as in my-model.")] = None,
+    authors: Annotated[list[str] | None, option("--author NAME", "Repeatable.")] = None,
+    command: Annotated[str | None, option("--command TEXT", "What makes the predictions again.")] = None,
+    urls: Annotated[list[str] | None, option("--url URL", "Where FILE can be had; one per FILE.")] = None,
     weights: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--weights", metavar="FILE", help="weights.pt to keep beside the entry; at most one a seed."
-        ),
+        option("--weights FILE", "weights.pt to keep beside the entry; at most one a seed."),
     ] = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace the entry of that name.")] = False,
-    add: Annotated[
-        bool, typer.Option("--add", help="Add seeds to the entry of that name; its others stay.")
-    ] = False,
+    replace: Annotated[bool, option("--replace", "Replace the entry of that name.")] = False,
+    add: Annotated[bool, option("--add", "Add seeds to the entry of that name; its others stay.")] = False,
     new_board: Annotated[
-        bool, typer.Option("--new-board", help="Begin a leaderboard in --board, where there is none.")
+        bool, option("--new-board", "Begin a leaderboard in --board, where there is none.")
     ] = False,
     board: BoardOption = BOARD,
     root: RootOption = None,
@@ -77,8 +64,7 @@ def submit(
     from lagbench.board.entry_file import read_meta
     from lagbench.board.submit import submit as run
 
-    given = {"method": method, "authors": authors, "command": command, "urls": urls}
-    meta = read_meta(source, given)
+    meta = read_meta(source, {"method": method, "authors": authors, "command": command, "urls": urls})
     with progress_bar(quiet=quiet or as_json) as draw:
         result = run(
             predictions,
@@ -93,34 +79,27 @@ def submit(
             progress=draw,
             examined=complain,
         )
-    if as_json:
-        print_json(result)
-    else:
-        _submitted(result, quiet=quiet)
+    tell(result, _submitted(result), as_json=as_json, quiet=quiet)
 
 
-def _submitted(result: SubmitResult, *, quiet: bool) -> None:
+def _submitted(result: SubmitResult) -> Iterator[str]:
     from lagbench.board.folder import VERIFIED
 
     mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
     spread = "" if result.std is None else f" ± {result.std:.2g} over seeds"
-    say(f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}", quiet=quiet)
-    for flag in result.flags:
-        say(f"flag {flag}: raised", quiet=quiet)
-    if result.size == "tiny" and result.board == BOARD and not quiet:
+    yield f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}"
+    yield from (f"flag {flag}: raised" for flag in result.flags)
+    if result.size == "tiny" and result.board == BOARD:
         advice = "it is for trying out: --board trial --new-board"
         typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
-    say("written: " + ", ".join(str(path) for path in result.files), quiet=quiet)
+    yield "written: " + ", ".join(map(str, result.files))
     for what, paths in {"kept": result.kept, "removed": result.removed}.items():
         if paths:
-            say(f"{what}, of the entry before: " + ", ".join(map(str, paths)), quiet=quiet)
+            yield f"{what}, of the entry before: " + ", ".join(map(str, paths))
     if result.board / VERIFIED in result.files:
-        say("its line of verified.yaml is gone: maintainers score the entry again", quiet=quiet)
+        yield "its line of verified.yaml is gone: maintainers score the entry again"
     where = "" if result.board == BOARD else f" --board {result.board}"
-    say(
-        f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}",
-        quiet=quiet,
-    )
+    yield f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}"
 
 
 leaderboard = typer.Typer(no_args_is_help=True, help="Draw, check and show the leaderboard.")
@@ -129,9 +108,7 @@ leaderboard = typer.Typer(no_args_is_help=True, help="Draw, check and show the l
 @leaderboard.command("build", epilog="Example: lagbench leaderboard build")
 def build(
     board: BoardOption = BOARD,
-    check: Annotated[
-        bool, typer.Option("--check", help="Write nothing; fail where the page is stale.")
-    ] = False,
+    check: Annotated[bool, option("--check", "Write nothing; fail where the page is stale.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -148,40 +125,29 @@ def build(
 def check(
     board: BoardOption = BOARD,
     base: Annotated[
-        str | None,
-        typer.Option(
-            "--base", metavar="REF", help="Find what the folder alters of entries that this commit has."
-        ),
+        str | None, option("--base REF", "Find what the folder alters of entries that this commit has.")
     ] = None,
     own: Annotated[
-        list[str] | None,
-        typer.Option("--own", metavar="METHOD", help="With --base: an entry of yours; repeatable."),
+        list[str] | None, option("--own METHOD", "With --base: an entry of yours; repeatable.")
     ] = None,
-    page: Annotated[bool, typer.Option("--page", help="Compare index.html and schema.json too.")] = False,
+    page: Annotated[bool, option("--page", "Compare index.html and schema.json too.")] = False,
     predictions: Annotated[
-        list[Path] | None,
-        typer.Option("--predictions", metavar="FILE", help="Score an entry's predictions again; repeatable."),
+        list[Path] | None, option("--predictions FILE", "Score an entry's predictions again; repeatable.")
     ] = None,
     recording: Annotated[
-        bool,
-        typer.Option("--record", help="With --predictions: note what is confirmed in verified.yaml."),
+        bool, option("--record", "With --predictions: note what is confirmed in verified.yaml.")
     ] = False,
     root: Annotated[
         Path | None,
-        typer.Option(
-            "--root",
-            parser=root_of,
-            metavar="FOLDER",
-            help="Where data sets live; without --predictions the shipped floors of those there are measured"
+        option(
+            "--root FOLDER",
+            "Where data sets live; without --predictions the shipped floors of those there are measured"
             " again.",
+            parser=root_of,
         ),
     ] = None,
-    split: Annotated[
-        str | None, typer.Option("--split", metavar="NAME", help="With --root: floors of this split only.")
-    ] = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="With --root: floors of this size only.")
-    ] = None,
+    split: Annotated[str | None, option("--split NAME", "With --root: floors of this split only.")] = None,
+    size: Annotated[str | None, option("--size NAME", "With --root: floors of this size only.")] = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -193,11 +159,8 @@ def check(
         raise UsageError("--split and --size say whose floors are measured again", fix="give --root as well")
     sizes = measured_sizes(root, split=split, name=size) if root and not predictions else []
     if root and not predictions and not sizes:
-        raise DataError(
-            "no test scenarios are there",
-            where=str(root),
-            fix="make them with `lagbench generate`, or name another --root",
-        )
+        fix = "make them with `lagbench generate`, or name another --root"
+        raise DataError("no test scenarios are there", where=str(root), fix=fix)
     with progress_bar(quiet=quiet or as_json) as draw:
         result = check_board(
             board,
@@ -210,28 +173,23 @@ def check(
             root=root,
             progress=draw,
         )
-    if as_json:
-        print_json(result)
-    else:
-        _checked(result, recording=recording, quiet=quiet)
+    for finding in () if as_json else result.findings:
+        typer.echo(str(finding), err=True)
+    tell(result, _checked(result, recording=recording), as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 
 
-def _checked(result: CheckResult, *, recording: bool, quiet: bool) -> None:
-    for finding in result.findings:
-        typer.echo(str(finding), err=True)
+def _checked(result: CheckResult, *, recording: bool) -> Iterator[str]:
     for one in result.confirmed:
         close = "exactly" if one.difference == 0.0 else f"to {one.difference:.1e}, relative"
-        say(f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}", quiet=quiet)
-    for name, floors in result.floors.items():
-        say(f"{name}: measured again {', '.join(floors)}", quiet=quiet)
-    for entry in result.recorded:
-        say(f"recorded as verified: {entry}", quiet=quiet)
+        yield f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}"
+    yield from (f"{name}: measured again {', '.join(floors)}" for name, floors in result.floors.items())
+    yield from (f"recorded as verified: {entry}" for entry in result.recorded)
     for entry in result.partly if recording and not result.findings else ():
-        say(f"not recorded: {entry}: give the predictions of all its seeds in one call", quiet=quiet)
+        yield f"not recorded: {entry}: give the predictions of all its seeds in one call"
     state = counted(len(result.findings), "finding") if result.findings else "nothing wrong"
     looked = ", page compared" if result.page_checked else ""
-    say(f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}", quiet=quiet)
+    yield f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}"
 
 
 @leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")
@@ -239,9 +197,7 @@ def picture(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: NewSizeOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="SVG file to write.")] = Path(
-        "cost.svg"
-    ),
+    output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path("cost.svg"),
     board: BoardOption = BOARD,
     quiet: QuietFlag = False,
 ) -> None:
@@ -263,13 +219,9 @@ def picture(
 def show(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="tiny, mini or full; all by default.")
-    ] = None,
-    metric: Annotated[
-        list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to show; repeatable.")
-    ] = None,
-    wide: Annotated[bool, typer.Option("--wide", help="Show the first metrics of each data set.")] = False,
+    size: Annotated[str | None, option("--size NAME", "tiny, mini or full; all by default.")] = None,
+    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to show; repeatable.")] = None,
+    wide: Annotated[bool, option("--wide", "Show the first metrics of each data set.")] = False,
     board: BoardOption = BOARD,
     as_json: JsonFlag = False,
 ) -> None:

@@ -29,11 +29,11 @@ from .options import (
     SubsetOption,
     WorkersOption,
     chosen,
+    option,
 )
 from .output import print_json, print_table, progress_bar, show, spell_bytes, spell_seconds
 
 if TYPE_CHECKING:
-    from lagbench.data.registry import Registry, Size
     from lagbench.make.generate import GenerationResult
     from lagbench.make.inventory import Overview
     from lagbench.make.verify import VerificationResult
@@ -43,11 +43,8 @@ TITLE = (
     "for neural surrogates of Lagrangian continuum simulators"
 )
 ESTIMATED = "estimated; measured after the first generate"
-MEASURED = "at the rate measured here"
-"""Where an expected time comes from."""
-
-RELEASED = 2026
-"""Year of this version; it and the title as in CITATION.cff."""
+MEASURED = "at the rate measured here"  # where an expected time comes from
+RELEASED = 2026  # year of this version; it and the title as in CITATION.cff
 
 
 def generate(
@@ -61,13 +58,10 @@ def generate(
     device: DeviceOption = "cpu",
     scheduler: SchedulerOption = None,
     gather: Annotated[
-        list[Path] | None,
-        typer.Option("--gather", metavar="FOLDER", help="Take what another root has finished; repeatable."),
+        list[Path] | None, option("--gather FOLDER", "Take what another root has finished; repeatable.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Simulate anew what is there.")] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what it takes: bytes, time, free disk.")
-    ] = False,
+    force: Annotated[bool, option("--force", "Simulate anew what is there.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Say what it takes: bytes, time, free disk.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -110,10 +104,7 @@ def _generated(result: GenerationResult) -> list[str]:
     done = f"{to_do} scenarios simulated {took}, {len(result.kept)} kept"
     if not to_do:
         done = f"nothing to simulate, {len(result.kept)} scenarios are there; checked {took}"
-    lines = [
-        f"{result.split} {result.size}: {done}",
-        f"  folder  {result.folder}",
-    ]
+    lines = [f"{result.split} {result.size}: {done}", f"  folder  {result.folder}"]
     if (url := url_of(result.root)) is not None:
         lines.append(f"  store   {url}/{result.folder.relative_to(result.root).as_posix()}")
     if result.missing:
@@ -131,10 +122,8 @@ def verify(
     scenarios: ScenariosOption = None,
     root: RootOption = None,
     workers: WorkersOption = None,
-    regenerate: Annotated[
-        int, typer.Option("--regenerate", metavar="K", help="Simulate K scenarios anew and compare.", min=0)
-    ] = 0,
-    complete: Annotated[bool, typer.Option("--complete", help="Fail if anything is missing.")] = False,
+    regenerate: Annotated[int, option("--regenerate K", "Simulate K scenarios anew and compare.", min=0)] = 0,
+    complete: Annotated[bool, option("--complete", "Fail if anything is missing.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -218,14 +207,13 @@ def _row(entry: Overview) -> tuple[object, ...]:
 def info(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="NAME", help="One size in full; all in brief by default.")
-    ] = None,
+    size: Annotated[str | None, option("--size NAME", "One size in full; all in brief by default.")] = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
     """Show a split: parameters with units, sizes in bytes, time to generate, local state."""
     from lagbench.data.local import home
+    from lagbench.data.registry import spell_ids
     from lagbench.make.inventory import overview
 
     split_name, folder, registry = home(chosen(name, split), root=root)
@@ -245,51 +233,34 @@ def info(
         ]
         print_table("Parameters", ("name", *entry.sizes, "[unit] meaning"), parameters)
         for one, tier in zip(found, sizes, strict=True):
-            yield from _details(one, tier)
+            subsets = "; ".join(f"{name} {spell_ids(ids)}" for name, ids in tier.subsets.items())
+            given, horizon, radius = tier.task.input_frames, tier.task.horizon, tier.task.radius
+            yield f"{one.split} {one.size}"
+            yield f"  scenarios  {subsets}"
+            yield f"  task       {given} frames given, {horizon} to predict, radius {radius}"
+            substeps = f"{tier.substeps_per_frame} substeps of {tier.dt:.6g} s"
+            yield f"  frame      {tier.frame_interval:.6g} s, {substeps}"
+            yield f"  hash       {one.dataset_sha256 or 'not measured yet'}"
+            yield f"  folder     {one.folder} (there: {one.state})"
+            yield f"  picture    {one.picture or 'none'}"
 
-    show(_facts(registry, split_name, sizes, found), told(), as_json=as_json)
-
-
-def _details(entry: Overview, size: Size) -> list[str]:
-    from lagbench.data.registry import spell_ids
-
-    task = size.task
-    subsets = "; ".join(f"{name} {spell_ids(ids)}" for name, ids in size.subsets.items())
-    return [
-        f"{entry.split} {entry.size}",
-        f"  scenarios  {subsets}",
-        f"  task       {task.input_frames} frames given, {task.horizon} to predict, radius {task.radius}",
-        f"  frame      {size.frame_interval:.6g} s, {size.substeps_per_frame} substeps of {size.dt:.6g} s",
-        f"  hash       {entry.dataset_sha256 or 'not measured yet'}",
-        f"  folder     {entry.folder} (there: {entry.state})",
-        f"  picture    {entry.picture or 'none'}",
-    ]
-
-
-def _facts(registry: Registry, split: str, sizes: list[Size], found: list[Overview]) -> dict[str, object]:
-    entry = registry.split(split)
     described = {
         tier.name: {
             "overview": one,
             "parameters": {name: p.model_dump() for name, p in tier.parameters.items()},
-            "subsets": tier.subsets,
             "task": tier.task.model_dump(),
-            "bounds": tier.bounds,
-            "dt": tier.dt,
-            "frame_interval": tier.frame_interval,
+            **{key: getattr(tier, key) for key in ("subsets", "bounds", "dt", "frame_interval")},
         }
         for tier, one in zip(sizes, found, strict=True)
     }
     head = {key: getattr(entry, key) for key in ("version", "title", "description", "citation", "licence")}
-    return {"split": split, **head, "sizes": described}
+    show({"split": split_name, **head, "sizes": described}, told(), as_json=as_json)
 
 
 def cite(
     name: SplitArgument = None,
     split: SplitOption = None,
-    bibtex: Annotated[
-        bool, typer.Option("--bibtex", help="Print BibTeX; without a split, of lagbench itself.")
-    ] = False,
+    bibtex: Annotated[bool, option("--bibtex", "Print BibTeX; without a split, of lagbench itself.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -351,10 +322,8 @@ def clean(
     split: SplitOption = None,
     size: PresentSizeOption = None,
     root: RootOption = None,
-    leftovers: Annotated[
-        bool, typer.Option("--leftovers", help="Only temporary files of killed writers.")
-    ] = False,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what would go.")] = False,
+    leftovers: Annotated[bool, option("--leftovers", "Only temporary files of killed writers.")] = False,
+    dry_run: Annotated[bool, option("--dry-run", "Say what would go.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

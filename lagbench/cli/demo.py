@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.baselines.train import TrainingResult
     from lagbench.board.build import BuildResult
-    from lagbench.board.entry import Meta
     from lagbench.board.submit import SubmitResult
     from lagbench.data.registry import Registry
     from lagbench.make.generate import GenerationResult
@@ -38,10 +37,7 @@ if TYPE_CHECKING:
 
 
 DEMO_SIZE = "tiny"
-
-MODEL, MODEL_SPLIT = "neuralmpm", "cavity"
-"""The baseline that the demo trains, and the split that it learns."""
-
+MODEL, MODEL_SPLIT = "neuralmpm", "cavity"  # the baseline that the demo trains, and the split that it learns
 SETTINGS = ("training.steps=150",)
 """Changes to the recipe of size tiny: half a minute, and better than what costs no learning with any seed."""
 
@@ -68,10 +64,6 @@ class ModelResult:
     solver: SolverBench | None  # what our solver takes here; None where it cannot be timed
     entry: SubmitResult  # its entry of the leaderboard
     page: BuildResult  # the leaderboard's page
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields by name, the card as what scores.json holds."""
-        return {**vars(self), "card": self.card.as_json()}
 
 
 def demo_splits(registry: Registry) -> list[str]:
@@ -144,11 +136,14 @@ def demo_model(
     nothing by a second, and the same machine trains the same weights. Interrupted, it goes on with
     the training at the next call.
     """
+    from lagbench.baselines.catalogue import find
     from lagbench.baselines.predict import predict
     from lagbench.baselines.train import train
     from lagbench.board.build import build
+    from lagbench.board.entry import Meta
     from lagbench.board.submit import submit
-    from lagbench.data.local import resolve_root
+    from lagbench.data.checksums import round_digits
+    from lagbench.data.layout import resolve_root
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)
@@ -162,7 +157,16 @@ def demo_model(
         training = begin(fresh=True)
     prediction = predict(training.weights, run / "predictions.nc", method=MODEL, **here)
     solver = _solver_time()
-    said = _said(training, prediction, solver)
+    said = Meta(
+        method=MODEL,
+        name=f"{find(MODEL).model.method}, {training.steps} steps",
+        authors=("lagbench demo",),
+        licence="MIT",
+        notes="Trained for seconds to show the way; it says little of what such a model can do.",
+        hardware=prediction.device,
+        command="lagbench demo",
+        solver_seconds_per_frame=None if solver is None else round_digits(solver.seconds_per_frame, 6),
+    )
     entry = submit([prediction.path], said, board=board, root=folder, replace=True, new_board=True)
     return ModelResult(
         training=training,
@@ -181,24 +185,6 @@ def _solver_time() -> SolverBench | None:
         return bench_apart(MODEL_SPLIT, DEMO_SIZE)
     except LagbenchError:
         return None
-
-
-def _said(training: TrainingResult, prediction: PredictionResult, solver: SolverBench | None) -> Meta:
-    """Return what the entry says of the model."""
-    from lagbench.baselines.catalogue import find
-    from lagbench.board.entry import Meta
-    from lagbench.data.checksums import round_digits
-
-    return Meta(
-        method=MODEL,
-        name=f"{find(MODEL).model.method}, {training.steps} steps",
-        authors=("lagbench demo",),
-        licence="MIT",
-        notes="Trained for seconds to show the way; it says little of what such a model can do.",
-        hardware=prediction.device,
-        command="lagbench demo",
-        solver_seconds_per_frame=None if solver is None else round_digits(solver.seconds_per_frame, 6),
-    )
 
 
 def demo(
@@ -235,7 +221,7 @@ def demo(
         with progress_bar(quiet=quiet, counted="done") as draw:
             model = demo_model(root=root, progress=draw)
     seconds = time.monotonic() - started
-    made = None if model is None else model.as_json()
+    made = None if model is None else {**vars(model), "card": model.card.as_json()}
     value = {"splits": splits, "model": made, "model_left_out": left_out, "seconds": seconds}
     show(value, _summary(len(splits), model, left_out, seconds), as_json=as_json, quiet=quiet)
 

@@ -11,19 +11,15 @@ import typer
 
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 
-from .options import JsonFlag, PresentSizeOption, QuietFlag, RootOption, chosen
+from .options import JsonFlag, PresentSizeOption, QuietFlag, RootOption, chosen, option
 from .output import show
 
 SourceArgument = Annotated[
     str | None, typer.Argument(metavar="SPLIT|FILE", help="Split, or a scenario file.")
 ]
-SplitNameOption = Annotated[str | None, typer.Option("--split", metavar="NAME", help="The same as SPLIT.")]
-ScenarioOption = Annotated[
-    int | None, typer.Option("--scenario", metavar="ID", help="Scenario; the first of test by default.")
-]
-OutputOption = Annotated[
-    Path | None, typer.Option("--output", "-o", metavar="FILE", help="File to write; named after the data.")
-]
+SplitNameOption = Annotated[str | None, option("--split NAME", "The same as SPLIT.")]
+ScenarioOption = Annotated[int | None, option("--scenario ID", "Scenario; the first of test by default.")]
+OutputOption = Annotated[Path | None, option("--output -o FILE", "File to write; named after the data.")]
 
 
 def _source(
@@ -85,16 +81,14 @@ def plot(
     split: SplitNameOption = None,
     size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
-    frame: Annotated[int, typer.Option("--frame", help="Frame number; negative ones from the end.")] = -1,
-    kind: Annotated[
-        str, typer.Option("--kind", help="all, speed, material, vorticity or streamlines.")
-    ] = "all",
+    frame: Annotated[int, option("--frame", "Frame number; negative ones from the end.")] = -1,
+    kind: Annotated[str, option("--kind", "all, speed, material, vorticity or streamlines.")] = "all",
     sheet: Annotated[
-        bool, typer.Option("--sheet", help="Draw many scenarios of the split on one page instead.")
+        bool, option("--sheet", "Draw many scenarios of the split on one page instead.")
     ] = False,
     output: OutputOption = None,
     dpi: Annotated[
-        int, typer.Option("--dpi", help="Pixels per inch of PNG, and of clouds in PDF.", min=32, max=1200)
+        int, option("--dpi", "Pixels per inch of PNG, and of clouds in PDF.", min=32, max=1200)
     ] = 128,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -131,12 +125,10 @@ def animate(
     split: SplitNameOption = None,
     size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
-    beside: Annotated[
-        int | None, typer.Option("--beside", metavar="ID", help="Second scenario of the split.")
-    ] = None,
-    kind: Annotated[str | None, typer.Option("--kind", help="speed, material or vorticity.")] = None,
-    fps: Annotated[float, typer.Option("--fps", help="Frames shown per second.")] = 30.0,
-    every: Annotated[int, typer.Option("--every", help="Show every n-th frame.", min=1)] = 1,
+    beside: Annotated[int | None, option("--beside ID", "Second scenario of the split.")] = None,
+    kind: Annotated[str | None, option("--kind", "speed, material or vorticity.")] = None,
+    fps: Annotated[float, option("--fps", "Frames shown per second.")] = 30.0,
+    every: Annotated[int, option("--every", "Show every n-th frame.", min=1)] = 1,
     output: OutputOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,

@@ -21,53 +21,33 @@ from .options import (
     SubsetOption,
     WorkersOption,
     chosen,
+    option,
 )
 from .output import progress_bar, show, spell_bytes
 
 if TYPE_CHECKING:
     from lagbench.exchange.local_split import LocalSplit
 
-FormatOption = Annotated[str, typer.Option("--format", metavar="NAME", help="gns-npz or lagrangebench-h5.")]
-FolderOption = Annotated[
-    Path,
-    typer.Option("--output", "-o", metavar="FOLDER", help="Folder to make; its last part names the split."),
-]
+FormatOption = Annotated[str, option("--format NAME", "gns-npz or lagrangebench-h5.")]
+FolderOption = Annotated[Path, option("--output -o FOLDER", "Folder to make; its last part names the split.")]
 DescribeOption = Annotated[
     Path | None,
-    typer.Option(
-        "--describe",
-        metavar="FILE",
-        help="YAML that says what the data are, see docs/exchange.md; options win.",
-    ),
+    option("--describe FILE", "YAML that says what the data are, see docs/exchange.md; options win."),
 ]
-RadiusOption = Annotated[
-    float | None, typer.Option("--radius", metavar="LENGTH", help="Connectivity radius of graph models.")
-]
-IntervalOption = Annotated[
-    float | None, typer.Option("--frame-interval", metavar="SECONDS", help="Time between frames.")
-]
-BoundsOption = Annotated[
-    str | None, typer.Option("--bounds", metavar="X0,X1,Y0,Y1", help="Walls of the box.")
-]
-RescaleFlag = Annotated[
-    bool, typer.Option("--rescale", help="Fit the bounds into the unit box, by a power of two.")
-]
+RadiusOption = Annotated[float | None, option("--radius LENGTH", "Connectivity radius of graph models.")]
+IntervalOption = Annotated[float | None, option("--frame-interval SECONDS", "Time between frames.")]
+BoundsOption = Annotated[str | None, option("--bounds X0,X1,Y0,Y1", "Walls of the box.")]
+RescaleFlag = Annotated[bool, option("--rescale", "Fit the bounds into the unit box, by a power of two.")]
 InputFramesOption = Annotated[
-    int | None, typer.Option("--input-frames", metavar="N", help="Frames given to a model; 6 by default.")
+    int | None, option("--input-frames N", "Frames given to a model; 6 by default.")
 ]
-HorizonOption = Annotated[
-    int | None, typer.Option("--horizon", metavar="N", help="Frames to predict; all by default.")
-]
+HorizonOption = Annotated[int | None, option("--horizon N", "Frames to predict; all by default.")]
 InterestOption = Annotated[
-    str | None,
-    typer.Option("--frames-of-interest", metavar="FRAMES", help="As in 15,25; the last one by default."),
+    str | None, option("--frames-of-interest FRAMES", "As in 15,25; the last one by default.")
 ]
-CellsOption = Annotated[
-    int | None, typer.Option("--cells", metavar="N", help="Cells across of the score grid.")
-]
+CellsOption = Annotated[int | None, option("--cells N", "Cells across of the score grid.")]
 FullBoxFlag = Annotated[
-    bool | None,
-    typer.Option("--full-box/--free-surface", help="Whether material fills the box: vorticity ranks then."),
+    bool | None, option("--full-box/--free-surface", "Whether material fills the box: vorticity ranks then.")
 ]
 
 
@@ -75,19 +55,13 @@ def download(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: NewSizeOption = None,
-    mirror: Annotated[
-        str | None,
-        typer.Option("--from", metavar="URL", help="Store or folder of archives; else mirrors."),
-    ] = None,
+    mirror: Annotated[str | None, option("--from URL", "Store or folder of archives; else mirrors.")] = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
     root: RootOption = None,
-    connections: Annotated[
-        int, typer.Option("--connections", metavar="N", help="Files fetched side by side.", min=1)
-    ] = 4,
+    connections: Annotated[int, option("--connections N", "Files fetched side by side.", min=1)] = 4,
     or_generate: Annotated[
-        bool,
-        typer.Option("--or-generate/--no-generate", help="Simulate what no store has, or stop there."),
+        bool, option("--or-generate/--no-generate", "Simulate what no store has, or stop there.")
     ] = True,
     workers: WorkersOption = None,
     as_json: JsonFlag = False,
@@ -130,24 +104,20 @@ def export(
     size: PresentSizeOption = None,
     form: FormatOption = "gns-npz",
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="FOLDER", help="Folder for the files; SPLIT-SIZE-FORMAT here."
-        ),
+        Path | None, option("--output -o FOLDER", "Folder for the files; SPLIT-SIZE-FORMAT here.")
     ] = None,
     root: RootOption = None,
     from_walls: Annotated[
         bool | None,
-        typer.Option(
+        option(
             "--from-walls/--unit-box",
-            help="lagrangebench-h5: measure positions from the lower walls; closed boxes do by default.",
+            "lagrangebench-h5: measure positions from the lower walls; closed boxes do by default.",
         ),
     ] = None,
     wall_particles: Annotated[
-        bool,
-        typer.Option("--wall-particles", help="Closed boxes: add particles that move along with the walls."),
+        bool, option("--wall-particles", "Closed boxes: add particles that move along with the walls.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write over an earlier export.")] = False,
+    force: Annotated[bool, option("--force", "Write over an earlier export.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -184,11 +154,10 @@ def import_split(
     form: FormatOption,
     output: FolderOption,
     allow_pickle: Annotated[
-        bool, typer.Option("--allow-pickle", help="Rebuild pickled arrays; other calls are refused.")
+        bool, option("--allow-pickle", "Rebuild pickled arrays; other calls are refused.")
     ] = False,
     kinds: Annotated[
-        str | None,
-        typer.Option("--kinds", metavar="LIST", help="Material of kinds of particles, as in 3=jelly,0=drop."),
+        str | None, option("--kinds LIST", "Material of kinds of particles, as in 3=jelly,0=drop.")
     ] = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
@@ -229,12 +198,8 @@ def adopt(
     describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
-    valid: Annotated[
-        int | None, typer.Option("--valid", metavar="N", help="Trajectories for valid; a tenth by default.")
-    ] = None,
-    test: Annotated[
-        int | None, typer.Option("--test", metavar="N", help="Trajectories for test; a tenth by default.")
-    ] = None,
+    valid: Annotated[int | None, option("--valid N", "Trajectories for valid; a tenth by default.")] = None,
+    test: Annotated[int | None, option("--test N", "Trajectories for test; a tenth by default.")] = None,
     bounds: BoundsOption = None,
     rescale: RescaleFlag = False,
     input_frames: InputFramesOption = None,
@@ -242,9 +207,7 @@ def adopt(
     frames_of_interest: InterestOption = None,
     cells: CellsOption = None,
     full_box: FullBoxFlag = None,
-    as_is: Annotated[
-        bool, typer.Option("--as-is", help="Take arrays whose axes or velocities look mistaken.")
-    ] = False,
+    as_is: Annotated[bool, option("--as-is", "Take arrays whose axes or velocities look mistaken.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:

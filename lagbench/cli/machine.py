@@ -100,13 +100,8 @@ def _folder(folder: Path) -> str:
         return f"{folder}, {free_bytes(folder)} bytes free"
 
 
-WARM_UP = 2
-"""Frames before the clock starts: kernels compile when they first run."""
-
-FRAMES = 20
-
-LEAST = 0.5
-"""Shortest time over which the mean is taken [s]."""
+WARM_UP = 2  # frames before the clock starts: kernels compile when they first run
+LEAST = 0.5  # shortest time over which the mean is taken [s]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,7 +118,7 @@ class SolverBench:
     seconds_per_frame: float
 
 
-def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
+def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """Simulate the first test scenario and time so many frames, or as many as half a second takes.
 
     Taichi starts once per process: call this from one of its own, as :func:`bench_apart` does.
@@ -147,21 +142,16 @@ def bench_solver(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
     return SolverBench(split=split, size=size, **flow, seconds_per_frame=seconds)
 
 
-def bench_apart(split: str, size: str, *, frames: int = FRAMES) -> SolverBench:
-    """Time the solver in a process of its own, which this one's memory and threads do not disturb.
-
-    Raises:
-        UsageError: unknown split or size, or Taichi is not installed.
-        WorkFailedError: the process failed.
-    """
+def bench_apart(split: str, size: str) -> SolverBench:
+    """Time the solver in a process of its own, which this one's memory and threads do not disturb."""
     load().size(split, size)
     check_installed("taichi", extra="generate")
     with Pool(1) as pool:
-        pool.submit(Task(name=f"bench of {split} {size}", function=_bench, arguments=(split, size, frames)))
+        pool.submit(Task(name=f"bench of {split} {size}", function=_bench, arguments=(split, size)))
         timed: SolverBench = next(event.value for event in pool.events() if event.kind == "done")
     return timed
 
 
-def _bench(split: str, size: str, frames: int, report: Report) -> SolverBench:
+def _bench(split: str, size: str, report: Report) -> SolverBench:
     """Time the solver in a worker process; there is nothing to report meanwhile."""
-    return bench_solver(split, size, frames=frames)
+    return bench_solver(split, size)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,60 +17,49 @@ def root_of(text: str) -> Path:
     return Path(text)
 
 
+def option(words: str, told: str, **how: Any) -> Any:  # noqa: ANN401
+    """Return an option as its help shows it: its names, then what stands for the value, as in ``-o FILE``."""
+    names = [word for word in words.split() if word.startswith("-")]
+    return typer.Option(*names, metavar=" ".join(words.split()[len(names) :]) or None, help=told, **how)
+
+
 SplitArgument = Annotated[str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")]
-SplitOption = Annotated[
-    str | None, typer.Option("--split", metavar="NAME", help="Data set; `lagbench list` names them.")
-]
-NewSizeOption = Annotated[
-    str | None, typer.Option("--size", metavar="NAME", help="tiny, mini or full; mini by default.")
-]
+SplitOption = Annotated[str | None, option("--split NAME", "Data set; `lagbench list` names them.")]
+NewSizeOption = Annotated[str | None, option("--size NAME", "tiny, mini or full; mini by default.")]
 PresentSizeOption = Annotated[
-    str | None,
-    typer.Option("--size", metavar="NAME", help="tiny, mini or full; by default the only one there is."),
+    str | None, option("--size NAME", "tiny, mini or full; by default the only one there is.")
 ]
-SubsetOption = Annotated[
-    str | None, typer.Option("--subset", metavar="NAMES", help="Some of train,valid,test; all by default.")
-]
+SubsetOption = Annotated[str | None, option("--subset NAMES", "Some of train,valid,test; all by default.")]
 ScenariosOption = Annotated[
-    str | None,
-    typer.Option("--scenarios", metavar="IDS", help="Some scenarios, as in 0,3-5; all by default."),
+    str | None, option("--scenarios IDS", "Some scenarios, as in 0,3-5; all by default.")
 ]
 RootOption = Annotated[
     Path | None,
-    typer.Option(
-        "--root",
+    option(
+        "--root FOLDER",
+        "Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else user data.",
         parser=root_of,
-        metavar="FOLDER",
-        help="Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else user data.",
     ),
 ]
 WorkersOption = Annotated[
-    int | None,
-    typer.Option("--workers", metavar="N", help="Worker processes; one per core by default.", min=1),
+    int | None, option("--workers N", "Worker processes; one per core by default.", min=1)
 ]
-DeviceOption = Annotated[
-    str, typer.Option("--device", metavar="NAME", help="cpu, parallel (its threads) or cuda.")
-]
+DeviceOption = Annotated[str, option("--device NAME", "cpu, parallel (its threads) or cuda.")]
 SchedulerOption = Annotated[
-    str | None,
-    typer.Option("--scheduler", metavar="ADDRESS", help="Dask scheduler, as in tcp://host:8786."),
+    str | None, option("--scheduler ADDRESS", "Dask scheduler, as in tcp://host:8786.")
 ]
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
-QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]
+QuietFlag = Annotated[bool, option("--quiet -q", "Print nothing but errors.")]
 
 
 def chosen(argument: str | None, option: str | None) -> str:
-    """Return the split that a user named, by argument or by option.
-
-    Raises:
-        UsageError: neither or two different ones were given.
-    """
+    """Return the split that a user named, by argument or by option; refuse none and two."""
     given = {name for name in (argument, option) if name is not None}
     if len(given) != 1:
-        raise UsageError(
-            "two splits are named" if given else "no split is named",
-            where="--split",
-            got=" and ".join(sorted(given)) or None,
-            fix="name one, as in --split cavity; `lagbench list` shows them",
+        what, got = (
+            f"{'two splits are' if given else 'no split is'} named",
+            " and ".join(sorted(given)) or None,
         )
+        fix = "name one, as in --split cavity; `lagbench list` shows them"
+        raise UsageError(what, where="--split", got=got, fix=fix)
     return given.pop()

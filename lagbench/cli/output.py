@@ -23,17 +23,10 @@ if TYPE_CHECKING:
     from lagbench.submission.findings import ValidationResult
     from lagbench.work.progress import Progress as State
 
-WIDTH = 80
-"""Characters that a table may be wide; a wider one comes in blocks."""
-
-GAP = 3
-"""Characters between two columns."""
-
-LAST = 24
-"""Characters to which the last column, which wraps, may shrink."""
-
-SECONDS_PER_LINE = 60.0
-"""Time between two lines of progress that go to a file [s]."""
+WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
+GAP = 3  # characters between two columns
+LAST = 24  # characters to which the last column, which wraps, may shrink
+SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
 
 
 def counted(number: int, noun: str) -> str:
@@ -84,13 +77,8 @@ def blocks(table: Table, width: int = WIDTH) -> Iterator[Table]:
             chosen.append([])
         chosen[-1].append(i)
     for number, block in enumerate(chosen):
-        kept = [*range(table.keys), *block]
-        yield Table(
-            table.title if number == 0 else "",
-            tuple(table.columns[i] for i in kept),
-            tuple(tuple(row[i] for i in kept) for row in table.rows),
-            table.keys,
-        )
+        heads, *rows = zip(*columns[: table.keys], *(columns[i] for i in block), strict=True)
+        yield Table("" if number else table.title, heads, tuple(rows), table.keys)
 
 
 def print_blocks(tables: Iterable[Table]) -> None:
@@ -178,14 +166,8 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    count = TextColumn("{task.fields[count]}")
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        count,
-        TimeRemainingColumn(),
-    )
+    stage, count = TextColumn("{task.description}"), TextColumn("{task.fields[count]}")
+    columns = (stage, BarColumn(), TaskProgressColumn(), count, TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 

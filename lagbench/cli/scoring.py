@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -21,6 +20,7 @@ from .options import (
     SplitOption,
     WorkersOption,
     chosen,
+    option,
 )
 from .output import complain, counted, print_blocks, print_json, progress_bar, say, show, spell_bytes
 
@@ -28,26 +28,18 @@ if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.submission.findings import ValidationResult
 
-PredictionsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")]
-FilesArgument = Annotated[
-    list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
-]
 OwnSplitOption = Annotated[
-    str | None,
-    typer.Option("--split", metavar="NAME", help="Split that they must be for; a local one by its folder."),
+    str | None, option("--split NAME", "Split that they must be for; a local one by its folder.")
 ]
-EveryFlag = Annotated[bool, typer.Option("--all", help="Show every metric.")]
-FloorsFlag = Annotated[bool, typer.Option("--all-floors", help="Show every floor, not only the best.")]
+EveryFlag = Annotated[bool, option("--all", "Show every metric.")]
 
 
 def template(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
-        "predictions.nc"
-    ),
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file of that name.")] = False,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
+    overwrite: Annotated[bool, option("--overwrite", "Replace a file of that name.")] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -63,7 +55,7 @@ def template(
 
 
 def validate(
-    predictions: PredictionsArgument,
+    predictions: Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")],
     split: OwnSplitOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -72,9 +64,9 @@ def validate(
     """Check a predictions.nc and say all that is wrong with it and how to mend it."""
     from lagbench.submission.validation import validate as run
 
-    wanted = _wanted(split, root)
-    result = run(predictions, root=wanted.root)
-    wanted.check(result)
+    root, check = _wanted(split, root)
+    result = run(predictions, root=root)
+    check(result)
     words = [str(finding) for finding in result.findings]
     for reason in dict.fromkeys(result.skipped.values()):
         checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
@@ -89,30 +81,27 @@ def validate(
 
 
 def score(
-    predictions: FilesArgument,
+    predictions: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
+    ],
     split: OwnSplitOption = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="Where scores go; beside predictions.nc by default, of other and of several files in folders"
+        option(
+            "--output -o FOLDER",
+            "Where scores go; beside predictions.nc by default, of other and of several files in folders"
             " named like them.",
         ),
     ] = None,
     report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="FOLDER", help="Write index.html with all figures there."),
+        Path | None, option("--report FOLDER", "Write index.html with all figures there.")
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    extras: Annotated[
-        str, typer.Option("--extras", metavar="NAMES", help="Extras with metrics, as in transport.")
-    ] = "",
+    extras: Annotated[str, option("--extras NAMES", "Extras with metrics, as in transport.")] = "",
     every: EveryFlag = False,
-    floors: FloorsFlag = False,
+    floors: Annotated[bool, option("--all-floors", "Show every floor, not only the best.")] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -121,8 +110,12 @@ def score(
 
     if len(predictions) > 1 and report is None:
         raise UsageError("several files are scored for one report", fix="add --report FOLDER")
-    targets, wanted = _targets(predictions, output), _wanted(split, root)
-    root = wanted.root
+    targets, (root, check) = _targets(predictions, output), _wanted(split, root)
+
+    def examined(result: ValidationResult) -> None:
+        check(result)
+        complain(result)
+
     together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
         from lagbench.report.report import check_folder
@@ -139,7 +132,7 @@ def score(
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=draw,
-                examined=wanted.complain,
+                examined=examined,
                 validated=validated,
             )
         cards.append(card)
@@ -204,38 +197,20 @@ def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[Va
     return results
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """The split that predictions must be for, if the user says, and the root folder of its data."""
+def _wanted(split: str | None, root: Path | None) -> tuple[Path | None, Callable[[ValidationResult], None]]:
+    """Return the root, which the path of a local split names, and what refuses predictions for another."""
+    name = None
+    if split is not None:
+        from lagbench.data.local import home
 
-    name: str | None
-    root: Path | None
+        name, root, _ = home(split, root=root)
 
-    def check(self, result: ValidationResult) -> None:
-        """Refuse predictions for another split."""
-        if self.name is not None and result.split not in (None, self.name):
-            raise UsageError(
-                "the predictions are for another split",
-                where=str(result.path),
-                expected=self.name,
-                got=ascii(result.split),
-                fix="name that one, or leave --split out",
-            )
+    def check(result: ValidationResult) -> None:
+        if name is not None and result.split not in (None, name):
+            what, fix = "the predictions are for another split", "name that one, or leave --split out"
+            raise UsageError(what, where=str(result.path), expected=name, got=ascii(result.split), fix=fix)
 
-    def complain(self, result: ValidationResult) -> None:
-        """Refuse predictions for another split; else tell what rejects the file."""
-        self.check(result)
-        complain(result)
-
-
-def _wanted(split: str | None, root: Path | None) -> _Wanted:
-    """Return what --split and --root say together: the path of a local split names its root."""
-    if split is None:
-        return _Wanted(None, root)
-    from lagbench.data.local import home
-
-    found = home(split, root=root)
-    return _Wanted(found.name, found.root)
+    return root, check
 
 
 def compare(
@@ -244,9 +219,7 @@ def compare(
         typer.Argument(metavar="A", help="scores.json or .nc, a folder of one or of seeds, predictions.nc."),
     ],
     second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
-    metric: Annotated[
-        list[str] | None, typer.Option("--metric", metavar="NAME", help="Metric to compare by; repeatable.")
-    ] = None,
+    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")] = None,
     root: RootOption = None,
     workers: WorkersOption = None,
     every: EveryFlag = False,

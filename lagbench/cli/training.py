@@ -22,8 +22,9 @@ from .options import (
     SplitArgument,
     SplitOption,
     chosen,
+    option,
 )
-from .output import print_json, progress_bar, say, spell_seconds
+from .output import progress_bar, show, spell_seconds
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
@@ -32,60 +33,39 @@ if TYPE_CHECKING:
     from .machine import SolverBench
 
 EXTRA = "baselines"
-DeviceOption = Annotated[str, typer.Option("--device", metavar="NAME", help="cpu, cuda, or auto.")]
+DeviceOption = Annotated[str, option("--device NAME", "cpu, cuda, or auto.")]
 ThreadsOption = Annotated[
     int | None,
-    typer.Option(
-        "--threads",
-        metavar="N",
-        help="CPU threads; else OMP_NUM_THREADS, else its share of the cores.",
-        min=1,
-    ),
+    option("--threads N", "CPU threads; else OMP_NUM_THREADS, else its share of the cores.", min=1),
 ]
 
 
 def train(
     name: SplitArgument = None,
     baseline: Annotated[
-        str | None,
-        typer.Option("--baseline", metavar="NAME", help="Model, as in gns; see docs/baselines.md."),
+        str | None, option("--baseline NAME", "Model, as in gns; see docs/baselines.md.")
     ] = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    recipe: Annotated[
-        str | None, typer.Option("--recipe", metavar="NAME", help="Variant, as in short; or a YAML file.")
-    ] = None,
+    recipe: Annotated[str | None, option("--recipe NAME", "Variant, as in short; or a YAML file.")] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change the recipe: training.steps=100; repeatable."),
+        list[str] | None, option("--set KEY=VALUE", "Change the recipe: training.steps=100; repeatable.")
     ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", metavar="N", help="Seed of all chance.", min=0)
-    ] = None,
+    seed: Annotated[int | None, option("--seed N", "Seed of all chance.", min=0)] = None,
     start: Annotated[
-        Path | None,
-        typer.Option("--start", metavar="FILE", help="weights.pt to start from; of another size perhaps."),
+        Path | None, option("--start FILE", "weights.pt to start from; of another size perhaps.")
     ] = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FOLDER",
-            help="By default in runs/, named after recipe, baseline and seed.",
-        ),
+        option("--output -o FOLDER", "By default in runs/, named after recipe, baseline and seed."),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume/--no-resume", help="Go on with what is there.")] = True,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Train anew whatever is there.")] = False,
+    resume: Annotated[bool, option("--resume/--no-resume", "Go on with what is there.")] = True,
+    fresh: Annotated[bool, option("--fresh", "Train anew whatever is there.")] = False,
     device: DeviceOption = "auto",
-    processes: Annotated[
-        int, typer.Option("--processes", metavar="N", help="Processes, one device each (DDP).", min=1)
-    ] = 1,
+    processes: Annotated[int, option("--processes N", "Processes, one device each (DDP).", min=1)] = 1,
     threads: ThreadsOption = None,
-    workers: Annotated[
-        int, typer.Option("--workers", metavar="N", help="Processes that read windows ahead.", min=0)
-    ] = 0,
+    workers: Annotated[int, option("--workers N", "Processes that read windows ahead.", min=0)] = 0,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -130,10 +110,8 @@ def train(
             workers=workers,
             progress=draw,
         )
-    if as_json and not is_helper():
-        print_json(result)
-    else:
-        say("\n".join(_trained(result, _where(split, root))), quiet=quiet)
+    as_json = as_json and not is_helper()
+    show(result, _trained(result, _where(split, root)), as_json=as_json, quiet=quiet)
 
 
 def _warn_of_scores(
@@ -156,18 +134,13 @@ def _warn_of_scores(
     plan = recipe_for(find(baseline), tier.split, tier.name, variant=variant, settings=settings)
     reasons = list(unusable(tier, home, validated=plan.training.validate_every != 0))
     if reasons:
-        typer.echo(
-            "warning: what is trained here cannot be scored as it should\n  " + "\n  ".join(reasons),
-            err=True,
-        )
+        warning = "warning: what is trained here cannot be scored as it should"
+        typer.echo("\n  ".join([warning, *reasons]), err=True)
 
 
 @contextmanager
 def _told_once() -> Iterator[None]:
-    """Let one process of each machine tell an error, and the first alone an interrupt.
-
-    What befell one process only, as where its memory is full, it tells itself.
-    """
+    """Let one process of each machine tell an error that befell all, and the first alone an interrupt."""
     from lagbench.baselines.machine import is_helper
 
     try:
@@ -177,6 +150,7 @@ def _told_once() -> Iterator[None]:
             raise typer.Exit(128 + signal.SIGINT) from None
         raise
     except LagbenchError as error:
+        # one with a cause, as where memory is full, befell this process only
         if os.environ.get("LOCAL_RANK", "0") != "0" and error.__cause__ is None:
             raise typer.Exit(error.exit_code) from error
         raise
@@ -192,7 +166,7 @@ def _where(split: str, root: Path | None) -> str:
     return f" --root {root or found.root}" if root or local else ""
 
 
-def _trained(result: TrainingResult, where: str) -> list[str]:
+def _trained(result: TrainingResult, where: str) -> Iterator[str]:
     time = f"{spell_seconds(result.wall_seconds)}, {spell_seconds(result.cpu_seconds)} of processor time"
     if result.gpu_seconds:
         time += f", {spell_seconds(result.gpu_seconds)} of GPU time"
@@ -200,60 +174,44 @@ def _trained(result: TrainingResult, where: str) -> list[str]:
         time += "; it was over before, --fresh trains anew"
     elif result.first_step:
         time += f"; this call went on from step {result.first_step}"
+    state = f"{result.state}, step {result.step} of {result.steps}"
+    yield f"{result.baseline} on {result.recipe}: {state}, {time}"
+    if result.start:
+        yield f"  started    from {result.start}; hours and track count what they took"
+    yield f"  parameters {result.parameters}"
     terms = sorted(result.loss, key=lambda name: (name == "total", name))
-    lines = [
-        f"{result.baseline} on {result.recipe}: {result.state}, step {result.step} of {result.steps}, {time}",
-        *(
-            [f"  started    from {result.start}; hours and track count what they took"]
-            if result.start
-            else []
-        ),
-        f"  parameters {result.parameters}",
-        "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms),
-    ]
+    yield "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms)
     if result.best_value is not None:
-        lines.append(
-            f"  best       {result.metric} {result.best_value:.4g} on valid, step {result.best_step}"
-            + (": nothing better than the weights that it started from" if result.best_step == 0 else "")
-        )
+        worse = ": nothing better than the weights that it started from" if result.best_step == 0 else ""
+        best = f"{result.best_value:.4g} on valid, step {result.best_step}{worse}"
+        yield f"  best       {result.metric} {best}"
     share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
     seen = f"{result.windows_seen:,} windows, " if result.windows_seen else ""
-    lines.append(
+    yield (
         f"  budget     {seen}{result.epochs:.3g} epochs; {share:.0%} of the processor time for validations;"
         f" {result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
     )
-    lines.append(f"  weights    {result.weights}")
+    yield f"  weights    {result.weights}"
     if result.size == "tiny":
-        lines.append("hint: tiny is for tests: no model learns much from so little; try --size mini")
-    return [*lines, f"next: lagbench predict {result.weights}{where} -o predictions.nc"]
+        yield "hint: tiny is for tests: no model learns much from so little; try --size mini"
+    yield f"next: lagbench predict {result.weights}{where} -o predictions.nc"
 
 
 def predict(
     checkpoint: Annotated[Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="File to write.")] = Path(
-        "predictions.nc"
-    ),
-    size: Annotated[
-        str | None,
-        typer.Option("--size", metavar="NAME", help="Another size than that of the training."),
-    ] = None,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
+    size: Annotated[str | None, option("--size NAME", "Another size than that of the training.")] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change the model: model.average=true; repeatable."),
+        list[str] | None, option("--set KEY=VALUE", "Change the model: model.average=true; repeatable.")
     ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     batch: Annotated[
-        int | None,
-        typer.Option("--batch", metavar="N", help="Scenarios side by side; 1 on a CPU, all on a GPU.", min=1),
+        int | None, option("--batch N", "Scenarios side by side; 1 on a CPU, all on a GPU.", min=1)
     ] = None,
-    method: Annotated[
-        str | None, typer.Option("--method", metavar="NAME", help="What the board shall call it.")
-    ] = None,
-    solver: Annotated[
-        bool, typer.Option("--bench/--no-bench", help="Time our solver too, for the speed-up.")
-    ] = True,
+    method: Annotated[str | None, option("--method NAME", "What the board shall call it.")] = None,
+    solver: Annotated[bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")] = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -285,17 +243,12 @@ def predict(
             solver=time_solver if solver else None,
             progress=draw,
         )
-    if as_json:
-        print_json({**vars(result), "solver": timed})
-    else:
-        say("\n".join(_predicted(result, timed, f" --root {root}" if root else "")), quiet=quiet)
+    told = _predicted(result, timed, f" --root {root}" if root else "")
+    show({**vars(result), "solver": timed}, told, as_json=as_json, quiet=quiet)
 
 
 def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
-    """Return what the solver takes here; None, with the reason on stderr, where it cannot run.
-
-    Local splits have no solver of ours.
-    """
+    """Return what the solver takes here; None for local splits, and where it cannot run: stderr says why."""
     from lagbench.data.registry import load
 
     from .machine import bench_apart
@@ -310,35 +263,33 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
         return None
 
 
-def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> list[str]:
+def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> Iterator[str]:
     trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
     trained += "".join(f", {setting}" for setting in result.settings)
-    lines = [
-        f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames",
+    yield f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames"
+    yield (
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
-        f" without the neighbour search) on {result.device}",
-    ]
+        f" without the neighbour search) on {result.device}"
+    )
     if solver is not None:
         ratio = result.seconds_per_frame / solver.seconds_per_frame
-        lines.append(
-            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: "
-            + (
-                f"{ratio:.2g} times as fast as the model"
-                if ratio > 1
-                else f"the model is {1 / ratio:.2g} times as fast"
-            )
+        slower, faster = (
+            f"{ratio:.2g} times as fast as the model",
+            f"the model is {1 / ratio:.2g} times as fast",
         )
+        beside = slower if ratio > 1 else faster
+        yield f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: {beside}"
     if result.diverged:
         marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
-        lines.append(f"  frozen  {marks}: not finite from there on")
-    return [*lines, f"next: lagbench score {result.path}{where}"]
+        yield f"  frozen  {marks}: not finite from there on"
+    yield f"next: lagbench score {result.path}{where}"
 
 
 def bench(
     what: Annotated[str, typer.Argument(metavar="WHAT", help="solver.")],
     split: SplitOption = None,
     size: NewSizeOption = None,
-    frames: Annotated[int, typer.Option("--frames", metavar="N", help="Frames to time.", min=1)] = 20,
+    frames: Annotated[int, option("--frames N", "Frames to time.", min=1)] = 20,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -348,19 +299,15 @@ def bench(
     from .machine import bench_solver
 
     if what != "solver":
-        raise UsageError(
-            f"nothing to time is called {what!r}", expected="solver", fix="lagbench bench solver"
-        )
+        fix = "lagbench bench solver"
+        raise UsageError(f"nothing to time is called {what!r}", expected="solver", fix=fix)
     tier = locate_new(chosen(None, split), size).size
     if not tier.simulated:
         fix = "lagbench list names splits of ours"
         raise UsageError("a local split cannot be simulated", where="--split", got=tier.split, fix=fix)
     result = bench_solver(tier.split, tier.name, frames=frames)
-    if as_json:
-        print_json(result)
-        return
-    say(
+    told = (
         f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of {result.particles}"
-        f" particles, {result.substeps} substeps, on one core",
-        quiet=quiet,
+        f" particles, {result.substeps} substeps, on one core"
     )
+    show(result, [told], as_json=as_json, quiet=quiet)
