@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pool_tasks
 import pytest
+from cluster_bench import gone
 
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.work.machine import available_cores
@@ -20,21 +21,12 @@ from lagbench.work.pool import ATTEMPTS, Pool, Task, worker_count
 HERE = str(Path(__file__).parent)
 
 
-def wait_until(condition: object, seconds: float = 30.0) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     """Wait until a function returns true, or fail."""
-    end = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
+    end = time.monotonic() + 30.0
+    while not condition():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.02)
-
-
-def is_alive(process: int) -> bool:
-    """Tell whether a process runs; one that its parent has not yet asked about does not."""
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
 
 
 def test_results_come_back_costliest_first() -> None:
@@ -147,12 +139,10 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     with Pool(1) as pool:
         pool.submit(Task(name="a", function=pool_tasks.sleep_long, arguments=(marker,)))
         events = pool.events()
-        pool._assign()
-        wait_until(marker.exists)
+        next(events)
         process = pool.process_ids()[0]
-        assert is_alive(process)
-        del events
-    assert not is_alive(process)
+        assert not gone(process)
+    assert gone(process)
 
 
 def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
@@ -162,7 +152,7 @@ def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
         list(pool.events())
         process = pool.process_ids()[0]
     assert (tmp_path / "note").read_text() == "left in peace"
-    assert not is_alive(process)
+    assert gone(process)
 
 
 SCRIPT = """
@@ -184,10 +174,10 @@ def test_workers_die_with_their_parent(tmp_path: Path) -> None:
     with subprocess.Popen(command) as parent:
         wait_until(lambda: marker.exists() and marker.read_text() != "")
         worker = int(marker.read_text())
-        assert is_alive(worker)
+        assert not gone(worker)
         os.kill(parent.pid, signal.SIGKILL)
         parent.wait()
-    wait_until(lambda: not is_alive(worker))
+    wait_until(lambda: gone(worker))
 
 
 def test_the_calling_script_is_not_imported_again() -> None:

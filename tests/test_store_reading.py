@@ -101,20 +101,16 @@ def test_scores_are_those_of_the_folder(
     assert all(near["rows"][row] == scores for row, scores in far["rows"].items())
 
 
-def test_baselines_read_from_a_store(url: str, generated: GenerationResult, tiny: Registry) -> None:
-    """Facts and training files are those of the folder."""
+def test_baselines_and_exports_read_from_a_store(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """Facts, training files and the bytes of an export, which needs all subsets, are those of the folder."""
     assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
     assert here(url) == ["manifest.json", "train/0000.nc"]
     found = copy.scenario_files(tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid"))
     assert [path.read_bytes() for path in found.values()] == [
         (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
     ]
-
-
-def test_exports_are_those_of_the_folder(
-    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
-) -> None:
-    """All three subsets come, and give the same bytes."""
     made = [
         export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny)
         for name, root in (("far", url), ("near", generated.root))

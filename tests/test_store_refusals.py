@@ -82,14 +82,10 @@ def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) 
         use(s3)
 
 
-def test_no_bucket(s3: str, use: Use) -> None:
-    """The bucket is named."""
+def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
+    """The bucket is named; a scheme that fsspec does not know is a usage error."""
     with pytest.raises(DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"):
         use("s3://elsewhere/data")
-
-
-def test_no_such_kind(use: Use) -> None:
-    """A scheme that fsspec does not know is a usage error."""
     with pytest.raises(UsageError, match="no such kind of address"):
         use("nonsense://data/x")
 

@@ -187,7 +187,16 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     s -= grid.origin
     base = np.floor(s - 0.5)
     s -= base
-    weight_x, weight_y = _spline(s)
+    # weights of the three nodes of each axis, shape [axis, node, particle]
+    weights = np.empty((len(s), 3, s.shape[1]))
+    for node, centre in enumerate((1.5, 1.0, 0.5)):
+        weight = weights[:, node]
+        np.subtract(s, centre, out=weight)
+        np.square(weight, out=weight)
+        if centre == 1.0:
+            np.subtract(0.75, weight, out=weight)
+        else:
+            weight *= 0.5
     side = grid.nodes + _LOW + _HIGH
     base += _LOW
     base[0] *= side
@@ -201,7 +210,7 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     for i in range(3):
         for k in range(3):
             shift = i * side + k
-            np.multiply(weight_x[i], weight_y[k], out=weight)
+            np.multiply(weights[0, i], weights[1, k], out=weight)
             np.add.at(sums[shift:], corner, weight)
             # both components go into one sum of complex numbers, which takes less than two of real ones
             np.multiply(weight, along_x, out=product.real)
@@ -209,20 +218,6 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
             np.add.at(momenta[shift:], corner, product)
     for field, held in zip(out, (sums, momenta.real, momenta.imag), strict=True):
         field[:] = held[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
-
-
-def _spline(s: Floats) -> Floats:
-    """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
-    weights = np.empty((len(s), 3, s.shape[1]))
-    for node, centre in enumerate((1.5, 1.0, 0.5)):
-        weight = weights[:, node]
-        np.subtract(s, centre, out=weight)
-        np.square(weight, out=weight)
-        if centre == 1.0:
-            np.subtract(0.75, weight, out=weight)
-        else:
-            weight *= 0.5
-    return weights
 
 
 def counted_nodes(weight: Floats, full: float) -> Mask:

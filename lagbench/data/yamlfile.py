@@ -48,22 +48,18 @@ class _StrictLoader(yaml.CSafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-def _integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:
-    return int(node.value, 0) if node.value[:2] in ("0o", "0x") else int(node.value)
-
-
-def _float(_: _StrictLoader, node: yaml.ScalarNode) -> float:
-    return float(node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value)
-
-
 _StrictLoader.yaml_implicit_resolvers = {
     first: [(tag, known) for tag, known in held if tag not in NUMBERS]
     for first, held in yaml.CSafeLoader.yaml_implicit_resolvers.items()
 }
 for _tag, _pattern in NUMBERS.items():
     _StrictLoader.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
-_StrictLoader.add_constructor(INTEGER, _integer)
-_StrictLoader.add_constructor(FLOAT, _float)
+_StrictLoader.add_constructor(
+    INTEGER, lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10)
+)
+_StrictLoader.add_constructor(
+    FLOAT, lambda _, node: float(node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value)
+)
 
 
 def _check_structure(text: str) -> None:

@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import SIGNATURE, Structure, check_structure, opened
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
@@ -45,8 +45,6 @@ PAUSE = 0.5  # pause after the first failed attempt [s]; it doubles
 FIX_LINE = "the same command goes on where it stopped"
 
 T = TypeVar("T")
-
-_NETCDF4 = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +139,7 @@ def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
                     pace,
                     limit=wanted.limit,
                     length=wanted.length,
-                    begins=_NETCDF4,
+                    begins=SIGNATURE,
                     remedy=wanted.remedy,
                 ):
                     out.write(block)
@@ -170,14 +168,12 @@ def saving(partial: Path) -> Iterator[None]:
 
 
 def insist(
-    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] | None = None
+    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] = lambda: 0
 ) -> T:
     """Attempt until it succeeds, or attempts bring a partial file, or a place, no further."""
 
     def held() -> int:
-        if place is not None:
-            return place()
-        return partial.stat().st_size if partial and partial.exists() else 0
+        return partial.stat().st_size if partial and partial.exists() else place()
 
     failures, restarted = 0, False
     for _ in range(MOST_ATTEMPTS):

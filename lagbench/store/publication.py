@@ -104,9 +104,8 @@ class Publication:
             return
         found = self._read_manifest()
         known = {e.scenario for e in (*self._named.files, *self._latest.files, *manifest.files)}
-        manifest = join(
-            self._size, manifest, found, [e for e in self._right(found) if e.scenario not in known]
-        )
+        others = [e for e in self._right(found) if e.scenario not in known]
+        manifest = join(self._size, manifest, found, others)
         self._objects.write(MANIFEST_NAME, (manifest.model_dump_json(indent=1) + "\n").encode())
         self._named, self._when = manifest, time.monotonic()
 
@@ -116,10 +115,8 @@ class Publication:
     def _restricted(self, manifest: Manifest) -> Manifest:
         """Return a manifest without what the store lacks."""
         lacking = self._lacking(manifest)
-        if not lacking:
-            return manifest
         files = tuple(entry for entry in manifest.files if entry not in lacking)
-        return merged(self._size, manifest.model_copy(update={"files": files}))
+        return merged(self._size, manifest.model_copy(update={"files": files})) if lacking else manifest
 
     def _right(self, manifest: Manifest) -> list[FileEntry]:
         return [entry for entry in manifest.files if is_right(entry, self._size, manifest)]

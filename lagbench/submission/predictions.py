@@ -143,17 +143,11 @@ def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Pre
     with ExitStack() as stack:
         file = stack.enter_context(opened(path, fix=WRITE))
         if checked is None or checked.length != path.stat().st_size:
-            checked = _checked(file, path)
+            checked, out = dissect(file, path), Findings()
+            for check in (check_format, check_dims, check_dtype, check_marks):
+                check(checked, out)
+            out.result(path).check()
         return attach(file, path, checked, stack)
-
-
-def _checked(file: h5py.File, path: Path) -> Anatomy:
-    anatomy = dissect(file, path)
-    out = Findings()
-    for check in (check_format, check_dims, check_dtype, check_marks):
-        check(anatomy, out)
-    out.result(path).check()
-    return anatomy
 
 
 def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:

@@ -76,7 +76,13 @@ class Mistake(NamedTuple):
 def read_starts(predictions: Predictions, truth: Truth) -> dict[int, Start]:
     """Return how each known scenario begins, by ascending id."""
     known = sorted(set(predictions.header.scenarios) & set(truth.size.subsets["test"]))
-    return {scenario: _start(predictions, truth, scenario) for scenario in known}
+    starts, frames = {}, predictions.header.frames
+    for scenario in known:
+        predicted = predictions.frames(scenario, frames[0], min(2, len(frames))).astype(np.float64)
+        given, true, *later = truth.around_start(scenario).astype(np.float64)
+        second = next(iter(later), None)
+        starts[scenario] = Start(given, true, predicted[0], predicted[-1], len(frames), second)
+    return starts
 
 
 def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Findings) -> None:
@@ -93,7 +99,20 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
         found = said[scenario]
         # A bad model may look so in one scenario by chance; what writes a file makes the mistake in all.
         if found is None or (found.everywhere and 2 * counts[found] < len(starts)):
-            _check_continuity(scenario, start, truth, first, out)
+            with np.errstate(all="ignore"):
+                distance = _rms(start.first - start.given)
+            limit = JUMP * start.largest_step(truth, scenario, enough=distance / JUMP)
+            if np.isfinite(distance) and distance > limit:
+                out.warning(
+                    "discontinuous_start",
+                    "the first predicted frame is far from the last given one",
+                    where=f"scenario {scenario}, frame {first}",
+                    expected=f"root mean square distance at most {limit:.3g},"
+                    f" {JUMP:g} times the truth's largest displacement in a frame",
+                    got=f"{distance:.3g}",
+                    fix="predict what follows the last given frame, particle by particle; "
+                    "where the model itself jumps, leave it: it is scored, and flagged on the board",
+                )
             continue
         out.error(
             "start",
@@ -105,31 +124,6 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
         )
     _check_shift(starts, first, out)
     out.made("start", "discontinuous_start")
-
-
-def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
-    frames = predictions.header.frames
-    predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
-    given, true, *later = truth.around_start(scenario).astype(np.float64)
-    first, second = predicted[0].astype(np.float64), predicted[-1].astype(np.float64)
-    return Start(given, true, first, second, len(frames), next(iter(later), None))
-
-
-def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
-    with np.errstate(all="ignore"):
-        distance = _rms(start.first - start.given)
-    limit = JUMP * start.largest_step(truth, scenario, enough=distance / JUMP)
-    if np.isfinite(distance) and distance > limit:
-        out.warning(
-            "discontinuous_start",
-            "the first predicted frame is far from the last given one",
-            where=f"scenario {scenario}, frame {frame}",
-            expected=f"root mean square distance at most {limit:.3g},"
-            f" {JUMP:g} times the truth's largest displacement in a frame",
-            got=f"{distance:.3g}",
-            fix="predict what follows the last given frame, particle by particle; "
-            "where the model itself jumps, leave it: it is scored, and flagged on the board",
-        )
 
 
 def _check_shift(starts: Mapping[int, Start], frame: int, out: Findings) -> None:

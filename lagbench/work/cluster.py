@@ -207,19 +207,22 @@ class Cluster:
     def __enter__(self) -> Self:
         """Connect, and mark the shared folder."""
         with ExitStack() as stack:
-            stack.enter_context(_quiet())
             self._dask = stack.enter_context(_connected(self.address))
             mark = None if self.folder is None else stack.enter_context(marked(self.folder))
             self._client = Client(f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark)
             self._dask.subscribe_topic(self._client.name, lambda event: self._heard.put(tuple(event[1])))
-            stack.callback(self._dismiss)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop what still runs and disconnect."""
+        """Make the workers drop what they hold, and disconnect."""
+        pending, self._pending = [future for _, future in self._pending.values()], {}
+        if pending and self._dask.status == "running":
+            with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
+                self._dask.cancel(pending)
+                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
         self._stack.__exit__(kind, error, trace)
 
     def submit(self, task: Task) -> None:
@@ -246,7 +249,9 @@ class Cluster:
             now = time.monotonic()
             if now - looked >= LOOK_SECONDS:
                 looked = now
-                alive = now if _has_workers(self._dask) else alive
+                with contextlib.suppress(OSError):  # the connection may break after the status was set
+                    if self._dask.status == "running" and self._dask.scheduler_info()["workers"]:
+                        alive = now
             if self._dask.status in ("closed", "failed") or now - alive > LOST_SECONDS:
                 raise _lost(f"{self._dask.status}, no worker for {now - alive:.0f} s")
             if not ended:
@@ -257,18 +262,17 @@ class Cluster:
         before, self._seen[number] = self._seen.get(number, 0), units
         return Event(task=task, kind="progress", value=units - before)
 
-    def _dismiss(self) -> None:
-        """Make the workers drop what they hold."""
-        pending, self._pending = [future for _, future in self._pending.values()], {}
-        if pending and self._dask.status == "running":
-            with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
-                self._dask.cancel(pending)
-                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
-
 
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    distributed = require("distributed", extra="cluster")
+    """Connect, with Dask's logs kept off the terminal: what matters of them becomes an error of ours.
+
+    After an error they stay off: a client that lost its scheduler logs until the process ends.
+    """
+    distributed = require("distributed", extra="cluster")  # its import sets the levels of its loggers
+    levels = {name: logging.getLogger(name).level for name in LOGGERS}
+    for name in LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         if not address.startswith(("ucx://", "inproc://")):
             # A client whose address cannot be one is 40 s in closing.
@@ -289,19 +293,6 @@ def _connected(address: str) -> Iterator[Any]:
         raise _lost(error) from error
     finally:
         client.close()
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Dask's logs off the terminal: what matters of them becomes an error of ours.
-
-    After an error they stay off: a client that lost its scheduler logs until the process ends.
-    """
-    require("distributed", extra="cluster")  # its import sets the levels of its loggers
-    levels = {name: logging.getLogger(name).level for name in LOGGERS}
-    for name in LOGGERS:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    yield
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
 
@@ -313,13 +304,6 @@ def _lost(got: object) -> WorkFailedError:
         got=f"{type(got).__name__}: {got}" if isinstance(got, Exception) else got,
         fix="start scheduler and workers, then run the same command again",
     )
-
-
-def _has_workers(client: Any) -> bool:  # noqa: ANN401
-    try:
-        return client.status == "running" and bool(client.scheduler_info()["workers"])
-    except OSError:  # the connection broke since the status was set
-        return False
 
 
 def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
