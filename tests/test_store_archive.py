@@ -154,14 +154,11 @@ def test_local_splits_are_asked_of_nobody(
     assert server.asked == []
 
 
-def test_files_of_other_schemes(server: Mirror, here: Path) -> None:
-    """An archive is read through fsspec as well."""
+def test_a_manifest_comes_before_an_archive(original: LocalSplit, server: Mirror, here: Path) -> None:
+    """A store that has files is not asked for an archive, which is read through fsspec as well."""
     assert fetched(server.folder.as_uri(), here).complete
     assert is_right(here)
-
-
-def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) -> None:
-    """A store that has files is not asked for an archive."""
+    shutil.rmtree(here / "own/full/v1")
     with serving(original.folder.parent) as running:
         assert fetched(running.url, here).complete
         assert running.count(".tar") == 0

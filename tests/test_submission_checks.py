@@ -78,7 +78,7 @@ def test_jumps_are_flagged(bench: Bench) -> None:
     Particles permuted in the middle of the rollout jump too; a displacement that is surely reached ends the
     search in the truth.
     """
-    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
+    source = truth_of(bench)
     everything = source.largest_displacement(4, enough=np.inf)
     assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
     result = changed(bench, lambda x: np.concatenate([x[:, :4], x[:, 4:, ::-1]], axis=1))
@@ -99,8 +99,7 @@ def test_jumps_are_flagged(bench: Bench) -> None:
 
 def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is flagged."""
-    size = bench.registry.size("cavity", "tiny")
-    source = Truth(size, bench.root)
+    source = truth_of(bench)
     limit = 10 * source.largest_displacement(3, enough=np.inf)
     flagged: list[list[float]] = []
     steps = np.diff(np.concatenate([source.given(3), truth(3)]).astype("f8"), axis=0)
@@ -306,8 +305,7 @@ def test_damaged_notes_are_no_notes(own: Bench, text: str) -> None:
 
 def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
     """A file that agrees with itself, but not with datasets.yaml."""
-    held = truth_of(own)
-    size = held.size
+    size = truth_of(own).size
     other = size.measured.model_copy(update={"scenario_sha256": {3: "0" * 16, 4: "0" * 16, 5: "0" * 16}})
     with pytest.raises(DataError) as caught:
         Truth(size.model_copy(update={"measured": other}), own.root).check()

@@ -47,7 +47,10 @@ def test_tabulated_profiles_have_no_slips(reynolds: int, name: str) -> None:
 
 
 def test_misprints_are_left_out() -> None:
-    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated."""
+    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated.
+
+    Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4.
+    """
     missing = {
         (reynolds, name, int(index))
         for reynolds in diagnostics.REYNOLDS
@@ -56,10 +59,6 @@ def test_misprints_are_left_out() -> None:
     }
     assert missing == {(400, "v", diagnostics.X.index(0.9063)), (3200, "u", diagnostics.Y.index(0.4531))}
     assert diagnostics.centre_lines(7.0) is None
-
-
-def test_deviation_skips_what_is_not_tabulated() -> None:
-    """Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4."""
     found = diagnostics.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
     assert found.rmse == pytest.approx(math.sqrt(12.5))
     assert found.maximum == 4.0

@@ -70,35 +70,29 @@ def check_parameters(size: str, given: Mapping[str, Value], declared: Mapping[st
     """Refuse unknown, missing and impossible parameters of a size."""
     for name in given:
         if name not in declared:
-            message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
-            raise ValueError(message)
+            raise ValueError(f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}")
     missing = [n for n, value in declared.items() if value is None and n not in given]
     if missing:
-        message = f"size {size}: no value for {', '.join(missing)}"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: no value for {', '.join(missing)}")
     for name in NEEDED:
         if name not in declared:
-            message = f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}"
-            raise ValueError(message)
+            raise ValueError(f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}")
     for name, default in declared.items():
         key = f"sizes.{size}.parameters.{name}" if name in given else f"parameters.{name}.value"
         value, limit = given.get(name, default), NEEDED.get(name, Limit())
         # Texts and switches are a split's own affair, unless the name is one that every split needs.
         if not limit.holds(value) and (name in NEEDED or not isinstance(value, bool | str)):
-            message = f"{key}: expected {limit}; got {value!r}"
-            raise ValueError(message)
+            raise ValueError(f"{key}: expected {limit}; got {value!r}")
 
 
 def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
     """Refuse unknown subsets and ids that stand in two of them."""
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
-        message = f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}")
     ids = [i for subset in subsets.values() for i in subset]
     if len(ids) != len(set(ids)):
-        message = f"size {size}: a scenario stands in two subsets"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: a scenario stands in two subsets")
 
 
 def check_frames(
@@ -111,22 +105,18 @@ def check_frames(
     """Refuse impossible frame counts, and test scenarios shorter than their task."""
     key = f"sizes.{size}.frames"
     ids = sorted(i for subset in subsets.values() for i in subset)
-    pairs = [(i, frames) for i in ids]
-    if not isinstance(frames, int):
+    if isinstance(frames, int):
+        pairs = [(i, frames) for i in ids]
+    else:
         pairs = sorted((i, count) for count, group in frames.items() for i in group)
         if [i for i, _ in pairs] != ids:
-            message = f"size {size}: frames must name every scenario once"
-            raise ValueError(message)
+            raise ValueError(f"size {size}: frames must name every scenario once")
     for scenario, count in pairs:
         if not FRAMES.holds(count):
-            message = f"{key}: expected {FRAMES}; got {count!r}"
-            raise ValueError(message)
+            raise ValueError(f"{key}: expected {FRAMES}; got {count!r}")
         if scenario in subsets.get("test", ()) and count < task_frames:
-            message = (
-                f"{key}: expected at least input_frames + horizon = {task_frames} "
-                f"for test scenario {scenario}; got {count}"
-            )
-            raise ValueError(message)
+            least = f"at least input_frames + horizon = {task_frames} for test scenario {scenario}"
+            raise ValueError(f"{key}: expected {least}; got {count}")
 
 
 MAX_ID = 9999

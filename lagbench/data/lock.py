@@ -64,19 +64,12 @@ def dataset_lock(
             try:
                 lock.acquire(timeout=-1 if timeout is None else timeout)
             except filelock.Timeout:
-                raise WorkFailedError(
-                    "another process writes this data set",
-                    where=str(folder),
-                    got=str(read_holder(folder) or last),
-                    fix="wait until it ends, or end it; files that are complete stay",
-                ) from None
+                what, got = "another process writes this data set", str(read_holder(folder) or last)
+                fix = "wait until it ends, or end it; files that are complete stay"
+                raise WorkFailedError(what, where=str(folder), got=got, fix=fix) from None
     except OSError as error:
-        raise WorkFailedError(
-            "cannot lock the data set",
-            where=str(folder),
-            got=error.strerror or error,
-            fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
-        ) from error
+        got, fix = error.strerror or error, "name a folder that you may write to: --root or LAGBENCH_ROOT"
+        raise WorkFailedError("cannot lock the data set", where=str(folder), got=got, fix=fix) from error
     try:
         holder = Holder(os.getpid(), socket.gethostname(), datetime.now(UTC).isoformat(timespec="seconds"))
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())

@@ -63,8 +63,7 @@ class FileEntry(_Strict):
         if {"subset", "scenario"} <= info.data.keys():
             wanted = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
             if path != wanted:
-                message = f"expected {wanted!r}"
-                raise ValueError(message)
+                raise ValueError(f"expected {wanted!r}")
         return path
 
     def has_hash(self, recorded: str | None) -> bool:
@@ -218,12 +217,8 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         found = Manifest.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise DataError(
-            "the manifest is damaged",
-            where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
-            got=first["msg"],
-            fix=_ANEW,
-        ) from None
+        where = f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}"
+        raise DataError("the manifest is damaged", where=where, got=first["msg"], fix=_ANEW) from None
     if not found.is_of(split, size, major):
         raise DataError(
             "the manifest is of another data set",

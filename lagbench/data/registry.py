@@ -91,8 +91,7 @@ class _Strict(BaseModel):
     def _known_keys(cls, data: Any) -> Any:  # noqa: ANN401
         for key in data if isinstance(data, Mapping) else ():
             if key not in cls.model_fields:
-                message = f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}"
-                raise ValueError(message)
+                raise ValueError(f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}")
         return data
 
 
@@ -392,9 +391,5 @@ def _read(path: Path) -> _File:
                 given = f"an integer of {given.bit_length()} bits"
             short = isinstance(given, str | int | float) and "; got " not in message
             lines.append(f"{'.'.join(map(str, item['loc']))}: {message}{f'; got {given!r}' if short else ''}")
-        raise UnreadableFileError(
-            f"{error.error_count()} mistake(s) in the registry",
-            where=str(path),
-            got="\n    ".join(lines),
-            fix="mend the keys named above",
-        ) from None
+        what, fix = f"{error.error_count()} mistake(s) in the registry", "mend the keys named above"
+        raise UnreadableFileError(what, where=str(path), got="\n    ".join(lines), fix=fix) from None

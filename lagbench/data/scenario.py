@@ -254,13 +254,9 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
         free = text is not None and text.length is None  # how long its values are, they say themselves
         held = variable.size * (1 if free else variable.dtype.itemsize)
         if held > largest:
-            raise DataError(
-                "a variable is larger than its file can hold",
-                where=f"{path}, variable {name!r}",
-                expected=f"at most {largest} bytes",
-                got=f"shape {variable.shape}",
-                fix=_REPAIR,
-            )
+            what, where = "a variable is larger than its file can hold", f"{path}, variable {name!r}"
+            expected, got = f"at most {largest} bytes", f"shape {variable.shape}"
+            raise DataError(what, where=where, expected=expected, got=got, fix=_REPAIR)
 
 
 def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioHeader:

@@ -231,11 +231,8 @@ def _checked(parameters: Mapping[str, object], path: Path) -> dict[str, object]:
     stored = {}
     for name, value in parameters.items():
         if name in _RESERVED or not name.isidentifier():
-            raise DataError(
-                f"a parameter cannot be named {name!r}",
-                where=str(path),
-                expected=f"an identifier other than {', '.join(sorted(_RESERVED))}",
-            )
+            expected = f"an identifier other than {', '.join(sorted(_RESERVED))}"
+            raise DataError(f"a parameter cannot be named {name!r}", where=str(path), expected=expected)
         stored[name] = plain(value)
         if stored[name] == "" or not isinstance(stored[name], (int, float, str)):
             raise DataError(

@@ -75,8 +75,7 @@ def _check_structure(text: str) -> None:
         elif getattr(event, "tag", None) is not None:
             what = "tags are not allowed"
         if what is not None:
-            message = f"{what} {event.start_mark}"
-            raise yaml.YAMLError(message)
+            raise yaml.YAMLError(f"{what} {event.start_mark}")
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
@@ -84,26 +83,17 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise UnreadableFileError(
-                "the YAML file is too large",
-                where=str(path),
-                expected=f"at most {MAX_BYTES} bytes",
-                got=f"{size} bytes",
-            )
+            what, expected = "the YAML file is too large", f"at most {MAX_BYTES} bytes"
+            raise UnreadableFileError(what, where=str(path), expected=expected, got=f"{size} bytes")
         text = path.read_text(encoding="utf-8")
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
-        raise UnreadableFileError(
-            "cannot read the YAML file", where=str(path), got=error.strerror or error
-        ) from error
+        got = error.strerror or error
+        raise UnreadableFileError("cannot read the YAML file", where=str(path), got=got) from error
     except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:  # as dates
-        raise UnreadableFileError(
-            "not a plain YAML file",
-            where=str(path),
-            got=" ".join(str(error).split()),
-            fix="use plain mappings, lists, numbers and strings, in UTF-8",
-        ) from error
+        got, fix = " ".join(str(error).split()), "use plain mappings, lists, numbers and strings, in UTF-8"
+        raise UnreadableFileError("not a plain YAML file", where=str(path), got=got, fix=fix) from error
 
 
 class _Dumper(yaml.SafeDumper):

@@ -159,12 +159,8 @@ def saving(partial: Path) -> Iterator[None]:
         partial.unlink(missing_ok=True)
         raise
     except OSError as error:
-        raise WorkFailedError(
-            "cannot write there",
-            where=str(partial),
-            got=error.strerror or error,
-            fix="--root names another folder",
-        ) from error
+        got, fix = error.strerror or error, "--root names another folder"
+        raise WorkFailedError("cannot write there", where=str(partial), got=got, fix=fix) from error
 
 
 def insist(
@@ -188,12 +184,9 @@ def insist(
                 partial.unlink(missing_ok=True)
                 restarted = True
             time.sleep(PAUSE * 2**failures)
-    raise ConnectionLostError(
-        "the connection to the store broke too often",
-        where=url,
-        got=f"{held()} bytes after {MOST_ATTEMPTS} attempts",
-        fix=FIX_LINE,
-    )
+    what = "the connection to the store broke too often"
+    got = f"{held()} bytes after {MOST_ATTEMPTS} attempts"
+    raise ConnectionLostError(what, where=url, got=got, fix=FIX_LINE)
 
 
 class Pace:
@@ -262,13 +255,8 @@ def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
             block = answer.read(BLOCK)
         except Exception as error:
             pace.count(0, time.monotonic() - started)
-            lost = ConnectionLostError(
-                "the connection to the store broke",
-                where=pace.url,
-                got=f"{type(error).__name__}: {error}",
-                fix=FIX_LINE,
-            )
-            raise BrokenError(lost) from error
+            what, got = "the connection to the store broke", f"{type(error).__name__}: {error}"
+            raise BrokenError(ConnectionLostError(what, where=pace.url, got=got, fix=FIX_LINE)) from error
         pace.count(len(block), time.monotonic() - started)
         yield block
 

@@ -85,11 +85,9 @@ class Publication:
     def _put(self, entry: FileEntry) -> None:
         path = self._folder / entry.path
         if file_sha256(path) != entry.file_sha256:
-            raise DataError(
-                "a file of the working copy is another than its manifest says",
-                where=str(path),
-                fix=f"remove it, then lagbench generate with --root {self._objects.root}",
-            )
+            what = "a file of the working copy is another than its manifest says"
+            fix = f"remove it, then lagbench generate with --root {self._objects.root}"
+            raise DataError(what, where=str(path), fix=fix)
         if self._named.entry(entry.scenario) is not None:
             # An object that is about to change must not be named meanwhile.
             self._there.pop(entry.path, None)

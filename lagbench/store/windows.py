@@ -269,8 +269,7 @@ class WindowReader:
         """Return scenario id and first frame of a window."""
         index = operator.index(index)
         if not -len(self) <= index < len(self):
-            message = f"no window {index} among {len(self)}"
-            raise IndexError(message)
+            raise IndexError(f"no window {index} among {len(self)}")
         index %= len(self)
         row = bisect_right(self.starts, index) - 1
         return self.scenarios[row], index - self.starts[row]

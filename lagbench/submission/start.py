@@ -90,13 +90,13 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
 
     ``first`` is the number of the first predicted frame.
     """
-    said = {
+    mistakes = {
         i: mistake(start, truth.size.bounds, {j: s for j, s in starts.items() if j != i})
         for i, start in starts.items()
     }
-    counts = Counter(found for found in said.values() if found is not None)
+    counts = Counter(found for found in mistakes.values() if found is not None)
     for scenario, start in starts.items():
-        found = said[scenario]
+        found = mistakes[scenario]
         # A bad model may look so in one scenario by chance; what writes a file makes the mistake in all.
         if found is None or (found.everywhere and 2 * counts[found] < len(starts)):
             with np.errstate(all="ignore"):
@@ -122,27 +122,23 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
             got=f"root mean square distance to it {_rms(start.first - start.given):.3g}",
             fix=found.fix,
         )
-    _check_shift(starts, first, out)
-    out.made("start", "discontinuous_start")
-
-
-def _check_shift(starts: Mapping[int, Start], frame: int, out: Findings) -> None:
-    told = {scenario: said for scenario, start in starts.items() if (said := shift(start)) is not None}
+    told = {scenario: by for scenario, start in starts.items() if (by := shift(start)) is not None}
     for by, what, fix in (
         (-1, "the last given frame", "leave the last given frame out: predictions begin one frame later"),
         (1, "the second frame of the truth", "predictions begin one frame earlier, after the last given one"),
     ):
-        wrong = [scenario for scenario, said in told.items() if said == by]
+        wrong = [scenario for scenario, shifted in told.items() if shifted == by]
         if wrong:
             report = out.error if len(wrong) == len(told) else out.warning
             report(
                 "start",
                 "the frames seem to be shifted by one",
-                where=f"scenario {wrong[0]}, frame {frame}",
+                where=f"scenario {wrong[0]}, frame {first}",
                 expected="the frame after the last given one first",
                 got=f"{what}, in {len(wrong)} of {len(told)} scenarios whose truth moves",
                 fix=fix,
             )
+    out.made("start", "discontinuous_start")
 
 
 def shift(start: Start) -> int | None:

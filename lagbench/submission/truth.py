@@ -48,8 +48,11 @@ class Truth:
         known, new = noted_hashes(self.folder), {}
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
         fix = f"{self._remedy()}; {verify} says what is wrong"
+        recorded = None if self.size.measured else read_or_empty(self.size, self.root)
         for scenario in sorted(self.size.subsets[self.subset]):
-            path, expected = self.path(scenario), self._expected(scenario)
+            path, entry = self.path(scenario), recorded.entry(scenario) if recorded else None
+            # what is known of the content hash: its first digits, all, or nothing
+            expected = entry.content_sha256 if entry else self._hash(scenario)
             try:
                 found = known(path)
                 if found is None:
@@ -59,8 +62,8 @@ class Truth:
                 what = f"cannot read a {self.subset} scenario"
                 raise DataError(what, where=str(path), got=error.strerror, fix=fix) from error
             except DataError as error:
-                where, expected = error.where or str(path), error.expected
-                raise DataError(error.what, where=where, expected=expected, got=error.got, fix=fix) from error
+                where, wanted = error.where or str(path), error.expected
+                raise DataError(error.what, where=where, expected=wanted, got=error.got, fix=fix) from error
             if not content.startswith(expected):
                 what = f"a {self.subset} scenario has another content hash"
                 raise DataError(what, where=str(path), expected=expected, got=content, fix=fix)
@@ -68,13 +71,6 @@ class Truth:
 
     def _remedy(self) -> str:
         return remedy(self.size, f"--subset {self.subset}", root=self.root)
-
-    def _expected(self, scenario: int) -> str:
-        """Return what is known of a content hash: its first digits, all, or nothing."""
-        if self.size.measured:
-            return self._hash(scenario)
-        entry = read_or_empty(self.size, self.root).entry(scenario)
-        return entry.content_sha256 if entry else ""
 
     def path(self, scenario: int) -> Path:
         """Return where a scenario lies."""

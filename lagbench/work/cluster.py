@@ -130,22 +130,14 @@ class Client:
 
     def check(self, worker: str, *, threads: int) -> None:
         """Refuse a worker that could not make the client's bits."""
-        if self.version != version("lagbench"):
-            raise WorkFailedError(
-                "a worker runs another version of lagbench",
-                where=f"worker {worker}",
-                expected=self.version,
-                got=version("lagbench"),
-                fix="install the same version on every worker",
-            )
+        where, own = f"worker {worker}", version("lagbench")
+        if self.version != own:
+            fix = "install the same version on every worker"
+            what = "a worker runs another version of lagbench"
+            raise WorkFailedError(what, where=where, expected=self.version, got=own, fix=fix)
         if threads != 1:
-            raise WorkFailedError(
-                "a worker runs several tasks in one process",
-                where=f"worker {worker}",
-                expected="1 thread",
-                got=f"{threads} threads",
-                fix=f"start the workers with `{WORKERS}`",
-            )
+            what, fix = "a worker runs several tasks in one process", f"start the workers with `{WORKERS}`"
+            raise WorkFailedError(what, where=where, expected="1 thread", got=f"{threads} threads", fix=fix)
         if self.mark is not None:
             self.mark.check(worker)
 

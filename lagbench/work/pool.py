@@ -206,12 +206,10 @@ class Pool:
         worker.channel.close()
         again = _Attempt(attempt.task, attempt.deaths + 1)
         if again.deaths >= ATTEMPTS:
-            raise WorkFailedError(
-                f"a worker process died {ATTEMPTS} times",
-                where=again.task.name,
-                got=f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}",
-                fix="free memory or take fewer workers: --workers 1",
-            )
+            got = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+            what = f"a worker process died {ATTEMPTS} times"
+            fix = "free memory or take fewer workers: --workers 1"
+            raise WorkFailedError(what, where=again.task.name, got=got, fix=fix)
         self._queue(again)
         return Event(task=again.task, kind="lost", value=worker.progress)
 

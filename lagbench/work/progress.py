@@ -36,11 +36,13 @@ class Meter:
 
     def __init__(self, listener: Callable[[Progress], None] | None = None) -> None:
         self._listener = listener
+        self.stage = ""  # what happens now
         self._state = Progress(stage="", done=0, total=0, scenarios_done=0, scenarios=0, seconds=0.0)
         self._started = time.monotonic()
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
         """Start a stage with counts at zero, or at what an earlier run had done."""
+        self.stage = stage
         counts = {"done": done, "total": total, "scenarios_done": done, "scenarios": scenarios}
         self._state = Progress(stage=stage, **counts, seconds=0.0, before=done)
         self._started = time.monotonic()
@@ -51,6 +53,6 @@ class Meter:
         old = self._state
         done, finished = old.done + units, old.scenarios_done + scenarios
         seconds = time.monotonic() - self._started
-        self._state = replace(old, done=done, scenarios_done=finished, seconds=seconds)
+        self._state = replace(old, stage=self.stage, done=done, scenarios_done=finished, seconds=seconds)
         if self._listener is not None:
             self._listener(self._state)
