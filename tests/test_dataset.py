@@ -71,19 +71,18 @@ def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
         assert float(data["position"][1, 99, 0, 0]) == frames_of(TEST_IDS[1], 100, 8192)[99, 0, 0]
 
 
-def test_missing_scenarios_name_the_command(ragged: Path) -> None:
+def test_missing_damaged_and_foreign_files_are_told(ragged: Path) -> None:
     """The error counts what is missing, lists the ids and gives the generate command."""
-    (ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[1]:04d}.nc").unlink()
+    other = ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[1]:04d}.nc"
+    other.rename(ragged / "kept")
     with pytest.raises(DataError) as caught:
         open_split("cavity", size="tiny", root=ragged)
     assert caught.value.exit_code == 4
     assert f"1 of {len(TEST_IDS)} scenarios" in str(caught.value)
     assert f"missing: {TEST_IDS[1]}" in str(caught.value)
     assert f"lagbench generate --split cavity --size tiny --subset test --root {ragged}" in str(caught.value)
-
-
-def test_damaged_and_foreign_files_are_named(ragged: Path) -> None:
-    """A truncated file and a file of another scenario are told by path."""
+    (ragged / "kept").rename(other)
+    # a truncated file and a file of another scenario are told by path
     path = ragged / "cavity/tiny/v2/test" / f"{TEST_IDS[0]:04d}.nc"
     sound = path.read_bytes()
     path.write_bytes(sound[: len(sound) // 2])

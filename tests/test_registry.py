@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -107,11 +108,11 @@ def edited(tmp_path: Path, change: Change) -> Path:
     return path
 
 
-def cavity(*below: str, **values: object) -> Change:
-    """Return a change of cavity full, or of a mapping in it; None takes a key away."""
+def within(*below: str, **values: object) -> Change:
+    """Return a change of a mapping in a registry; None takes a key away."""
 
     def change(splits: dict[str, Any]) -> None:
-        entry = splits["cavity"]["sizes"]["full"]
+        entry = splits
         for key in below:
             entry = entry[key]
         entry.update(values)
@@ -119,6 +120,11 @@ def cavity(*below: str, **values: object) -> Change:
             del entry[key]
 
     return change
+
+
+cavity = partial(within, "cavity", "sizes", "full")
+tiny = partial(within, "fluid", "sizes", "tiny", "parameters")
+always = partial(within, "fluid", "parameters")  # what fluid declares for all sizes
 
 
 def test_unknown_names_offer_the_nearest() -> None:
@@ -150,21 +156,6 @@ def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     refused(path, ("format",), lambda: load(path))
 
 
-def tiny(**values: object) -> Change:
-    """Return a change of parameters of tiny fluid."""
-    return lambda splits: splits["fluid"]["sizes"]["tiny"]["parameters"].update(values)
-
-
-def always(name: str, value: object) -> Change:
-    """Return a change of a parameter that fluid declares for all sizes."""
-    return lambda splits: splits["fluid"]["parameters"][name].update(value=value)
-
-
-def frames(count: object) -> Change:
-    """Return a change of the frame counts of tiny fluid."""
-    return lambda splits: splits["fluid"]["sizes"]["tiny"].update(frames=count)
-
-
 def renamed(split: str, old: str, new: str) -> Change:
     """Return a change of a parameter's name, wherever it stands."""
 
@@ -189,7 +180,7 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (lambda splits: splits["cavity"].update(splts={}), ("cavity", "unknown key 'splts'")),
+        (within("cavity", splts={}), ("cavity", "unknown key 'splts'")),
         (cavity(taks={}), ("splits.cavity.sizes.full", "did you mean 'task'?")),
         (cavity("task", radios=1.0), ("task", "did you mean 'radius'?")),
         (cavity("task", horizon="ninety"), ("task.horizon", "valid integer")),
@@ -199,7 +190,7 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
         (cavity("subsets", tset="90"), ("cavity", "did you mean 'test'?")),
         (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
-        (lambda splits: splits["cavity"].update(version="1.0"), ("cavity.version", "match pattern")),
+        (within("cavity", version="1.0"), ("cavity.version", "match pattern")),
         (
             lambda splits: splits["cavity"]["sizes"].update(
                 {"../x": dict(splits["cavity"]["sizes"].pop("tiny"))}
@@ -212,11 +203,14 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
         (tiny(particles=True), ("tiny.parameters.particles", "an integer, >= 1", "True")),
         (tiny(particles=99999999999), ("tiny.parameters.particles", "<= 10000000", "99999999999")),
         (tiny(grid=10**6), ("tiny.parameters.grid", "<= 4096", "1000000")),
-        (always("frame_rate", 0), ("parameters.frame_rate.value", "a finite number, > 0", "got 0")),
-        (always("gravity", math.nan), ("parameters.gravity.value", "a finite number", "nan")),
-        (always("gravity", math.inf), ("parameters.gravity.value", "a finite number", "inf")),
-        (frames(0), ("sizes.tiny.frames", "an integer, >= 1", "got 0")),
-        (frames({31: "0-3", 32: "4"}), ("sizes.tiny.frames", "horizon = 32 for test scenario 3", "got 31")),
+        (always("frame_rate", value=0), ("parameters.frame_rate.value", "a finite number, > 0", "got 0")),
+        (always("gravity", value=math.nan), ("parameters.gravity.value", "a finite number", "nan")),
+        (always("gravity", value=math.inf), ("parameters.gravity.value", "a finite number", "inf")),
+        (within("fluid", "sizes", "tiny", frames=0), ("sizes.tiny.frames", "an integer, >= 1", "got 0")),
+        (
+            within("fluid", "sizes", "tiny", frames={31: "0-3", 32: "4"}),
+            ("sizes.tiny.frames", "horizon = 32 for test scenario 3", "got 31"),
+        ),
         (renamed("fluid", "particles", "particels"), ("'particles'", "did you mean 'particels'?")),
         (renamed("cavity", "density", "denstiy"), ("'density'", "did you mean 'denstiy'?", "needs")),
     ],
@@ -231,11 +225,11 @@ def test_mistakes_are_named_on_load(change: Change, parts: tuple[str, ...], tmp_
     ("change", "parts"),
     [
         (renamed("fluid", "gravity", "gravty"), ("parameter gravity", "did you mean 'gravty'?")),
-        (always("gravity", "down"), ("parameter gravity", "a finite number", "'down'")),
-        (always("liquid_modulus", -1.0), ("parameter liquid_modulus", "a finite number, > 0", "-1.0")),
-        (always("jacobian_relaxation", 2), ("parameter jacobian_relaxation", ">= 0 and <= 1", "2")),
+        (always("gravity", value="down"), ("parameter gravity", "a finite number", "'down'")),
+        (always("liquid_modulus", value=-1.0), ("parameter liquid_modulus", "a finite number, > 0", "-1.0")),
+        (always("jacobian_relaxation", value=2), ("parameter jacobian_relaxation", ">= 0 and <= 1", "2")),
         (tiny(wall=16), ("parameter wall", "an integer, >= 0 and <= 14", "16")),
-        (always("area_min", "big"), ("size tiny", "generators.fluid can use", "area_min = 'big'")),
+        (always("area_min", value="big"), ("size tiny", "generators.fluid can use", "area_min = 'big'")),
         (renamed("fluid", "area_max", "aera_max"), ("size tiny", "did you mean 'aera_max'?", "'area_max'")),
     ],
 )

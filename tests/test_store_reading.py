@@ -73,7 +73,7 @@ def here(url: str) -> list[str]:
 
 
 def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
-    """The arrays are those of the folder; a second look fetches nothing."""
+    """The arrays are those of the folder; a second look fetches nothing; what the store lacks is named."""
     with (
         lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
         lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
@@ -83,6 +83,8 @@ def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResu
     store.remove(f"{FOLDER}/test/0003.nc")
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     assert not store.server or store.server.count("0004.nc") == 1
+    with pytest.raises(DataError, match="0-1"):
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
 
 
 def test_scores_are_those_of_the_folder(
@@ -124,13 +126,6 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
     assert here(url) == []
     assert overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
-
-
-def test_what_the_store_lacks_is_missed(store: Store, tiny: Registry) -> None:
-    """As in a folder: a DataError that names the scenarios."""
-    with pytest.raises(DataError) as caught:
-        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
-    assert "0-1" in str(caught.value)
 
 
 def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:

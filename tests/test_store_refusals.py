@@ -96,8 +96,9 @@ def test_where_nothing_can_be_written_nothing_is_kept(
 ) -> None:
     """The address is judged before its working copy is made."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    with pytest.raises(UsageError):
-        generate(SPLIT, SIZE, root=root, dry_run=True)
+    for dry_run in (True, False):
+        with pytest.raises(UsageError):
+            generate(SPLIT, SIZE, root=root, dry_run=dry_run)
     assert not list(tmp_path.iterdir())
 
 

@@ -20,7 +20,7 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import resolve_root, url_of
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange import adopt, download
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.store import publication
@@ -248,13 +248,6 @@ def test_a_file_that_changed_is_not_put(url: str, run: Run, simulated_here: Fill
     with pytest.raises(DataError):
         run(url, scenarios="3")
     assert f"{FOLDER}/train/0000.nc" not in objects(url)
-
-
-def test_nothing_is_written_over_http(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A root of a web server is one to read from."""
-    machine(monkeypatch, tmp_path / "cache")
-    with pytest.raises(UsageError):
-        run("http://127.0.0.1:9/data")
 
 
 def test_a_download_goes_into_a_store(tmp_path: Path, url: str) -> None:

@@ -172,7 +172,10 @@ def test_what_is_published_comes_along(
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
-    """Windows of 8 and 11 particles make one row; each keeps its number, scenario and first frame."""
+    """Windows of 8 and 11 particles make one row; each keeps its number, scenario and first frame.
+
+    No windows, unequal lengths and walls that move in some only are errors.
+    """
     data = train()
     windows = [data[2], data[34 + 20 + 1]]
     batch = collate(windows)
@@ -182,11 +185,7 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
     assert batch.material.shape == (19,)
     assert batch.wall_velocity is not None
     assert batch.wall_velocity.shape == (2, LENGTH, 4, 2)
-
-
-def test_unlike_windows_are_not_put_together(train: Open) -> None:
-    """No windows, unequal lengths and walls that move in some only are errors."""
-    window = train()[0]
+    window = windows[0]
     for windows in ([], [window, train(history=3)[0]], [window, window._replace(wall_velocity=None)]):
         with pytest.raises(UsageError, match="side by side"):
             collate(windows)
@@ -466,13 +465,19 @@ def drifting(batch: Batch) -> torch.Tensor:
 
 
 def test_a_window_is_followed_by_a_frame(train: Open) -> None:
-    """The first frame leaves, the new one joins; forcing and frame number go on with them."""
+    """The first frame leaves, the new one joins; forcing and frame number go on with them.
+
+    Parts are consecutive frames: with steps the forcing would be another frame's.
+    """
     batch = collate([train(history=3, future=2)[i] for i in (0, 4)])
     given, new = batch.part(slice(3)), batch.position[:, 3]
     later = given.followed_by(new)
     assert same(later, batch.part(slice(1, 4)))
     assert later.frame.tolist() == [1, 5]
     assert given.frames == later.frames == 3
+    for odd in (slice(0, 4, 2), slice(None, None, -1), slice(2, 2), slice(9, 12)):
+        with pytest.raises(UsageError):
+            batch.part(odd)
 
 
 def test_a_rollout_feeds_on_itself(train: Open) -> None:
@@ -529,13 +534,6 @@ def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
     with pytest.raises(UsageError) as caught:
         roll_out(lambda seen: seen.position[:, -1], given, 4)
     assert caught.value.where == "roll_out"
-
-
-@pytest.mark.parametrize("odd", [slice(0, 4, 2), slice(None, None, -1), slice(2, 2), slice(9, 12)])
-def test_parts_of_batches_are_consecutive_frames(train: Open, odd: slice) -> None:
-    """Forcing is given per frame: with steps it would be another frame's."""
-    with pytest.raises(UsageError):
-        collate([train(history=2, future=4)[0]]).part(odd)
 
 
 @pytest.mark.parametrize("history", [None, 2])

@@ -51,11 +51,8 @@ def plain(value: object) -> object:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
-    raise DataError(
-        "a value cannot be hashed",
-        expected="a finite number or a string without NUL, or lists and mappings of them",
-        got=repr(value),
-    )
+    expected = "a finite number or a string without NUL, or lists and mappings of them"
+    raise DataError("a value cannot be hashed", expected=expected, got=repr(value))
 
 
 def round_digits(value: float, digits: int = 9) -> float:

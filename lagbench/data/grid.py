@@ -167,11 +167,8 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
-        raise UsageError(
-            "positions and velocities do not fit",
-            expected="two arrays of one shape [..., particle, 2]",
-            got=f"{x.shape} and {u.shape}",
-        )
+        expected, got = "two arrays of one shape [..., particle, 2]", f"{x.shape} and {u.shape}"
+        raise UsageError("positions and velocities do not fit", expected=expected, got=got)
     sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
         _scatter(x[frame], u[frame], grid, sums[frame])

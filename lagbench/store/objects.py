@@ -291,12 +291,8 @@ def _file_system(url: str) -> tuple[Any, str]:
 
     scheme = url.split("://", 1)[0]
     if scheme not in fsspec.available_protocols():
-        raise UsageError(
-            "no such kind of address",
-            where=url,
-            expected="s3://bucket/prefix, or another that fsspec knows; file:///path for a folder",
-            got=scheme,
-        )
+        expected = "s3://bucket/prefix, or another that fsspec knows; file:///path for a folder"
+        raise UsageError("no such kind of address", where=url, expected=expected, got=scheme)
     # Another endpoint or other credentials are another system, also within one process.
     key = (scheme, *sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
     if key not in _systems:

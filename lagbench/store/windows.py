@@ -233,12 +233,9 @@ class WindowReader:
                 fix=f"leave history out for the task's {entry.task.input_frames}",
             )
         if not frames or cache_bytes < 0:
-            raise UsageError(
-                "no windows can be read like that",
-                where=where,
-                expected="a subset at least, and cache_bytes >= 0",
-                got=f"{len(frames)} scenarios, cache_bytes {cache_bytes}",
-            )
+            what, expected = "no windows can be read like that", "a subset at least, and cache_bytes >= 0"
+            got = f"{len(frames)} scenarios, cache_bytes {cache_bytes}"
+            raise UsageError(what, where=where, expected=expected, got=got)
         if not len(self):
             raise UsageError(
                 "no scenario is as long as a window",

@@ -77,12 +77,9 @@ class Predictions:
         numbers = self.header.frames
         first = numbers.index(start) if start in numbers else -1
         if scenario not in self._row or first < 0 or count < 0 or first + count > len(numbers):
-            raise UsageError(
-                "the file has no such frames",
-                where=str(self.path),
-                expected=f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}",
-                got=f"scenario {scenario}, {count} frames from {start}",
-            )
+            what, got = "the file has no such frames", f"scenario {scenario}, {count} frames from {start}"
+            expected = f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}"
+            raise UsageError(what, where=str(self.path), expected=expected, got=got)
         with reading(self.path, "position"):
             values: NDArray[Any] = self._position[self._row[scenario], first : first + count]
             return np.ascontiguousarray(values, dtype=np.float32)

@@ -113,12 +113,9 @@ class Truth:
             frames: NDArray[np.float32] = file.read("position", slice(start, stop))
             if len(frames) == stop - start and frames.shape[1] == self.size.particles:
                 return frames
-            raise DataError(
-                f"a {self.subset} scenario has other frames or particles than the registry says",
-                where=str(self.path(scenario)),
-                expected=f"at least {stop} frames of {self.size.particles} particles",
-                got=frames.shape,
-            )
+            what = f"a {self.subset} scenario has other frames or particles than the registry says"
+            expected = f"at least {stop} frames of {self.size.particles} particles"
+            raise DataError(what, where=str(self.path(scenario)), expected=expected, got=frames.shape)
 
     def largest_displacement(self, scenario: int, *, enough: float) -> float:
         """Return the largest distance that a particle moves from one frame to the next [length].

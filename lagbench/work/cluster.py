@@ -90,12 +90,9 @@ def marked(folder: Path) -> Iterator[Mark]:
 def await_file(path: Path) -> None:
     """Wait until a file that another machine has written is seen here."""
     if not _appears(path, PATIENCE):
-        raise WorkFailedError(
-            "a worker's file does not appear",
-            where=str(path),
-            expected=f"a file within {PATIENCE:.0f} s",
-            fix="name a folder on storage that all machines share, then run the same command again",
-        )
+        what, expected = "a worker's file does not appear", f"a file within {PATIENCE:.0f} s"
+        fix = "name a folder on storage that all machines share, then run the same command again"
+        raise WorkFailedError(what, where=str(path), expected=expected, fix=fix)
 
 
 def _appears(path: Path, patience: float, *, holding: str | None = None) -> bool:
@@ -306,19 +303,13 @@ def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
     except LagbenchError:
         raise
     except killed as error:
-        raise WorkFailedError(
-            "workers of the Dask cluster died again and again",
-            where=name,
-            got=str(error),
-            fix="give the workers more memory, or leave --scheduler out",
-        ) from error
+        what = "workers of the Dask cluster died again and again"
+        fix = "give the workers more memory, or leave --scheduler out"
+        raise WorkFailedError(what, where=name, got=str(error), fix=fix) from error
     except Exception as error:  # whatever a worker raises that cannot even read the task
         if future.status != "error":
             raise _lost(error) from error
-        raise WorkFailedError(
-            "a worker of the Dask cluster cannot do the work",
-            where=name,
-            got=f"{type(error).__name__}: {error}",
-            fix="install the same version of lagbench with its extras on every worker",
-        ) from error
+        what, got = "a worker of the Dask cluster cannot do the work", f"{type(error).__name__}: {error}"
+        fix = "install the same version of lagbench with its extras on every worker"
+        raise WorkFailedError(what, where=name, got=got, fix=fix) from error
     return done

@@ -24,7 +24,6 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, package_at_fault
@@ -117,9 +116,7 @@ class Pool:
         """Return the pool itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Let idle workers end by themselves, then kill; after an error kill at once."""
         if error is None:  # Taichi saves what it compiled as its process exits
             idle = [worker for worker in self._workers if worker.attempt is None]
