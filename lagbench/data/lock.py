@@ -68,8 +68,8 @@ def dataset_lock(
                 fix = "wait until it ends, or end it; files that are complete stay"
                 raise WorkFailedError(what, where=str(folder), got=got, fix=fix) from None
     except OSError as error:
-        got, fix = error.strerror or error, "name a folder that you may write to: --root or LAGBENCH_ROOT"
-        raise WorkFailedError("cannot lock the data set", where=str(folder), got=got, fix=fix) from error
+        why, fix = error.strerror or error, "name a folder that you may write to: --root or LAGBENCH_ROOT"
+        raise WorkFailedError("cannot lock the data set", where=str(folder), got=why, fix=fix) from error
     try:
         holder = Holder(os.getpid(), socket.gethostname(), datetime.now(UTC).isoformat(timespec="seconds"))
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())

@@ -89,12 +89,6 @@ class FrameStore:
             self.cached_bytes -= self._frames.popitem(last=False)[1].nbytes
         return list(held.values())
 
-    def _read(self, scenario: int, first: int, last: int) -> Iterator[tuple[int, Floats]]:
-        with self._naming(scenario):
-            values = self._opened(scenario).position[first:last]
-        # Copies, so that each frame's memory is free when it leaves the cache.
-        return ((first + i, frame.copy()) for i, frame in enumerate(values))
-
     def constants(self, scenario: int) -> tuple[NDArray[np.int8], Floats | None]:
         """Return material, shape [particle], and wall velocity [length/s], [frame, wall, 2].
 
@@ -107,6 +101,12 @@ class FrameStore:
         """Reopen files after a fork: HDF5 handles do not survive one."""
         if os.getpid() != self._process:
             self._forget()
+
+    def _read(self, scenario: int, first: int, last: int) -> Iterator[tuple[int, Floats]]:
+        with self._naming(scenario):
+            values = self._opened(scenario).position[first:last]
+        # Copies, so that each frame's memory is free when it leaves the cache.
+        return ((first + i, frame.copy()) for i, frame in enumerate(values))
 
     def _opened(self, scenario: int) -> _Open:
         """Return an open file that is what the registry says; of too many the longest unused is closed."""
