@@ -45,6 +45,7 @@ def crash(report: Report) -> None:
 def sleep_long(marker: Path, report: Report) -> None:
     """Write the worker's process id, then work for a minute, deaf to everything."""
     marker.write_text(str(os.getpid()))
+    report(1)
     for _ in range(600):
         time.sleep(0.1)
 

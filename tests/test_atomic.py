@@ -38,15 +38,11 @@ def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException] 
     assert list(tmp_path.iterdir()) == [target]
 
 
-def test_the_system_refusing_is_told_with_path_and_remedy(tmp_path: Path) -> None:
-    """A folder that cannot be made gives exit code 5."""
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*in-the-way.*--root"):
-        write_atomically(tmp_path / "file" / "in-the-way", b"")
-
-
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
-    """A usable folder is made and left empty; an unusable one is told with the option that names it."""
+    """A usable folder is made and left empty; an unusable one is told with the option that names it.
+
+    So is one that is met by the work itself.
+    """
     check_writable(tmp_path / "deep" / "folder")
     assert list((tmp_path / "deep" / "folder").iterdir()) == []
     (tmp_path / "file").touch()
@@ -54,6 +50,8 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     for folder, remedy in ((file, "remove it"), (file / "below", "remove it"), (Path("/proc/self"), "free")):
         with pytest.raises(WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"):
             check_writable(folder, option="--output")
+    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*in-the-way.*--root"):
+        write_atomically(file / "in-the-way", b"")
 
 
 def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult, generate
 
 FOLDER = Path(SPLIT) / SIZE / "v2"
+Gather = Callable[..., GenerationResult]
 
 
 def part(generated: GenerationResult, root: Path, registry: Registry, ids: tuple[int, ...]) -> Path:
@@ -42,6 +43,13 @@ def parts(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> 
         part(generated, tmp_path / "part-0", unmeasured, first),
         part(generated, tmp_path / "part-1", unmeasured, second),
     )
+
+
+@pytest.fixture
+def gather(tmp_path: Path, unmeasured: Registry) -> Gather:
+    """Generate into a root, taking over what others hold."""
+    options = {"root": tmp_path / "whole", "registry": unmeasured}
+    return lambda *sources, **more: generate(SPLIT, SIZE, gather=sources, **(options | more))
 
 
 @pytest.mark.slow
@@ -68,29 +76,23 @@ def test_two_processes_and_a_last_call(tmp_path: Path, unmeasured_path: Path) ->
 
 
 def test_what_no_part_holds_is_simulated(
-    parts: tuple[Path, Path], tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+    parts: tuple[Path, Path], tmp_path: Path, gather: Gather, generated: GenerationResult
 ) -> None:
     """A job that failed costs its scenarios only, as a dry run says; files behind links are taken whole."""
     whole, linked = tmp_path / "whole", parts[1] / FOLDER / "test" / "0004.nc"
     linked.rename(parts[1] / "blob")
     linked.symlink_to(os.path.relpath(parts[1] / "blob", linked.parent))
     for dry in (True, False):
-        result = generate(
-            SPLIT, SIZE, root=whole, gather=parts[1:], registry=unmeasured, scenarios="1,3,4", dry_run=dry
-        )
+        result = gather(parts[1], scenarios="1,3,4", dry_run=dry)
         assert (result.simulated, result.kept) == ((1,), (3, 4))
     assert not (whole / FOLDER / "test" / "0004.nc").is_symlink()
-    again = generate(SPLIT, SIZE, root=whole, gather=parts, registry=unmeasured)
+    again = gather(*parts)
     assert again.simulated == ()
     assert again.dataset_sha256 == generated.dataset_sha256
 
 
 def test_a_copy_where_nothing_can_be_linked(
-    parts: tuple[Path, Path],
-    tmp_path: Path,
-    unmeasured: Registry,
-    generated: GenerationResult,
-    monkeypatch: pytest.MonkeyPatch,
+    parts: tuple[Path, Path], gather: Gather, generated: GenerationResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Across file systems files are copied; the parts may then be removed."""
 
@@ -98,31 +100,27 @@ def test_a_copy_where_nothing_can_be_linked(
         raise OSError(18, "Invalid cross-device link")
 
     monkeypatch.setattr(os, "link", refuse)
-    result = generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts, registry=unmeasured)
+    result = gather(*parts)
     for root in parts:
         shutil.rmtree(root)
     assert result.simulated == ()
-    assert everything(tmp_path / "whole" / FOLDER) == everything(generated.folder)
+    assert everything(result.folder) == everything(generated.folder)
 
 
-def test_a_damaged_part_is_named(
-    parts: tuple[Path, Path], tmp_path: Path, unmeasured: Registry, copied: Callable[[], Path]
-) -> None:
+def test_a_damaged_part_is_named(parts: tuple[Path, Path], tmp_path: Path, gather: Gather) -> None:
     """A cut file, and one of another scenario under a false entry, are refused; nothing is taken."""
     path = parts[1] / FOLDER / "test" / "0004.nc"
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(DataError, match=r"0004\.nc"):
-        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts[1:], registry=unmeasured)
-    shutil.copy(parts[1] / FOLDER / "test" / "0003.nc", path)
-    with pytest.raises(DataError, match=r"0004\.nc"):
-        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=parts[1:], registry=unmeasured)
+    for harmful in (path.read_bytes()[:-2000], path.with_name("0003.nc").read_bytes()):
+        path.write_bytes(harmful)
+        with pytest.raises(DataError, match=r"0004\.nc"):
+            gather(parts[1])
     assert not (tmp_path / "whole" / FOLDER / "test" / "0004.nc").exists()
 
 
-def test_folders_without_parts(tmp_path: Path, unmeasured: Registry, copied: Callable[[], Path]) -> None:
+def test_folders_without_parts(tmp_path: Path, gather: Gather, copied: Callable[[], Path]) -> None:
     """An empty folder, and the one that is written to, are no sources."""
     with pytest.raises(UsageError, match="no manifest of that data set"):
-        generate(SPLIT, SIZE, root=tmp_path / "whole", gather=[tmp_path / "none"], registry=unmeasured)
+        gather(tmp_path / "none")
     root = copied()
     with pytest.raises(UsageError, match="the folder to write to"):
-        generate(SPLIT, SIZE, root=root, gather=[root], registry=unmeasured)
+        gather(root, root=root)

@@ -29,7 +29,7 @@ from lagbench.work.cluster import Client, Mark, marked
 from lagbench.work.pool import Task
 from lagbench.work.progress import Progress
 
-pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -55,14 +55,8 @@ def test_a_worker_killed_and_one_slowed(
     folder, holders = tmp_path / SPLIT / SIZE / "v2", list[Holder | None]()
     news: list[Progress] = []
     with Sabotage(tmp_path, lambda: holders.append(read_holder(folder))) as sabotage:
-        result = generate(
-            SPLIT,
-            SIZE,
-            root=tmp_path,
-            scheduler=workers.scheduler_address,
-            progress=news.append,
-            registry=unmeasured,
-        )
+        there: dict[str, Any] = {"scheduler": workers.scheduler_address, "progress": news.append}
+        result = generate(SPLIT, SIZE, root=tmp_path, registry=unmeasured, **there)
     assert sabotage.killed is not None
     assert gone(sabotage.killed[0])
     assert sabotage.slowed
@@ -130,15 +124,14 @@ def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["mark"]
 
 
-def test_another_version_is_refused() -> None:
-    """A worker with another lagbench might write other bits: it does nothing."""
+def test_unfit_workers_are_refused(tmp_path: Path, unmeasured: Registry) -> None:
+    """Taichi and HDF5 want a process for themselves: exit code 5, and the command for such workers.
+
+    A worker with another lagbench might write other bits: it does nothing.
+    """
     with pytest.raises(WorkFailedError, match="another version of lagbench") as caught:
         Client("c", version="0").check("w", threads=1)
     assert caught.value.expected == "0"
-
-
-def test_workers_of_several_threads_are_refused(tmp_path: Path, unmeasured: Registry) -> None:
-    """Taichi and HDF5 want a process for themselves: exit code 5, and the command for such workers."""
     with local_cluster(threads=2) as running, pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=tmp_path, scheduler=running.scheduler_address, registry=unmeasured)
     assert caught.value.exit_code == 5
@@ -160,19 +153,16 @@ def test_what_nobody_waits_for_ends(workers: Any, tmp_path: Path) -> None:
 
 
 def test_no_scheduler_there(tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An address that nobody answers is failed work; nothing is simulated here instead."""
+    """An address that nobody answers is failed work; nothing is simulated here instead.
+
+    A client with half an address would wait 40 s at the end of the process: none is made.
+    """
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
     with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
         generate(SPLIT, SIZE, root=tmp_path, scheduler="tcp://127.0.0.1:9", registry=unmeasured)
     with pytest.raises(UsageError, match="tcp://"):
         generate(SPLIT, SIZE, root=tmp_path, scheduler="pigeon://roof", registry=unmeasured)
     assert not list(tmp_path.rglob("*.nc"))
-
-
-def test_no_client_is_made_for_what_is_no_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A client with half an address waits 40 s at the end of the process: none is made."""
-    import distributed
-
     monkeypatch.setattr(distributed, "Client", lambda *_, **__: pytest.fail("a client was made"))
     with pytest.raises(UsageError, match="missing port"), cluster.Cluster("nonsense"):
         pass

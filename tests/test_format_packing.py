@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import independent_hash
@@ -40,25 +40,31 @@ def test_packing_does_not_matter(
 
     path, content = write_scenario(tmp_path, KEY)
     other = tmp_path / f"{library}.nc"
-    REPACK[library](path, other, level, shuffle, chunk, shuffled)
+    REPACK[library](path, other, Packing(level, shuffle, chunk, shuffled))
     assert rehash(other) == content
     assert independent_hash.content_hash(other) == content
 
 
-Shuffled = Callable[[Any], list[str]]
 CHUNKED = ("position", "velocity")
 
 
-def repack_h5py(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
-) -> None:
+class Packing(NamedTuple):
+    """How a file is packed."""
+
+    level: int
+    shuffle: bool
+    chunk: tuple[int, int, int]
+    shuffled: Callable[[Any], list[str]]  # puts names into another order
+
+
+def repack_h5py(path: Path, other: Path, how: Packing) -> None:
     """Copy a scenario file by h5py with other packing."""
     with h5py.File(path) as old, h5py.File(other, "w", track_order=True) as new:
-        names = shuffled(old)
+        names = how.shuffled(old)
         for name in names:
-            packing = {"chunks": chunk, "shuffle": shuffle} if name in CHUNKED else {}
-            if packing and level:
-                packing |= {"compression": "gzip", "compression_opts": level}
+            packing = {"chunks": how.chunk, "shuffle": how.shuffle} if name in CHUNKED else {}
+            if packing and how.level:
+                packing |= {"compression": "gzip", "compression_opts": how.level}
             dtype = h5py.string_dtype() if old[name].dtype.kind == "O" else old[name].dtype.newbyteorder(">")
             new.create_dataset(name, data=old[name][()], dtype=dtype, **packing)
             if DIMS[name] == (name,):
@@ -66,39 +72,35 @@ def repack_h5py(
         for name in names:
             for axis, dim in enumerate(DIMS[name] if DIMS[name] != (name,) else ()):
                 new[name].dims[axis].attach_scale(new[dim])
-        for name in shuffled(old.attrs):
+        for name in how.shuffled(old.attrs):
             value = old.attrs[name]
             new.attrs[name] = value.decode() if isinstance(value, bytes) else value
 
 
-def repack_netcdf4(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
-) -> None:
+def repack_netcdf4(path: Path, other: Path, how: Packing) -> None:
     """Copy a scenario file by netCDF4 with other packing."""
     with netCDF4.Dataset(path) as old, netCDF4.Dataset(other, "w") as new:
-        for name in shuffled(old.dimensions):
+        for name in how.shuffled(old.dimensions):
             new.createDimension(name, None if name == "frame" else old.dimensions[name].size)
-        for name in shuffled(old.variables):
+        for name in how.shuffled(old.variables):
             dtype = old[name].dtype
             packing: dict[str, Any] = {}
             if name in CHUNKED:
-                packing = {"chunksizes": chunk, "shuffle": shuffle, "endian": "big"}
-                packing |= {"compression": "zlib" if level else None, "complevel": level}
+                packing = {"chunksizes": how.chunk, "shuffle": how.shuffle, "endian": "big"}
+                packing |= {"compression": "zlib" if how.level else None, "complevel": how.level}
                 dtype = dtype.newbyteorder(">")
             variable = new.createVariable(name, dtype, DIMS[name], **packing)
             variable[...] = old[name][...]
-        new.setncatts({name: old.getncattr(name) for name in shuffled(old.ncattrs())})
+        new.setncatts({name: old.getncattr(name) for name in how.shuffled(old.ncattrs())})
 
 
-def repack_xarray(
-    path: Path, other: Path, level: int, shuffle: bool, chunk: tuple[int, int, int], shuffled: Shuffled
-) -> None:
+def repack_xarray(path: Path, other: Path, how: Packing) -> None:
     """Copy a scenario file by xarray with other packing."""
     with xr.open_dataset(path) as old:
         loaded = old.load().drop_encoding()
-    loaded = loaded[shuffled(loaded.data_vars)]
-    loaded.attrs = {name: loaded.attrs[name] for name in shuffled(loaded.attrs)}
-    packing = {"chunksizes": chunk, "zlib": level > 0, "complevel": level, "shuffle": shuffle}
+    loaded = loaded[how.shuffled(loaded.data_vars)]
+    loaded.attrs = {name: loaded.attrs[name] for name in how.shuffled(loaded.attrs)}
+    packing = {"chunksizes": how.chunk, "zlib": how.level > 0, "complevel": how.level, "shuffle": how.shuffle}
     encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in loaded.variables}
     for name in ("position", "velocity"):
         encoding[name] |= packing

@@ -12,29 +12,30 @@ from pathlib import Path
 
 import pool_tasks
 import pytest
+from cluster_bench import gone
 
-from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.work.machine import available_cores
 from lagbench.work.pool import ATTEMPTS, Pool, Task, worker_count
 
 HERE = str(Path(__file__).parent)
 
 
-def wait_until(condition: object, seconds: float = 30.0) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     """Wait until a function returns true, or fail."""
-    end = time.monotonic() + seconds
-    while not condition():  # type: ignore[operator]
+    end = time.monotonic() + 30.0
+    while not condition():
         assert time.monotonic() < end, "waited too long"
         time.sleep(0.02)
 
 
-def is_alive(process: int) -> bool:
-    """Tell whether a process runs; one that its parent has not yet asked about does not."""
-    try:
-        state = Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != "Z"
+def failure(name: str, function: Callable[..., object]) -> LagbenchError:
+    """Return the error that a task ends a pool with."""
+    with Pool(1) as pool:
+        pool.submit(Task(name=name, function=function))
+        with pytest.raises(LagbenchError) as caught:
+            list(pool.events())
+    return caught.value
 
 
 def test_results_come_back_costliest_first() -> None:
@@ -75,11 +76,9 @@ def test_a_killed_worker_costs_one_attempt(tmp_path: Path) -> None:
 
 def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
     """After three deaths the error says which task and how its workers died."""
-    with Pool(1) as pool:
-        pool.submit(Task(name="cavity tiny, scenario 3", function=pool_tasks.die))
-        with pytest.raises(WorkFailedError) as caught:
-            list(pool.events())
-    text = str(caught.value)
+    error = failure("cavity tiny, scenario 3", pool_tasks.die)
+    text = str(error)
+    assert type(error) is WorkFailedError
     assert f"died {ATTEMPTS} times" in text
     assert "cavity tiny, scenario 3" in text
     assert "SIGKILL" in text
@@ -109,36 +108,27 @@ def test_fewer_than_one_worker_is_refused() -> None:
 
 def test_errors_of_ours_arrive_whole() -> None:
     """A LagbenchError keeps its class, exit code and all of its parts."""
-    with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.refuse))
-        with pytest.raises(DataError) as caught:
-            list(pool.events())
-    error = caught.value
+    error = failure("a", pool_tasks.refuse)
+    assert type(error) is DataError
     assert (error.what, error.where, error.expected, error.got, error.fix) == (
         *("what is wrong", "here", 1, 2, "mend it"),
     )
     assert error.exit_code == 4
 
 
-def test_other_errors_bring_their_traceback() -> None:
-    """Whatever else a task raises names the line that raised it."""
-    with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.crash))
-        with pytest.raises(WorkFailedError, match="a worker crashed") as caught:
-            list(pool.events())
-    assert "ZeroDivisionError" in str(caught.value)
-    assert "pool_tasks.py" in str(caught.value)
+def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> None:
+    """Whatever else a task raises names the line that raised it.
 
-
-def test_a_package_that_fails_is_named(package: Callable[..., Path]) -> None:
-    """Where the line that raised belongs to one that adds a split, it is the package that is told of."""
+    Where the line belongs to a package that adds a split, it is the package that is told of.
+    """
+    error = failure("a", pool_tasks.crash)
+    assert (type(error), error.what) == (WorkFailedError, "a worker crashed")
+    assert "ZeroDivisionError" in str(error)
+    assert "pool_tasks.py" in str(error)
     package("generators", "pool_tasks")
-    with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.crash))
-        with pytest.raises(WorkFailedError) as caught:
-            list(pool.events())
-    assert "pool_tasks.py" in str(caught.value.where)
-    assert "ZeroDivisionError" in str(caught.value.got)
+    error = failure("a", pool_tasks.crash)
+    assert "pool_tasks.py" in str(error.where)
+    assert "ZeroDivisionError" in str(error.got)
 
 
 def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
@@ -147,12 +137,10 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     with Pool(1) as pool:
         pool.submit(Task(name="a", function=pool_tasks.sleep_long, arguments=(marker,)))
         events = pool.events()
-        pool._assign()
-        wait_until(marker.exists)
+        next(events)
         process = pool.process_ids()[0]
-        assert is_alive(process)
-        del events
-    assert not is_alive(process)
+        assert not gone(process)
+    assert gone(process)
 
 
 def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
@@ -162,7 +150,7 @@ def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
         list(pool.events())
         process = pool.process_ids()[0]
     assert (tmp_path / "note").read_text() == "left in peace"
-    assert not is_alive(process)
+    assert gone(process)
 
 
 SCRIPT = """
@@ -184,10 +172,10 @@ def test_workers_die_with_their_parent(tmp_path: Path) -> None:
     with subprocess.Popen(command) as parent:
         wait_until(lambda: marker.exists() and marker.read_text() != "")
         worker = int(marker.read_text())
-        assert is_alive(worker)
+        assert not gone(worker)
         os.kill(parent.pid, signal.SIGKILL)
         parent.wait()
-    wait_until(lambda: not is_alive(worker))
+    wait_until(lambda: gone(worker))
 
 
 def test_the_calling_script_is_not_imported_again() -> None:

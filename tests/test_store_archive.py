@@ -154,14 +154,11 @@ def test_local_splits_are_asked_of_nobody(
     assert server.asked == []
 
 
-def test_files_of_other_schemes(server: Mirror, here: Path) -> None:
-    """An archive is read through fsspec as well."""
+def test_a_manifest_comes_before_an_archive(original: LocalSplit, server: Mirror, here: Path) -> None:
+    """A store that has files is not asked for an archive, which is read through fsspec as well."""
     assert fetched(server.folder.as_uri(), here).complete
     assert is_right(here)
-
-
-def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) -> None:
-    """A store that has files is not asked for an archive."""
+    shutil.rmtree(here / "own/full/v1")
     with serving(original.folder.parent) as running:
         assert fetched(running.url, here).complete
         assert running.count(".tar") == 0
@@ -234,6 +231,14 @@ def garbled(members: Members) -> Members:
     return [*members[:2], (member, data[:-500] + bytes([data[-500] ^ 1]) + data[-499:]), *members[3:]]
 
 
+def other(members: Members) -> Members:
+    """Give all scenarios another content hash."""
+    (head, text), *rest = members
+    manifest = Manifest.model_validate_json(text)
+    files = [entry.model_copy(update={"content_sha256": "0" * 64}) for entry in manifest.files]
+    return [(head, manifest.model_copy(update={"files": tuple(files)}).model_dump_json().encode()), *rest]
+
+
 LIES: dict[str, tuple[Callable[[Members], Members], type[LagbenchError]]] = {
     "foreign first": (lambda m: [foreign("a.nc"), *m], objects.NotDataError),
     "foreign between": (lambda m: [*m[:2], foreign("../evil.nc"), *m[2:]], objects.WrongContentError),
@@ -244,6 +249,7 @@ LIES: dict[str, tuple[Callable[[Members], Members], type[LagbenchError]]] = {
     "one missing": (lambda m: m[:-1], objects.NotDataError),
     "wrong bytes": (garbled, objects.WrongContentError),
     "longer": (lambda m: [m[0], (m[1][0], m[1][1] + bytes(9)), *m[2:]], objects.WrongLengthError),
+    "another data set": (other, objects.WrongContentError),
     "no manifest": (lambda m: [(m[0][0], b"{}"), *m[1:]], objects.NotDataError),
     "other hashes": (
         lambda m: [(m[0][0], m[0][1].replace(b'"content_sha256": "', b'"content_sha256": "0')), *m[1:]],
@@ -265,23 +271,8 @@ def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -
     assert caught.value.where.startswith(f"{server.url}/{packed.name}")
     with tarfile.open(packed) as tar:
         assert left(here) <= {f"own/full/v1/{name}" for name in tar.getnames()}
+    assert not (left(here) and lie == "another data set")  # it is refused before any file is taken
     assert not list(here.rglob("evil.nc"))
     shutil.copy(packed, target)
     fetched(server.url, here)
     assert is_right(here)
-
-
-def test_another_data_set_under_the_name(server: Mirror, packed: Path, here: Path) -> None:
-    """A manifest with other content hashes is refused before any file is taken."""
-
-    def other(members: Members) -> Members:
-        (head, text), *rest = members
-        manifest = Manifest.model_validate_json(text)
-        files = [entry.model_copy(update={"content_sha256": "0" * 64}) for entry in manifest.files]
-        changed = manifest.model_copy(update={"files": tuple(files)})
-        return [(head, changed.model_dump_json().encode()), *rest]
-
-    rewritten(server.folder / packed.name, other)
-    with pytest.raises(objects.WrongContentError):
-        fetched(server.url, here)
-    assert left(here) == set()

@@ -53,8 +53,13 @@ def left(root: Path) -> set[str]:
     return {name for name in found if name != "split.yaml" and not name.startswith(".lock")}
 
 
-def test_all_files_come_and_are_right(store: Store, here: Path, original: LocalSplit) -> None:
-    """The data set is complete, has its hash, and equals the original; nothing temporary is left."""
+def test_all_files_come_and_are_right(
+    store: Store, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The data set is complete, has its hash, and equals the original; nothing temporary is left.
+
+    A second download reads bytes, not values.
+    """
     result = download("own", root=here, mirror=store.url + "/")
     assert (result.downloaded, result.kept, result.generated) == ((0, 1, 2, 3), (), ())
     assert result.complete
@@ -65,11 +70,6 @@ def test_all_files_come_and_are_right(store: Store, here: Path, original: LocalS
     assert lagbench.verify("own", root=here, complete=True).warnings == ()
     with lagbench.open_split("own", root=here) as one, lagbench.open_split(str(original.folder)) as two:
         np.testing.assert_array_equal(one["position"].values, two["position"].values)
-
-
-def test_what_came_is_not_hashed_again(store: Store, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A second download reads bytes, not values."""
-    download("own", root=here, mirror=store.url)
     monkeypatch.setattr("lagbench.make.inventory.check_scenario", None)
     assert download("own", root=here, mirror=store.url).kept == (0, 1, 2, 3)
 
@@ -134,22 +134,16 @@ def test_wrong_objects_are_refused(
 
 
 def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
-    """A store whose manifest has other content hashes is refused before any file is asked for."""
+    """A store whose manifest has other content hashes, or is none, is refused before files are asked for."""
     np.save(here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9)))
     other = adopt(here / "runs.npy", output=here / "other" / "own", radius=0.1, frame_interval=0.1)
-    store.put("own/full/v1/manifest.json", (other.folder / "full/v1/manifest.json").read_bytes())
-    with pytest.raises(objects.WrongContentError) as caught:
-        download("own", root=here, mirror=store.url)
-    assert f"{store.url}/own/full/v1/manifest.json" in str(caught.value.where)
-    assert left(here / "own") == set()
-
-
-def test_what_is_no_manifest_is_told_at_once(store: Store, here: Path) -> None:
-    """As is one that is none."""
-    store.put("own/full/v1/manifest.json", b'{"format": 1}')
-    with pytest.raises(objects.NotDataError) as caught:
-        download("own", root=here, mirror=store.url)
-    assert caught.value.where == f"{store.url}/own/full/v1/manifest.json"
+    of_another = (other.folder / "full/v1/manifest.json").read_bytes()
+    for text, error in ((of_another, objects.WrongContentError), (b'{"format": 1}', objects.NotDataError)):
+        store.put("own/full/v1/manifest.json", text)
+        with pytest.raises(error) as caught:
+            download("own", root=here, mirror=store.url)
+        assert str(caught.value.where).startswith(f"{store.url}/own/full/v1/manifest.json")
+        assert left(here / "own") == set()
 
 
 @pytest.mark.parametrize(
@@ -184,24 +178,29 @@ def test_an_interrupted_download_goes_on(server: Mirror, here: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "error"),
+    ("fault", "manifest", "error"),
     [
-        ("page", objects.NotDataError),
-        ("hidden page", objects.NotDataError),
-        ("nowhere", objects.NotDataError),
-        ("announces more", objects.WrongLengthError),
-        ("announces less", objects.WrongLengthError),
-        ("chopped", objects.WrongLengthError),
-        ("ends early", objects.TruncatedError),
-        ("endless", objects.WrongLengthError),
-        ("flipped", objects.WrongContentError),
+        ("page", True, objects.NotDataError),
+        ("hidden page", True, objects.NotDataError),
+        ("nowhere", True, objects.NotDataError),
+        ("announces more", True, objects.WrongLengthError),
+        ("announces less", True, objects.WrongLengthError),
+        ("chopped", True, objects.WrongLengthError),
+        ("ends early", True, objects.TruncatedError),
+        ("endless", True, objects.WrongLengthError),
+        ("flipped", True, objects.WrongContentError),
+        # where the store has no manifest lengths are not known, but content is
+        ("announces more", False, objects.TruncatedError),
+        ("announces less", False, objects.WrongContentError),
+        ("chopped", False, objects.WrongContentError),
+        ("endless", False, objects.WrongLengthError),
     ],
 )
 def test_each_lie_has_its_error_and_leaves_nothing(
-    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+    server: Mirror, here: Path, fault: str, manifest: bool, error: type[LagbenchError]
 ) -> None:
     """No file of that name, no temporary one; the message names the address; other files stay right."""
-    server.faults = {FIRST: fault}
+    server.faults = {FIRST: fault} | ({} if manifest else {"manifest.json": "gone"})
     with pytest.raises(error) as caught:
         download("own", root=here, mirror=server.url, connections=1)
     assert type(caught.value) is error
@@ -211,25 +210,6 @@ def test_each_lie_has_its_error_and_leaves_nothing(
     assert not [name for name in left(here) if "partial" in name]
     server.faults = {}
     assert download("own", root=here, mirror=server.url).complete
-
-
-@pytest.mark.parametrize(
-    ("fault", "error"),
-    [
-        ("announces more", objects.TruncatedError),
-        ("announces less", objects.WrongContentError),
-        ("chopped", objects.WrongContentError),
-        ("endless", objects.WrongLengthError),
-    ],
-)
-def test_lies_are_found_without_a_manifest(
-    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
-) -> None:
-    """Where the store has no manifest, lengths are not known, but content is."""
-    server.faults = {FIRST: fault, "manifest.json": "gone"}
-    with pytest.raises(error):
-        download("own", root=here, mirror=server.url, scenarios="0")
-    assert left(here) == set()
 
 
 @pytest.mark.parametrize("fault", ["page", "hidden page"])
@@ -242,21 +222,14 @@ def test_a_page_as_manifest(server: Mirror, here: Path, fault: str) -> None:
     assert server.count(".nc") == 0
 
 
-def test_a_line_that_brings_it_no_further(server: Mirror, here: Path) -> None:
-    """Where each attempt starts over and breaks at the same place, five are enough."""
-    server.faults = {FIRST: "drops and starts over"}
-    with pytest.raises((objects.ConnectionLostError, objects.TruncatedError)):
-        download("own", root=here, mirror=server.url, scenarios="0")
-    assert server.count(FIRST) == fetch.ATTEMPTS + 1
-
-
-def test_a_line_that_stays_broken(server: Mirror, here: Path) -> None:
-    """A connection that brings nothing five times is given up, with an error that names the address."""
-    server.faults = {FIRST: "drops always"}
+@pytest.mark.parametrize(("fault", "useful"), [("drops always", 0), ("drops and starts over", 1)])
+def test_a_line_that_stays_broken(server: Mirror, here: Path, fault: str, useful: int) -> None:
+    """A connection that brings it no further five times is given up, with an error that names the address."""
+    server.faults = {FIRST: fault}
     with pytest.raises((objects.ConnectionLostError, objects.TruncatedError)) as caught:
         download("own", root=here, mirror=server.url, scenarios="0")
     assert caught.value.where == f"{server.url}/own/full/v1/{FIRST}"
-    assert server.count(FIRST) == fetch.ATTEMPTS
+    assert server.count(FIRST) == fetch.ATTEMPTS + useful
 
 
 @pytest.mark.parametrize("name", ["manifest.json", FIRST])
@@ -296,14 +269,10 @@ def test_no_generate_stops_where_the_store_does(
 
 
 def test_no_store_at_all(here: Path) -> None:
-    """Without a store there is nothing to download; a local split cannot be simulated either."""
+    """There is nothing to download, and nothing to simulate; a port that nobody listens on is unreachable."""
     for or_generate in (False, True):
         with pytest.raises(UsageError):
             download("own", root=here, or_generate=or_generate)
-
-
-def test_nobody_answers(here: Path) -> None:
-    """A port that nobody listens on is an unreachable store."""
     with socket.socket() as reserved:
         reserved.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{reserved.getsockname()[1]}"

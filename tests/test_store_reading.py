@@ -74,7 +74,7 @@ def here(url: str) -> list[str]:
 
 
 def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
-    """The arrays are those of the folder; a second look fetches nothing."""
+    """The arrays are those of the folder; a second look fetches nothing; what the store lacks is named."""
     with (
         lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
         lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
@@ -84,6 +84,8 @@ def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResu
     store.remove(f"{FOLDER}/test/0003.nc")
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     assert not store.server or store.server.count("0004.nc") == 1
+    with pytest.raises(DataError, match="0-1"):
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
 
 
 def test_scores_are_those_of_the_folder(
@@ -102,20 +104,16 @@ def test_scores_are_those_of_the_folder(
     assert all(near["rows"][row] == scores for row, scores in far["rows"].items())
 
 
-def test_baselines_read_from_a_store(url: str, generated: GenerationResult, tiny: Registry) -> None:
-    """Facts and training files are those of the folder."""
+def test_baselines_and_exports_read_from_a_store(
+    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
+) -> None:
+    """Facts, training files and the bytes of an export, which needs all subsets, are those of the folder."""
     assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
     assert here(url) == ["manifest.json", "train/0000.nc"]
     found = copy.scenario_files(tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid"))
     assert [path.read_bytes() for path in found.values()] == [
         (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
     ]
-
-
-def test_exports_are_those_of_the_folder(
-    url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
-) -> None:
-    """All three subsets come, and give the same bytes."""
     made = [
         export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny)
         for name, root in (("far", url), ("near", generated.root))
@@ -129,13 +127,6 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
     assert here(url) == []
     assert overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
-
-
-def test_what_the_store_lacks_is_missed(store: Store, tiny: Registry) -> None:
-    """As in a folder: a DataError that names the scenarios."""
-    with pytest.raises(DataError) as caught:
-        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
-    assert "0-1" in str(caught.value)
 
 
 def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:

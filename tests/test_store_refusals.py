@@ -82,14 +82,10 @@ def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) 
         use(s3)
 
 
-def test_no_bucket(s3: str, use: Use) -> None:
-    """The bucket is named."""
+def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
+    """The bucket is named; a scheme that fsspec does not know is a usage error."""
     with pytest.raises(DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"):
         use("s3://elsewhere/data")
-
-
-def test_no_such_kind(use: Use) -> None:
-    """A scheme that fsspec does not know is a usage error."""
     with pytest.raises(UsageError, match="no such kind of address"):
         use("nonsense://data/x")
 
@@ -100,8 +96,9 @@ def test_where_nothing_can_be_written_nothing_is_kept(
 ) -> None:
     """The address is judged before its working copy is made."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    with pytest.raises(UsageError):
-        generate(SPLIT, SIZE, root=root, dry_run=True)
+    for dry_run in (True, False):
+        with pytest.raises(UsageError):
+            generate(SPLIT, SIZE, root=root, dry_run=dry_run)
     assert not list(tmp_path.iterdir())
 
 

@@ -23,7 +23,6 @@ from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import ScenarioFile
-from lagbench.data.writer import scenario_path
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
 from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
@@ -78,7 +77,7 @@ def test_jumps_are_flagged(bench: Bench) -> None:
     Particles permuted in the middle of the rollout jump too; a displacement that is surely reached ends the
     search in the truth.
     """
-    source = Truth(bench.registry.size("cavity", "tiny"), bench.root)
+    source = truth_of(bench)
     everything = source.largest_displacement(4, enough=np.inf)
     assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
     result = changed(bench, lambda x: np.concatenate([x[:, :4], x[:, 4:, ::-1]], axis=1))
@@ -99,8 +98,7 @@ def test_jumps_are_flagged(bench: Bench) -> None:
 
 def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second is flagged."""
-    size = bench.registry.size("cavity", "tiny")
-    source = Truth(size, bench.root)
+    source = truth_of(bench)
     limit = 10 * source.largest_displacement(3, enough=np.inf)
     flagged: list[list[float]] = []
     steps = np.diff(np.concatenate([source.given(3), truth(3)]).astype("f8"), axis=0)
@@ -154,23 +152,6 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_p
     assert required.exit_code == 4
     with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
         required.check()
-
-
-@pytest.mark.parametrize("damage", ["cut", "another"])
-def test_a_damaged_data_set_is_told_from_a_bad_submission(bench: Bench, tmp_path: Path, damage: str) -> None:
-    """A truncated or foreign test scenario is exit code 4 and names the file."""
-    root = tmp_path / "root"
-    shutil.copytree(bench.root, root)
-    key = make_key(4)
-    path = scenario_path(root, key)
-    if damage == "cut":
-        path.write_bytes(path.read_bytes()[:3000])
-    else:
-        write_scenario(root, key, frames=FRAMES, particles=PARTICLES, seed="another")
-    result = replace(bench, root=root).validate(bench.valid)
-    assert result.exit_code == 4
-    assert str(path) in result.errors[0].where
-    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 
 def test_without_a_recorded_hash_the_check_warns(unmeasured: Registry, bench: Bench, tmp_path: Path) -> None:
@@ -262,14 +243,21 @@ def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return found
 
 
-def test_a_changed_value_is_refused(own: Bench) -> None:
-    """One value, all attributes kept: exit code 4, naming the file and the command that mends it."""
+@pytest.mark.parametrize("damage", ["cut", "another scenario", "one value, all attributes kept"])
+def test_a_damaged_data_set_is_told_from_a_bad_submission(own: Bench, damage: str) -> None:
+    """Exit code 4, naming the file and the command that mends it."""
     path = truth_of(own).path(4)
-    change(path)
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:3000])
+    elif damage == "another scenario":
+        write_scenario(own.root, make_key(4), frames=FRAMES, particles=PARTICLES, seed="another")
+    else:
+        change(path)
     result = own.validate(own.valid)
     assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
     assert str(path) in result.errors[0].where
-    assert "lagbench generate --split cavity --size tiny --subset test" in result.errors[0].fix
+    names = "" if damage == "cut" else " --split cavity --size tiny --subset test"
+    assert f"lagbench generate{names}" in result.errors[0].fix
     assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 
@@ -306,8 +294,7 @@ def test_damaged_notes_are_no_notes(own: Bench, text: str) -> None:
 
 def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
     """A file that agrees with itself, but not with datasets.yaml."""
-    held = truth_of(own)
-    size = held.size
+    size = truth_of(own).size
     other = size.measured.model_copy(update={"scenario_sha256": {3: "0" * 16, 4: "0" * 16, 5: "0" * 16}})
     with pytest.raises(DataError) as caught:
         Truth(size.model_copy(update={"measured": other}), own.root).check()

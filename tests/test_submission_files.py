@@ -167,16 +167,17 @@ def test_a_full_disk_is_said(bench: Bench, tmp_path: Path, size: int, whole: boo
 
 
 def test_labels_may_come_while_writing(bench: Bench) -> None:
-    """The cost of a frame is known only after the rollout."""
+    """The cost of a frame is known only after the rollout; it may be a number of NumPy."""
     path = bench.folder / "late.nc"
     with PredictionsWriter(path, **options(bench)) as writer:
         for scenario in reversed(TESTS):
             writer.add(scenario, truth(scenario))
         with pytest.raises(UsageError, match="written twice"):
             writer.add(3, truth(3))
-        writer.label(seconds_per_frame=0.5, device="one core")
+        writer.label(seconds_per_frame=np.float32(0.5), seed=np.int64(2), device="one core")
     with open_predictions(path) as predictions:
-        assert (predictions.header.seconds_per_frame, predictions.header.device) == (0.5, "one core")
+        header = predictions.header
+        assert (header.seconds_per_frame, header.seed, header.device) == (0.5, 2, "one core")
 
 
 def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
@@ -220,22 +221,19 @@ def test_what_is_no_array_of_numbers_is_refused(bench: Bench, odd: Any) -> None:
         write(bench.folder / "odd.nc", RIGHT | {3: odd}, **options(bench))
 
 
-def test_scalars_of_numpy_are_labels(bench: Bench) -> None:
-    """As loops over arrays give them."""
-    path = write(
-        bench.folder / "np.nc", RIGHT, **options(bench, seed=np.int64(2), seconds_per_frame=np.float32(0.5))
-    )
-    with open_predictions(path) as predictions:
-        assert (predictions.header.seed, predictions.header.seconds_per_frame) == (2, 0.5)
-
-
 ALL = list(range(GIVEN, FRAMES))
 
 
 def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
-    """Scenario 4, three frames from frame 5 on; names, ids, frames, optional attributes in the header."""
+    """Scenario 4, three frames from frame 5 on; names, ids, frames, optional attributes in the header.
+
+    No such scenario, before the first, beyond the last, fewer than none: that is told.
+    """
     with open_predictions(bench.valid) as predictions:
         got, header = predictions.frames(4, 5, 3), predictions.header
+        for place in ((9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)):
+            with pytest.raises(UsageError, match="no such frames"):
+                predictions.frames(*place)
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
     assert (header.split, header.size, header.method) == ("cavity", "tiny", "truth")
@@ -341,15 +339,6 @@ def test_blocks_cover_a_scenario_in_order_and_in_bounded_memory(tmp_path: Path) 
     tracemalloc.stop()
     assert len(seen) == frames
     assert peak < 20e6
-
-
-@pytest.mark.parametrize(
-    ("scenario", "start", "count"), [(9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)]
-)
-def test_frames_that_are_not_there_are_named(bench: Bench, scenario: int, start: int, count: int) -> None:
-    """No such scenario, before the first, beyond the last."""
-    with open_predictions(bench.valid) as predictions, pytest.raises(UsageError, match="no such frames"):
-        predictions.frames(scenario, start, count)
 
 
 @pytest.mark.parametrize(

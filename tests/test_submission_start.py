@@ -96,12 +96,6 @@ def early(world: World, scenario: int) -> Floats:
     return world.truth(scenario, late=-1)
 
 
-def standardised(world: World, scenario: int) -> Floats:
-    """The truth less its mean over its standard deviation."""
-    held = world.truth(scenario)
-    return (held - held.mean((0, 1))) / held.std((0, 1))
-
-
 def following(world: World, scenario: int) -> int:
     """The next scenario."""
     ids = list(world.positions)
@@ -121,7 +115,10 @@ MISTAKES: dict[str, tuple[Predict, str]] = {
     "late": (lambda w, i: np.concatenate([w.truth(i)[1:], w.truth(i)[-1:]]), "shifted"),
     "steps": (lambda w, i: np.diff(np.concatenate([w.last(i)[None], w.truth(i)]), axis=0), "displacements"),
     "from the last given frame": (lambda w, i: w.truth(i) - w.last(i), "displacements"),
-    "standardised": (standardised, "standardised"),
+    "standardised": (
+        lambda w, i: (w.truth(i) - w.truth(i).mean((0, 1))) / w.truth(i).std((0, 1)),
+        "standardised",
+    ),
     "another scenario": (lambda w, i: w.truth(following(w, i)), "scenario"),
 }
 

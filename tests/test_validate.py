@@ -31,19 +31,14 @@ def _tabulated(reynolds: int, name: str) -> tuple[NDArray[np.float64], NDArray[n
 
 @pytest.mark.parametrize("name", ["u", "v"])
 @pytest.mark.parametrize("reynolds", diagnostics.REYNOLDS)
-def test_no_net_flow_crosses_a_centre_line(reynolds: int, name: str) -> None:
+def test_tabulated_profiles_have_no_slips(reynolds: int, name: str) -> None:
     """Mass is conserved in a closed box: each tabulated profile integrates to nearly 0.
 
-    A wrong sign or first digit among the widely spaced points would move the integral by 0.01.
+    A wrong sign or first digit among the widely spaced points would move the integral by 0.01. Among the
+    points 0.008 apart, each lies within 0.006 of a spline through the others.
     """
-    assert abs(CubicSpline(*_tabulated(reynolds, name)).integrate(0.0, 1.0)) < 0.004
-
-
-@pytest.mark.parametrize("name", ["u", "v"])
-@pytest.mark.parametrize("reynolds", diagnostics.REYNOLDS)
-def test_tabulated_profiles_are_smooth_near_the_walls(reynolds: int, name: str) -> None:
-    """Among the points 0.008 apart, each lies within 0.006 of a spline through the others."""
     abscissae, values = _tabulated(reynolds, name)
+    assert abs(CubicSpline(abscissae, values).integrate(0.0, 1.0)) < 0.004
     crowded = [i for i in range(1, len(values) - 1) if abscissae[i + 1] - abscissae[i - 1] < 0.017]
     assert len(crowded) >= 3
     for i in crowded:
@@ -52,7 +47,10 @@ def test_tabulated_profiles_are_smooth_near_the_walls(reynolds: int, name: str) 
 
 
 def test_misprints_are_left_out() -> None:
-    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated."""
+    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated.
+
+    Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4.
+    """
     missing = {
         (reynolds, name, int(index))
         for reynolds in diagnostics.REYNOLDS
@@ -61,10 +59,6 @@ def test_misprints_are_left_out() -> None:
     }
     assert missing == {(400, "v", diagnostics.X.index(0.9063)), (3200, "u", diagnostics.Y.index(0.4531))}
     assert diagnostics.centre_lines(7.0) is None
-
-
-def test_deviation_skips_what_is_not_tabulated() -> None:
-    """Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4."""
     found = diagnostics.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
     assert found.rmse == pytest.approx(math.sqrt(12.5))
     assert found.maximum == 4.0
@@ -77,11 +71,7 @@ def test_occupancy_counts_every_particle_once() -> None:
     counts = diagnostics.occupancy(np.array([[0.0, 1.0]]), BOX)
     assert counts[0, -1] == 1
     assert counts.sum() == 1
-
-
-def test_lid_corners_are_five_cells_wide() -> None:
-    """Of 35 x 35 cell centres, 2 x 5 x 5 lie in the lid's corners, none in the lower half."""
-    middles = np.stack(np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    # of 35 x 35 cell centres 2 x 5 x 5 lie in the lid's corners
     corners = middles[diagnostics.lid_corners(middles, BOX)]
     assert len(corners) == 50
     assert corners[:, 1].min() > 0.5
@@ -198,29 +188,19 @@ def _arguments(folder: Path, *more: str) -> list[str]:
     return [*base, "--json", str(folder / "result.json"), *more]
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Return the folders of the same run, done twice, picture included."""
-    folders = [tmp_path_factory.mktemp("run") for _ in range(2)]
-    for folder in folders:
-        assert __main__.main(_arguments(folder, "--profiles", str(folder / "profiles.png"))) == 0
-    return folders
+def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
+    """Ghia's points with his values, errors that follow from them, checks, energy that grows.
 
-
-def test_validate_writes_the_same_file_twice(written: list[Path]) -> None:
-    """All but the timing is equal, to the byte; the picture is one."""
+    All but the timing is equal in a second run, to the byte; the picture is one.
+    """
     texts = []
-    for folder in written:
-        assert (folder / "profiles.png").read_bytes().startswith(b"\x89PNG")
-        found = json.loads((folder / "result.json").read_text())
+    for _ in range(2):
+        assert __main__.main(_arguments(tmp_path, "--profiles", str(tmp_path / "profiles.png"))) == 0
+        assert (tmp_path / "profiles.png").read_bytes().startswith(b"\x89PNG")
+        found = json.loads((tmp_path / "result.json").read_text())
         assert found.pop("timing")["particle_substeps_per_second"] > 0.0
         texts.append(json.dumps(found))
     assert texts[0] == texts[1]
-
-
-def test_validate_reports_what_it_measured(written: list[Path]) -> None:
-    """Ghia's points with his values, errors that follow from them, checks, energy that grows."""
-    found = json.loads((written[0] / "result.json").read_text())
     lines = found["centre_lines"]
     assert [point["y"] for point in lines["u"]] == list(diagnostics.Y)
     assert lines["v"][0]["ghia"] == -0.05906

@@ -91,7 +91,10 @@ def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None
 
 
 def test_how_often() -> None:
-    """Validations share a training evenly, the last step among them, and take at most 15 % of it."""
+    """Validations share a training evenly, the last step among them, and take at most 15 % of it.
+
+    What a recipe names in `validate_every` wins; 0 means never.
+    """
     options = TrainingOptions()
     for steps, trained, rolled, expected in (
         (5000, 64, 720, 8),  # NeuralMPM: four windows of 16 frames a step
@@ -104,10 +107,6 @@ def test_how_often() -> None:
         assert len(at) == count == expected
         assert at[-1] == steps
         assert at[count // 2 - 1] == steps // 2 or count == 1
-
-
-def test_steps_that_a_recipe_names() -> None:
-    """`validate_every` wins; 0 means never."""
     options, never = TrainingOptions(validate_every=4), TrainingOptions(validate_every=0)
     assert [s for s in range(1, 11) if options.is_validated(s, steps=10, validations=1)] == [4, 8, 10]
     assert not any(never.is_validated(s, steps=10, validations=8) for s in range(1, 11))

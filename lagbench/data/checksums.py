@@ -18,7 +18,6 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,28 +31,14 @@ BLOCK_BYTES = 1 << 18
 """Values are made canonical in blocks that stay in the second-level cache [bytes]."""
 
 
-class Variable(Protocol):
-    """What :func:`content_hash` needs of a variable; those of xarray fit."""
-
-    @property
-    def dims(self) -> Sequence[object]:
-        """Names of the dimensions."""
-
-    @property
-    def values(self) -> ArrayLike:
-        """All values."""
-
-
 def plain(value: object) -> object:
     """Return a JSON value equal to an attribute, whatever library read it.
 
     Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one element
     become Python numbers; -0.0 becomes 0.0.
     """
-    if isinstance(value, np.ndarray):
+    if isinstance(value, (np.ndarray, np.generic)):
         value = value.item() if value.size == 1 else value.tolist()
-    if isinstance(value, np.generic):
-        value = value.item()
     if isinstance(value, bytes):
         value = value.decode("utf-8")
     if isinstance(value, int):
@@ -66,11 +51,8 @@ def plain(value: object) -> object:
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
-    raise DataError(
-        "a value cannot be hashed",
-        expected="a finite number or a string without NUL, or lists and mappings of them",
-        got=repr(value),
-    )
+    expected = "a finite number or a string without NUL, or lists and mappings of them"
+    raise DataError("a value cannot be hashed", expected=expected, got=repr(value))
 
 
 def round_digits(value: float, digits: int = 9) -> float:
@@ -134,29 +116,23 @@ class VariableHasher:
             raise self._wrong("too many values", f"at most {self._missing} more", array.size)
         self._missing -= array.size
         if self.dtype == "string":
-            self._update_strings(array)
-        else:
-            self._update_numbers(array)
+            for item in array.reshape(-1).tolist():
+                text = plain(item)
+                if not isinstance(text, str):
+                    raise self._wrong("a value is not a string", "a string", repr(item))
+                self._sha.update(self._joint + text.encode("utf-8"))
+                self._joint = b"\0"
+            return
+        little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False).reshape(-1)
+        step = BLOCK_BYTES // little.itemsize
+        for start in range(0, little.size, step):
+            self._sha.update(_canonical(little[start : start + step]).data)
 
     def hexdigest(self) -> str:
         """Return the hash, 64 hex digits."""
         if self._missing:
             raise self._wrong("values are missing", "as many as the shape holds", f"{self._missing} fewer")
         return self._sha.hexdigest()
-
-    def _update_numbers(self, array: NDArray[np.generic]) -> None:
-        little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False).reshape(-1)
-        step = BLOCK_BYTES // little.itemsize
-        for start in range(0, little.size, step):
-            self._sha.update(_canonical(little[start : start + step]).data)
-
-    def _update_strings(self, array: NDArray[np.generic]) -> None:
-        for item in array.reshape(-1).tolist():
-            text = plain(item)
-            if not isinstance(text, str):
-                raise self._wrong("a value is not a string", "a string", repr(item))
-            self._sha.update(self._joint + text.encode("utf-8"))
-            self._joint = b"\0"
 
     def _wrong(self, what: str, expected: object, got: object) -> DataError:
         return DataError(what, where=f"variable {self.name!r}", expected=expected, got=got)
@@ -182,12 +158,8 @@ class ContentHasher:
     """Content hash of a scenario whose variables arrive side by side."""
 
     def __init__(self, identity: Mapping[str, object]) -> None:
-        self._identity = dict(identity)
+        self.identity = identity  # what enters beside the variables
         self._variables: dict[str, VariableHasher] = {}
-
-    def identify(self, identity: Mapping[str, object]) -> None:
-        """Put another identity in place of the present one."""
-        self._identity = dict(identity)
 
     def declare(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
         """Announce a variable before its values come."""
@@ -203,18 +175,8 @@ class ContentHasher:
 
     def hexdigest(self) -> str:
         """Return the content hash, 64 hex digits."""
-        whole = {**self._identity, "variables": self.digests()}
+        whole = {**self.identity, "variables": self.digests()}
         return hashlib.sha256(canonical_json(whole)).hexdigest()
-
-
-def content_hash(variables: Mapping[Any, Variable], identity: Mapping[str, object]) -> str:
-    """Return the content hash of variables held in memory."""
-    hasher = ContentHasher(identity)
-    for name, variable in variables.items():
-        values = np.asarray(variable.values)
-        hasher.declare(str(name), values.dtype, variable.dims, values.shape)
-        hasher.update(str(name), values)
-    return hasher.hexdigest()
 
 
 def file_sha256(path: Path) -> str:

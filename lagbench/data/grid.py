@@ -167,11 +167,8 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
-        raise UsageError(
-            "positions and velocities do not fit",
-            expected="two arrays of one shape [..., particle, 2]",
-            got=f"{x.shape} and {u.shape}",
-        )
+        expected, got = "two arrays of one shape [..., particle, 2]", f"{x.shape} and {u.shape}"
+        raise UsageError("positions and velocities do not fit", expected=expected, got=got)
     sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
         _scatter(x[frame], u[frame], grid, sums[frame])
@@ -187,7 +184,16 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     s -= grid.origin
     base = np.floor(s - 0.5)
     s -= base
-    weight_x, weight_y = _spline(s)
+    # weights of the three nodes of each axis, shape [axis, node, particle]
+    weights = np.empty((len(s), 3, s.shape[1]))
+    for node, centre in enumerate((1.5, 1.0, 0.5)):
+        weight = weights[:, node]
+        np.subtract(s, centre, out=weight)
+        np.square(weight, out=weight)
+        if centre == 1.0:
+            np.subtract(0.75, weight, out=weight)
+        else:
+            weight *= 0.5
     side = grid.nodes + _LOW + _HIGH
     base += _LOW
     base[0] *= side
@@ -201,7 +207,7 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     for i in range(3):
         for k in range(3):
             shift = i * side + k
-            np.multiply(weight_x[i], weight_y[k], out=weight)
+            np.multiply(weights[0, i], weights[1, k], out=weight)
             np.add.at(sums[shift:], corner, weight)
             # both components go into one sum of complex numbers, which takes less than two of real ones
             np.multiply(weight, along_x, out=product.real)
@@ -209,20 +215,6 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
             np.add.at(momenta[shift:], corner, product)
     for field, held in zip(out, (sums, momenta.real, momenta.imag), strict=True):
         field[:] = held[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
-
-
-def _spline(s: Floats) -> Floats:
-    """Return the weights of the three nodes of each axis, shape [2, node, particle]."""
-    weights = np.empty((len(s), 3, s.shape[1]))
-    for node, centre in enumerate((1.5, 1.0, 0.5)):
-        weight = weights[:, node]
-        np.subtract(s, centre, out=weight)
-        np.square(weight, out=weight)
-        if centre == 1.0:
-            np.subtract(0.75, weight, out=weight)
-        else:
-            weight *= 0.5
-    return weights
 
 
 def counted_nodes(weight: Floats, full: float) -> Mask:

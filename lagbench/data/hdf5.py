@@ -3,7 +3,7 @@
 HDF5 lets a file point to other files (external links, external storage, virtual data sets), ask
 for plug-ins, and claim any size. Here links are listed and never followed, and what a header
 declares is held against what the file holds. :func:`check_structure` refuses a file; formats
-that report all their findings together use :func:`describe` and :func:`storage_problems`.
+that report all their findings together use :func:`describe` and :func:`storage_problem`.
 """
 
 from __future__ import annotations
@@ -76,9 +76,6 @@ OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
 AGAIN = "write the file again; if it was copied or downloaded, compare its length"
 
 
-# --- the file itself -----------------------------------------------------------------------
-
-
 def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> None:
     """Refuse what is no HDF5 file by its kind, length and first bytes."""
     check_regular(path, longest=longest, fix=fix)
@@ -94,16 +91,11 @@ def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> N
             fix="check the path and that you may read the file",
         ) from error
     if head != SIGNATURE:
-        got = next((what for start, what in FOREIGN.items() if head.startswith(start)), _guess(head))
-        raise UnreadableFileError(
-            "not an HDF5 file", where=str(path), expected="HDF5, as netCDF4 is", got=got, fix=fix
-        )
-
-
-def _guess(head: bytes) -> str:
-    if not head:
-        return "an empty file"
-    return "text" if head.isascii() and head.decode("ascii").isprintable() else "bytes of another format"
+        text = head.isascii() and head.decode("ascii").isprintable()
+        guess = ("text" if text else "bytes of another format") if head else "an empty file"
+        got = next((what for start, what in FOREIGN.items() if head.startswith(start)), guess)
+        expected = "HDF5, as netCDF4 is"
+        raise UnreadableFileError("not an HDF5 file", where=str(path), expected=expected, got=got, fix=fix)
 
 
 @contextmanager
@@ -129,13 +121,8 @@ def opened(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> Itera
     check_file(path, longest=longest, fix=fix)
     with reading(path):
         file = h5py.File(path, "r", locking=False)
-    try:
+    with file:
         yield file
-    finally:
-        file.close()
-
-
-# --- what its headers say ------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -157,7 +144,6 @@ class Problem(NamedTuple):
 class Array:
     """A data set as its header describes it."""
 
-    name: str
     shape: tuple[int, ...] | None  # None where asking could touch another file
     dims: tuple[str, ...]  # an empty name where a dimension has none
     kind: str  # its type in words, such as "float32" or "compound"
@@ -186,16 +172,14 @@ def members_of(group: h5py.Group, most: int = MAX_LINKS) -> tuple[dict[str, str]
     A member is a "variable", "group", "named type", "soft link", "external link" or
     "user-defined link".
     """
-    identifier = group.id
-    count: int = identifier.get_num_objs()
+    count: int = group.id.get_num_objs()
     found = {}
     for index in range(min(count, most)):
-        name = identifier.get_objname_by_idx(index)
-        kind = identifier.links.get_info(name).type
+        name = group.id.get_objname_by_idx(index)
+        kind = group.id.links.get_info(name).type
+        word = LINKS.get(kind, "user-defined link")
         if kind == h5py.h5l.TYPE_HARD:
-            word = OBJECTS.get(h5py.h5o.get_info(identifier, name).type, "named type")
-        else:
-            word = LINKS.get(kind, "user-defined link")
+            word = OBJECTS.get(h5py.h5o.get_info(group.id, name).type, "named type")
         found[name.decode("utf-8", "backslashreplace")] = word
     return found, count
 
@@ -231,22 +215,18 @@ def layout_of(dataset: h5py.Dataset) -> str:
     return "external files" if plist.get_external_count() else LAYOUTS.get(plist.get_layout(), "unknown")
 
 
-def describe(dataset: h5py.Dataset, name: str) -> Array:
+def describe(dataset: h5py.Dataset) -> Array:
     """Return what the header of a data set says; no value is read."""
     plist, layout = dataset.id.get_create_plist(), layout_of(dataset)
     # HDF5 opens the sources of a virtual data set to tell its shape.
-    elsewhere = layout not in INSIDE
-    simple = not elsewhere and dataset.id.get_space().get_simple_extent_type() in (
-        h5py.h5s.SIMPLE,
-        h5py.h5s.SCALAR,
-    )
+    elsewhere, plain = layout not in INSIDE, (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
+    simple = not elsewhere and dataset.id.get_space().get_simple_extent_type() in plain
     filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
     sizes: list[int] = []
     if layout == "chunked":
         dataset.id.chunk_iter(lambda chunk: sizes.append(chunk.size))
     kind = dataset.id.get_type()
     return Array(
-        name=name,
         shape=tuple(dataset.id.shape) if simple else None,
         dims=() if elsewhere else dims_of(dataset),
         kind=_kind(kind),
@@ -257,9 +237,7 @@ def describe(dataset: h5py.Dataset, name: str) -> Array:
         largest_chunk=max(sizes, default=0),
         filters=tuple(code for code, *_ in filters),
         foreign_filters=tuple(
-            f"{text.decode('ascii', 'replace')} ({code})"
-            for code, _, _, text in filters
-            if code not in FILTERS
+            f"{text.decode('ascii', 'replace')} ({code})" for code, *_, text in filters if code not in FILTERS
         ),
     )
 
@@ -291,9 +269,6 @@ def _kind(kind: h5py.h5t.TypeID) -> str:
     return KINDS.get(kind.get_class(), "another type")
 
 
-# --- what may be read ----------------------------------------------------------------------
-
-
 def cache_of(array: Array) -> tuple[int, int]:
     """Return the bytes and the number of chunks to keep while frames are read in order.
 
@@ -308,8 +283,8 @@ def cache_of(array: Array) -> tuple[int, int]:
     return kept * array.chunk_bytes, kept
 
 
-def storage_problems(array: Array, *, length: int | None = None, cache: int = MAX_CACHE) -> list[Problem]:
-    """Return why an array reaches outside its file, needs plug-ins, or is a trap.
+def storage_problem(array: Array, *, length: int, cache: int = MAX_CACHE) -> Problem | None:
+    """Return why an array reaches outside its file, needs plug-ins, or is a trap; None where it is sound.
 
     ``length`` is that of the file [bytes]: chunks may overlap, and then promise more than it has;
     ``cache`` the most memory for chunks that must stay unpacked [bytes].
@@ -317,38 +292,32 @@ def storage_problems(array: Array, *, length: int | None = None, cache: int = MA
     if array.shape is None:
         away = "file" in array.layout or array.layout == "virtual"
         what = "the values lie in other files" if away else "there are no values"
-        return [Problem(what, "compact, contiguous or chunked storage in this file", array.layout)]
+        return Problem(what, "compact, contiguous or chunked storage in this file", array.layout)
     if array.foreign_filters:
         got = ", ".join(array.foreign_filters)
-        return [
-            Problem("a filter is needed that not every reader has", "zlib, shuffle, checksum or none", got)
-        ]
+        return Problem("a filter is needed that not every reader has", "zlib, shuffle, checksum or none", got)
     if len(set(array.filters)) < len(array.filters):
         # Each zlib in a pipeline multiplies what a chunk may unpack to by a thousand.
         got = f"filters {', '.join(map(str, array.filters[:10]))}"
-        return [Problem("a filter is applied more than once", "each filter at most once", got)]
-    if length is not None and array.packed > length:
+        return Problem("a filter is applied more than once", "each filter at most once", got)
+    if array.packed > length:
         got = f"{array.packed} bytes in a file of {length}"
-        return [Problem("the values claim more room than the file has", f"at most {length} bytes", got)]
-    return _chunk_problems(array, cache)
-
-
-def _chunk_problems(array: Array, cache: int) -> list[Problem]:
-    if array.chunks is None or array.shape is None or len(array.shape) != len(array.chunks):
-        return []
+        return Problem("the values claim more room than the file has", f"at most {length} bytes", got)
+    if array.chunks is None or len(array.shape) != len(array.chunks):
+        return None
     count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
     if count > MAX_CHUNKS:
-        return [Problem("too many chunks", f"at most {MAX_CHUNKS}", f"{count} of shape {array.chunks}")]
+        return Problem("too many chunks", f"at most {MAX_CHUNKS}", f"{count} of shape {array.chunks}")
     whole = array.chunk_bytes
     if array.largest_chunk > 2 * whole + 1024:
         # zlib unpacks as much as the stream says: a thousand times its length at worst.
         got = f"{array.largest_chunk} bytes"
-        return [Problem("a chunk is longer packed than unpacked", f"about {whole} bytes at most", got)]
+        return Problem("a chunk is longer packed than unpacked", f"about {whole} bytes at most", got)
     size = cache_of(array)[0]
     if size > cache:
         got = f"chunks {array.chunks}: {size} bytes"
-        return [Problem("frames cannot be read without unpacking much more", f"at most {cache} bytes", got)]
-    return []
+        return Problem("frames cannot be read without unpacking much more", f"at most {cache} bytes", got)
+    return None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -369,93 +338,62 @@ def check_structure(file: h5py.File, path: Path, expected: Structure) -> dict[st
     types that the format does not have, and arrays that unpack to far more than the file holds:
     by their headers, and large chunks by unpacking them up to the length that they declare.
     """
+
+    def refused(name: str, what: str, wanted: str, got: str) -> UnreadableFileError:
+        where = f"{path}, {name!a}" if name else str(path)
+        fix = "write it again without links, filters of its own, and arrays larger than their values"
+        return UnreadableFileError(what, where=where, expected=wanted, got=got, fix=fix)
+
+    def names() -> Iterator[str]:
+        root, _ = members_of(file["/"], expected.members)
+        for prefix in ["", *(f"{name}/" for name, kind in root.items() if kind == "group")]:
+            members, count = members_of(file[prefix or "/"], expected.members)
+            if count > expected.members:
+                raise refused(prefix, "too many members", f"at most {expected.members}", str(count))
+            for name, kind in members.items():
+                if kind == "variable":
+                    yield f"{prefix}{name}"
+                elif kind != "group" or prefix or not (expected.groups is None or name in expected.groups):
+                    raise refused(prefix + name, "a member that is no variable", "a variable", kind)
+
     length, found = path.stat().st_size, {}
     with reading(path):
-        for name in _arrays(file, path, expected):
-            array = found[name] = describe(file[name], name)
-            problems = storage_problems(array, length=length, cache=expected.cache)
-            problems = problems or _type_problems(array, expected) or _inflation(file[name], array)
-            if problems:
-                raise _refused(path, name, problems[0])
+        for name in names():
+            array = found[name] = describe(file[name])
+            if problem := storage_problem(array, length=length, cache=expected.cache):
+                raise refused(name, *problem)
+            text = expected.texts and array.kind in ("string", "variable-length")
+            if not text and not array.kind.startswith(("float", "int", "uint")):
+                raise refused(name, "an array of another type", "plain numbers", array.kind)
+            if problem := _inflation(file[name], array):
+                raise refused(name, *problem)
     total = sum(array.unpacked + array.chunk_bytes for array in found.values())
     if expected.unpacked is not None and total > expected.unpacked:
-        problem = Problem(
-            "the file unpacks to too much", f"at most {expected.unpacked} bytes", f"{total} bytes"
-        )
-        raise _refused(path, "", problem)
+        most = f"at most {expected.unpacked} bytes"
+        raise refused("", "the file unpacks to too much", most, f"{total} bytes")
     return found
 
 
-def _arrays(file: h5py.File, path: Path, expected: Structure) -> Iterator[str]:
-    """Yield the names of all arrays of a file that has no other members than it may."""
-    for prefix in _groups(file, path, expected):
-        members, count = members_of(file[prefix or "/"], expected.members)
-        if count > expected.members:
-            raise _refused(
-                path, prefix, Problem("too many members", f"at most {expected.members}", str(count))
-            )
-        for name, kind in members.items():
-            if kind == "variable":
-                yield f"{prefix}{name}"
-            elif kind != "group" or prefix or not (expected.groups is None or name in expected.groups):
-                raise _refused(
-                    path, prefix + name, Problem("a member that is no variable", "a variable", kind)
-                )
-
-
-def _groups(file: h5py.File, path: Path, expected: Structure) -> list[str]:
-    members, _ = members_of(file["/"], expected.members)
-    return ["", *(f"{name}/" for name, kind in members.items() if kind == "group")]
-
-
-def _type_problems(array: Array, expected: Structure) -> list[Problem]:
-    numbers = array.kind.startswith(("float", "int", "uint"))
-    if numbers or (expected.texts and array.kind in ("string", "variable-length")):
-        return []
-    return [Problem("an array of another type", "plain numbers", array.kind)]
-
-
-def _inflation(dataset: h5py.Dataset, array: Array) -> list[Problem]:
+def _inflation(dataset: h5py.Dataset, array: Array) -> Problem | None:
     """Hold what an array declares against what its chunks hold."""
     if array.unpacked > max(HARMLESS, MOST * array.packed):
-        expected = f"at most {MOST} times {array.packed} bytes"
-        return [
-            Problem(
-                "the array would unpack to far more than the file holds", expected, f"{array.unpacked} bytes"
-            )
-        ]
+        what = "the array would unpack to far more than the file holds"
+        return Problem(what, f"at most {MOST} times {array.packed} bytes", f"{array.unpacked} bytes")
     if array.largest_chunk * DEFLATE_RATIO <= HARMLESS or h5py.h5z.FILTER_DEFLATE not in array.filters:
-        return []
+        return None
     places: list[tuple[int, ...]] = []
     dataset.id.chunk_iter(
         lambda chunk: places.append(chunk.chunk_offset) if chunk.size * DEFLATE_RATIO > HARMLESS else None
     )
+    most = array.chunk_bytes + 4  # a checksum may stand behind the values
     for place in places:
         mask, raw = dataset.id.read_direct_chunk(place)
-        if _unpacks_to_more(bytes(raw), array, mask):
-            expected = f"{array.chunk_bytes} bytes"
-            return [Problem("a chunk unpacks to more than it declares", expected, "more")]
-    return []
-
-
-def _unpacks_to_more(raw: bytes, array: Array, mask: int) -> bool:
-    """Tell whether the zlib stream of a chunk goes on beyond the chunk's declared length."""
-    applied = [code for bit, code in enumerate(array.filters) if not mask >> bit & 1]
-    if h5py.h5z.FILTER_DEFLATE not in applied:
-        return False
-    after = applied[applied.index(h5py.h5z.FILTER_DEFLATE) + 1 :]
-    if h5py.h5z.FILTER_SHUFFLE in after:  # no writer packs first and shuffles then
-        return True
-    most = array.chunk_bytes + 4  # a checksum may stand behind the values
-    stream = zlib.decompressobj()
-    return len(stream.decompress(raw[: len(raw) - 4 * len(after)], most + 1)) > most
-
-
-def _refused(path: Path, name: str, problem: Problem) -> UnreadableFileError:
-    return UnreadableFileError(
-        problem.what,
-        where=f"{path}, {name!a}" if name else str(path),
-        expected=problem.expected,
-        got=problem.got,
-        fix="write it again without links, filters of its own, and arrays larger than their values",
-    )
+        applied = [code for bit, code in enumerate(array.filters) if not mask >> bit & 1]
+        if h5py.h5z.FILTER_DEFLATE not in applied:
+            continue
+        after = applied[applied.index(h5py.h5z.FILTER_DEFLATE) + 1 :]
+        packed = bytes(raw)[: len(raw) - 4 * len(after)]
+        # no writer packs first and shuffles then
+        if h5py.h5z.FILTER_SHUFFLE in after or len(zlib.decompressobj().decompress(packed, most + 1)) > most:
+            return Problem("a chunk unpacks to more than it declares", f"{array.chunk_bytes} bytes", "more")
+    return None

@@ -3,15 +3,18 @@
 Checked when a datasets.yaml is loaded, for every split alike; what the constants of a solver
 may be is told where it gets them (``lagbench.generators.constants``). Every mistake is a
 ``ValueError`` whose message names key, expected, got and, for names, the nearest known one.
+
+Scenario ids as text: ``0,3-5`` means 0, 3, 4 and 5.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from lagbench.errors import nearest
+from lagbench.errors import UsageError, nearest
 
 Value = int | float | bool | str
 
@@ -62,48 +65,34 @@ NEEDED = {
 FRAMES = Limit(low=1, high=1_000_000, whole=True)
 """Frames of one scenario."""
 
-_NUMBER = Limit()
-
 
 def check_parameters(size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]) -> None:
     """Refuse unknown, missing and impossible parameters of a size."""
     for name in given:
         if name not in declared:
-            message = f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
-            raise ValueError(message)
+            raise ValueError(f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}")
     missing = [n for n, value in declared.items() if value is None and n not in given]
     if missing:
-        message = f"size {size}: no value for {', '.join(missing)}"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: no value for {', '.join(missing)}")
     for name in NEEDED:
         if name not in declared:
-            message = f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}"
-            raise ValueError(message)
+            raise ValueError(f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}")
     for name, default in declared.items():
         key = f"sizes.{size}.parameters.{name}" if name in given else f"parameters.{name}.value"
-        _check_value(key, given.get(name, default), NEEDED.get(name))
-
-
-def _check_value(key: str, value: Value | None, limit: Limit | None) -> None:
-    # Texts and switches are a split's own affair, unless the name is one that every split needs.
-    if limit is None and isinstance(value, bool | str):
-        return
-    limit = limit or _NUMBER
-    if not limit.holds(value):
-        message = f"{key}: expected {limit}; got {value!r}"
-        raise ValueError(message)
+        value, limit = given.get(name, default), NEEDED.get(name, Limit())
+        # Texts and switches are a split's own affair, unless the name is one that every split needs.
+        if not limit.holds(value) and (name in NEEDED or not isinstance(value, bool | str)):
+            raise ValueError(f"{key}: expected {limit}; got {value!r}")
 
 
 def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
     """Refuse unknown subsets and ids that stand in two of them."""
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
-        message = f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}")
     ids = [i for subset in subsets.values() for i in subset]
     if len(ids) != len(set(ids)):
-        message = f"size {size}: a scenario stands in two subsets"
-        raise ValueError(message)
+        raise ValueError(f"size {size}: a scenario stands in two subsets")
 
 
 def check_frames(
@@ -116,23 +105,67 @@ def check_frames(
     """Refuse impossible frame counts, and test scenarios shorter than their task."""
     key = f"sizes.{size}.frames"
     ids = sorted(i for subset in subsets.values() for i in subset)
-    counts = dict.fromkeys(ids, frames) if isinstance(frames, int) else _counts(size, frames, ids)
-    for scenario, count in counts.items():
+    if isinstance(frames, int):
+        pairs = [(i, frames) for i in ids]
+    else:
+        pairs = sorted((i, count) for count, group in frames.items() for i in group)
+        if [i for i, _ in pairs] != ids:
+            raise ValueError(f"size {size}: frames must name every scenario once")
+    for scenario, count in pairs:
         if not FRAMES.holds(count):
-            message = f"{key}: expected {FRAMES}; got {count!r}"
-            raise ValueError(message)
+            raise ValueError(f"{key}: expected {FRAMES}; got {count!r}")
         if scenario in subsets.get("test", ()) and count < task_frames:
-            message = (
-                f"{key}: expected at least input_frames + horizon = {task_frames} "
-                f"for test scenario {scenario}; got {count}"
-            )
-            raise ValueError(message)
+            least = f"at least input_frames + horizon = {task_frames} for test scenario {scenario}"
+            raise ValueError(f"{key}: expected {least}; got {count}")
 
 
-def _counts(size: str, frames: Mapping[int, Sequence[int]], ids: Sequence[int]) -> dict[int, int]:
-    """Return the frame count of each scenario."""
-    pairs = sorted((i, count) for count, group in frames.items() for i in group)
-    if [i for i, _ in pairs] != list(ids):
-        message = f"size {size}: frames must name every scenario once"
-        raise ValueError(message)
-    return dict(pairs)
+MAX_ID = 9999
+"""Largest scenario id: file names have four digits."""
+
+
+def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") -> tuple[int, ...]:
+    """Return the scenario ids that a text names, in its order.
+
+    Args:
+        text: comma-separated ids and inclusive ranges; an int stands for itself.
+        where: option that gave the text, for messages.
+        noun: what the numbers are, for messages.
+
+    Raises:
+        UsageError: the text is no list of ids, a range runs backwards, or an id stands twice.
+
+    >>> parse_ids("0,3-5")
+    (0, 3, 4, 5)
+    """
+
+    def bad(got: str) -> UsageError:
+        expected = f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5"
+        return UsageError(f"bad list of {noun}s {text!r}", where=where, expected=expected, got=got)
+
+    ids: list[int] = []
+    for part in str(text).replace(" ", "").split(","):
+        match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
+        if match is None:
+            raise bad(f"{part!r} is no {noun} and no range")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
+            raise bad(f"{part!r} runs backwards")
+        ids.extend(range(first, last + 1))
+    if len(set(ids)) != len(ids):
+        raise bad("a number stands twice")
+    return tuple(ids)
+
+
+def spell_ids(ids: Iterable[int]) -> str:
+    """Return the shortest text that :func:`parse_ids` reads as these ids.
+
+    >>> spell_ids([0, 3, 4, 5])
+    '0,3-5'
+    """
+    runs: list[list[int]] = []
+    for i in ids:
+        if runs and i == runs[-1][-1] + 1:
+            runs[-1].append(i)
+        else:
+            runs.append([i])
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)

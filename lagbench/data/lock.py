@@ -15,16 +15,11 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
 from lagbench.errors import WorkFailedError
 
 from .layout import dataset_folder
-
-if TYPE_CHECKING:
-    import filelock
-
 
 LOCK_NAME = ".lock"
 HOLDER_NAME = ".lock.holder.json"
@@ -53,21 +48,28 @@ def dataset_lock(
     timeout: float | None = None,
     on_wait: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
-    """Hold the lock of one data set version."""
+    """Hold the lock of one data set version; where another has it, tell, wait, or say who."""
     import filelock
 
     folder = dataset_folder(root, split, size, major)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = filelock.FileLock(folder / LOCK_NAME)
-        _acquire(lock, folder, timeout, on_wait)
+        try:
+            lock.acquire(timeout=0)
+        except filelock.Timeout:
+            last = read_holder(folder) or "another process"
+            if on_wait is not None and timeout != 0:
+                on_wait(str(last))
+            try:
+                lock.acquire(timeout=-1 if timeout is None else timeout)
+            except filelock.Timeout:
+                what, got = "another process writes this data set", str(read_holder(folder) or last)
+                fix = "wait until it ends, or end it; files that are complete stay"
+                raise WorkFailedError(what, where=str(folder), got=got, fix=fix) from None
     except OSError as error:
-        raise WorkFailedError(
-            "cannot lock the data set",
-            where=str(folder),
-            got=error.strerror or error,
-            fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
-        ) from error
+        why, fix = error.strerror or error, "name a folder that you may write to: --root or LAGBENCH_ROOT"
+        raise WorkFailedError("cannot lock the data set", where=str(folder), got=why, fix=fix) from error
     try:
         holder = Holder(os.getpid(), socket.gethostname(), datetime.now(UTC).isoformat(timespec="seconds"))
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())
@@ -83,29 +85,3 @@ def read_holder(folder: Path) -> Holder | None:
         return Holder(**json.loads((folder / HOLDER_NAME).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
-
-
-def _acquire(
-    lock: filelock.BaseFileLock,
-    folder: Path,
-    timeout: float | None,
-    on_wait: Callable[[str], None] | None,
-) -> None:
-    """Take the lock at once, or tell and wait, or say who holds it."""
-    import filelock
-
-    try:
-        lock.acquire(timeout=0)
-    except filelock.Timeout:
-        holder = read_holder(folder) or "another process"
-        if on_wait is not None and timeout != 0:
-            on_wait(str(holder))
-        try:
-            lock.acquire(timeout=-1 if timeout is None else timeout)
-        except filelock.Timeout:
-            raise WorkFailedError(
-                "another process writes this data set",
-                where=str(folder),
-                got=str(read_holder(folder) or holder),
-                fix="wait until it ends, or end it; files that are complete stay",
-            ) from None

@@ -10,9 +10,8 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import (
     BaseModel,
@@ -30,10 +29,9 @@ from lagbench.work.machine import may_differ
 
 from .checksums import HASHED_SUBSETS, dataset_hash, file_sha256, round_digits, subset_hash
 from .layout import MANIFEST_NAME, NOTES_NAME, ScenarioKey, dataset_folder, major_of, scenario_path
-from .registry import Size
+from .registry import Hash, Size
 from .scenario import read_scenario
 
-Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
 Row = Annotated[tuple[FiniteFloat, ...], Field(strict=False)]
 
@@ -65,8 +63,7 @@ class FileEntry(_Strict):
         if {"subset", "scenario"} <= info.data.keys():
             wanted = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
             if path != wanted:
-                message = f"expected {wanted!r}"
-                raise ValueError(message)
+                raise ValueError(f"expected {wanted!r}")
         return path
 
     def has_hash(self, recorded: str | None) -> bool:
@@ -152,19 +149,25 @@ def merge(
     """Return a manifest with new files put in; new entries replace old ones of the same id."""
     kept = [entry for entry in old.files if entry.scenario in subsets.get(entry.subset, ())] if old else []
     entries = {entry.scenario: entry for entry in (*kept, *files)}
-    hashes = _subset_hashes(entries, subsets)
+    hashes = {
+        name: subset_hash({i: entries[i].content_sha256 for i in ids})
+        for name, ids in subsets.items()
+        if all(i in entries for i in ids)
+    }
     complete = all(name in hashes for name in HASHED_SUBSETS)
     environments = list(old.environments) if old else []
     if environment is not None and dict(environment) not in environments:
         environments.append(dict(environment))
     if statistics is None and old and old.subset_sha256.get("train") == hashes.get("train"):
         statistics = old.statistics
+    unproven = [e for e in entries.values() if not e.has_hash((recorded or {}).get(e.scenario))]
+    differing = any(may_differ(entry.device, environments) for entry in unproven)
     return Manifest(
         split=split,
         size=size,
         version=version,
         complete=complete,
-        identity=_identity(entries.values(), environments, recorded or {}),
+        identity="tolerance" if differing else "bitwise",
         dataset_sha256=dataset_hash(split, size, major_of(version), hashes) if complete else None,
         subset_sha256=hashes,
         statistics={n: tuple(row) for n, row in (statistics or {}).items()} if "train" in hashes else {},
@@ -214,12 +217,8 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         found = Manifest.model_validate_json(text)
     except ValidationError as error:
         first = error.errors()[0]
-        raise DataError(
-            "the manifest is damaged",
-            where=f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}",
-            got=first["msg"],
-            fix=_ANEW,
-        ) from None
+        where = f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}"
+        raise DataError("the manifest is damaged", where=where, got=first["msg"], fix=_ANEW) from None
     if not found.is_of(split, size, major):
         raise DataError(
             "the manifest is of another data set",
@@ -248,22 +247,6 @@ def write_manifest(root: Path, manifest: Manifest) -> Path:
     return path
 
 
-def _identity(
-    entries: Iterable[FileEntry], environments: Sequence[Mapping[str, str]], recorded: Mapping[int, str]
-) -> Literal["bitwise", "tolerance"]:
-    unproven = [entry for entry in entries if not entry.has_hash(recorded.get(entry.scenario))]
-    return "tolerance" if any(may_differ(entry.device, environments) for entry in unproven) else "bitwise"
-
-
-def _subset_hashes(entries: Mapping[int, FileEntry], subsets: Mapping[str, Sequence[int]]) -> dict[str, str]:
-    """Return the hash of every subset whose scenarios are all there."""
-    return {
-        name: subset_hash({i: entries[i].content_sha256 for i in ids})
-        for name, ids in subsets.items()
-        if all(i in entries for i in ids)
-    }
-
-
 # --- what this machine has hashed ----------------------------------------------------------
 
 # Hashing the values of a file takes seconds where it is large, and a manifest is a claim of
@@ -272,8 +255,7 @@ def _subset_hashes(entries: Mapping[int, FileEntry], subsets: Mapping[str, Seque
 # that came with a copied or downloaded folder count for nothing.
 
 
-@dataclass(frozen=True)
-class _Note:
+class _Note(NamedTuple):
     """A file whose values were hashed."""
 
     bytes: int
@@ -298,27 +280,23 @@ def note(folder: Path, contents: Mapping[Path, str], digests: Mapping[Path, str]
     old, found = _notes(folder), {}
     for path, content in contents.items():
         stamp, known = _stamp(path), old.get(_spelled(path, folder))
-        if known is None or (*astuple(known)[:3], known.content_sha256) != (*stamp, content):
+        if known is None or (*known[:3], known.content_sha256) != (*stamp, content):
             # The times are from before the bytes: a file that changes meanwhile does not fit its note.
             digest = (digests or {}).get(path)
             found[path] = _Note(*stamp, digest or file_sha256(path), content)
             if digest is None:
                 _seen[path] = found[path]
     if found:
-        rows = {_spelled(path, folder): astuple(held) for path, held in found.items()}
-        kept = {name: astuple(held) for name, held in old.items()}
+        notes = old | {_spelled(path, folder): held for path, held in found.items()}
         with suppress(WorkFailedError):
-            write_atomically(folder / NOTES_NAME, (json.dumps(kept | rows, indent=1) + "\n").encode())
+            write_atomically(folder / NOTES_NAME, (json.dumps(notes, indent=1) + "\n").encode())
 
 
 def note_entries(folder: Path, entries: Iterable[FileEntry]) -> None:
     """Note files by their entries, which this machine has just made from them."""
     files = {folder / entry.path: entry for entry in entries}
-    note(
-        folder,
-        {path: entry.content_sha256 for path, entry in files.items()},
-        {path: entry.file_sha256 for path, entry in files.items()},
-    )
+    digests = {path: entry.file_sha256 for path, entry in files.items()}
+    note(folder, {path: entry.content_sha256 for path, entry in files.items()}, digests)
 
 
 def noted_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
@@ -330,7 +308,7 @@ def noted_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
 
     def hashes(path: Path) -> tuple[str, str] | None:
         held = notes.get(_spelled(path, folder))
-        if held is None or astuple(held)[:3] != _stamp(path):
+        if held is None or held[:3] != _stamp(path):
             return None
         if _seen.get(path) != held and file_sha256(path) != held.file_sha256:
             return None

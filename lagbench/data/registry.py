@@ -5,8 +5,6 @@ bits (parameters, scenario ids, frame counts) is written by hand; everything tha
 from them (hashes, statistics, twin floor) stands under ``measured`` and is written by
 ``python -m lagbench.generators.record``.
 
-Scenario ids as text: ``0,3-5`` means 0, 3, 4 and 5.
-
 Splits that other installed packages add, none of which can harm ours.
 """
 
@@ -14,13 +12,13 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 import sys
 import warnings
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -34,92 +32,14 @@ from pydantic import (
 
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, loaded, nearest
 
-from .layout import ScenarioKey, dataset_folder, scenario_path
-from .limits import check_frames, check_parameters, check_subsets
-
-__all__ = [
-    "MAX_ID",
-    "parse_ids",
-    "spell_ids",
-    "GROUP",
-    "PluginWarning",
-    "added_splits",
-    "installed",
-    "NO_GENERATOR",
-    "Measured",
-    "Parameter",
-    "Registry",
-    "ScoreGrid",
-    "Size",
-    "Split",
-    "Task",
-    "default_path",
-    "load",
-]
-
-
-MAX_ID = 9999
-"""Largest scenario id: file names have four digits."""
-
-_PART = re.compile(r"(\d{1,4})(?:-(\d{1,4}))?")
-
-
-def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") -> tuple[int, ...]:
-    """Return the scenario ids that a text names, in its order.
-
-    Args:
-        text: comma-separated ids and inclusive ranges; an int stands for itself.
-        where: option that gave the text, for messages.
-        noun: what the numbers are, for messages.
-
-    Raises:
-        UsageError: the text is no list of ids, a range runs backwards, or an id stands twice.
-
-    >>> parse_ids("0,3-5")
-    (0, 3, 4, 5)
-    """
-
-    def bad(got: str) -> UsageError:
-        return UsageError(
-            f"bad list of {noun}s {text!r}",
-            where=where,
-            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
-            got=got,
-        )
-
-    ids: list[int] = []
-    for part in str(text).replace(" ", "").split(","):
-        match = _PART.fullmatch(part)
-        if match is None:
-            raise bad(f"{part!r} is no {noun} and no range")
-        first, last = int(match[1]), int(match[2] or match[1])
-        if last < first:
-            raise bad(f"{part!r} runs backwards")
-        ids.extend(range(first, last + 1))
-    if len(set(ids)) != len(ids):
-        raise bad("a number stands twice")
-    return tuple(ids)
-
-
-def spell_ids(ids: Iterable[int]) -> str:
-    """Return the shortest text that :func:`parse_ids` reads as these ids.
-
-    >>> spell_ids([0, 3, 4, 5])
-    '0,3-5'
-    """
-    runs: list[list[int]] = []
-    for i in ids:
-        if runs and i == runs[-1][-1] + 1:
-            runs[-1].append(i)
-        else:
-            runs.append([i])
-    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
-
+from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
+from .limits import MAX_ID as MAX_ID
+from .limits import Value, check_frames, check_parameters, check_subsets
+from .limits import parse_ids as parse_ids
+from .limits import spell_ids as spell_ids
 
 GROUP = "lagbench.generators"
 """Entry points of this group name a split and its module; ours register the same way."""
-
-Found = TypeVar("Found")
 
 
 class PluginWarning(UserWarning):
@@ -132,57 +52,16 @@ def installed(group: str) -> tuple[EntryPoint, ...]:
     Python reads the files of every package at each call. Here they are read again once a folder on the
     path has changed, as it does where a package is installed or removed.
     """
-    return _read_points(group, tuple((place, _changed_at(place)) for place in sys.path))
-
-
-def _changed_at(place: str) -> int | None:
-    try:
-        return os.stat(place or os.curdir).st_mtime_ns
-    except OSError:
-        return None
+    changed = []
+    for place in sys.path:
+        with suppress(OSError):
+            changed.append((place, os.stat(place or os.curdir).st_mtime_ns))
+    return _read_points(group, tuple(changed))
 
 
 @functools.lru_cache(maxsize=8)
 def _read_points(group: str, _: Hashable) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=group))
-
-
-def added_splits(own: Mapping[str, str], read: Callable[[Path, str], Found]) -> dict[str, Found]:
-    """Return what other packages say about their splits, by name.
-
-    A package that cannot be imported or read, or wants a name that is taken, is left out with
-    a :class:`PluginWarning`.
-    """
-    added: dict[str, Found] = {}
-    for point in dict.fromkeys(installed(GROUP)):
-        if own.get(point.name) == point.value:
-            continue
-        try:
-            if point.name in own or point.name in added:
-                raise UsageError("its name is taken")
-            added[point.name] = read(_registry_path(point), point.name)
-        except Exception as error:  # a stranger's module: importing it may raise anything
-            warnings.warn(_complaint(point, error), PluginWarning, stacklevel=2)
-    return added
-
-
-def _registry_path(point: EntryPoint) -> Path:
-    """Return the datasets.yaml that a split's module names as REGISTRY."""
-    module = loaded(point)
-    if not hasattr(module, "REGISTRY"):
-        raise UsageError(
-            "its module has no registry", expected="an attribute REGISTRY: the path of its datasets.yaml"
-        )
-    return Path(module.REGISTRY)
-
-
-def _complaint(point: EntryPoint, error: Exception) -> str:
-    package = point.dist.name if point.dist else point.value.partition(".")[0]
-    reason = error if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}"
-    return f"package {package} adds no split {point.name!r} ({point.value}): {reason}"
-
-
-Number = int | float
 
 
 def _ids(value: str | int) -> tuple[int, ...]:
@@ -195,15 +74,11 @@ def _ids(value: str | int) -> tuple[int, ...]:
 Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
 Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-ShortHash = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
-SizeName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")]  # names a folder
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
 """Environment variable that names a datasets.yaml to use instead of ours."""
 
 NO_GENERATOR = "none"
 """Generator of splits that were not simulated here; see ``lagbench.data.local``."""
-
-Address = Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")]
 
 
 class _Strict(BaseModel):
@@ -214,29 +89,25 @@ class _Strict(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _known_keys(cls, data: Any) -> Any:  # noqa: ANN401
-        if isinstance(data, Mapping):
-            for key in data:
-                if key not in cls.model_fields:
-                    message = f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}"
-                    raise ValueError(message)
+        for key in data if isinstance(data, Mapping) else ():
+            if key not in cls.model_fields:
+                raise ValueError(f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}")
         return data
 
 
 class Parameter(_Strict):
     """A physical or numerical parameter: value, unit and what it means."""
 
-    value: Number | bool | str | None = None
+    value: Value | None = None
     unit: str
     description: str
 
 
 class ScoreGrid(_Strict):
-    """Grid on which the scorer forms fields.
-
-    ``cell_centres`` has nodes at (i + 1/2) / cells, ``nodes`` at i / cells.
-    """
+    """Grid on which the scorer forms fields."""
 
     cells: int = Field(gt=1)
+    # nodes at (i + 1/2) / cells, or at i / cells
     placement: Literal["cell_centres", "nodes"]
 
 
@@ -255,7 +126,8 @@ class Measured(_Strict):
 
     dataset_sha256: Hash  # data set hash over train, valid and test
     subset_sha256: dict[str, Hash]  # hash of each subset
-    scenario_sha256: dict[int, ShortHash]  # content hash of each scenario, first 16 hex digits
+    # content hash of each scenario, first 16 hex digits
+    scenario_sha256: dict[int, Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]]
     # mean and standard deviation per component over train
     statistics: dict[str, Annotated[tuple[float, ...], Field(strict=False)]]
     # position RMSE of the perturbed twin per predicted frame, mean over test [length]
@@ -268,25 +140,12 @@ class _SizeEntry(_Strict):
     subsets: dict[str, Ids]
     frames: int | dict[int, Ids]
     bounds: tuple[Interval, Interval] = Field(strict=False)
-    parameters: dict[str, Number | bool | str]
+    parameters: dict[str, Value]
     task: Task
 
 
-BYTES_PER_PARTICLE = 2 * 2 * 4
-"""Position and velocity in one frame, two float32 each, before compression [bytes]."""
-
-BYTES_BESIDE_FRAMES = 64 * 1024
-"""Header, constants and chunk index of a file, generously [bytes]."""
-
-SLACK = 1.25
-"""Share by which a compressed file may be longer than its values."""
-
-
 class Size(BaseModel):
-    """One tier of a split with all that is needed to simulate, read and score it.
-
-    ``file`` is the datasets.yaml that describes it.
-    """
+    """One tier of a split with all that is needed to simulate, read and score it."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -300,12 +159,12 @@ class Size(BaseModel):
     parameters: dict[str, Parameter]
     task: Task
     measured: Measured | None = None
-    file: Path = Path("datasets.yaml")
+    file: Path = Path("datasets.yaml")  # what describes it
 
     @property
     def major(self) -> int:
         """MAJOR of the version: it changes when existing bits change."""
-        return int(self.version.split(".")[0])
+        return major_of(self.version)
 
     @property
     def simulated(self) -> bool:
@@ -314,14 +173,10 @@ class Size(BaseModel):
 
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Return a parameter's value."""
-        try:
-            return self.parameters[name].value
-        except KeyError:
-            raise UsageError(
-                f"no parameter {name!r}",
-                where=f"datasets.yaml, {self.split} {self.name}",
-                fix=nearest(name, self.parameters),
-            ) from None
+        if name not in self.parameters:
+            where = f"datasets.yaml, {self.split} {self.name}"
+            raise UsageError(f"no parameter {name!r}", where=where, fix=nearest(name, self.parameters))
+        return self.parameters[name].value
 
     @property
     def particles(self) -> int:
@@ -358,18 +213,13 @@ class Size(BaseModel):
         for subset, ids in self.subsets.items():
             if scenario in ids:
                 return subset
-        raise UsageError(
-            f"no scenario {scenario}",
-            where=f"{self.split} {self.name}",
-            expected=", ".join(f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items()),
-        )
+        expected = ", ".join(f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items())
+        raise UsageError(f"no scenario {scenario}", where=f"{self.split} {self.name}", expected=expected)
 
     def key(self, scenario: int) -> ScenarioKey:
         """Return what names a scenario."""
-        subset = self.subset_of(scenario)
-        return ScenarioKey(
-            split=self.split, size=self.name, version=self.version, scenario=scenario, subset=subset
-        )
+        names = {"split": self.split, "size": self.name, "version": self.version}
+        return ScenarioKey(**names, scenario=scenario, subset=self.subset_of(scenario))
 
     def folder(self, root: Path) -> Path:
         """Return the folder of the data set below a root folder."""
@@ -387,11 +237,13 @@ class Size(BaseModel):
 
     def file_bytes(self, scenario: int) -> int:
         """Return the most bytes that a scenario's file takes, in sum over a data set."""
-        return self.frame_count(scenario) * self.particles * BYTES_PER_PARTICLE + BYTES_BESIDE_FRAMES
+        # Position and velocity are two float32 each; header, constants and chunk index take 64 KiB at most.
+        return self.frame_count(scenario) * self.particles * 16 + 64 * 1024
 
     def longest_file(self, scenario: int) -> int:
         """Return the bytes beyond which no file of a scenario goes, whatever a store says of it."""
-        return round(SLACK * self.file_bytes(scenario)) + (1 << 20)
+        # What zlib cannot pack becomes longer.
+        return round(1.25 * self.file_bytes(scenario)) + (1 << 20)
 
     def frames_behind(self, scenario: int) -> int:
         """Return how many of a scenario's frames lie behind the horizon of the task."""
@@ -409,8 +261,9 @@ class Split(_Strict):
     generator: str
     source: str
     parameters: dict[str, Parameter]
-    sizes: dict[SizeName, _SizeEntry]
-    mirrors: tuple[Address, ...] = Field(default=(), strict=False)
+    # a size's name is that of a folder
+    sizes: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")], _SizeEntry]
+    mirrors: tuple[Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")], ...] = Field((), strict=False)
 
     @model_validator(mode="after")
     def _consistent(self) -> Split:
@@ -445,9 +298,8 @@ class Registry:
         """Return one size of a split with its merged parameters and measured values."""
         parent = self.split(split)
         if name not in parent.sizes:
-            raise UsageError(
-                f"split {split!r} has no size {name!r}", where="--size", fix=nearest(name, parent.sizes)
-            )
+            fix = nearest(name, parent.sizes)
+            raise UsageError(f"split {split!r} has no size {name!r}", where="--size", fix=fix)
         entry = parent.sizes[name]
         return Size(
             split=split,
@@ -457,7 +309,10 @@ class Registry:
             subsets=entry.subsets,
             frames=entry.frames,
             bounds=entry.bounds,
-            parameters=_merge(parent.parameters, entry.parameters),
+            parameters={
+                key: p.model_copy(update={"value": entry.parameters.get(key, p.value)})
+                for key, p in parent.parameters.items()
+            },
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),
             file=self.files.get(split, Path("datasets.yaml")),
@@ -499,17 +354,27 @@ def _load(path: Path | None, modified: int) -> Registry:
     own = _read(path or default_path())
     splits, measured = dict(own.splits), dict(own.measured)
     files = dict.fromkeys(splits, path or default_path())
-    if path is None:
-        modules = {name: split.generator for name, split in own.splits.items()}
-        for name, (split, hashes, file) in added_splits(modules, _read_split).items():
-            splits[name], measured[name], files[name] = split, hashes, file
+    for point in dict.fromkeys(installed(GROUP)) if path is None else ():
+        name = point.name
+        if name in own.splits and own.splits[name].generator == point.value:
+            continue
+        try:
+            if name in splits:
+                raise UsageError("its name is taken")
+            module = loaded(point)
+            if not hasattr(module, "REGISTRY"):
+                expected = "an attribute REGISTRY: the path of its datasets.yaml"
+                raise UsageError("its module has no registry", expected=expected)
+            place = Path(module.REGISTRY)
+            theirs = _read(place)
+            splits[name] = Registry(theirs.splits, {}).split(name)
+            measured[name], files[name] = theirs.measured.get(name, {}), place
+        except Exception as error:  # a stranger's module: importing it may raise anything
+            package = point.dist.name if point.dist else point.value.partition(".")[0]
+            reason = error if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}"
+            message = f"package {package} adds no split {name!r} ({point.value}): {reason}"
+            warnings.warn(message, PluginWarning, stacklevel=2)
     return Registry(splits, measured, files)
-
-
-def _read_split(path: Path, name: str) -> tuple[Split, dict[str, Measured], Path]:
-    """Return one split of a datasets.yaml, its measured values and the file."""
-    file = _read(path)
-    return Registry(file.splits, {}).split(name), file.measured.get(name, {}), path
 
 
 def _read(path: Path) -> _File:
@@ -519,23 +384,12 @@ def _read(path: Path) -> _File:
     try:
         return _File.model_validate(read_yaml(path))
     except ValidationError as error:
-        lines = [_mistake(item["loc"], item["msg"], item["input"]) for item in error.errors()[:10]]
-        raise UnreadableFileError(
-            f"{error.error_count()} mistake(s) in the registry",
-            where=str(path),
-            got="\n    ".join(["", *lines]),
-            fix="mend the keys named above",
-        ) from None
-
-
-def _mistake(place: tuple[int | str, ...], message: str, given: object) -> str:
-    """Return one line: key, what is expected there, and what was got if that is short."""
-    if isinstance(given, int) and given.bit_length() > 256:  # Python prints no integer of thousands of digits
-        given = f"an integer of {given.bit_length()} bits"
-    got = f"; got {given!r}" if isinstance(given, str | int | float) and "; got " not in message else ""
-    return f"{'.'.join(map(str, place))}: {message.removeprefix('Value error, ')}{got}"
-
-
-def _merge(split: Mapping[str, Parameter], size: Mapping[str, Number | bool | str]) -> dict[str, Parameter]:
-    """Return the split's parameters with the size's values put in."""
-    return {name: p.model_copy(update={"value": size.get(name, p.value)}) for name, p in split.items()}
+        lines = [""]  # for each mistake: key, what is expected there, and what was got if that is short
+        for item in error.errors()[:10]:
+            given, message = item["input"], item["msg"].removeprefix("Value error, ")
+            if isinstance(given, int) and given.bit_length() > 256:  # Python prints no thousands of digits
+                given = f"an integer of {given.bit_length()} bits"
+            short = isinstance(given, str | int | float) and "; got " not in message
+            lines.append(f"{'.'.join(map(str, item['loc']))}: {message}{f'; got {given!r}' if short else ''}")
+        what, fix = f"{error.error_count()} mistake(s) in the registry", "mend the keys named above"
+        raise UnreadableFileError(what, where=str(path), got="\n    ".join(lines), fix=fix) from None

@@ -54,22 +54,12 @@ ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
 }
 """Attributes of each variable beside ``coordinates`` and ``content_sha256``."""
 
-_FREE = {"content_sha256", "long_name"}
-"""Attributes that are checked elsewhere, and prose, which a patch release may word anew."""
-
 
 def attributes_of(name: str, dims: Sequence[str]) -> dict[str, object]:
     """Return the attributes that a variable is written with."""
     # xarray makes a coordinate only of what the CF attribute `coordinates` names.
     extra = {"coordinates": "time"} if "frame" in dims and len(dims) > 1 else {}
     return {**ATTRIBUTES[name], **extra}
-
-
-def differing_attributes(name: str, dims: Sequence[str], found: Mapping[str, object]) -> list[str]:
-    """Return the names of attributes that are missing, unknown or say something else."""
-    wanted = attributes_of(name, dims) if name in ATTRIBUTES else {}
-    names = (wanted.keys() | found.keys()) - _FREE
-    return sorted(n for n in names if not _equal(wanted.get(n), found.get(n)))
 
 
 def _equal(wanted: object, found: object) -> bool:
@@ -177,8 +167,10 @@ class ScenarioFile:
 
         for name, variable in sorted(self._variables.items()):
             with _damage(self.path, name):
-                found = attributes(variable)
-                unlike = differing_attributes(name, dimensions(variable, name), found)
+                found, wanted = attributes(variable), attributes_of(name, dimensions(variable, name))
+            # The hash is checked elsewhere, and prose may be worded anew by a patch release.
+            names = (wanted.keys() | found.keys()) - {"content_sha256", "long_name"}
+            unlike = sorted(n for n in names if not _equal(wanted.get(n), found.get(n)))
             if unlike:
                 raise DataError(
                     "attributes of a variable are not those of the format",
@@ -201,13 +193,6 @@ class ScenarioFile:
                 for block in self.blocks(name):
                     hasher.update(name, block)
         return hasher
-
-    def stored_digests(self) -> dict[str, object]:
-        """Return the hash of each variable as stored; :meth:`computed_hasher` has the true ones."""
-        from .netcdf import attribute
-
-        with _damage(self.path):
-            return {name: attribute(held, "content_sha256") for name, held in self._variables.items()}
 
 
 def read_scenario(path: Path) -> ScenarioFile:
@@ -232,18 +217,20 @@ def rehash(path: Path) -> str:
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
     """Recompute a file's content hash, compare it, and check what is not hashed."""
+    from .netcdf import attribute
+
     with read_scenario(path) as file:
-        stored, digests = file.header, file.stored_digests()
+        with _damage(path):
+            digests = {name: attribute(held, "content_sha256") for name, held in file._variables.items()}
         hasher = file.computed_hasher()
         file.check_attributes()
     for name, digest in hasher.digests().items():
         if digests.get(name) != digest:
             where = f"{path}, variable {name!r}"
             raise _mismatch("values differ from their hash", where, digests.get(name), digest)
-    content = hasher.hexdigest()
-    if content != stored.content_sha256:
-        where = f"{path}, attributes"
-        raise _mismatch("attributes differ from their hash", where, stored.content_sha256, content)
+    content, stored = hasher.hexdigest(), file.header.content_sha256
+    if content != stored:
+        raise _mismatch("attributes differ from their hash", f"{path}, attributes", stored, content)
     if expected is not None and not content.startswith(expected):
         raise _mismatch("the file has another content hash", str(path), expected, content)
     return content
@@ -260,20 +247,16 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
     largest = DEFLATE_RATIO * path.stat().st_size
     for name, variable in variables.items():
         if name not in ATTRIBUTES:
-            raise _damaged(path, name, "no scenario has that variable")
+            raise damaged(path, "no scenario has that variable", name)
         if math.prod(variable.shape[1:]) > MOST_IN_ROW:
-            raise _damaged(path, name, f"more than {MOST_IN_ROW} values in a frame: shape {variable.shape}")
+            raise damaged(path, f"more than {MOST_IN_ROW} values in a frame: shape {variable.shape}", name)
         text = h5py.check_string_dtype(variable.dtype)
         free = text is not None and text.length is None  # how long its values are, they say themselves
         held = variable.size * (1 if free else variable.dtype.itemsize)
         if held > largest:
-            raise DataError(
-                "a variable is larger than its file can hold",
-                where=f"{path}, variable {name!r}",
-                expected=f"at most {largest} bytes",
-                got=f"shape {variable.shape}",
-                fix=_REPAIR,
-            )
+            what, where = "a variable is larger than its file can hold", f"{path}, variable {name!r}"
+            expected, got = f"at most {largest} bytes", f"shape {variable.shape}"
+            raise DataError(what, where=where, expected=expected, got=got, fix=_REPAIR)
 
 
 def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioHeader:
@@ -285,36 +268,24 @@ def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioH
             raise DataError(f"the attribute {name!r} is missing")
         return value
 
-    return ScenarioHeader(
-        key=ScenarioKey(
-            split=str(said("split")),
-            size=str(said("size")),
-            version=str(said("version")),
-            scenario=int(said("scenario")),
-            subset=str(said("subset")),
-        ),
-        seed=str(said("seed")),
-        parameters={name: plain(said(name)) for name in str(said("hashed_parameters")).split()},
-        content_sha256=str(said("content_sha256")),
-        frames=variables["frame"].shape[0],
-        particles=variables["particle"].shape[0],
-        device=str(said("device")),
-        generator=str(said("generator")),
-        lagbench_version=str(said("lagbench_version")),
-        facts=_facts(attribute(file, "facts")),
-    )
-
-
-def _facts(text: object) -> dict[str, float]:
-    """Return the numbers of a mapping in JSON; none where a file states none."""
-    if text is None:
-        return {}
+    names = ("split", "size", "version", "subset")
+    labels = ("seed", "content_sha256", "device", "generator", "lagbench_version")
+    key = ScenarioKey(scenario=int(said("scenario")), **{name: str(said(name)) for name in names})
+    text = attribute(file, "facts")
     if len(str(text)) > MOST_OF_FACTS:
         raise DataError("the attribute 'facts' is too long")
-    found = {str(name): float(value) for name, value in json.loads(str(text)).items()}
-    if not all(_FACT.fullmatch(name) and math.isfinite(value) for name, value in found.items()):
+    stated = {} if text is None else json.loads(str(text))
+    facts = {str(name): float(value) for name, value in stated.items()}
+    if not all(_FACT.fullmatch(name) and math.isfinite(value) for name, value in facts.items()):
         raise DataError("the attribute 'facts' holds something else than finite numbers by name")
-    return found
+    return ScenarioHeader(
+        key=key,
+        parameters={name: plain(said(name)) for name in str(said("hashed_parameters")).split()},
+        frames=variables["frame"].shape[0],
+        particles=variables["particle"].shape[0],
+        facts=facts,
+        **{name: str(said(name)) for name in labels},
+    )
 
 
 @contextmanager
@@ -325,11 +296,12 @@ def _damage(path: Path, variable: str | None = None) -> Iterator[None]:
     except LagbenchError as error:
         if str(path) in (error.where or ""):
             raise
-        raise _damaged(path, variable, error.what) from error
+        raise damaged(path, error.what, variable) from error
     except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
-        raise _damaged(path, variable, f"{type(error).__name__}: {error}") from error
+        raise damaged(path, f"{type(error).__name__}: {error}", variable) from error
 
 
-def _damaged(path: Path, variable: str | None, got: str) -> DataError:
+def damaged(path: Path, got: str, variable: str | None = None, *, fix: str = _REPAIR) -> DataError:
+    """Return the error that a file is damaged, or one of its variables."""
     where = str(path) if variable is None else f"{path}, variable {variable!r}"
-    return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=_REPAIR)
+    return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=fix)

@@ -41,48 +41,26 @@ class Moments:
     squares: tuple[float, ...]  # sum of their squares
 
 
-class MomentStream:
-    """Moments of one scenario whose frames arrive in order."""
-
-    def __init__(self) -> None:
-        self._recent: list[NDArray[np.float64]] = []
-        self._counts = dict.fromkeys(QUANTITIES, 0)
-        self._totals: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
-        self._squares: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
-
-    def update(self, position: NDArray[np.float32]) -> None:
-        """Add the next frame.
-
-        Args:
-            position: particle positions [length], shape [particle, space].
-        """
-        differences = [np.ascontiguousarray(position.T, dtype=np.float64)]
-        for earlier in self._recent:
-            differences.append(differences[-1] - earlier)
-        self._recent = differences[: len(QUANTITIES) - 1]
-        for name, values in zip(QUANTITIES, differences, strict=False):
-            self._counts[name] += values.shape[1]
-            self._totals[name].append(values.sum(axis=1))
-            self._squares[name].append((values * values).sum(axis=1))
-
-    def result(self) -> dict[str, Moments]:
-        """Return the moments of each quantity over the frames so far."""
-        return {
-            name: Moments(self._counts[name], _fsum(self._totals[name]), _fsum(self._squares[name]))
-            for name in QUANTITIES
-        }
-
-
 def scenario_moments(frames: Iterable[NDArray[np.float32]]) -> dict[str, Moments]:
     """Return the moments of one scenario.
 
     Args:
         frames: positions of every frame in order, each of shape [particle, space].
     """
-    stream = MomentStream()
-    for frame in frames:
-        stream.update(frame)
-    return stream.result()
+    recent: list[NDArray[np.float64]] = []
+    counts = dict.fromkeys(QUANTITIES, 0)
+    totals: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
+    squares: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
+    for position in frames:
+        differences = [np.ascontiguousarray(position.T, dtype=np.float64)]
+        for earlier in recent:
+            differences.append(differences[-1] - earlier)
+        recent = differences[: len(QUANTITIES) - 1]
+        for name, values in zip(QUANTITIES, differences, strict=False):
+            counts[name] += values.shape[1]
+            totals[name].append(values.sum(axis=1))
+            squares[name].append((values * values).sum(axis=1))
+    return {name: Moments(counts[name], _fsum(totals[name]), _fsum(squares[name])) for name in QUANTITIES}
 
 
 def combine(scenarios: Iterable[dict[str, Moments]]) -> dict[str, Moments]:

@@ -22,30 +22,13 @@ from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
 from . import WALLS
 from .checksums import ContentHasher, plain
-from .layout import ScenarioKey, scenario_path
-from .scenario import (
-    AXES,
-    MOST_IN_ROW,
-    ScenarioFile,
-    ScenarioHeader,
-    attributes_of,
-    check_scenario,
-    read_scenario,
-    rehash,
-)
-
-__all__ = [
-    "FORMAT",
-    "ScenarioFile",
-    "ScenarioHeader",
-    "ScenarioKey",
-    "ScenarioWriter",
-    "check_scenario",
-    "read_scenario",
-    "rehash",
-    "scenario_path",
-]
-
+from .layout import ScenarioKey as ScenarioKey
+from .layout import scenario_path as scenario_path
+from .scenario import AXES, MOST_IN_ROW, attributes_of
+from .scenario import ScenarioFile as ScenarioFile
+from .scenario import check_scenario as check_scenario
+from .scenario import read_scenario as read_scenario
+from .scenario import rehash as rehash
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
@@ -135,14 +118,38 @@ class ScenarioWriter:
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the frames."""
+        from importlib.metadata import version
+
         import netCDF4
 
         with ExitStack() as stack:
             stack.enter_context(_write_errors(self.path))
             temporary = stack.enter_context(atomic_path(self.path))
             self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
-            stack.callback(self._close)
-            self._define()
+            stack.callback(self._file.close)
+            for name, length in self._shape.items():
+                self._file.createDimension(name, length)
+            for name, (dims, values) in self._constants.items():
+                self._create(name, values.dtype, dims)
+                self._hasher.update(name, values)
+                self._file[name][...] = values
+            for name in ("position", "velocity"):
+                self._create(name, np.dtype(np.float32), ("frame", "particle", "space"))
+            key, program = self.key, version("lagbench")
+            attributes = {
+                "Conventions": "CF-1.11",
+                "title": f"lagbench {key.split} {key.size}, scenario {key.scenario}",
+                "source": f"lagbench {program}, {self._labels['generator']}",
+                "lagbench_format": FORMAT,
+                "lagbench_version": program,
+                "split": key.split,
+                "size": key.size,
+                "version": key.version,
+                "scenario": key.scenario,
+                "subset": key.subset,
+                **self._labels,
+            }
+            self._file.setncatts(attributes | self._stated())
             self._stack = stack.pop_all()
         return self
 
@@ -170,11 +177,12 @@ class ScenarioWriter:
     def state(self, **parameters: object) -> None:
         """State further parameters, known only after the last frame; they are hashed like the others."""
         self._parameters |= _checked(parameters, self.path)
-        self._hasher.identify(self.key.identity(str(self._labels["seed"]), self._parameters))
+        self._hasher.identity = self.key.identity(str(self._labels["seed"]), self._parameters)
         with _write_errors(self.path):
-            self._file.setncatts(
-                {**self._parameters, "hashed_parameters": " ".join(sorted(self._parameters))}
-            )
+            self._file.setncatts(self._stated())
+
+    def _stated(self) -> dict[str, object]:
+        return {**self._parameters, "hashed_parameters": " ".join(sorted(self._parameters))}
 
     def state_facts(self, facts: Mapping[str, float]) -> None:
         """State what the scenario went through: finite numbers by name, which no hash covers."""
@@ -194,22 +202,6 @@ class ScenarioWriter:
             for name, digest in digests.items():
                 self._file[name].content_sha256 = digest
             self._file.content_sha256 = self.content_sha256
-            self._file.close()
-
-    def _close(self) -> None:
-        if self._file.isopen():
-            self._file.close()
-
-    def _define(self) -> None:
-        for name, length in self._shape.items():
-            self._file.createDimension(name, length)
-        for name, (dims, values) in self._constants.items():
-            self._create(name, values.dtype, dims)
-            self._hasher.update(name, values)
-            self._file[name][...] = values
-        for name in ("position", "velocity"):
-            self._create(name, np.dtype(np.float32), ("frame", "particle", "space"))
-        self._file.setncatts(self._global_attributes())
 
     def _create(self, name: str, dtype: np.dtype[Any], dims: tuple[str, ...]) -> None:
         shape = tuple(self._shape[dim] for dim in dims)
@@ -233,46 +225,23 @@ class ScenarioWriter:
         variable.setncatts(attributes_of(name, dims))
         self._hasher.declare(name, dtype, dims, shape)
 
-    def _global_attributes(self) -> dict[str, object]:
-        from importlib.metadata import version
-
-        key = self.key
-        program = version("lagbench")
-        return {
-            "Conventions": "CF-1.11",
-            "title": f"lagbench {key.split} {key.size}, scenario {key.scenario}",
-            "source": f"lagbench {program}, {self._labels['generator']}",
-            "lagbench_format": FORMAT,
-            "lagbench_version": program,
-            "split": key.split,
-            "size": key.size,
-            "version": key.version,
-            "scenario": key.scenario,
-            "subset": key.subset,
-            **self._labels,
-            **self._parameters,
-            "hashed_parameters": " ".join(sorted(self._parameters)),
-        }
-
 
 def _checked(parameters: Mapping[str, object], path: Path) -> dict[str, object]:
     """Return parameters as plain values; refuse names that the format needs itself."""
+    stored = {}
     for name, value in parameters.items():
         if name in _RESERVED or not name.isidentifier():
-            raise DataError(
-                f"a parameter cannot be named {name!r}",
-                where=str(path),
-                expected=f"an identifier other than {', '.join(sorted(_RESERVED))}",
-            )
-        stored = plain(value)
-        if stored == "" or not isinstance(stored, (int, float, str)):
+            expected = f"an identifier other than {', '.join(sorted(_RESERVED))}"
+            raise DataError(f"a parameter cannot be named {name!r}", where=str(path), expected=expected)
+        stored[name] = plain(value)
+        if stored[name] == "" or not isinstance(stored[name], (int, float, str)):
             raise DataError(
                 f"the parameter {name!r} cannot be stored",
                 where=str(path),
                 expected="a finite number or a string that is not empty",
                 got=repr(value),
             )
-    return {name: plain(value) for name, value in parameters.items()}
+    return stored
 
 
 @contextmanager

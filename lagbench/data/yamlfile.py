@@ -48,22 +48,18 @@ class _StrictLoader(yaml.CSafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-def _integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:
-    return int(node.value, 0) if node.value[:2] in ("0o", "0x") else int(node.value)
-
-
-def _float(_: _StrictLoader, node: yaml.ScalarNode) -> float:
-    return float(node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value)
-
-
 _StrictLoader.yaml_implicit_resolvers = {
     first: [(tag, known) for tag, known in held if tag not in NUMBERS]
     for first, held in yaml.CSafeLoader.yaml_implicit_resolvers.items()
 }
 for _tag, _pattern in NUMBERS.items():
     _StrictLoader.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
-_StrictLoader.add_constructor(INTEGER, _integer)
-_StrictLoader.add_constructor(FLOAT, _float)
+_StrictLoader.add_constructor(
+    INTEGER, lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10)
+)
+_StrictLoader.add_constructor(
+    FLOAT, lambda _, node: float(node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value)
+)
 
 
 def _check_structure(text: str) -> None:
@@ -79,8 +75,7 @@ def _check_structure(text: str) -> None:
         elif getattr(event, "tag", None) is not None:
             what = "tags are not allowed"
         if what is not None:
-            message = f"{what} {event.start_mark}"
-            raise yaml.YAMLError(message)
+            raise yaml.YAMLError(f"{what} {event.start_mark}")
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
@@ -88,26 +83,17 @@ def read_yaml(path: Path) -> Any:  # noqa: ANN401
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
-            raise UnreadableFileError(
-                "the YAML file is too large",
-                where=str(path),
-                expected=f"at most {MAX_BYTES} bytes",
-                got=f"{size} bytes",
-            )
+            what, expected = "the YAML file is too large", f"at most {MAX_BYTES} bytes"
+            raise UnreadableFileError(what, where=str(path), expected=expected, got=f"{size} bytes")
         text = path.read_text(encoding="utf-8")
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
-        raise UnreadableFileError(
-            "cannot read the YAML file", where=str(path), got=error.strerror or error
-        ) from error
+        got = error.strerror or error
+        raise UnreadableFileError("cannot read the YAML file", where=str(path), got=got) from error
     except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:  # as dates
-        raise UnreadableFileError(
-            "not a plain YAML file",
-            where=str(path),
-            got=" ".join(str(error).split()),
-            fix="use plain mappings, lists, numbers and strings, in UTF-8",
-        ) from error
+        got, fix = " ".join(str(error).split()), "use plain mappings, lists, numbers and strings, in UTF-8"
+        raise UnreadableFileError("not a plain YAML file", where=str(path), got=got, fix=fix) from error
 
 
 class _Dumper(yaml.SafeDumper):

@@ -16,12 +16,13 @@ import tarfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import MANIFEST_LIMIT, FileEntry, Manifest, read_manifest
+from lagbench.data.manifest import MANIFEST_LIMIT, FileEntry, read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
@@ -42,6 +43,7 @@ RELEASES = "https://lagbench.invalid/releases"
 """Folder of the released archives; a placeholder as long as its host is .invalid (RFC 2606)."""
 
 RELEASES_VARIABLE = "LAGBENCH_RELEASES"  # environment variable that names another such folder
+PATH = attrgetter("path")  # the order of scenario files in an archive
 
 
 def releases(size: Size) -> tuple[str, ...]:
@@ -53,15 +55,9 @@ def releases(size: Size) -> tuple[str, ...]:
 def archive_name(size: Size) -> str:
     """Return the name of the archive of a data set whose hash is recorded."""
     if size.measured is None:
-        raise DataError(
-            "a data set without a recorded hash has no archive", where=f"{size.split} {size.name}"
-        )
+        where = f"{size.split} {size.name}"
+        raise DataError("a data set without a recorded hash has no archive", where=where)
     return f"{size.split}-{size.name}-{size.measured.dataset_sha256[:16]}.tar"
-
-
-def _members(manifest: Manifest) -> list[FileEntry]:
-    """Return the scenario files of a data set in the order in which they stand in its archive."""
-    return sorted(manifest.files, key=lambda entry: entry.path)
 
 
 def write_archive(
@@ -83,7 +79,7 @@ def write_archive(
             got=manifest.dataset_sha256 if manifest else "no manifest",
             fix=remedy(tier),
         )
-    files = _members(manifest)
+    files = sorted(manifest.files, key=PATH)
     for entry in files:
         check_scenario(folder / entry.path, entry.content_sha256)
     with (
@@ -125,7 +121,7 @@ def fetch_archive(
         known = size.measured.scenario_sha256 if size.measured else {}
         other = other or [e.scenario for e in manifest.files if not e.has_hash(known.get(e.scenario))]
         refuse_strangers(manifest, other, where=address, remedy=remedy)
-        for entry in _members(manifest):
+        for entry in sorted(manifest.files, key=PATH):
             if not missing:
                 return
             padding = -entry.bytes % tarfile.BLOCKSIZE
@@ -225,9 +221,9 @@ class _Stream:
 
     def _next(self) -> bytes:
         """Return a block from the present place on, none at the end; the line may have to be opened."""
+        if self._rest:
+            return self._rest
         try:
-            if self._rest:
-                return self._rest
             if self._answer is None:
                 self._answer = open_object(self._url, self._place, remedy=self._remedy)
                 behind = self._place - self._answer.start

@@ -78,13 +78,9 @@ def parse_manifest(size: Size, text: bytes, *, where: str, remedy: str) -> Manif
     try:
         found = Manifest.model_validate_json(text)
     except ValidationError as error:
-        raise NotDataError(
-            "the store's manifest is none",
-            where=where,
-            expected="a manifest.json as lagbench generate writes it",
-            got=ascii(text[:80].decode("utf-8", "replace")),
-            fix=remedy,
-        ) from error
+        what, expected = "the store's manifest is none", "a manifest.json as lagbench generate writes it"
+        got = ascii(text[:80].decode("utf-8", "replace"))
+        raise NotDataError(what, where=where, expected=expected, got=got, fix=remedy) from error
     if not found.is_of(size.split, size.name, size.major):
         raise NotDataError(
             "the store's manifest is of another data set",
@@ -119,12 +115,9 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
     missing = [i for i, path in paths.items() if not path.is_file()]
     if missing:
         lacking = ",".join(subset for subset in subsets if not set(missing).isdisjoint(size.subsets[subset]))
-        raise DataError(
-            f"{len(missing)} of {len(paths)} scenarios are not there",
-            where=str(size.folder(root)),
-            got=f"missing: {spell_ids(missing)} of {lacking}",
-            fix=remedy_of(size, f"--subset {lacking}", root=root),
-        )
+        what, got = f"{len(missing)} of {len(paths)} scenarios are not there", spell_ids(missing)
+        where, fix = str(size.folder(root)), remedy_of(size, f"--subset {lacking}", root=root)
+        raise DataError(what, where=where, got=f"missing: {got} of {lacking}", fix=fix)
     return paths
 
 
@@ -143,18 +136,16 @@ def bring(size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: 
         found = remote_manifest(size, url, fresh=0.0)  # it may have come just now
     if found is None:
         return False
+    where = address_of(size, url, MANIFEST_NAME)
     if thoroughly and not url.startswith(HTTP):  # which lists nothing
         there = Objects(url, folder_of(size)).sizes()
         wrong = [entry.scenario for entry in found.files if there.get(entry.path) != entry.bytes]
         if wrong:
-            raise DataError(
-                "the store's manifest names objects that are not there, or of another length",
-                where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios {spell_ids(wrong)}",
-                fix=_remedy(size, url),
-            )
+            what = "the store's manifest names objects that are not there, or of another length"
+            where = f"{where}, scenarios {spell_ids(wrong)}"
+            raise DataError(what, where=where, fix=_remedy(size, url))
     named = [e for i in scenarios if (e := found.entry(i))]
     strangers = [e.scenario for e in named if not is_right(e, size, found)]
-    where = address_of(size, url, MANIFEST_NAME)
     refuse_strangers(found, strangers, where=where, remedy=_remedy(size, url))
     old = read_or_empty(size, root)
     lacking = [e for e in named if not is_here(e, size, root, None if thoroughly else old)]

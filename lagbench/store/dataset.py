@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from lagbench.data import registry
 from lagbench.data.local import locate, remedy
+from lagbench.data.scenario import damaged
 from lagbench.errors import DataError
 
 if TYPE_CHECKING:
@@ -47,9 +48,8 @@ def load_manifest(split: str | Path, *, size: str | None = None, root: str | Pat
     bring(entry, folder)
     manifest = read_manifest(folder, entry.split, entry.name, entry.major)
     if manifest is None:
-        raise DataError(
-            "the data set has no manifest", where=str(entry.folder(folder)), fix=remedy(entry, root=folder)
-        )
+        where, fix = str(entry.folder(folder)), remedy(entry, root=folder)
+        raise DataError("the data set has no manifest", where=where, fix=fix)
     return manifest
 
 
@@ -79,9 +79,8 @@ def open_split(
 
     entry, folder, _ = locate(split, size, root=root)
     paths, fix = scenario_files(entry, folder, (subset,)), remedy(entry, root=folder)
-    with (
-        ExitStack() as opened
-    ):  # what stays open after an error is closed by whichever thread collects garbage
+    # What stays open after an error is closed by whichever thread collects garbage.
+    with ExitStack() as opened:
         scenarios = [
             opened.enter_context(_open_scenario(path, entry.key(i), fix)) for i, path in paths.items()
         ]
@@ -126,12 +125,7 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             scenario = stored.chunk(frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1)
             found = {name: scenario.attrs[name] for name in ("split", "size", "scenario", "version")}
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-            raise DataError(
-                "a scenario file is damaged or not one of lagbench",
-                where=str(path),
-                got=f"{type(error).__name__}: {error}",
-                fix=fix,
-            ) from error
+            raise damaged(path, f"{type(error).__name__}: {error}", fix=fix) from error
         same_major = str(found["version"]).split(".")[0] == str(key.major)
         named = (found["split"], found["size"], int(found["scenario"]))
         if not same_major or named != (key.split, key.size, key.scenario):

@@ -18,7 +18,7 @@ from typing import TypeVar
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import SIGNATURE, Structure, check_structure, opened
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
@@ -45,8 +45,6 @@ PAUSE = 0.5  # pause after the first failed attempt [s]; it doubles
 FIX_LINE = "the same command goes on where it stopped"
 
 T = TypeVar("T")
-
-_NETCDF4 = b"\x89HDF\r\n\x1a\n"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,7 +139,7 @@ def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
                     pace,
                     limit=wanted.limit,
                     length=wanted.length,
-                    begins=_NETCDF4,
+                    begins=SIGNATURE,
                     remedy=wanted.remedy,
                 ):
                     out.write(block)
@@ -161,23 +159,17 @@ def saving(partial: Path) -> Iterator[None]:
         partial.unlink(missing_ok=True)
         raise
     except OSError as error:
-        raise WorkFailedError(
-            "cannot write there",
-            where=str(partial),
-            got=error.strerror or error,
-            fix="--root names another folder",
-        ) from error
+        got, fix = error.strerror or error, "--root names another folder"
+        raise WorkFailedError("cannot write there", where=str(partial), got=got, fix=fix) from error
 
 
 def insist(
-    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] | None = None
+    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] = lambda: 0
 ) -> T:
     """Attempt until it succeeds, or attempts bring a partial file, or a place, no further."""
 
     def held() -> int:
-        if place is not None:
-            return place()
-        return partial.stat().st_size if partial and partial.exists() else 0
+        return partial.stat().st_size if partial and partial.exists() else place()
 
     failures, restarted = 0, False
     for _ in range(MOST_ATTEMPTS):
@@ -192,12 +184,9 @@ def insist(
                 partial.unlink(missing_ok=True)
                 restarted = True
             time.sleep(PAUSE * 2**failures)
-    raise ConnectionLostError(
-        "the connection to the store broke too often",
-        where=url,
-        got=f"{held()} bytes after {MOST_ATTEMPTS} attempts",
-        fix=FIX_LINE,
-    )
+    what = "the connection to the store broke too often"
+    got = f"{held()} bytes after {MOST_ATTEMPTS} attempts"
+    raise ConnectionLostError(what, where=url, got=got, fix=FIX_LINE)
 
 
 class Pace:
@@ -266,13 +255,8 @@ def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
             block = answer.read(BLOCK)
         except Exception as error:
             pace.count(0, time.monotonic() - started)
-            lost = ConnectionLostError(
-                "the connection to the store broke",
-                where=pace.url,
-                got=f"{type(error).__name__}: {error}",
-                fix=FIX_LINE,
-            )
-            raise BrokenError(lost) from error
+            what, got = "the connection to the store broke", f"{type(error).__name__}: {error}"
+            raise BrokenError(ConnectionLostError(what, where=pace.url, got=got, fix=FIX_LINE)) from error
         pace.count(len(block), time.monotonic() - started)
         yield block
 

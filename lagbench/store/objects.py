@@ -30,16 +30,10 @@ S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")
 
 FIX_LINE = "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: it goes on"
-FIX_RIGHTS = (
-    "see that AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY may read it, and write to it"
-)
-FIX_BUCKET = "create the bucket, or correct the address: --root or LAGBENCH_ROOT"
 
-_GONE = {404, 410}
 _BUSY = {408, 425, 429, 500, 502, 503, 504}
 _LENGTH = re.compile(r"\d{1,18}")  # no object has more bytes, and Python reads no endless number
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
-_PAGE = ("text/html", "application/xhtml+xml")
 
 _systems: dict[tuple[object, ...], Any] = {}
 
@@ -109,24 +103,24 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
     if offset:
         headers["Range"] = f"bytes={offset}-"
     try:
-        response = _OPENER.open(urllib.request.Request(_encoded(url), headers=headers), timeout=TIMEOUT)
+        parts = urllib.parse.urlsplit(url)
+        if not parts.hostname:
+            raise ValueError("it names no host")
+        # Percent-encoded, but for what is encoded already.
+        path, query = (urllib.parse.quote(p, safe=string.punctuation) for p in (parts.path, parts.query))
+        address = parts._replace(path=path, query=query).geturl()
+        response = _OPENER.open(urllib.request.Request(address, headers=headers), timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         with closing(error):
             raise _refusal_of_status(error, url, offset, remedy) from None
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
-        raise UsageError(
-            "not the address of a store", where=url, expected="http://host/path", got=str(error)
-        ) from error
+        what, expected = "not the address of a store", "http://host/path"
+        raise UsageError(what, where=url, expected=expected, got=str(error)) from error
     except (OSError, http.client.HTTPException) as error:
-        reason = getattr(error, "reason", error)
-        raise BrokenError(
-            StoreUnreachableError(
-                "the store does not answer",
-                where=url,
-                got=f"{type(error).__name__}: {reason}",
-                fix="repeat the command later: it goes on where it stopped",
-            )
-        ) from error
+        got = f"{type(error).__name__}: {getattr(error, 'reason', error)}"
+        fix = "repeat the command later: it goes on where it stopped"
+        silent = StoreUnreachableError("the store does not answer", where=url, got=got, fix=fix)
+        raise BrokenError(silent) from error
     start, total = 0, response.headers.get("Content-Length")
     if response.status == http.client.PARTIAL_CONTENT:
         match = _RANGE.fullmatch(response.headers.get("Content-Range", ""))
@@ -140,24 +134,14 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
         close=response.close,
         start=start,
         total=int(total) if total is not None and _LENGTH.fullmatch(total) else None,
-        page=response.headers.get_content_type() in _PAGE,
+        page=response.headers.get_content_type() in ("text/html", "application/xhtml+xml"),
     )
-
-
-def _encoded(url: str) -> str:
-    """Return an address with its path percent-encoded; one without a host is a ValueError."""
-    parts = urllib.parse.urlsplit(url)
-    if not parts.hostname:
-        raise ValueError("it names no host")
-    path = urllib.parse.quote(parts.path, safe=string.punctuation)  # what is encoded already stays
-    query = urllib.parse.quote(parts.query, safe=string.punctuation)
-    return parts._replace(path=path, query=query).geturl()
 
 
 def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, remedy: str) -> Exception:
     """Return the error that an HTTP status means."""
     code = error.code
-    if code in _GONE:
+    if code in (404, 410):
         got = f"HTTP status {code}"
         return NotInStoreError("the store does not have the object", where=url, got=got, fix=remedy)
     if code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
@@ -307,12 +291,8 @@ def _file_system(url: str) -> tuple[Any, str]:
 
     scheme = url.split("://", 1)[0]
     if scheme not in fsspec.available_protocols():
-        raise UsageError(
-            "no such kind of address",
-            where=url,
-            expected="s3://bucket/prefix, or another that fsspec knows; file:///path for a folder",
-            got=scheme,
-        )
+        expected = "s3://bucket/prefix, or another that fsspec knows; file:///path for a folder"
+        raise UsageError("no such kind of address", where=url, expected=expected, got=scheme)
     # Another endpoint or other credentials are another system, also within one process.
     key = (scheme, *sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
     if key not in _systems:
@@ -338,13 +318,16 @@ def _refusal(error: Exception, url: str) -> LagbenchError:
     if isinstance(error, ImportError):
         return UsageError("this kind of address needs another package", where=url, got=got, fix=str(error))
     if isinstance(error, FileNotFoundError):
-        return DataError("there is no such bucket", where=url, got=_bucket(url), fix=FIX_BUCKET)
-    rights: tuple[type[Exception], ...] = (PermissionError,)
+        fix = "create the bucket, or correct the address: --root or LAGBENCH_ROOT"
+        return DataError("there is no such bucket", where=url, got=_bucket(url), fix=fix)
+    refused = isinstance(error, PermissionError)
     if url.startswith(S3):
         from botocore import exceptions as boto  # type: ignore[import-untyped]
 
-        rights += (boto.NoCredentialsError, boto.PartialCredentialsError)
-        rights += (boto.ProfileNotFound, boto.TokenRetrievalError)
-    if isinstance(error, rights):
-        return StoreUnreachableError("the store refuses", where=url, got=got, fix=FIX_RIGHTS)
+        refused |= isinstance(error, (boto.NoCredentialsError, boto.PartialCredentialsError))
+        refused |= isinstance(error, (boto.ProfileNotFound, boto.TokenRetrievalError))
+    if refused:
+        keys = "AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+        fix = f"see that {keys} may read it, and write to it"
+        return StoreUnreachableError("the store refuses", where=url, got=got, fix=fix)
     return StoreUnreachableError("the store does not answer or fails", where=url, got=got, fix=FIX_LINE)

@@ -86,11 +86,9 @@ class Publication:
     def _put(self, entry: FileEntry) -> None:
         path = self._folder / entry.path
         if file_sha256(path) != entry.file_sha256:
-            raise DataError(
-                "a file of the working copy is another than its manifest says",
-                where=str(path),
-                fix=f"remove it, then lagbench generate with --root {self._objects.root}",
-            )
+            what = "a file of the working copy is another than its manifest says"
+            fix = f"remove it, then lagbench generate with --root {self._objects.root}"
+            raise DataError(what, where=str(path), fix=fix)
         if self._named.entry(entry.scenario) is not None:
             # An object that is about to change must not be named meanwhile.
             self._there.pop(entry.path, None)
@@ -105,9 +103,8 @@ class Publication:
             return
         found = self._read_manifest()
         known = {e.scenario for e in (*self._named.files, *self._latest.files, *manifest.files)}
-        manifest = join(
-            self._size, manifest, found, [e for e in self._right(found) if e.scenario not in known]
-        )
+        others = [e for e in self._right(found) if e.scenario not in known]
+        manifest = join(self._size, manifest, found, others)
         self._objects.write(MANIFEST_NAME, (manifest.model_dump_json(indent=1) + "\n").encode())
         self._named, self._when = manifest, time.monotonic()
 
@@ -117,10 +114,8 @@ class Publication:
     def _restricted(self, manifest: Manifest) -> Manifest:
         """Return a manifest without what the store lacks."""
         lacking = self._lacking(manifest)
-        if not lacking:
-            return manifest
         files = tuple(entry for entry in manifest.files if entry not in lacking)
-        return merged(self._size, manifest.model_copy(update={"files": files}))
+        return merged(self._size, manifest.model_copy(update={"files": files})) if lacking else manifest
 
     def _right(self, manifest: Manifest) -> list[FileEntry]:
         return [entry for entry in manifest.files if is_right(entry, self._size, manifest)]

@@ -9,7 +9,6 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from itertools import accumulate, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, remedy
 from lagbench.data.registry import Registry, Size
+from lagbench.data.scenario import damaged
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
 from .copy import scenario_files
@@ -33,8 +33,7 @@ CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
 OPEN_FILES = 128  # files that a store keeps open, about 0.6 MB each; our splits train on up to 63
 
 
-@dataclass(frozen=True)
-class _Open:
+class _Open(NamedTuple):
     """An open file with what is the same in all its windows."""
 
     file: h5py.File
@@ -96,8 +95,7 @@ class FrameStore:
         Material is 0, liquid, in files without it; wall velocity is None where no wall moves.
         """
         self._own()
-        opened = self._opened(scenario)
-        return opened.material, opened.wall_velocity
+        return self._opened(scenario)[2:]
 
     def _own(self) -> None:
         """Reopen files after a fork: HDF5 handles do not survive one."""
@@ -151,12 +149,8 @@ class FrameStore:
                 fix=self._remedy(scenario),
             )
         material, walls = values.get("material"), values.get("wall_velocity")
-        return _Open(
-            file,
-            position,
-            np.zeros(position.shape[1], np.int8) if material is None else material[...],
-            None if walls is None else walls[...],
-        )
+        kinds = np.zeros(position.shape[1], np.int8) if material is None else material[...]
+        return _Open(file, position, kinds, None if walls is None else walls[...])
 
     @contextmanager
     def _naming(self, scenario: int) -> Iterator[None]:
@@ -173,12 +167,8 @@ class FrameStore:
                     got=f"{len(self._open)} scenario files are open",
                     fix="allow more, as by `ulimit -n 4096`, or open fewer data sets at a time",
                 ) from error
-            raise DataError(
-                "a scenario file is damaged or not one of lagbench",
-                where=str(self._paths[scenario]),
-                got=f"{type(error).__name__}: {error}",
-                fix=self._remedy(scenario),
-            ) from error
+            got, fix = f"{type(error).__name__}: {error}", self._remedy(scenario)
+            raise damaged(self._paths[scenario], got, fix=fix) from error
 
     def _remedy(self, scenario: int) -> str:
         return remedy(self._size, f"--subset {self._size.subset_of(scenario)}")
@@ -243,12 +233,9 @@ class WindowReader:
                 fix=f"leave history out for the task's {entry.task.input_frames}",
             )
         if not frames or cache_bytes < 0:
-            raise UsageError(
-                "no windows can be read like that",
-                where=where,
-                expected="a subset at least, and cache_bytes >= 0",
-                got=f"{len(frames)} scenarios, cache_bytes {cache_bytes}",
-            )
+            what, expected = "no windows can be read like that", "a subset at least, and cache_bytes >= 0"
+            got = f"{len(frames)} scenarios, cache_bytes {cache_bytes}"
+            raise UsageError(what, where=where, expected=expected, got=got)
         if not len(self):
             raise UsageError(
                 "no scenario is as long as a window",
@@ -279,8 +266,7 @@ class WindowReader:
         """Return scenario id and first frame of a window."""
         index = operator.index(index)
         if not -len(self) <= index < len(self):
-            message = f"no window {index} among {len(self)}"
-            raise IndexError(message)
+            raise IndexError(f"no window {index} among {len(self)}")
         index %= len(self)
         row = bisect_right(self.starts, index) - 1
         return self.scenarios[row], index - self.starts[row]

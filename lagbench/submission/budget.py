@@ -73,17 +73,13 @@ def track_of(size: str, budget: Budget) -> Track | None:
     on_cpu = budget.cpu_hours is not None and not budget.gpu_hours
     if most is not None and on_cpu and 60.0 * (budget.cpu_hours or 0.0) <= most * (1.0 + TOLERANCE):
         return "equal compute"
-    return "converged" if _has_converged(budget) else None
-
-
-def _has_converged(budget: Budget) -> bool:
-    """Tell whether the last doubling brought less than 2 %; a validation near half the steps must tell."""
     first = budget.start_steps or 0
     steps = first + (budget.steps or 0)
     before = [(step, value) for step, value in budget.validations if first + step <= (steps + 1) // 2]
+    # A validation near half the steps must tell what the last doubling brought.
     if not before or budget.best is None or first + before[-1][0] < 0.4 * steps:
-        return False
+        return None
     if budget.epochs is not None and budget.epochs < 1.0 and not first:
-        return False
+        return None
     half = min(value for _, value in before)
-    return half > 0.0 and (half - budget.best) / half < CONVERGED
+    return "converged" if half > 0.0 and (half - budget.best) / half < CONVERGED else None

@@ -55,7 +55,11 @@ class Survey:
         if not (block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL):  # NaN too
             wrong = ~np.isfinite(block) | (block == FILL)
             if wrong.any():
-                self._add_wrong(first, block, wrong)
+                if self.first_bad is None:
+                    frame, particle, axis = (int(i[0]) for i in np.nonzero(wrong))
+                    self.first_bad = (first + frame, particle, axis)
+                self.bad += int(np.count_nonzero(wrong))
+                self.unwritten += int(np.count_nonzero(block == FILL))
                 block = np.where(wrong, np.float32(np.nan), block)
         self.values += block.size
         self._add_places(first, block, size)
@@ -71,13 +75,6 @@ class Survey:
         if self._first:
             frame, first = self._first
             self._add_jumps(frame, np.concatenate([given[None], first]))
-
-    def _add_wrong(self, first: int, block: NDArray[np.float32], wrong: NDArray[np.bool_]) -> None:
-        if self.first_bad is None:
-            frame, particle, axis = (int(i[0]) for i in np.nonzero(wrong))
-            self.first_bad = (first + frame, particle, axis)
-        self.bad += int(np.count_nonzero(wrong))
-        self.unwritten += int(np.count_nonzero(block == FILL))
 
     def _add_places(self, first: int, block: NDArray[np.float32], size: Size) -> None:
         slack = 1.0 / size.grid

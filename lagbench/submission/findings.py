@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UnreadableFileError
@@ -118,13 +118,9 @@ class ValidationResult:
             return
         first = self.errors[0]
         others = f" (and {len(self.errors) - 1} more)" if len(self.errors) > 1 else ""
-        raise self._failure()(
-            f"{self.path} is not valid: [{first.check}] {first.what}{others}",
-            where=first.where,
-            expected=first.expected,
-            got=first.got,
-            fix=first.fix,
-        )
+        what = f"{self.path} is not valid: [{first.check}] {first.what}{others}"
+        where, expected, got, fix = first.where, first.expected, first.got, first.fix
+        raise self._failure()(what, where=where, expected=expected, got=got, fix=fix)
 
     def _failure(self) -> type[LagbenchError]:
         failed = {f.check for f in self.errors}
@@ -156,29 +152,29 @@ class Findings:
 
     def error(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
         """Add a finding that rejects the file."""
-        self._add(Severity.ERROR, check, what, where, expected, got, fix)
+        self._made.add(check)
+        said = {"what": what, "where": where, "expected": str(expected), "got": str(got), "fix": fix}
+        self._found.append(Finding(check=check, severity=Severity.ERROR, **said))
 
     def warning(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
         """Add a finding that flags the file."""
-        self._add(Severity.WARNING, check, what, where, expected, got, fix)
+        self.error(check, what, where=where, expected=expected, got=got, fix=fix)
+        self._found.append(replace(self._found.pop(), severity=Severity.WARNING))
 
     def failed(self, *checks: str) -> str | None:
         """Return the first of some checks that has an error."""
         wrong = {f.check for f in self._found if f.severity is Severity.ERROR}
         return next((check for check in checks if check in wrong), None)
 
-    def result(
-        self, path: Path, names: Mapping[str, str] | None = None, *, sha256: str | None = None
-    ) -> ValidationResult:
+    def result(self, path: Path, *, sha256: str | None = None, **names: str) -> ValidationResult:
         """Return all that was collected of a file that names split, size and method."""
-        known = names or {}
         touched = {f.check for f in self._found}
         rest = [check for check in CHECKS if check not in touched]
         return ValidationResult(
             path=path,
-            split=known.get("split"),
-            size=known.get("size"),
-            method=known.get("method"),
+            split=names.get("split"),
+            size=names.get("size"),
+            method=names.get("method"),
             findings=tuple(sorted(self._found, key=lambda f: CHECKS.index(f.check))),
             passed=tuple(check for check in rest if check in self._made and check not in self._skipped),
             skipped={check: self._skipped[check] for check in rest if check in self._skipped},
@@ -190,10 +186,3 @@ class Findings:
         where, expected = error.where or "the file", error.expected or "an undamaged file"
         fix = error.fix or "make it again"
         self.error(check, error.what, where=where, expected=expected, got=error.got or "nothing", fix=fix)
-
-    def _add(
-        self, severity: Severity, check: str, what: str, where: str, expected: object, got: object, fix: str
-    ) -> None:
-        self._made.add(check)
-        said = {"what": what, "where": where, "expected": str(expected), "got": str(got), "fix": fix}
-        self._found.append(Finding(check=check, severity=severity, **said))

@@ -24,9 +24,9 @@ from lagbench.data.hdf5 import (
     describe,
     members_of,
     reading,
-    storage_problems,
+    storage_problem,
 )
-from lagbench.errors import UnreadableFileError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, nearest
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
@@ -74,6 +74,15 @@ MAX_COORDINATE_CHUNK = 1 << 26
 
 INTEGERS = ("scenario", "frame", "diverged_at")
 PACKING = ("scale_factor", "add_offset")
+
+ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
+    "scenario": {"long_name": "scenario id", "units": "1"},
+    "frame": {"long_name": "absolute frame number", "units": "1"},
+    "position": {"long_name": "predicted particle position in lengths of the unit box", "units": "1"},
+    "velocity": {"long_name": "predicted particle velocity in box lengths per second", "units": "s-1"},
+    "diverged_at": {"long_name": "first frame of a frozen rollout, -1 where none is", "units": "1"},
+}
+"""Attributes of each variable, as we write them."""
 
 _START = "start from what `lagbench template` writes, or use lagbench.submission.write"
 WRITE = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
@@ -152,6 +161,12 @@ def fits(name: str, value: object) -> bool:
     return isinstance(value, OPTIONAL[name]) and not (name == "parameters" and int(value) < 0)
 
 
+def require_fit(name: str, value: object) -> None:
+    """Refuse an attribute that may not have a value, before it is written."""
+    if not fits(name, value):
+        raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
+
+
 def dissect(file: h5py.File, path: Path) -> Anatomy:
     """Return what a file holds; of values only coordinates are read."""
     length = path.stat().st_size
@@ -164,12 +179,19 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
         if links.get(name) == "variable":
             with reading(path, name):
                 dataset = file[name]
-                array = describe(dataset, name)
+                array = describe(dataset)
                 arrays[name] = array if array.shape else replace(array, shape=None)
                 if name == "position":
                     found = {key: attribute_of(dataset, key) for key in PACKING}
                     packing = {key: value for key, value in found.items() if value is not None}
-                elif _is_coordinate(arrays[name], length):
+                elif (
+                    array.shape is not None
+                    and len(array.shape) == 1
+                    and array.shape[0] <= MAX_COORDINATE
+                    and array.chunk_bytes <= MAX_COORDINATE_CHUNK
+                    and array.kind.lstrip("u").startswith("int")
+                    and not storage_problem(array, length=length)
+                ):
                     integers[name] = tuple(int(i) for i in dataset[...])
     return Anatomy(
         links=links,
@@ -182,20 +204,15 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
     )
 
 
-def _is_coordinate(array: Array, length: int) -> bool:
-    """Tell whether an array's values may be read as a short list of integers."""
-    if array.shape is None or len(array.shape) != 1 or storage_problems(array, length=length):
-        return False
-    small = array.shape[0] <= MAX_COORDINATE and array.chunk_bytes <= MAX_COORDINATE_CHUNK
-    return small and array.kind.lstrip("u").startswith("int")
-
-
 def header_of(anatomy: Anatomy) -> Header:
     """Return the header of a file whose layout has been checked."""
     scenarios = anatomy.integers["scenario"]
     marks = anatomy.integers.get("diverged_at", ())
     labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
-    labels |= {name: _optional(anatomy.attributes[name], kind) for name, kind in OPTIONAL.items()}
+    for name, kind in OPTIONAL.items():
+        value = anatomy.attributes[name]
+        value = float(value) if kind is float and isinstance(value, int) else value
+        labels[name] = value if isinstance(value, kind) else None
     labels["budget"] = budget_in(labels["budget"]) if labels["budget"] else None
     return Header(
         **labels,
@@ -204,12 +221,6 @@ def header_of(anatomy: Anatomy) -> Header:
         particles=(anatomy.arrays["position"].shape or ())[2],
         diverged_at={i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0},
     )
-
-
-def _optional(value: object, kind: type[Any]) -> Any:  # noqa: ANN401
-    if kind is float and isinstance(value, int):
-        return float(value)
-    return value if isinstance(value, kind) else None
 
 
 def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
@@ -226,29 +237,6 @@ def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
 def check_format(anatomy: Anatomy, out: Findings) -> bool:
     """Check links, variables, storage and attributes; tell whether the values can be read."""
     out.made("format")
-    _check_links(anatomy, out)
-    for name in ("position", "scenario", "frame"):
-        _check_variable(name, anatomy, out)
-    for name, array in anatomy.arrays.items():
-        where = f"variable {name!r}"
-        problems = storage_problems(array, length=anatomy.length)
-        for what, expected, got in problems:
-            out.error("format", what, where=where, expected=expected, got=got, fix=_WRITE)
-        if not problems and name != "position" and name not in anatomy.integers:
-            out.error(
-                "format",
-                "a coordinate cannot be read",
-                where=where,
-                expected=f"one dimension of at most {MAX_COORDINATE} integers",
-                got=f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
-                fix=_START,
-            )
-    readable = not out.failed("format")
-    _check_attributes(anatomy, out)
-    return readable
-
-
-def _check_links(anatomy: Anatomy, out: Findings) -> None:
     for name, kind in anatomy.links.items():
         if kind.endswith("link"):
             out.error(
@@ -260,50 +248,50 @@ def _check_links(anatomy: Anatomy, out: Findings) -> None:
                 fix="store the values themselves",
             )
     if anatomy.link_count > MAX_LINKS:
-        out.error(
-            "format",
-            "too many variables",
-            where="/",
-            expected=f"at most {MAX_LINKS}",
-            got=anatomy.link_count,
-            fix=_START,
-        )
-
-
-def _check_variable(name: str, anatomy: Anatomy, out: Findings) -> None:
-    kind = anatomy.links.get(name)
-    if kind == "variable" or (kind is not None and kind.endswith("link")):
-        return
+        most, count = f"at most {MAX_LINKS}", anatomy.link_count
+        out.error("format", "too many variables", where="/", expected=most, got=count, fix=_START)
     known = [quoted(other) for other in anatomy.links][:10]
-    fix = _START if kind else nearest(quoted(name), known)
-    got = kind or f"{', '.join(known) or 'nothing'}"
-    out.error("format", f"no variable {name!r}", where="/", expected=f"a variable {name!r}", got=got, fix=fix)
+    for name in ("position", "scenario", "frame"):
+        kind = anatomy.links.get(name, "")
+        if kind != "variable" and not kind.endswith("link"):
+            fix, got = _START if kind else nearest(quoted(name), known), kind or ", ".join(known) or "nothing"
+            what, expected = f"no variable {name!r}", f"a variable {name!r}"
+            out.error("format", what, where="/", expected=expected, got=got, fix=fix)
+    for name, array in anatomy.arrays.items():
+        problem = storage_problem(array, length=anatomy.length)
+        if problem is None and (name == "position" or name in anatomy.integers):
+            continue
+        what, expected, got = problem or (
+            "a coordinate cannot be read",
+            f"one dimension of at most {MAX_COORDINATE} integers",
+            f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
+        )
+        fix = _WRITE if problem else _START
+        out.error("format", what, where=f"variable {name!r}", expected=expected, got=got, fix=fix)
+    readable = not out.failed("format")
+    _check_attributes(anatomy, out)
+    return readable
 
 
 def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
-    number = anatomy.attributes["lagbench_format"]
-    if isinstance(number, (str, Odd)) or number != FORMAT:
-        _bad_attribute("lagbench_format", FORMAT, number, out)
-    for name in REQUIRED:
-        value = anatomy.attributes[name]
-        if not fits(name, value):
-            _bad_attribute(name, kind_of(name), value, out)
-    for name in OPTIONAL:
-        value = anatomy.attributes[name]
-        if value is not None and not fits(name, value):
-            _bad_attribute(name, f"{kind_of(name)}, or no such attribute", value, out)
-
-
-def _bad_attribute(name: str, expected: object, value: object, out: Findings) -> None:
-    got = "no such attribute" if value is None else value.reason if isinstance(value, Odd) else quoted(value)
-    out.error(
-        "format",
-        f"the attribute {name!r} {'is missing' if value is None else 'cannot be used'}",
-        where="global attributes",
-        expected=expected,
-        got=got,
-        fix=f"set it: file.{name} = ...",
-    )
+    for name, value in anatomy.attributes.items():
+        if name == "lagbench_format":
+            expected, right = str(FORMAT), not isinstance(value, (str, Odd)) and value == FORMAT
+        elif name in REQUIRED:
+            expected, right = kind_of(name), fits(name, value)
+        else:
+            expected, right = f"{kind_of(name)}, or no such attribute", value is None or fits(name, value)
+        if right:
+            continue
+        got = value.reason if isinstance(value, Odd) else quoted(value)
+        out.error(
+            "format",
+            f"the attribute {name!r} {'is missing' if value is None else 'cannot be used'}",
+            where="global attributes",
+            expected=expected,
+            got="no such attribute" if value is None else got,
+            fix=f"set it: file.{name} = ...",
+        )
 
 
 def check_dims(anatomy: Anatomy, out: Findings) -> bool:
@@ -316,7 +304,13 @@ def check_dims(anatomy: Anatomy, out: Findings) -> bool:
     where = "variable 'position'"
     if array.dims != DIMS:
         got = ", ".join(quoted(name) if name else "one without a name" for name in array.dims) or "none"
-        expected, fix = ", ".join(DIMS), _fix_dims(array)
+        expected, fix = ", ".join(DIMS), _START
+        if sorted(array.dims) == sorted(DIMS):
+            fix = "transpose it"
+        elif len(array.dims) == len(DIMS) - 1:
+            fix = "add the leading dimension 'scenario', also for a single scenario"
+        elif not any(array.dims):
+            fix = "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
         out.error("dims", "the dimensions are others", where=where, expected=expected, got=got, fix=fix)
         return False
     rows = {name: anatomy.integers.get(name) for name in ("scenario", "frame")}
@@ -328,16 +322,6 @@ def check_dims(anatomy: Anatomy, out: Findings) -> bool:
         out.error("dims", "the lengths do not fit", where=where, expected=lengths, got=array.shape, fix=fix)
         return False
     return True
-
-
-def _fix_dims(array: Array) -> str:
-    if sorted(array.dims) == sorted(DIMS):
-        return "transpose it"
-    if len(array.dims) == len(DIMS) - 1:
-        return "add the leading dimension 'scenario', also for a single scenario"
-    if not any(array.dims):
-        return "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
-    return _START
 
 
 def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
@@ -364,16 +348,16 @@ def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
     return not out.failed("dtype")
 
 
-def check_marks(anatomy: Anatomy, out: Findings) -> bool:
+def check_marks(anatomy: Anatomy, out: Findings) -> None:
     """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per scenario."""
     array = anatomy.arrays.get("diverged_at")
     marks, frames = anatomy.integers.get("diverged_at"), anatomy.integers.get("frame")
     if array is not None and (marks is None or frames is None):
         out.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
-        return False
+        return
     out.made("diverged_at")
     if array is None or marks is None or frames is None:
-        return True
+        return
     where = "variable 'diverged_at'"
     if array.dims != ("scenario",) or len(marks) != len(anatomy.integers.get("scenario", ())):
         out.error(
@@ -394,4 +378,3 @@ def check_marks(anatomy: Anatomy, out: Findings) -> bool:
             got=", ".join(map(str, wrong[:5])),
             fix=f"name the first frozen frame, or {NEVER}",
         )
-    return not out.failed("diverged_at")

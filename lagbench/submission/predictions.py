@@ -77,12 +77,9 @@ class Predictions:
         numbers = self.header.frames
         first = numbers.index(start) if start in numbers else -1
         if scenario not in self._row or first < 0 or count < 0 or first + count > len(numbers):
-            raise UsageError(
-                "the file has no such frames",
-                where=str(self.path),
-                expected=f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}",
-                got=f"scenario {scenario}, {count} frames from {start}",
-            )
+            what, got = "the file has no such frames", f"scenario {scenario}, {count} frames from {start}"
+            expected = f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}"
+            raise UsageError(what, where=str(self.path), expected=expected, got=got)
         with reading(self.path, "position"):
             values: NDArray[Any] = self._position[self._row[scenario], first : first + count]
             return np.ascontiguousarray(values, dtype=np.float32)
@@ -143,17 +140,11 @@ def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Pre
     with ExitStack() as stack:
         file = stack.enter_context(opened(path, fix=WRITE))
         if checked is None or checked.length != path.stat().st_size:
-            checked = _checked(file, path)
+            checked, out = dissect(file, path), Findings()
+            for check in (check_format, check_dims, check_dtype, check_marks):
+                check(checked, out)
+            out.result(path).check()
         return attach(file, path, checked, stack)
-
-
-def _checked(file: h5py.File, path: Path) -> Anatomy:
-    anatomy = dissect(file, path)
-    out = Findings()
-    for check in (check_format, check_dims, check_dtype, check_marks):
-        check(anatomy, out)
-    out.result(path).check()
-    return anatomy
 
 
 def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:

@@ -76,7 +76,13 @@ class Mistake(NamedTuple):
 def read_starts(predictions: Predictions, truth: Truth) -> dict[int, Start]:
     """Return how each known scenario begins, by ascending id."""
     known = sorted(set(predictions.header.scenarios) & set(truth.size.subsets["test"]))
-    return {scenario: _start(predictions, truth, scenario) for scenario in known}
+    starts, frames = {}, predictions.header.frames
+    for scenario in known:
+        predicted = predictions.frames(scenario, frames[0], min(2, len(frames))).astype(np.float64)
+        given, true, *later = truth.around_start(scenario).astype(np.float64)
+        second = next(iter(later), None)
+        starts[scenario] = Start(given, true, predicted[0], predicted[-1], len(frames), second)
+    return starts
 
 
 def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Findings) -> None:
@@ -84,16 +90,29 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
 
     ``first`` is the number of the first predicted frame.
     """
-    said = {
+    mistakes = {
         i: mistake(start, truth.size.bounds, {j: s for j, s in starts.items() if j != i})
         for i, start in starts.items()
     }
-    counts = Counter(found for found in said.values() if found is not None)
+    counts = Counter(found for found in mistakes.values() if found is not None)
     for scenario, start in starts.items():
-        found = said[scenario]
+        found = mistakes[scenario]
         # A bad model may look so in one scenario by chance; what writes a file makes the mistake in all.
         if found is None or (found.everywhere and 2 * counts[found] < len(starts)):
-            _check_continuity(scenario, start, truth, first, out)
+            with np.errstate(all="ignore"):
+                distance = _rms(start.first - start.given)
+            limit = JUMP * start.largest_step(truth, scenario, enough=distance / JUMP)
+            if np.isfinite(distance) and distance > limit:
+                out.warning(
+                    "discontinuous_start",
+                    "the first predicted frame is far from the last given one",
+                    where=f"scenario {scenario}, frame {first}",
+                    expected=f"root mean square distance at most {limit:.3g},"
+                    f" {JUMP:g} times the truth's largest displacement in a frame",
+                    got=f"{distance:.3g}",
+                    fix="predict what follows the last given frame, particle by particle; "
+                    "where the model itself jumps, leave it: it is scored, and flagged on the board",
+                )
             continue
         out.error(
             "start",
@@ -103,52 +122,23 @@ def check_start(starts: Mapping[int, Start], first: int, truth: Truth, out: Find
             got=f"root mean square distance to it {_rms(start.first - start.given):.3g}",
             fix=found.fix,
         )
-    _check_shift(starts, first, out)
-    out.made("start", "discontinuous_start")
-
-
-def _start(predictions: Predictions, truth: Truth, scenario: int) -> Start:
-    frames = predictions.header.frames
-    predicted = predictions.frames(scenario, frames[0], min(2, len(frames)))
-    given, true, *later = truth.around_start(scenario).astype(np.float64)
-    first, second = predicted[0].astype(np.float64), predicted[-1].astype(np.float64)
-    return Start(given, true, first, second, len(frames), next(iter(later), None))
-
-
-def _check_continuity(scenario: int, start: Start, truth: Truth, frame: int, out: Findings) -> None:
-    with np.errstate(all="ignore"):
-        distance = _rms(start.first - start.given)
-    limit = JUMP * start.largest_step(truth, scenario, enough=distance / JUMP)
-    if np.isfinite(distance) and distance > limit:
-        out.warning(
-            "discontinuous_start",
-            "the first predicted frame is far from the last given one",
-            where=f"scenario {scenario}, frame {frame}",
-            expected=f"root mean square distance at most {limit:.3g},"
-            f" {JUMP:g} times the truth's largest displacement in a frame",
-            got=f"{distance:.3g}",
-            fix="predict what follows the last given frame, particle by particle; "
-            "where the model itself jumps, leave it: it is scored, and flagged on the board",
-        )
-
-
-def _check_shift(starts: Mapping[int, Start], frame: int, out: Findings) -> None:
-    told = {scenario: said for scenario, start in starts.items() if (said := shift(start)) is not None}
+    told = {scenario: by for scenario, start in starts.items() if (by := shift(start)) is not None}
     for by, what, fix in (
         (-1, "the last given frame", "leave the last given frame out: predictions begin one frame later"),
         (1, "the second frame of the truth", "predictions begin one frame earlier, after the last given one"),
     ):
-        wrong = [scenario for scenario, said in told.items() if said == by]
+        wrong = [scenario for scenario, shifted in told.items() if shifted == by]
         if wrong:
             report = out.error if len(wrong) == len(told) else out.warning
             report(
                 "start",
                 "the frames seem to be shifted by one",
-                where=f"scenario {wrong[0]}, frame {frame}",
+                where=f"scenario {wrong[0]}, frame {first}",
                 expected="the frame after the last given one first",
                 got=f"{what}, in {len(wrong)} of {len(told)} scenarios whose truth moves",
                 fix=fix,
             )
+    out.made("start", "discontinuous_start")
 
 
 def shift(start: Start) -> int | None:

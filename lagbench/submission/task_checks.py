@@ -10,9 +10,9 @@ from pathlib import Path
 
 from lagbench.data.layout import major_of
 from lagbench.data.local import remedy
-from lagbench.data.manifest import read_manifest
+from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Registry, Size, spell_ids
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError, UsageError
 
 from .findings import Findings, quoted
 from .format import Anatomy
@@ -88,21 +88,15 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
 
 def dataset_hash_of(size: Size, root: Path) -> str | None:
     """Return the hash of a data set: the registry's, else that of a complete local one."""
-    if size.measured is not None:
-        return size.measured.dataset_sha256
-    try:
-        manifest = read_manifest(root, size.split, size.name, size.major)
-    except DataError:
-        return None
-    return manifest.dataset_sha256 if manifest else None
+    return (size.measured or read_or_empty(size, root)).dataset_sha256
 
 
-def check_scenarios(anatomy: Anatomy, size: Size, out: Findings) -> bool:
+def check_scenarios(anatomy: Anatomy, size: Size, out: Findings) -> None:
     """Check that every test scenario is there once, in any order, and no other."""
     got = anatomy.integers.get("scenario")
     if got is None:
         out.skip("the coordinate 'scenario' cannot be read", "scenarios")
-        return False
+        return
     out.made("scenarios")
     wanted = size.subsets["test"]
     twice = sorted(i for i, count in Counter(got).items() if count > 1)
@@ -121,7 +115,6 @@ def check_scenarios(anatomy: Anatomy, size: Size, out: Findings) -> bool:
                 got=f"{word}: {_numbers(ids)}",
                 fix=fix,
             )
-    return not out.failed("scenarios")
 
 
 def _numbers(ids: Sequence[int]) -> str:
@@ -129,25 +122,23 @@ def _numbers(ids: Sequence[int]) -> str:
     return spell_numbers(ids) if min(ids) >= 0 else quoted(list(ids[:20]))
 
 
-def check_frames(anatomy: Anatomy, size: Size, out: Findings) -> bool:
+def check_frames(anatomy: Anatomy, size: Size, out: Findings) -> None:
     """Check that the frames are those to predict, ascending."""
     got = anatomy.integers.get("frame")
     if got is None:
         out.skip("the coordinate 'frame' cannot be read", "frames")
-        return False
+        return
     out.made("frames")
     expected = frames_to_predict(size)
-    if list(got) == list(expected):
-        return True
-    out.error(
-        "frames",
-        "the frames are not those to predict",
-        where="coordinate 'frame'",
-        expected=f"{spell_numbers(expected)} (absolute numbers, {len(expected)} of them)",
-        got=f"{_numbers(got) if got else 'none'} ({len(got)})",
-        fix=guess_frames(got, expected),
-    )
-    return False
+    if list(got) != list(expected):
+        out.error(
+            "frames",
+            "the frames are not those to predict",
+            where="coordinate 'frame'",
+            expected=f"{spell_numbers(expected)} (absolute numbers, {len(expected)} of them)",
+            got=f"{_numbers(got) if got else 'none'} ({len(got)})",
+            fix=guess_frames(got, expected),
+        )
 
 
 def frames_to_predict(size: Size) -> range:
@@ -161,19 +152,17 @@ def check_particles(anatomy: Anatomy, size: Size, out: Findings) -> bool:
     if array is None or array.shape is None or out.failed("dims"):
         out.skip("the dimensions are not known", "particles")
         return False
-    shape = array.shape
     out.made("particles")
-    if shape[2] == size.particles:
-        return True
-    out.error(
-        "particles",
-        "the number of particles is another",
-        where="variable 'position', dimension 'particle'",
-        expected=size.particles,
-        got=shape[2],
-        fix=f"predict every particle of {size.split} {size.name}, in the order of the given frames",
-    )
-    return False
+    if array.shape[2] != size.particles:
+        out.error(
+            "particles",
+            "the number of particles is another",
+            where="variable 'position', dimension 'particle'",
+            expected=size.particles,
+            got=array.shape[2],
+            fix=f"predict every particle of {size.split} {size.name}, in the order of the given frames",
+        )
+    return array.shape[2] == size.particles
 
 
 # --- guesses, so that a message can say what may have happened ------------------------------
@@ -200,21 +189,14 @@ def guess_frames(got: Sequence[int], expected: range) -> str:
     if sorted(got) == list(expected):
         return "seems to hold the right frames in another order: store them ascending"
     steps = {b - a for a, b in pairwise(got)}
-    if len(steps) == 1 and (step := steps.pop()) > 1:
-        return f"seems to skip: it holds every {_ordinal(step)} frame only"
-    return _guess_run(got, given, count)
-
-
-def _guess_run(got: Sequence[int], given: int, count: int) -> str:
-    """Guess about frame numbers that may be one run of consecutive numbers."""
+    if len(steps) == 1 and (step := min(steps)) > 1:
+        ending = "th" if step % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(step % 10, "th")
+        return f"seems to skip: it holds every {step}{ending} frame only"
     first, last = got[0], got[-1]
-    if any(b - a != 1 for a, b in pairwise(got)):
-        missing = sorted(set(range(given, given + count)) - set(got))
-        return (
-            f"lacks the frames {spell_numbers(missing)}"
-            if missing
-            else "holds frames that are no predictions"
-        )
+    if steps and steps != {1}:
+        if missing := sorted(set(expected) - set(got)):
+            return f"lacks the frames {spell_numbers(missing)}"
+        return "holds frames that are no predictions"
     if first in (0, 1) and len(got) == count:
         return f"seems to count from the first predicted frame, whose absolute number is {given}"
     if first < given and last == given + count - 1:
@@ -224,12 +206,6 @@ def _guess_run(got: Sequence[int], given: int, count: int) -> str:
     if first == given:
         return f"goes on too long: leave out the frames after {given + count - 1}"
     return f"seems to be shifted by {first - given} frames" if len(got) == count else "holds other frames"
-
-
-def _ordinal(number: int) -> str:
-    if number % 100 in (11, 12, 13):
-        return f"{number}th"
-    return f"{number}{ {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th') }"
 
 
 def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) -> str:

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import dataset_folder
 from lagbench.data.local import remedy
-from lagbench.data.manifest import note, noted_hashes, read_manifest
+from lagbench.data.manifest import note, noted_hashes, read_or_empty
 from lagbench.data.registry import Size, spell_ids
 from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
@@ -29,7 +28,7 @@ class Truth:
     @property
     def folder(self) -> Path:
         """The folder of the data set."""
-        return dataset_folder(self.root, self.size.split, self.size.name, self.size.major)
+        return self.size.folder(self.root)
 
     def require(self) -> None:
         """Check that every scenario is there."""
@@ -47,50 +46,31 @@ class Truth:
     def check(self) -> None:
         """Hash the values of every scenario, or find that this machine has done so."""
         known, new = noted_hashes(self.folder), {}
+        verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
+        fix = f"{self._remedy()}; {verify} says what is wrong"
+        recorded = None if self.size.measured else read_or_empty(self.size, self.root)
         for scenario in sorted(self.size.subsets[self.subset]):
-            path, expected = self.path(scenario), self._expected(scenario)
+            path, entry = self.path(scenario), recorded.entry(scenario) if recorded else None
+            # what is known of the content hash: its first digits, all, or nothing
+            expected = entry.content_sha256 if entry else self._hash(scenario)
             try:
                 found = known(path)
                 if found is None:
                     new[path] = check_scenario(path)
                 content = found[0] if found else new[path]
-            except (DataError, OSError) as error:
-                raise self._damaged(path, error) from error
+            except OSError as error:
+                what = f"cannot read a {self.subset} scenario"
+                raise DataError(what, where=str(path), got=error.strerror, fix=fix) from error
+            except DataError as error:
+                where, wanted = error.where or str(path), error.expected
+                raise DataError(error.what, where=where, expected=wanted, got=error.got, fix=fix) from error
             if not content.startswith(expected):
-                raise DataError(
-                    f"a {self.subset} scenario has another content hash",
-                    where=str(path),
-                    expected=expected,
-                    got=content,
-                    fix=self._fix(),
-                )
+                what = f"a {self.subset} scenario has another content hash"
+                raise DataError(what, where=str(path), expected=expected, got=content, fix=fix)
         note(self.folder, new)
-
-    def _damaged(self, path: Path, error: DataError | OSError) -> DataError:
-        if isinstance(error, OSError):
-            return DataError(
-                f"cannot read a {self.subset} scenario", where=str(path), got=error.strerror, fix=self._fix()
-            )
-        where = error.where or str(path)
-        return DataError(error.what, where=where, expected=error.expected, got=error.got, fix=self._fix())
-
-    def _fix(self) -> str:
-        verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        return f"{self._remedy()}; {verify} says what is wrong"
 
     def _remedy(self) -> str:
         return remedy(self.size, f"--subset {self.subset}", root=self.root)
-
-    def _expected(self, scenario: int) -> str:
-        """Return what is known of a content hash: its first digits, all, or nothing."""
-        if self.size.measured:
-            return self._hash(scenario)
-        try:
-            manifest = read_manifest(self.root, self.size.split, self.size.name, self.size.major)
-        except DataError:  # whoever needs the manifest says what is wrong with it
-            return ""
-        entry = manifest.entry(scenario) if manifest else None
-        return entry.content_sha256 if entry else ""
 
     def path(self, scenario: int) -> Path:
         """Return where a scenario lies."""
@@ -133,12 +113,9 @@ class Truth:
             frames: NDArray[np.float32] = file.read("position", slice(start, stop))
             if len(frames) == stop - start and frames.shape[1] == self.size.particles:
                 return frames
-            raise DataError(
-                f"a {self.subset} scenario has other frames or particles than the registry says",
-                where=str(self.path(scenario)),
-                expected=f"at least {stop} frames of {self.size.particles} particles",
-                got=frames.shape,
-            )
+            what = f"a {self.subset} scenario has other frames or particles than the registry says"
+            expected = f"at least {stop} frames of {self.size.particles} particles"
+            raise DataError(what, where=str(self.path(scenario)), expected=expected, got=frames.shape)
 
     def largest_displacement(self, scenario: int, *, enough: float) -> float:
         """Return the largest distance that a particle moves from one frame to the next [length].

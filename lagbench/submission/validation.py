@@ -91,14 +91,8 @@ def validate(
         takes it, so that nothing is read twice.
     """
     folder, file = resolve_root(root), Path(path).absolute()
-    known = rooted(folder, registry)
-
-    def look() -> ValidationResult:
-        if isolated:
-            return _isolated(file, folder, known, require_truth=require_truth)
-        return _examine(file, folder, known, require_truth=require_truth)
-
-    result = look()
+    known, look = rooted(folder, registry), _isolated if isolated else _examine
+    result = look(file, folder, known, require_truth=require_truth)
     if result.split is None or result.size is None or "split" not in result.passed:
         return result
     size = known.size(result.split, result.size)
@@ -106,17 +100,13 @@ def validate(
     from lagbench.store.copy import bring
 
     if bring(size, folder, size.subsets["test"]):
-        result = look()
-    return _with_hashed_truth(result, Truth(size, folder))
-
-
-def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResult:
-    """Take back what was said by a truth that is not the one of the registry."""
-    used = "discontinuous_start" not in result.skipped
+        result = look(file, folder, known, require_truth=require_truth)
+    if "discontinuous_start" in result.skipped:
+        return result
     try:
-        if used:
-            truth.check()
+        Truth(size, folder).check()
     except DataError as error:
+        # What was said by a truth that is not the one of the registry is taken back.
         out = Findings()
         out.raised("dataset", error)
         findings = [f for f in result.findings if f.check not in TRUE]
@@ -132,11 +122,6 @@ def _with_hashed_truth(result: ValidationResult, truth: Truth) -> ValidationResu
 
 def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
     """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
-    try:
-        check_file(path, fix=WRITE)
-        extra = seconds_for(path)
-    except UnreadableFileError as error:
-        return _unreadable(path, error)
     request = {
         "path": str(path),
         "root": str(root),
@@ -146,17 +131,24 @@ def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool
             for split, found in registry.splits.items()
         },
     }
-    seconds, wall = CPU_SECONDS + extra, WALL_SECONDS + extra
-    values, stopped = in_child(EXAMINE, [request], seconds=seconds, wall=wall)
-    if not values:
-        trap = UnreadableFileError(
-            "reading the file had to be stopped",
-            where=str(path),
-            expected="a file that HDF5 reads within the limits",
-            got=stopped,
-            fix="the file is damaged or made to do harm; write it again with lagbench.submission.write",
-        )
-        return _unreadable(path, trap)
+    try:
+        check_file(path, fix=WRITE)
+        extra = seconds_for(path)
+        seconds, wall = CPU_SECONDS + extra, WALL_SECONDS + extra
+        values, stopped = in_child(f"{__name__}.{examine.__name__}", [request], seconds=seconds, wall=wall)
+        if not values:
+            raise UnreadableFileError(
+                "reading the file had to be stopped",
+                where=str(path),
+                expected="a file that HDF5 reads within the limits",
+                got=stopped,
+                fix="the file is damaged or made to do harm; write it again with lagbench.submission.write",
+            )
+    except UnreadableFileError as error:
+        out = Findings()
+        out.raised("readable", error)
+        out.skip("the file cannot be read", *CHECKS)
+        return out.result(path)
     said = values[0]
     findings = tuple(Finding(**{**f, "severity": Severity(f["severity"])}) for f in said["findings"])
     return ValidationResult(**{**said, "path": path, "findings": findings, "passed": tuple(said["passed"])})
@@ -187,9 +179,6 @@ def examine(request: Mapping[str, Any]) -> Mapping[str, Any]:
     return dataclasses.asdict(result) | {"path": str(path)}
 
 
-EXAMINE = f"{__name__}.{examine.__name__}"
-
-
 def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
     out = Findings()
     names: dict[str, str] = {}
@@ -207,7 +196,7 @@ def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool)
     except UnreadableFileError as error:
         out.raised("readable", error)
         out.skip("the file cannot be read", *CHECKS)
-    return out.result(path, names, sha256=content)
+    return out.result(path, sha256=content, **names)
 
 
 def _check_layout_and_task(anatomy: Anatomy, registry: Registry, root: Path, out: Findings) -> Size | None:
@@ -259,10 +248,3 @@ def _check_values(
             out.raised("dataset", error)
             out.skip(f"{error.what}: {error.where}", *TRUE)
         return content
-
-
-def _unreadable(path: Path, error: UnreadableFileError) -> ValidationResult:
-    out = Findings()
-    out.raised("readable", error)
-    out.skip("the file cannot be read", *CHECKS)
-    return out.result(path)

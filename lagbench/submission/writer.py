@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -18,15 +18,11 @@ from lagbench.data.registry import Registry, Size, spell_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
 
 from .findings import quoted
-from .format import DIMS, FORMAT, NEVER, OPTIONAL, SPACE, fits, kind_of
+from .format import ATTRIBUTES, DIMS, FORMAT, NEVER, OPTIONAL, SPACE, require_fit
 from .task_checks import HASH, dataset_hash_of, frames_to_predict
 from .truth import Truth
 
-CHUNK_CACHE = 1 << 20
-"""Chunk cache while writing [bytes]; frames are written once, in order."""
-
-Label = str | int | float
-"""Value of an optional attribute."""
+Label = str | int | float  # value of an optional attribute
 
 
 class PredictionsWriter:
@@ -66,10 +62,20 @@ class PredictionsWriter:
     ) -> None:
         self.path = Path(path)
         self.size, folder, _ = locate(split, size, root=root, registry=registry)
-        self._hash = _known_hash(self.size, folder) if dataset_sha256 is None else dataset_sha256
+        if dataset_sha256 is None:
+            _bring(self.size, folder)
+            dataset_sha256 = dataset_hash_of(self.size, folder)
+            if dataset_sha256 is None:
+                raise DataError(
+                    "the hash of the data set is not known",
+                    where=f"{self.size.split} {self.size.name}",
+                    expected="a hash in datasets.yaml, or a complete data set here",
+                    fix=f"{remedy(self.size, root=folder)}, or give dataset_sha256",
+                )
+        self._hash = dataset_sha256
         if not isinstance(self._hash, str) or not HASH.fullmatch(self._hash):
             raise UsageError("dataset_sha256 does not fit", expected="64 hex digits", got=quoted(self._hash))
-        _require_fit("method", method)
+        require_fit("method", method)
         self._names = ("position", "velocity") if velocity else ("position",)
         self._rows = {scenario: row for row, scenario in enumerate(sorted(self.size.subsets["test"]))}
         self._open = False  # whether a file is being written
@@ -97,7 +103,7 @@ class PredictionsWriter:
             value = value.item() if isinstance(value, np.generic) else value
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
-            _require_fit(name, value)
+            require_fit(name, value)
             self._labels[name] = value
 
     def __enter__(self) -> Self:
@@ -110,12 +116,18 @@ class PredictionsWriter:
         self._diverged.fill(NEVER)
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self.path, option="--output"))
-            try:
+            with self._writing():
                 self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
                 stack.callback(self._abandon)
-                self._define()
-            except (OSError, RuntimeError) as error:
-                raise self._refused(error) from error
+                for name, length in zip(DIMS, (len(self._rows), *self.shape), strict=True):
+                    self._file.createDimension(name, length)
+                self._create("scenario", "scenario", np.array(list(self._rows), np.int32))
+                self._create("frame", "frame", np.array(frames_to_predict(self.size), np.int32))
+                for name in self._names:
+                    self._create(name)
+                size, head = self.size, {"Conventions": "CF-1.11", "lagbench_format": np.int32(FORMAT)}
+                names = {"split": size.split, "size": size.name, "dataset_version": size.version}
+                self._file.setncatts({**head, **names, "dataset_sha256": self._hash})
             self._stack = stack.pop_all()
         self._open = True
         return self
@@ -142,26 +154,34 @@ class PredictionsWriter:
             WorkFailedError: the disk is full.
         """
         if not self._open:
-            raise UsageError(
-                "no file is open", where=str(self.path), fix="with PredictionsWriter(...) as writer:"
-            )
+            fix = "with PredictionsWriter(...) as writer:"
+            raise UsageError("no file is open", where=str(self.path), fix=fix)
         if scenario not in self._rows or scenario in self._written:
             what = "is written twice" if scenario in self._written else "is no test scenario"
-            raise UsageError(
-                f"scenario {scenario!r} {what}", expected=f"whole numbers: {spell_ids(self._rows)}"
-            )
+            expected = f"whole numbers: {spell_ids(self._rows)}"
+            raise UsageError(f"scenario {scenario!r} {what}", expected=expected)
         arrays = [position] if velocity is None else [position, velocity]
         if len(arrays) != len(self._names):
             raise UsageError("velocities come for every scenario or for none", where=f"scenario {scenario}")
+        checked = [self._checked(n, scenario, held) for n, held in zip(self._names, arrays, strict=True)]
+        frames, where = frames_to_predict(self.size), f"diverged_at of scenario {scenario}"
+        if diverged_at is not None and diverged_at not in frames:
+            what, expected = "no such frame is predicted", spell_ids(frames)
+            raise UsageError(what, where=where, expected=expected, got=repr(diverged_at))
+        rest = checked[0][len(frames) if diverged_at is None else frames.index(diverged_at) :]
+        moved = np.flatnonzero((rest != rest[:1]).any(axis=(1, 2)))
+        if moved.size:
+            raise UsageError(
+                "the rollout moves after it was frozen",
+                where=where,
+                expected=f"the same positions from frame {diverged_at} on",
+                got=f"frame {frames[int(moved[0]) - len(rest)]} differs",
+                fix="freeze a diverging rollout at its last finite frame",
+            )
         row = self._rows[scenario]
-        for name, values in zip(self._names, arrays, strict=True):
-            checked = self._checked(name, scenario, values)
-            if name == "position" and diverged_at is not None:
-                self._check_frozen(scenario, checked, diverged_at)
-            try:
-                self._file[name][row] = checked
-            except (OSError, RuntimeError) as error:
-                raise self._refused(error) from error
+        with self._writing():
+            for name, values in zip(self._names, checked, strict=True):
+                self._file[name][row] = values
         self._diverged[row] = NEVER if diverged_at is None else diverged_at
         self._written.add(scenario)
 
@@ -174,21 +194,14 @@ class PredictionsWriter:
             self._stack.__exit__(kind, error, trace)
             return
         with self._stack:
-            missing = sorted(set(self._rows) - self._written)
-            if missing:
-                raise UsageError(
-                    f"{len(missing)} test scenarios are missing",
-                    where=str(self.path),
-                    expected=spell_ids(self._rows),
-                    got=f"missing: {spell_ids(missing)}",
-                )
-            try:
+            if missing := sorted(set(self._rows) - self._written):
+                what, got = f"{len(missing)} test scenarios are missing", f"missing: {spell_ids(missing)}"
+                raise UsageError(what, where=str(self.path), expected=spell_ids(self._rows), got=got)
+            with self._writing():
                 if (self._diverged != NEVER).any():
-                    self._create("diverged_at", "i4", ("scenario",), self._diverged)
+                    self._create("diverged_at", "scenario", self._diverged)
                 self._file.setncatts(self._labels)
                 self._file.close()
-            except (OSError, RuntimeError) as failure:
-                raise self._refused(failure) from failure
 
     def _abandon(self) -> None:
         """Close a file that goes; that it cannot be written either must not hide the error before."""
@@ -204,104 +217,48 @@ class PredictionsWriter:
         except (ValueError, TypeError, RuntimeError) as error:  # ragged lists, tensors with gradients
             given, kind = np.empty(0, object), f"{type(values).__name__}: {str(error)[:200]}"
         if given.dtype.kind not in "fiu" or np.ma.is_masked(given):
-            raise UsageError(
-                "these are no positions", where=where, expected="an array of numbers without a mask", got=kind
-            )
+            expected = "an array of numbers without a mask"
+            raise UsageError("these are no positions", where=where, expected=expected, got=kind)
         with np.errstate(over="ignore"):
             array = np.asarray(given).astype(np.float32)
         if array.shape != self.shape:
             turned = sorted(array.shape) == sorted(self.shape)
-            fix = "transpose it: frame, particle, space" if turned else None
-            raise UsageError(
-                "the shape is another", where=where, expected=self.shape, got=array.shape, fix=fix
-            )
+            fix, got = "transpose it: frame, particle, space" if turned else None, array.shape
+            raise UsageError("the shape is another", where=where, expected=self.shape, got=got, fix=fix)
         wrong = np.argwhere(~np.isfinite(array))
         if len(wrong):
-            frame, particle, axis = (int(i) for i in wrong[0])
-            raise UsageError(
-                f"{len(wrong)} values are not finite as float32",
-                where=f"{where}, frame {frame + self.size.task.input_frames}, particle {particle}",
-                got=array[frame, particle, axis],
-                fix="freeze a diverging rollout at its last finite frame and give diverged_at",
-            )
+            frame, particle, axis = wrong[0].tolist()
+            what, got = f"{len(wrong)} values are not finite as float32", array[frame, particle, axis]
+            where += f", frame {frame + self.size.task.input_frames}, particle {particle}"
+            fix = "freeze a diverging rollout at its last finite frame and give diverged_at"
+            raise UsageError(what, where=where, got=got, fix=fix)
         return array
 
-    def _check_frozen(self, scenario: int, position: NDArray[np.float32], mark: int) -> None:
-        frames = frames_to_predict(self.size)
-        where = f"diverged_at of scenario {scenario}"
-        if mark not in frames:
-            raise UsageError(
-                "no such frame is predicted", where=where, expected=spell_ids(frames), got=repr(mark)
-            )
-        rest = position[frames.index(mark) :]
-        moved = np.flatnonzero((rest != rest[0]).any(axis=(1, 2)))
-        if moved.size:
-            raise UsageError(
-                "the rollout moves after it was frozen",
-                where=where,
-                expected=f"the same positions from frame {mark} on",
-                got=f"frame {mark + int(moved[0])} differs",
-                fix="freeze a diverging rollout at its last finite frame",
-            )
-
-    def _define(self) -> None:
-        size = self.size
-        lengths = (len(self._rows), *self.shape)
-        for name, length in zip(DIMS, lengths, strict=True):
-            self._file.createDimension(name, length)
-        self._create("scenario", "i4", ("scenario",), np.array(list(self._rows), np.int32))
-        self._create("frame", "i4", ("frame",), np.array(frames_to_predict(size), np.int32))
-        for name in self._names:
-            self._create(name, "f4", DIMS)
-        names = {"split": size.split, "size": size.name, "dataset_version": size.version}
-        head = {"Conventions": "CF-1.11", "lagbench_format": np.int32(FORMAT)}
-        self._file.setncatts({**head, **names, "dataset_sha256": self._hash})
-
-    def _create(
-        self, name: str, dtype: str, dims: tuple[str, ...], values: NDArray[np.int32] | None = None
-    ) -> None:
+    def _create(self, name: str, dim: str = "", values: NDArray[np.int32] | None = None) -> None:
         packing: dict[str, Any] = {"endian": "little", "fill_value": False}
-        if len(dims) > 1:
-            # not packed: zlib saves little of digits that hardly repeat, and unpacking makes scoring slower
-            packing |= {"fletcher32": True, "chunksizes": (1, 1, *self.shape[1:]), "chunk_cache": CHUNK_CACHE}
-        variable = self._file.createVariable(name, dtype, dims, **packing)
-        variable.setncatts(_ATTRIBUTES[name])
+        if not dim:
+            # Not packed: zlib saves little of digits that hardly repeat, and unpacking makes scoring slower.
+            # Frames are written once, in order: a cache of a MiB does.
+            packing |= {"fletcher32": True, "chunksizes": (1, 1, *self.shape[1:]), "chunk_cache": 1 << 20}
+        variable = self._file.createVariable(name, "i4" if dim else "f4", (dim,) if dim else DIMS, **packing)
+        variable.setncatts(ATTRIBUTES[name])
         if values is not None:
             variable[:] = values
 
-    def _refused(self, error: Exception) -> WorkFailedError:
-        fix = "free disk space, or name a folder that you may write to: --output"
-        return WorkFailedError("cannot write the predictions", where=str(self.path), got=error, fix=fix)
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            fix = "free disk space, or name a folder that you may write to: --output"
+            what, where = "cannot write the predictions", str(self.path)
+            raise WorkFailedError(what, where=where, got=error, fix=fix) from error
 
 
-_ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
-    "scenario": {"long_name": "scenario id", "units": "1"},
-    "frame": {"long_name": "absolute frame number", "units": "1"},
-    "position": {"long_name": "predicted particle position in lengths of the unit box", "units": "1"},
-    "velocity": {"long_name": "predicted particle velocity in box lengths per second", "units": "s-1"},
-    "diverged_at": {"long_name": "first frame of a frozen rollout, -1 where none is", "units": "1"},
-}
-
-
-def _require_fit(name: str, value: object) -> None:
-    """Refuse what `validate` would refuse of the file."""
-    if not fits(name, value):
-        raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
-
-
-def _known_hash(size: Size, root: Path) -> str:
+def _bring(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
     from lagbench.store.copy import bring  # http and more, which a child that only reads can do without
 
-    bring(size, root)
-    known = dataset_hash_of(size, root)
-    if known is None:
-        raise DataError(
-            "the hash of the data set is not known",
-            where=f"{size.split} {size.name}",
-            expected="a hash in datasets.yaml, or a complete data set here",
-            fix=f"{remedy(size, root=root)}, or give dataset_sha256",
-        )
-    return known
+    bring(size, root, scenarios)
 
 
 def write(
@@ -355,19 +312,15 @@ def write(
     )
     ids = sorted(writer.size.subsets["test"])
     placed, moving = _by_id(positions, ids), None if velocities is None else _by_id(velocities, ids)
-    for name, held in (("velocities", moving), ("diverged_at", diverged_at)):
-        if unknown := [scenario for scenario in held or {} if scenario not in ids]:
-            raise UsageError(
-                "no such test scenario",
-                where=name,
-                expected=spell_ids(ids),
-                got=", ".join(map(quoted, unknown[:5])),
-                fix="name scenarios by id, not by row",
-            )
+    marks = diverged_at or {}
+    for name, held in (("velocities", moving or {}), ("diverged_at", marks)):
+        if unknown := [scenario for scenario in held if scenario not in ids]:
+            got, fix = ", ".join(map(quoted, unknown[:5])), "name scenarios by id, not by row"
+            raise UsageError("no such test scenario", where=name, expected=spell_ids(ids), got=got, fix=fix)
     with writer:
         for scenario, values in placed.items():
             velocity = None if moving is None else moving.get(scenario)
-            writer.add(scenario, values, velocity, diverged_at=(diverged_at or {}).get(scenario))
+            writer.add(scenario, values, velocity, diverged_at=marks.get(scenario))
     return writer.path
 
 
@@ -423,31 +376,25 @@ def template(
         WorkFailedError: the disk is full or not writable.
     """
     if Path(output).exists() and not overwrite:
-        raise UsageError(
-            "there is such a file already",
-            where=str(output),
-            fix="write elsewhere: -o template.nc; or replace it: --overwrite",
-        )
-    from lagbench.store.copy import bring
-
+        fix = "write elsewhere: -o template.nc; or replace it: --overwrite"
+        raise UsageError("there is such a file already", where=str(output), fix=fix)
     entry, folder, described = locate(split, size, root=root, registry=registry)
-    bring(entry, folder, entry.subsets["test"])
+    _bring(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
     writer = PredictionsWriter(
         output, split=entry.split, size=entry.name, method="persistence", root=folder, registry=described
     )
-    ids = tuple(sorted(entry.subsets["test"]))
+    ids, frames = tuple(sorted(entry.subsets["test"])), frames_to_predict(entry)
     with writer:
         for scenario in ids:
             writer.add(scenario, np.broadcast_to(truth.given(scenario)[-1], writer.shape))
-    task = entry.task
     return TemplateResult(
         path=writer.path,
         split=entry.split,
         size=entry.name,
         scenarios=ids,
-        frames=(task.input_frames, task.input_frames + task.horizon - 1),
+        frames=(frames[0], frames[-1]),
         particles=entry.particles,
         bytes=writer.path.stat().st_size,
     )

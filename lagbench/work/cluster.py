@@ -90,12 +90,9 @@ def marked(folder: Path) -> Iterator[Mark]:
 def await_file(path: Path) -> None:
     """Wait until a file that another machine has written is seen here."""
     if not _appears(path, PATIENCE):
-        raise WorkFailedError(
-            "a worker's file does not appear",
-            where=str(path),
-            expected=f"a file within {PATIENCE:.0f} s",
-            fix="name a folder on storage that all machines share, then run the same command again",
-        )
+        what, expected = "a worker's file does not appear", f"a file within {PATIENCE:.0f} s"
+        fix = "name a folder on storage that all machines share, then run the same command again"
+        raise WorkFailedError(what, where=str(path), expected=expected, fix=fix)
 
 
 def _appears(path: Path, patience: float, *, holding: str | None = None) -> bool:
@@ -130,22 +127,14 @@ class Client:
 
     def check(self, worker: str, *, threads: int) -> None:
         """Refuse a worker that could not make the client's bits."""
-        if self.version != version("lagbench"):
-            raise WorkFailedError(
-                "a worker runs another version of lagbench",
-                where=f"worker {worker}",
-                expected=self.version,
-                got=version("lagbench"),
-                fix="install the same version on every worker",
-            )
+        where, own = f"worker {worker}", version("lagbench")
+        if self.version != own:
+            fix = "install the same version on every worker"
+            what = "a worker runs another version of lagbench"
+            raise WorkFailedError(what, where=where, expected=self.version, got=own, fix=fix)
         if threads != 1:
-            raise WorkFailedError(
-                "a worker runs several tasks in one process",
-                where=f"worker {worker}",
-                expected="1 thread",
-                got=f"{threads} threads",
-                fix=f"start the workers with `{WORKERS}`",
-            )
+            what, fix = "a worker runs several tasks in one process", f"start the workers with `{WORKERS}`"
+            raise WorkFailedError(what, where=where, expected="1 thread", got=f"{threads} threads", fix=fix)
         if self.mark is not None:
             self.mark.check(worker)
 
@@ -207,19 +196,22 @@ class Cluster:
     def __enter__(self) -> Self:
         """Connect, and mark the shared folder."""
         with ExitStack() as stack:
-            stack.enter_context(_quiet())
             self._dask = stack.enter_context(_connected(self.address))
             mark = None if self.folder is None else stack.enter_context(marked(self.folder))
             self._client = Client(f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark)
             self._dask.subscribe_topic(self._client.name, lambda event: self._heard.put(tuple(event[1])))
-            stack.callback(self._dismiss)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop what still runs and disconnect."""
+        """Make the workers drop what they hold, and disconnect."""
+        pending, self._pending = [future for _, future in self._pending.values()], {}
+        if pending and self._dask.status == "running":
+            with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
+                self._dask.cancel(pending)
+                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
         self._stack.__exit__(kind, error, trace)
 
     def submit(self, task: Task) -> None:
@@ -246,7 +238,9 @@ class Cluster:
             now = time.monotonic()
             if now - looked >= LOOK_SECONDS:
                 looked = now
-                alive = now if _has_workers(self._dask) else alive
+                with contextlib.suppress(OSError):  # the connection may break after the status was set
+                    if self._dask.status == "running" and self._dask.scheduler_info()["workers"]:
+                        alive = now
             if self._dask.status in ("closed", "failed") or now - alive > LOST_SECONDS:
                 raise _lost(f"{self._dask.status}, no worker for {now - alive:.0f} s")
             if not ended:
@@ -257,18 +251,17 @@ class Cluster:
         before, self._seen[number] = self._seen.get(number, 0), units
         return Event(task=task, kind="progress", value=units - before)
 
-    def _dismiss(self) -> None:
-        """Make the workers drop what they hold."""
-        pending, self._pending = [future for _, future in self._pending.values()], {}
-        if pending and self._dask.status == "running":
-            with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
-                self._dask.cancel(pending)
-                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
-
 
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    distributed = require("distributed", extra="cluster")
+    """Connect, with Dask's logs kept off the terminal: what matters of them becomes an error of ours.
+
+    After an error they stay off: a client that lost its scheduler logs until the process ends.
+    """
+    distributed = require("distributed", extra="cluster")  # its import sets the levels of its loggers
+    levels = {name: logging.getLogger(name).level for name in LOGGERS}
+    for name in LOGGERS:
+        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     try:
         if not address.startswith(("ucx://", "inproc://")):
             # A client whose address cannot be one is 40 s in closing.
@@ -289,19 +282,6 @@ def _connected(address: str) -> Iterator[Any]:
         raise _lost(error) from error
     finally:
         client.close()
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Dask's logs off the terminal: what matters of them becomes an error of ours.
-
-    After an error they stay off: a client that lost its scheduler logs until the process ends.
-    """
-    require("distributed", extra="cluster")  # its import sets the levels of its loggers
-    levels = {name: logging.getLogger(name).level for name in LOGGERS}
-    for name in LOGGERS:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    yield
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
 
@@ -315,13 +295,6 @@ def _lost(got: object) -> WorkFailedError:
     )
 
 
-def _has_workers(client: Any) -> bool:  # noqa: ANN401
-    try:
-        return client.status == "running" and bool(client.scheduler_info()["workers"])
-    except OSError:  # the connection broke since the status was set
-        return False
-
-
 def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
     """Return what came of a task; put whatever else came into an error of ours."""
     killed = require("distributed", extra="cluster").KilledWorker
@@ -330,19 +303,13 @@ def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
     except LagbenchError:
         raise
     except killed as error:
-        raise WorkFailedError(
-            "workers of the Dask cluster died again and again",
-            where=name,
-            got=str(error),
-            fix="give the workers more memory, or leave --scheduler out",
-        ) from error
+        what = "workers of the Dask cluster died again and again"
+        fix = "give the workers more memory, or leave --scheduler out"
+        raise WorkFailedError(what, where=name, got=str(error), fix=fix) from error
     except Exception as error:  # whatever a worker raises that cannot even read the task
         if future.status != "error":
             raise _lost(error) from error
-        raise WorkFailedError(
-            "a worker of the Dask cluster cannot do the work",
-            where=name,
-            got=f"{type(error).__name__}: {error}",
-            fix="install the same version of lagbench with its extras on every worker",
-        ) from error
+        what, got = "a worker of the Dask cluster cannot do the work", f"{type(error).__name__}: {error}"
+        fix = "install the same version of lagbench with its extras on every worker"
+        raise WorkFailedError(what, where=name, got=got, fix=fix) from error
     return done

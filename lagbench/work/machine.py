@@ -127,23 +127,23 @@ def in_child(
         )
     except subprocess.TimeoutExpired as error:
         return Answers(_lines(error.stdout), f"no end after {wall:.0f} s")
-    if done.returncode == 0:
-        return Answers(_lines(done.stdout), None)
-    if done.returncode == OUT_OF_MEMORY:
-        return Answers(_lines(done.stdout), f"more than {memory >> 20} MiB of memory")
-    if done.returncode == TOO_LONG:
-        return Answers(_lines(done.stdout), "no end within the computing time allowed")
-    if done.returncode < 0:
-        name = signal.strsignal(-done.returncode) or str(-done.returncode)
-        return Answers(_lines(done.stdout), f"it crashed: {name}")
-    if b"Traceback" not in done.stderr:  # ended by a library: exit(), or a crash on Windows
-        return Answers(_lines(done.stdout), f"it ended with exit code {done.returncode:#x}")
-    raise WorkFailedError(
-        "a child process itself failed",
-        where=function,
-        got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
-        fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
-    )
+    stopped, code = None, done.returncode
+    if code == OUT_OF_MEMORY:
+        stopped = f"more than {memory >> 20} MiB of memory"
+    elif code == TOO_LONG:
+        stopped = "no end within the computing time allowed"
+    elif code < 0:
+        stopped = f"it crashed: {signal.strsignal(-code) or -code}"
+    elif code and b"Traceback" not in done.stderr:  # ended by a library: exit(), or a crash on Windows
+        stopped = f"it ended with exit code {code:#x}"
+    elif code:
+        raise WorkFailedError(
+            "a child process itself failed",
+            where=function,
+            got=ascii(done.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)[-1][:300]),
+            fix="`lagbench doctor` checks the installation; if it finds nothing, report this with the file",
+        )
+    return Answers(_lines(done.stdout), stopped)
 
 
 def _lines(output: bytes | None) -> list[Any]:

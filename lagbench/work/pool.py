@@ -24,8 +24,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, package_at_fault
 
@@ -79,8 +78,7 @@ class Event:
     machine: Mapping[str, str] | None = None
 
 
-@dataclass(frozen=True)
-class _Attempt:
+class _Attempt(NamedTuple):
     """A task and how many workers have died under it."""
 
     task: Task
@@ -118,9 +116,7 @@ class Pool:
         """Return the pool itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Let idle workers end by themselves, then kill; after an error kill at once."""
         if error is None:  # Taichi saves what it compiled as its process exits
             idle = [worker for worker in self._workers if worker.attempt is None]
@@ -139,7 +135,15 @@ class Pool:
     def events(self) -> Iterator[Event]:
         """Run every queued task and yield news until all are done."""
         while self._waiting or any(worker.attempt for worker in self._workers):
-            self._assign()
+            idle = [worker for worker in self._workers if worker.attempt is None]
+            while self._waiting and (idle or len(self._workers) < self.size):
+                worker = idle.pop() if idle else self._start()
+                _, _, attempt = heapq.heappop(self._waiting)
+                worker.attempt, worker.progress = attempt, 0
+                try:
+                    worker.channel.send_bytes(pickle.dumps((attempt.task.function, attempt.task.arguments)))
+                except OSError:  # it died while idle
+                    self._bury(worker, attempt)
             busy = [worker for worker in self._workers if worker.attempt]
             news = wait([worker.channel for worker in busy])  # one that died has some too
             for worker in busy:
@@ -161,17 +165,6 @@ class Pool:
 
     def _queue(self, attempt: _Attempt) -> None:
         heapq.heappush(self._waiting, (-attempt.task.cost, next(self._number), attempt))
-
-    def _assign(self) -> None:
-        idle = [worker for worker in self._workers if worker.attempt is None]
-        while self._waiting and (idle or len(self._workers) < self.size):
-            worker = idle.pop() if idle else self._start()
-            _, _, attempt = heapq.heappop(self._waiting)
-            worker.attempt, worker.progress = attempt, 0
-            try:
-                worker.channel.send_bytes(pickle.dumps((attempt.task.function, attempt.task.arguments)))
-            except OSError:  # it died while idle
-                self._bury(worker, attempt)
 
     def _start(self) -> _Worker:
         ours, theirs = socket.socketpair()
@@ -210,12 +203,10 @@ class Pool:
         worker.channel.close()
         again = _Attempt(attempt.task, attempt.deaths + 1)
         if again.deaths >= ATTEMPTS:
-            raise WorkFailedError(
-                f"a worker process died {ATTEMPTS} times",
-                where=again.task.name,
-                got=f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}",
-                fix="free memory or take fewer workers: --workers 1",
-            )
+            got = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+            what = f"a worker process died {ATTEMPTS} times"
+            fix = "free memory or take fewer workers: --workers 1"
+            raise WorkFailedError(what, where=again.task.name, got=got, fix=fix)
         self._queue(again)
         return Event(task=again.task, kind="lost", value=worker.progress)
 
@@ -235,7 +226,15 @@ def serve(descriptor: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(descriptor)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_listen, args=(channel, inbox), daemon=True).start()
+
+    def listen() -> None:
+        try:
+            while True:
+                inbox.put(channel.recv_bytes())
+        except (EOFError, OSError):  # the parent is gone
+            os._exit(1)
+
+    threading.Thread(target=listen, daemon=True).start()
     while (message := inbox.get()) != _FAREWELL:
         try:
             function, arguments = pickle.loads(message)
@@ -245,12 +244,3 @@ def serve(descriptor: int) -> None:
         except Exception as error:
             reply = ("error", crashed(error))
         channel.send(reply)
-
-
-def _listen(channel: Connection, inbox: queue.SimpleQueue[bytes]) -> None:
-    """Pass messages on; end the process at once when the parent is gone."""
-    try:
-        while True:
-            inbox.put(channel.recv_bytes())
-    except (EOFError, OSError):
-        os._exit(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 
 def watched() -> bool:
@@ -31,40 +31,28 @@ class Progress:
         return (self.scenarios_done - self.before) / self.seconds if self.seconds > 0.0 else 0.0
 
 
-@dataclass
 class Meter:
-    """Counts work and tells a listener at every count."""
+    """Counts work and tells a listener, where there is one, at every count."""
 
-    # called with the state after every count; nobody when None
-    listener: Callable[[Progress], None] | None = None
-    stage: str = ""  # what happens now
-    total: int = 0  # units to do
-    scenarios: int = 0  # scenarios to finish
-    done: int = 0  # units done
-    finished: int = 0  # scenarios finished
-    _before: int = field(default=0, init=False)
-    _started: float = field(default_factory=time.monotonic, init=False)
+    def __init__(self, listener: Callable[[Progress], None] | None = None) -> None:
+        self._listener = listener
+        self.stage = ""  # what happens now
+        self._state = Progress(stage="", done=0, total=0, scenarios_done=0, scenarios=0, seconds=0.0)
+        self._started = time.monotonic()
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
         """Start a stage with counts at zero, or at what an earlier run had done."""
-        self.stage, self.total, self.scenarios = stage, total, scenarios
-        self.done = self.finished = self._before = done
+        self.stage = stage
+        counts = {"done": done, "total": total, "scenarios_done": done, "scenarios": scenarios}
+        self._state = Progress(stage=stage, **counts, seconds=0.0, before=done)
         self._started = time.monotonic()
         self.count()
 
     def count(self, units: int = 0, *, scenarios: int = 0) -> None:
         """Add units of work (negative where work was lost) and finished scenarios."""
-        self.done += units
-        self.finished += scenarios
-        if self.listener is not None:
-            self.listener(
-                Progress(
-                    stage=self.stage,
-                    done=self.done,
-                    total=self.total,
-                    scenarios_done=self.finished,
-                    scenarios=self.scenarios,
-                    seconds=time.monotonic() - self._started,
-                    before=self._before,
-                )
-            )
+        old = self._state
+        done, finished = old.done + units, old.scenarios_done + scenarios
+        seconds = time.monotonic() - self._started
+        self._state = replace(old, stage=self.stage, done=done, scenarios_done=finished, seconds=seconds)
+        if self._listener is not None:
+            self._listener(self._state)
