@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import torch
@@ -72,26 +72,14 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Self:
         """Return the batch on a device."""
-        moved = {
-            field.name: value.to(device)
-            for field in fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
-        }
-        return replace(self, **moved)
+        held = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: value.to(device) for name, value in held.items()})
 
     def followed_by(self, position: Tensor) -> Self:
-        """Return the windows one frame later: their first frame leaves, the given one joins.
-
-        Args:
-            position: particle positions of the frame after the last [length], shape [particle, 2].
-        """
+        """Return the windows one frame later: the first leaves, positions of the next [particle, 2] join."""
         walls = None if self.wall_velocity is None else self.wall_velocity[:, 1:]
-        return replace(
-            self,
-            position=torch.cat([self.position[:, 1:], position[:, None]], dim=1),
-            wall_velocity=walls,
-            frame=self.frame + 1,
-        )
+        joined = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
+        return replace(self, position=joined, wall_velocity=walls, frame=self.frame + 1)
 
 
 def collate(windows: Sequence[Window]) -> Batch:

@@ -110,12 +110,8 @@ class WindowSampler(Sampler[int]):
         self.rank = rank if rank is not None else torch.distributed.get_rank() if grouped else 0
         self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if grouped else 1
         if not 0 <= self.rank < self.ranks <= len(data):
-            raise UsageError(
-                "no window for a rank",
-                where="WindowSampler",
-                expected=f"0 <= rank < ranks <= {len(data)}",
-                got=f"rank {self.rank} of {self.ranks}",
-            )
+            expected, got = f"0 <= rank < ranks <= {len(data)}", f"rank {self.rank} of {self.ranks}"
+            raise UsageError("no window for a rank", where="WindowSampler", expected=expected, got=got)
         self.data = data  # what is drawn from
         self.seed = _natural(seed, "seed")  # seed of all epochs
         self.epoch = 0  # epoch that is drawn from
@@ -178,9 +174,8 @@ def _natural(value: object, name: str) -> int:
     except TypeError:
         number = -1
     if number < 0:
-        raise UsageError(
-            f"{name} does not fit", where="WindowSampler", expected="a whole number from 0", got=repr(value)
-        )
+        what, expected = f"{name} does not fit", "a whole number from 0"
+        raise UsageError(what, where="WindowSampler", expected=expected, got=repr(value))
     return number
 
 
@@ -269,12 +264,9 @@ def predict(
     data = WindowDataset(split, subset=subset, size=size, root=root, future=0, registry=registry)
     task = data.size.task
     if history is not None and not 1 <= history <= task.input_frames:
-        raise UsageError(
-            "a model cannot see that many of the given frames",
-            where="predict",
-            expected=f"history from 1 to {task.input_frames}",
-            got=history,
-        )
+        what = "a model cannot see that many of the given frames"
+        expected = f"history from 1 to {task.input_frames}"
+        raise UsageError(what, where="predict", expected=expected, got=history)
     seen = slice(task.input_frames - (history or task.input_frames), None)
     needed = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):

@@ -142,12 +142,12 @@ def mirrored(given: Given, points: Floats, values: Floats, walls: Floats) -> tup
     (left, right), (bottom, top) = given.size.bounds
     depth = DEPTH * np.sqrt((right - left) * (top - bottom) / len(points))
     places, speeds = [points], [values]
-    for wall, (axis, where) in enumerate([(0, left), (0, right), (1, bottom), (1, top)]):
+    for motion, axis, where in zip(walls, (0, 0, 1, 1), (left, right, bottom, top), strict=True):
         near = np.abs(points[:, axis] - where) < depth
         image, speed = points[near].copy(), values[near].copy()
         image[:, axis] = 2.0 * where - image[:, axis]
         if given.driven:
-            speed = 2.0 * walls[wall] - speed
+            speed = 2.0 * motion - speed
         else:
             speed[:, axis] *= -1.0
         places.append(image)

@@ -15,7 +15,7 @@ import numpy as np
 
 from lagbench.data.grid import divergence
 
-from .frame import Floats, FramePair, Snapshot, average, dot, lengths
+from .frame import Floats, FramePair, Snapshot, dot, lengths, mean_squared_error
 from .metric import Direction, enough_nodes, floored_quotient, metric, metrics_of, quotient, total
 from .metric import root_mean_square as over_frames_rms
 
@@ -148,11 +148,6 @@ def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
     return floored_quotient(gap, scale)
 
 
-def root_mean_square(values: Floats) -> float:
-    """Return ``sqrt(mean(v^2))`` over nodes."""
-    return math.sqrt(average(values**2))
-
-
 @metric(unit="1", direction=Direction.LOWER, source="design section 8", over_frames=over_frames_rms)
 def density_rmse(pair: FramePair) -> float:
     """Root mean squared error of density relative to rest, over all nodes.
@@ -160,7 +155,7 @@ def density_rmse(pair: FramePair) -> float:
     All nodes of the grid, so that material in the wrong place shows both where it is missing
     and where it should not be. 0 is perfect; values of a box that is filled in part are small.
     """
-    return root_mean_square(pair.prediction.fields.density - pair.truth.fields.density)
+    return math.sqrt(mean_squared_error(pair.prediction.fields.density - pair.truth.fields.density))
 
 
 @metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
@@ -177,7 +172,7 @@ def divergence_rms_true(pair: FramePair) -> float:
 
 def _divergence(pair: FramePair, snapshot: Snapshot) -> float:
     spacing = pair.scenario.setting.grid.spacing
-    return root_mean_square(divergence(snapshot.fields.velocity, spacing)[pair.nodes])
+    return math.sqrt(mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes]))
 
 
 @metric(unit="%", direction=Direction.LOWER, source="design 2, section 4")

@@ -56,8 +56,8 @@ def sinkhorn_divergence(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
     def cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
         weights: list[NDArray[np.float64]] = [np.full(len(side), 1.0 / len(side)) for side in (a, b)]
         distances = ot.dist(a, b, metric="sqeuclidean")
-        found = ot.sinkhorn2(*weights, distances, reg=BLUR, numItermax=ROUNDS, stopThr=TOLERANCE, warn=False)
-        return float(found)
+        options = {"reg": BLUR, "numItermax": ROUNDS, "stopThr": TOLERANCE, "warn": False}
+        return float(ot.sinkhorn2(*weights, distances, **options))
 
     return max(0.0, cost(x, y) - (cost(x, x) + cost(y, y)) / 2.0)
 

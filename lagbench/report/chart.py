@@ -49,8 +49,7 @@ class Scale:
         x = np.asarray(values, np.float64)
         if not self.log:
             return (x - self.low) / (self.high - self.low)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
+        logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
         low, high = math.log10(self.low), math.log10(self.high)
         return np.asarray((logs - low) / (high - low), np.float64)
 
@@ -189,8 +188,7 @@ class Plot:
     def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
         """Draw a cloud of points."""
         points = zip(self._columns(x), self._rows(y), strict=True)
-        data = "".join(path_data([point]) for point in points)
-        self._add("path", "", d=data, class_=f"dots {kind}")
+        self._add("path", "", d="".join(path_data([point]) for point in points), class_=f"dots {kind}")
 
     def level(self, value: float, label: str, *, above: bool = True) -> None:
         """Draw a horizontal line with a name at its right end."""
@@ -222,11 +220,9 @@ class Plot:
                 name,
             ]
             kind = f"dot {spot.kind}".strip()
-            if spot.href is None:
-                mark = tag("g", *drawn, class_=kind, tabindex=0, role="img", aria_label=spot.said)
-            else:
-                mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
-            self._marks.append(mark)
+            reached = {"tabindex": 0, "role": "img"} if spot.href is None else {"href": spot.href}
+            element = "g" if spot.href is None else "a"
+            self._marks.append(tag(element, *drawn, class_=kind, **reached, aria_label=spot.said))
         self._marks += leads  # above the dots
 
     def svg(self, title: str, description: str) -> Markup:
@@ -262,11 +258,13 @@ class Plot:
             column = LEFT + float(self._columns(tick.value))
             drawn.append(tag("path", d=path_data([(column, bottom), (column, bottom + 4)]), class_="mark"))
             drawn.append(written(tick.label, column, bottom + 17, "tick middle"))
-        drawn.append(tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"))
         x_label, y_label = self._labels
-        drawn.append(written(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
-        drawn.append(written(_with_factor(y_label, self._y), 2, 14, "label"))
-        return drawn
+        return [
+            *drawn,
+            tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"),
+            written(_with_factor(x_label, self._x), right, self._height - 5, "label end"),
+            written(_with_factor(y_label, self._y), 2, 14, "label"),
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,25 +294,20 @@ def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, descrip
         drawn.append(written(tick.label, column, bottom + 16, "tick middle"))
     zero = place(0.0) if not scale.log else left
     for number, bar in enumerate(bars):
-        drawn += _bar(bar, number * ROW + 19, zero, place)
+        top = number * ROW + 19
+        name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
+        value = tag("tspan", f"  {bar.written}", class_="value")
+        drawn.append(tag("text", name, value, x=14, y=top - 5, class_="name"))
+        if np.isfinite(bar.value):
+            low, high = sorted((zero, place(bar.value)))
+            box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
+            drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
+        points = [(place(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
+        if points:
+            drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
     drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
     drawn.append(written(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
     return _canvas(bottom + 40, title, description, *drawn)
-
-
-def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
-    at = place if callable(place) else float
-    name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
-    value = tag("tspan", f"  {bar.written}", class_="value")
-    drawn = [tag("text", name, value, x=14, y=top - 5, class_="name")]
-    if np.isfinite(bar.value):
-        low, high = sorted((zero, at(bar.value)))
-        box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
-        drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
-    points = [(at(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
-    if points:
-        drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
-    return drawn
 
 
 def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:

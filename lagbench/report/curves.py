@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.metric import Direction, mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
@@ -26,22 +26,22 @@ def error_curves(subject: Subject) -> Iterator[Figure]:
     several = len(subject.entries) > 1
     shared = " The axis is shared by all files." if several else ""
     first, last = subject.frames[0], subject.frames[-1]
-    for row in subject.rows:
+    for entry in subject.entries:
         for name in ("vorticity_mse" if subject.full_box else "attribute_mse", "position_rmse"):
-            if row.entry is None or name not in row.scores:
+            score = entry.card.submission.get(name)
+            if score is None:
                 continue
-            score = row.scores[name]
-            y = spanning([r.scores[name].per_frame for r in subject.rows if r.entry is not None])
+            y = spanning([other.card.submission[name].per_frame for other in subject.entries])
             scenarios = enumerate(zip(score.scenarios, score.per_frame, strict=True))
             series = [(f"scenario {number}", kind_of(i), values) for i, (number, values) in scenarios]
             plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric))
             for label, kind, values in series:
                 plot.line(subject.frames, values, kind, label)
-            said = f"Lines of {len(series)} test scenarios of {row.name} from frame {first} to {last}."
+            said = f"Lines of {len(series)} test scenarios of {entry.name} from frame {first} to {last}."
             yield _figure(
                 subject,
-                f"scenarios-{name.replace('_', '-')}-{row.entry.number}",
-                f"{words(name, capital=True)}, every test scenario" + (f": {row.name}" if several else ""),
+                f"scenarios-{name.replace('_', '-')}-{entry.number}",
+                f"{words(name, capital=True)}, every test scenario" + (f": {entry.name}" if several else ""),
                 "Fig. 5.10",
                 series,
                 plot.svg(f"{score.metric.name} over frames", said),
@@ -71,8 +71,7 @@ def method_curves(subject: Subject) -> Iterator[Figure]:
         plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
         for row in rows:
             if row.entry is not None:
-                columns = row.scores[name].per_frame.T
-                low, high = np.array([bootstrap_interval(column) for column in columns]).T
+                low, high = np.array([*map(bootstrap_interval, row.scores[name].per_frame.T)]).T
                 plot.band(subject.frames, low, high, row.kind)
         _draw(subject, plot, series)
         if twinned:
@@ -184,7 +183,7 @@ def _figure(
         title=title,
         thesis=thesis,
         body=join([key([*((kind, label) for label, kind, _ in series), *more]), drawn]),
-        caption=join([caption]),
+        caption=caption,
         data=table([what, *(tag("span", f"frame {frame}") for frame in frames)], rows, label="Numbers"),
     )
 
@@ -199,10 +198,7 @@ def _frame_axis(subject: Subject) -> Scale:
 
 def _mean(score: Score) -> Floats:
     """Return the mean over scenarios per frame, NaN where none has a value, shape [frame]."""
-    known = np.isfinite(score.per_frame)
-    count = known.sum(axis=0)
-    total = np.where(known, score.per_frame, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean_over_seeds(np.where(np.isfinite(score.per_frame), score.per_frame, np.nan))
 
 
 SHOWN = (
@@ -239,26 +235,19 @@ def bar_figures(subject: Subject) -> Iterator[Figure]:
         higher = metric.direction is Direction.HIGHER
         scale = linear(min(0.0, *known, 0.0), 1.0) if higher else spanning([np.array(known)], log=False)
         whole, said = f"{title} at frame {frame}", "; ".join(f"{bar.label}: {bar.written}" for bar in bars)
+        cells = [
+            [row.name, *map(html, (bar.value, *(bar.dots or unknown)))]
+            for row, bar in zip(rows, bars, strict=True)
+        ]
         yield Figure(
             name=f"bars-{name.replace('_', '-')}",
             title=whole,
             thesis=thesis,
             body=bar_chart(bars, scale, quantity(metric), whole, said),
-            caption=join(
-                [
-                    f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
-                    f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} is better;"
-                    f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
-                ]
-            ),
-            data=table(
-                ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
-                [
-                    [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
-                    for row, bar in zip(rows, bars, strict=True)
-                ],
-                label=title,
-            ),
+            caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
+            f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} is better;"
+            f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest.",
+            data=table(["method", "mean", *(f"scenario {i}" for i in subject.scenarios)], cells, label=title),
         )
 
 
@@ -279,13 +268,8 @@ def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         title=f"Vorticity distribution at frame {subject.key_frame}",
         thesis="Fig. 5.12",
         body=join([key(items), _histogram(subject, moment)]),
-        caption=join(
-            [
-                "Share of the grid nodes per bin of vorticity [1/frame], scenario"
-                f" {scenario}. Black: the truth, whose range sets the bins; the first and the last bin hold"
-                " all that lies beyond."
-            ]
-        ),
+        caption=f"Share of the grid nodes per bin of vorticity [1/frame], scenario {scenario}. Black: the"
+        " truth, whose range sets the bins; the first and the last bin hold all that lies beyond.",
     )
     charts = [
         tag("div", tag("p", f"frame {held.frame}", class_="panels-title"), _histogram(subject, held))
@@ -296,20 +280,19 @@ def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         title="Vorticity distribution over time",
         thesis="Fig. 5.18",
         body=join([key(items), tag("div", *charts, class_="figures small")]),
-        caption=join(
-            [f"As the figure before, at other frames of scenario {scenario}; each frame has bins of its own."]
-        ),
+        caption=f"As the figure before, at other frames of scenario {scenario}; each frame has bins of its"
+        " own.",
         wide=True,
     )
 
 
 def _histogram(subject: Subject, moment: Moment) -> Markup:
-    series = [("truth", "truth", moment.pairs[0].true_vorticity)]
+    true = moment.pairs[0].true_vorticity
+    edges, heights = shares_of(true, true)
+    shares = [("truth", "truth", heights)]
     for entry, pair in zip(subject.entries, moment.pairs, strict=True):
-        series.append((entry.name, entry.kind, pair.predicted_vorticity))
-    edges, _ = shares_of(series[0][2], series[0][2])
-    shares = [(name, kind, shares_of(values, series[0][2])[1]) for name, kind, values in series]
-    top = max((float(heights.max()) for _, _, heights in shares), default=1.0)
+        shares.append((entry.name, entry.kind, shares_of(pair.predicted_vorticity, true)[1]))
+    top = max(float(heights.max()) for _, _, heights in shares)
     plot = Plot(
         linear(float(edges[0]), float(edges[-1]), tight=True),
         linear(0.0, top),
@@ -342,8 +325,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     if not pairs[0].node_count:  # nodes are the truth's
         return
     # axes leave out the farthest nodes
-    farthest = [np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs]
-    reach = float(max(farthest))
+    reach = float(max(np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs))
     reach = reach if np.isfinite(reach) and 0.0 < reach < 1e300 else 1.0
     y, true = linear(-reach, reach), pairs[0].true_vorticity
     low, high = np.percentile(true, [FAR_QUANTILE, 100.0 - FAR_QUANTILE])
@@ -378,6 +360,6 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
             title=title,
             thesis=thesis,
             body=tag("div", *charts, class_="figures small"),
-            caption=join([f"{said} {told}{drawn}"]),
+            caption=f"{said} {told}{drawn}",
             wide=len(charts) > 1,
         )

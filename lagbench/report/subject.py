@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +16,7 @@ from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
-from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
 from lagbench.scoring.card import ScoreCard, told_apart
 from lagbench.scoring.task import SUBMISSION, OpenScenario, ScoredTask, load_scored_task
@@ -87,7 +87,7 @@ class Subject:
     @property
     def best_entry(self) -> Row:
         """The entry with the least loss in the ranking metric, the first of equals."""
-        metric, rows = self.ranking, [row for row in self.rows if row.entry is not None]
+        metric, rows = self.ranking, self.rows[: len(self.entries)]
         losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
         return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
 
@@ -129,10 +129,8 @@ class Subject:
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, the first and the last predicted one among them."""
         predicted = self.task.setting.predicted_frames
-        if len(self.frames_of_interest) >= TIMES:
-            chosen = _spaced(self.frames_of_interest, TIMES - 1)
-        else:
-            chosen = _spaced(tuple(predicted), TIMES)
+        many = len(self.frames_of_interest) >= TIMES
+        chosen = _spaced(self.frames_of_interest, TIMES - 1) if many else _spaced(predicted, TIMES)
         return tuple(sorted({*chosen, predicted[-1]}))
 
 
@@ -141,13 +139,11 @@ def kind_of(number: int) -> str:
     return f"s{number % COLOURS}" + (f" d{min(number // COLOURS, 3)}" if number >= COLOURS else "")
 
 
-def _spaced(numbers: Sequence[int], count: int) -> Iterator[int]:
-    """Yield evenly spaced members, first and last included."""
+def _spaced(numbers: Sequence[int], count: int) -> Sequence[int]:
+    """Return evenly spaced members, first and last included."""
     if len(numbers) <= count:
-        yield from numbers
-        return
-    for i in range(count):
-        yield numbers[round(i * (len(numbers) - 1) / (count - 1))]
+        return numbers
+    return [numbers[round(i * (len(numbers) - 1) / (count - 1))] for i in range(count)]
 
 
 def subject_of(
@@ -216,11 +212,6 @@ class Moment:
     def truth(self) -> Snapshot:
         """The true particles."""
         return self.pairs[0].truth
-
-    @property
-    def setting_of(self) -> Scenario:
-        """What holds in all frames of the scenario."""
-        return self.pairs[0].scenario
 
     @cached_property
     def true_vorticity(self) -> NDArray[np.float64]:

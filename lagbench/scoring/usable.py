@@ -31,11 +31,19 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
     """
     setting = task.setting
     counts = [covered_nodes(_clouds(task, i)[0], setting.grid) for i in scenarios]
-
-    def every() -> Iterator[Cloud]:
-        return (cloud for i in task.scenarios for cloud in _clouds(task, i))
-
-    cells = fitting_cells(every, setting.grid.placement, near=setting.grid.cells)
+    cells = fitting_cells(
+        lambda: (cloud for i in task.scenarios for cloud in _clouds(task, i)),
+        setting.grid.placement,
+        near=setting.grid.cells,
+    )
+    if cells is None:
+        fix = "more particles: they cover enough nodes of no grid"
+    else:
+        word = "coarser" if cells < setting.grid.cells else "finer"
+        described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
+        local = (task.truth.root / described).is_file()
+        here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
+        fix = f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
     least, most = min(counts), max(counts)
     return Finding(
         check="undefined",
@@ -45,18 +53,8 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
         expected=f"{MINIMUM_NODES} nodes with particles enough around them",
         got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios undefined:"
         f" {least if least == most else f'{least} to {most}'} nodes counted, {MINIMUM_NODES} needed",
-        fix=_regrid(task, cells),
+        fix=fix,
     )
-
-
-def _regrid(task: ScoredTask, cells: int | None) -> str:
-    if cells is None:
-        return "more particles: they cover enough nodes of no grid"
-    word = "coarser" if cells < task.setting.grid.cells else "finer"
-    described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
-    local = (task.truth.root / described).is_file()
-    here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
-    return f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
 
 
 def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
@@ -71,11 +69,6 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
     """Yield why predictions of a data set could not be scored or validated, with what mends it.
 
     Only the first and last frames that are to be predicted are read, beside what checks the files.
-
-    Args:
-        size: the split and size.
-        root: folder of all data sets.
-        validated: whether a training is validated on ``valid``.
     """
     for subset in ("test", "valid") if validated else ("test",):
         try:
@@ -87,8 +80,7 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
 
 
 def _faults(task: ScoredTask) -> Iterator[str]:
-    subset, counts, moves = task.truth.subset, set(), False
-    sparse = []
+    subset, counts, moves, sparse = task.truth.subset, set(), False, []
     for i in task.scenarios:
         with task.opened(i) as opened:
             before = opened.scenario.last_given.position
