@@ -60,12 +60,9 @@ class Batch:
         """
         kept = range(self.frames)[frames]
         if not kept or kept.step != 1:
-            raise UsageError(
-                "a part of a batch is of consecutive frames",
-                where="Batch.part",
-                expected=f"some of {self.frames} frames, in steps of 1",
-                got=frames,
-            )
+            what = "a part of a batch is of consecutive frames"
+            expected = f"some of {self.frames} frames, in steps of 1"
+            raise UsageError(what, where="Batch.part", expected=expected, got=frames)
         first = kept[0]
         walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
         return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
@@ -88,13 +85,10 @@ def collate(windows: Sequence[Window]) -> Batch:
     origins = [window.origin for window in windows if window.origin is not None]
     frames = {window.position.shape[1] for window in windows}
     if len(frames) != 1 or not {len(walls), len(origins)} <= {0, len(windows)}:
-        raise UsageError(
-            "windows do not fit side by side",
-            where="collate",
-            expected="windows of one split and one length",
-            got=f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
-            f" {len(origins)} with their first frame",
-        )
+        what, expected = "windows do not fit side by side", "windows of one split and one length"
+        got = f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
+        got += f" {len(origins)} with their first frame"
+        raise UsageError(what, where="collate", expected=expected, got=got)
     particles = torch.tensor([len(window.material) for window in windows])
     return Batch(
         position=torch.cat([window.position for window in windows]),

@@ -168,7 +168,6 @@ class WindowSampler(Sampler[int]):
 
 
 def _natural(value: object, name: str) -> int:
-    """Return a whole number that is not negative."""
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
@@ -215,12 +214,10 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
     for _ in range(frames):
         position = step(given)
         if not isinstance(position, Tensor) or position.shape != expected:
-            raise UsageError(
-                "a model returned no positions of the next frame",
-                where="roll_out, step",
-                expected=f"a tensor of shape {list(expected)}: [particle, 2]",
-                got=getattr(position, "shape", None) or type(position).__name__,
-            )
+            what = "a model returned no positions of the next frame"
+            shape = f"a tensor of shape {list(expected)}: [particle, 2]"
+            got = getattr(position, "shape", None) or type(position).__name__
+            raise UsageError(what, where="roll_out, step", expected=shape, got=got)
         given = given.followed_by(position)
         predicted.append(given.position[:, -1])  # a copy: the model may use the memory of its answer again
     return torch.stack(predicted, dim=1)
@@ -271,13 +268,10 @@ def predict(
     needed = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):
         if (held := data.size.frame_count(scenario)) < needed:
-            raise UsageError(
-                "a scenario is too short to be predicted",
-                where=f"predict, {data.size.split} {data.size.name}, scenario {scenario}",
-                expected=f"{needed} frames",
-                got=held,
-                fix="predict the subset test, whose scenarios are long enough",
-            )
+            what = "a scenario is too short to be predicted"
+            where = f"predict, {data.size.split} {data.size.name}, scenario {scenario}"
+            fix = "predict the subset test, whose scenarios are long enough"
+            raise UsageError(what, where=where, expected=f"{needed} frames", got=held, fix=fix)
         _, walls = data.store.constants(scenario)
         # The forcing is given for all frames, unlike the positions.
         forcing = None if walls is None else torch.from_numpy(walls.copy())

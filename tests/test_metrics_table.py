@@ -88,7 +88,7 @@ def test_chunks_in_any_order_give_the_same_bits(cuts: list[int], random: object)
     assert same_bits(functools.reduce(Tally.__add__, chunks), tallied())
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.randoms(use_true_random=False))
 def test_particle_order_changes_nothing(random: object) -> None:
     """Truth and prediction permuted alike have the same scores, but for the rounding of sums."""
@@ -245,9 +245,8 @@ def test_the_tables_of_the_design_are_complete() -> None:
     assert not any(math.isnan(found.mean) for found in scores(0.1).values())
     assert scores(0.1)["vorticity_mse"].per_frame.shape == (1, 52)
     assert scores(0.1)["vorticity_mse"].frames == tuple(range(2, 54))
-    expected = {
-        f"{of}_{law}" for of in ("position", "velocity", "vorticity") for law in ("mse", "mae", "rmse")
-    }
+    quantities = ("position", "velocity", "vorticity")
+    expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
     expected |= {f"vorticity_{name}" for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")}
     expected |= {"energy_ratio", "energy_retention", "energy_error", "momentum_error", "divergence_rms"}
     expected |= {"angular_momentum_error", "density_rmse", "sliced_w2", "sinkhorn_pot", "attribute_mse"}

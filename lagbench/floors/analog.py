@@ -136,7 +136,6 @@ FLOOR = Floor(
     title="Analog",
     definition="The scenario of train whose given frames are nearest to those given here: its motion carries"
     " the particles of a full box, its matched particles are the answer on a free surface.",
-    applies=lambda _: True,
     predict=predict,
     reads_train=True,
 )

@@ -46,8 +46,7 @@ def coarser(size: Size) -> Size | None:
 
 def predict(given: Given) -> Prediction:
     """Yield positions that the solver on the coarser grid finds."""
-    coarse = coarser(given.size)
-    if coarse is None:
+    if (coarse := coarser(given.size)) is None:
         raise ValueError(f"{given.size.split} {given.size.name} has no coarser size")
     return predict_with(given, coarse)
 
@@ -103,7 +102,6 @@ def spread_subset(position: Floats, material: NDArray[np.integer], count: int) -
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
-    """Return the last given frame as the solver starts from it."""
     from lagbench.generators.split import InitialState
 
     interval, count = given.size.frame_interval, len(carriers)

@@ -39,7 +39,6 @@ PERSISTENCE = Floor(
     name="persistence",
     title="Persistence",
     definition="The last given frame, repeated.",
-    applies=lambda _: True,
     predict=at_rest,
 )
 
@@ -47,7 +46,6 @@ CONSTANT_VELOCITY = Floor(
     name="constant-velocity",
     title="Constant velocity",
     definition="Every particle keeps its last given velocity and stops at the walls.",
-    applies=lambda _: True,
     predict=on_lines,
 )
 

@@ -82,10 +82,9 @@ class Floor:
     name: str  # name of its rows
     title: str  # the same for readers
     definition: str  # what it predicts, one sentence
-    applies: Callable[[Size], bool]  # whether a split and size has it
     predict: Callable[[Given], Prediction]
-    # whether it may be the best floor, which skill is measured against
-    counts: bool = True
+    applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it
+    counts: bool = True  # whether it may be the best floor, which skill is measured against
     reads_train: bool = False  # whether it looks at the scenarios of train
 
 

@@ -106,7 +106,6 @@ def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
 
 
 def _held(size: Size, folder: Path) -> dict[str, Any] | None:
-    """Return what was measured on the data set that the registry describes."""
     path = shipped_path(size, folder)
     if size.measured is None or not path.is_file():
         return None
@@ -116,7 +115,6 @@ def _held(size: Size, folder: Path) -> dict[str, Any] | None:
 
 
 def _measured(size: Size, folder: Path) -> dict[str, Any]:
-    """Return what was measured on a data set; refuse one on which nothing was."""
     held = _held(size, folder)
     if held is None:
         raise DataError("no floors were measured on this data set", where=str(shipped_path(size, folder)))
@@ -168,16 +166,18 @@ def write_shipped(
         **kept,
         "floors": said,
     }
-    path = shipped_path(size, folder)
-    write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
-    return path
+    return _write(size, held, folder)
 
 
 def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
     """Add what a frame costs the solver itself to the measured floors of a data set [s]."""
-    held, path = _measured(size, folder), shipped_path(size, folder)
+    held = _measured(size, folder)
     floors = held.pop("floors")
-    held |= {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}
+    return _write(size, held | {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}, folder)
+
+
+def _write(size: Size, held: Mapping[str, Any], folder: Path) -> Path:
+    path = shipped_path(size, folder)
     write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
     return path
 
@@ -200,7 +200,6 @@ def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Return the mean over the scenarios that have a value."""
     return mean(values[np.isfinite(values)])
 
 

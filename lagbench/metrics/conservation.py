@@ -10,6 +10,7 @@ one mass; it cancels, and momenta are told over it.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,11 @@ from .metric import root_mean_square as over_frames_rms
 
 MOVING = 0.01
 """Share of the truth's greatest kinetic energy from which on a frame counts as moving."""
+
+
+ENERGIES = ("energy_predicted", "energy_true")
+
+_error = partial(metric, unit="1", direction=Direction.LOWER)
 
 
 def kinetic_energy(snapshot: Snapshot, particle_mass: float) -> float:
@@ -40,13 +46,7 @@ def energy_predicted(pair: FramePair) -> float:
     return kinetic_energy(pair.prediction, pair.scenario.particle_mass)
 
 
-@metric(
-    unit="1",
-    direction=Direction.TARGET,
-    perfect=1.0,
-    source="Eq. 5.11",
-    of=("energy_predicted", "energy_true"),
-)
+@metric(unit="1", direction=Direction.TARGET, perfect=1.0, source="Eq. 5.11", of=ENERGIES)
 def energy_ratio(predicted: Floats, true: Floats) -> Floats:
     """Predicted over true kinetic energy where the truth has 1 % of its peak.
 
@@ -75,12 +75,7 @@ def _retained(pair: FramePair, snapshot: Snapshot) -> float:
     return kinetic_energy(snapshot, mass) / given if given > 0.0 else math.nan
 
 
-@metric(
-    unit="1",
-    direction=Direction.LOWER,
-    source="design section 8",
-    of=("energy_predicted", "energy_true"),
-)
+@_error(source="design section 8", of=ENERGIES)
 def energy_error(predicted: Floats, true: Floats) -> Floats:
     """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
 
@@ -119,7 +114,7 @@ def momentum_scale(pair: FramePair) -> float:
     return float(pair.truth.speeds.sum())
 
 
-@metric(unit="1", direction=Direction.LOWER, source="section 5.2", of=("momentum_gap", "momentum_scale"))
+@_error(source="section 5.2", of=("momentum_gap", "momentum_scale"))
 def momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of total momentum over its scale (at least 1e-3 of its greatest)."""
     return floored_quotient(gap, scale)
@@ -137,18 +132,13 @@ def angular_momentum_scale(pair: FramePair) -> float:
     return dot(lengths(pair.truth.arms), pair.truth.speeds)
 
 
-@metric(
-    unit="1",
-    direction=Direction.LOWER,
-    source="section 5.2, Eq. 5.1",
-    of=("angular_momentum_gap", "angular_momentum_scale"),
-)
+@_error(source="section 5.2, Eq. 5.1", of=("angular_momentum_gap", "angular_momentum_scale"))
 def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
     return floored_quotient(gap, scale)
 
 
-@metric(unit="1", direction=Direction.LOWER, source="design section 8", over_frames=over_frames_rms)
+@_error(source="design section 8", over_frames=over_frames_rms)
 def density_rmse(pair: FramePair) -> float:
     """Root mean squared error of density relative to rest, over all nodes.
 
@@ -175,7 +165,7 @@ def _divergence(pair: FramePair, snapshot: Snapshot) -> float:
     return math.sqrt(mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes]))
 
 
-@metric(unit="%", direction=Direction.LOWER, source="design 2, section 4")
+@_error(unit="%", source="design 2, section 4")
 def outside_share(pair: FramePair) -> float:
     """Share of predicted particles that are past a wall."""
     return 100.0 * pair.outside

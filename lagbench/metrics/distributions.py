@@ -133,9 +133,8 @@ def energy_spectrum(velocity: Floats) -> Floats:
     return energy[1 : min(rows, columns)]
 
 
-@metric(
+@_distance(
     unit="1",
-    direction=Direction.LOWER,
     source="design 2, section 4",
     applies=lambda pair: pair.scenario.setting.full_box and at_slow_frames(pair),
     defined=enough_nodes,

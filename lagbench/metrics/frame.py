@@ -202,11 +202,8 @@ class Scenario:
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""
         if self.given.ndim != 3 or len(self.given) < 2 or self.given.shape[1:] != (len(self.material), 2):
-            raise UsageError(
-                "the given frames do not fit the scenario",
-                expected=f"[2 or more frames, {len(self.material)} particles, 2]",
-                got=str(self.given.shape),
-            )
+            expected, got = f"[2 or more frames, {len(self.material)} particles, 2]", str(self.given.shape)
+            raise UsageError("the given frames do not fit the scenario", expected=expected, got=got)
 
     @cached_property
     def full(self) -> float:
@@ -245,11 +242,9 @@ class Scenario:
         if x.shape != expected or before.shape != expected:
             raise UsageError("wrong shape of positions", expected=str(expected), got=got)
         if not np.isfinite(x).all():
-            raise ChecksFailedError(
-                "positions are not finite",
-                got=f"{np.count_nonzero(~np.isfinite(x).all(axis=1))} of {len(x)} particles",
-                fix="freeze the rollout at its last finite frame",
-            )
+            got = f"{np.count_nonzero(~np.isfinite(x).all(axis=1))} of {len(x)} particles"
+            fix = "freeze the rollout at its last finite frame"
+            raise ChecksFailedError("positions are not finite", got=got, fix=fix)
         return Snapshot(x, x - before, self)
 
 

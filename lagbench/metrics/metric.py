@@ -202,7 +202,6 @@ class Metric:
         raise error
 
     def _broken(self, what: str, place: str, expected: str, got: object) -> WorkFailedError:
-        """Return the error of a metric that does not do what it must."""
         package = getattr(self.series if self.statistic is None else self.statistic, "__module__", "?")
         where, told = f"{package}, {self.name}, {place}", f"{type(got).__name__}: {got!r:.60}"
         fix = "mend or uninstall the package that adds it"

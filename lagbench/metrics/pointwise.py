@@ -61,7 +61,6 @@ class ErrorMean:
 
 
 def _errors(quantity: str, unit: str, material: str | None) -> Iterator[Metric]:
-    """Yield MSE, MAE and RMSE of one quantity over one material."""
     whose = "all particles" if material is None else f"{material} particles"
     suffix = "" if material is None else f"_{material}"
     laws = {"mse": (mean_squared_error, SQUARED[unit], "3.3"), "mae": (mean_absolute_error, unit, "3.4")}

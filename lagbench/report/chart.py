@@ -162,7 +162,7 @@ class Plot:
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
         data = path_data(zip(self._columns(x), self._rows(y), strict=True))
-        self._add("path", title, d=data, class_=f"line {kind}")
+        self._path(data, f"line {kind}", title)
 
     def front(self, x: ArrayLike, y: ArrayLike) -> None:
         """Draw a line through dots, which their names keep off."""
@@ -178,7 +178,7 @@ class Plot:
         for run in _runs(known):
             there = zip(columns[run], above[run], strict=True)
             back = zip(columns[run][::-1], below[run][::-1], strict=True)
-            self._add("path", "", d=path_data([*there, *back]) + "Z", class_=f"band {kind}")
+            self._path(path_data([*there, *back]) + "Z", f"band {kind}")
 
     def steps(self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a histogram's outline; there is one edge more than heights."""
@@ -188,19 +188,19 @@ class Plot:
     def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
         """Draw a cloud of points."""
         points = zip(self._columns(x), self._rows(y), strict=True)
-        self._add("path", "", d="".join(path_data([point]) for point in points), class_=f"dots {kind}")
+        self._path("".join(path_data([point]) for point in points), f"dots {kind}")
 
     def level(self, value: float, label: str, *, above: bool = True) -> None:
         """Draw a horizontal line with a name at its right end."""
         row = float(self._rows(np.array([value]))[0])
-        self._add("path", "", d=path_data([(0, row), (self._across, row)]), class_="level")
+        self._path(path_data([(0, row), (self._across, row)]), "level")
         place = row - 5 if above else row + 13
         self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
 
     def upright(self, value: float, label: str) -> None:
         """Draw a vertical line with a name at its top."""
         column = float(self._columns(np.array([value]))[0])
-        self._add("path", "", d=path_data([(column, 0), (column, self._up)]), class_="level")
+        self._path(path_data([(column, 0), (column, self._up)]), "level")
         left = column > self._across / 2
         x, kind = (column - 5, "note end") if left else (column + 5, "note")
         self._marks.append(written(label, x, 11, kind))
@@ -237,8 +237,8 @@ class Plot:
         )
         return _canvas(self._height, title, description, *self._axes(), area, linked=self._linked)
 
-    def _add(self, name: str, title: str, **attributes: object) -> None:
-        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
+    def _path(self, data: str, kind: str, title: str = "") -> None:
+        self._marks.append(tag("path", *([tag("title", title)] if title else []), d=data, class_=kind))
 
     def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
         return np.clip(self._x.share(x), -FAR, FAR) * self._across
@@ -247,7 +247,6 @@ class Plot:
         return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
 
     def _axes(self) -> list[Markup]:
-        """Return grid lines, tick labels and the names of the axes."""
         bottom, right = TOP + self._up, WIDTH - RIGHT
         drawn = []
         for tick in self._y.ticks:

@@ -13,7 +13,7 @@ from lagbench.metrics.vorticity import STABLE_PEARSON
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Figure, Markup, clipped, html, join, key, quantity, sentence, table, tag, text, words
-from .subject import Gallery, Moment, Row, Subject, kind_of
+from .subject import Gallery, Moment, Subject, kind_of
 
 Floats = NDArray[np.float64]
 
@@ -52,43 +52,60 @@ def error_curves(subject: Subject) -> Iterator[Figure]:
 
 def method_curves(subject: Subject) -> Iterator[Figure]:
     """Yield the methods side by side: mean over scenarios with its interval (Fig. 5.11)."""
+    said = f"Mean over {len(subject.scenarios)} test scenarios; the bands are 95 % bootstrap intervals over"
+    said += " scenarios. Grey: floors that cost nothing."
     for name, thesis in (
         ("vorticity_mse" if subject.full_box else "attribute_mse", "Fig. 5.11"),
         ("position_rmse", "Fig. 5.11"),
         ("velocity_rmse", "Fig. 5.11"),
         ("vorticity_pearson", "Fig. 5.13"),
     ):
-        rows = [row for row in subject.rows if name in row.scores]
-        if not rows:
-            continue
-        metric = rows[0].scores[name].metric
-        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-        twin = np.asarray(subject.task.twin_floor)
-        twinned = name == "position_rmse" and len(twin) == len(subject.frames)
-        y = spanning([*(values for _, _, values in series), *([twin] if twinned else [])])
-        if name == "vorticity_pearson":
-            y = linear(min(float(np.min(s[np.isfinite(s)], initial=0.0)) for _, _, s in series), 1.0)
-        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-        for row in rows:
-            if row.entry is not None:
-                low, high = np.array([*map(bootstrap_interval, row.scores[name].per_frame.T)]).T
-                plot.band(subject.frames, low, high, row.kind)
-        _draw(subject, plot, series)
-        if twinned:
-            plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
-        if name == "vorticity_pearson":
-            plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
-        yield _figure(
-            subject,
-            f"methods-{name.replace('_', '-')}",
-            f"{words(metric.name, capital=True)} over frames",
-            thesis,
-            series,
-            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
-            f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
-            " bootstrap intervals over scenarios. Grey: floors that cost nothing.",
-            more=[("twin", "twin of the solver")] if twinned else [],
-        )
+        yield from _by_method(subject, name, "methods", "over frames", thesis, said)
+
+
+def body_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
+    said = "Mean over the scenarios with an elastic body."
+    for name in ("shape_error", "connectivity"):
+        yield from _by_method(subject, name, "bodies", "of jelly and rope", "section 4.8.2", said)
+
+
+def _by_method(subject: Subject, name: str, part: str, of: str, thesis: str, said: str) -> Iterator[Figure]:
+    """Yield the mean over scenarios of a metric, a line per method, where methods have it."""
+    rows, bodies = [row for row in subject.rows if name in row.scores], part == "bodies"
+    if not rows:
+        return
+    metric = rows[0].scores[name].metric
+    series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
+    if (true := rows[0].scores.get(f"{name}_true")) is not None:
+        series.insert(0, ("truth", "truth", _mean(true)))
+    twin = np.asarray(subject.task.twin_floor if name == "position_rmse" else ())
+    twinned = len(twin) == len(subject.frames)
+    drawn = [*(values for _, _, values in series), *([twin] if twinned else [])]
+    y = linear(0.0, 1.0) if name == "connectivity" else spanning(drawn, log=False if bodies else None)
+    if name == "vorticity_pearson":
+        y = linear(min(float(np.min(line[np.isfinite(line)], initial=0.0)) for line in drawn), 1.0)
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
+    for row in rows:
+        if row.entry is not None and not bodies:
+            low, high = np.array([*map(bootstrap_interval, row.scores[name].per_frame.T)]).T
+            plot.band(subject.frames, low, high, row.kind)
+    _draw(subject, plot, series)
+    if twinned:
+        plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
+    if name == "vorticity_pearson":
+        plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
+    methods = ", ".join(row.name for row in rows)
+    yield _figure(
+        subject,
+        f"{part}-{name.replace('_', '-')}",
+        f"{words(name, capital=True)} {of}",
+        thesis,
+        series,
+        plot.svg(f"{name} over frames", f"{metric.summary}, one line each for {methods}."),
+        f"{sentence(metric)} {said}",
+        more=[("twin", "twin of the solver")] if twinned else [],
+    )
 
 
 def energy_curves(subject: Subject) -> Iterator[Figure]:
@@ -131,31 +148,6 @@ def _energy_figure(
     return _figure(subject, name, title, thesis, series, drawn, said + more)
 
 
-def body_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
-    for name in ("shape_error", "connectivity"):
-        rows = [row for row in subject.rows if name in row.scores]
-        if not rows:
-            continue
-        metric = rows[0].scores[name].metric
-        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-        true = rows[0].scores.get(f"{name}_true")
-        if true is not None:
-            series.insert(0, ("truth", "truth", _mean(true)))
-        y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
-        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-        _draw(subject, plot, series)
-        yield _figure(
-            subject,
-            f"bodies-{name.replace('_', '-')}",
-            f"{words(metric.name, capital=True)} of jelly and rope",
-            "section 4.8.2",
-            series,
-            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
-            f"{sentence(metric)} Mean over the scenarios with an elastic body.",
-        )
-
-
 def _draw(subject: Subject, plot: Plot, series: Series) -> None:
     """Draw lines, the first on top."""
     for label, kind, values in reversed(series):
@@ -188,16 +180,11 @@ def _figure(
     )
 
 
-def _names(rows: Sequence[Row]) -> str:
-    return ", ".join(row.name for row in rows)
-
-
 def _frame_axis(subject: Subject) -> Scale:
     return linear(float(subject.frames[0]), float(subject.frames[-1]), count=6, tight=True)
 
 
 def _mean(score: Score) -> Floats:
-    """Return the mean over scenarios per frame, NaN where none has a value, shape [frame]."""
     return mean_over_seeds(np.where(np.isfinite(score.per_frame), score.per_frame, np.nan))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from .subject import Gallery, Moment, Subject, Walls, limit_of
 Floats = NDArray[np.float64]
 
 Bytes = NDArray[np.uint8]
+
+Draw = Callable[[Floats, float], bytes]
+"""From a field, shape [x node, y node], and the value of full colour to a picture."""
 
 CLOCKWISE, COUNTER, FAST = "#0072b2", "#d55e00", "#009e73"
 """Colours of negative and positive values and of great magnitudes (Okabe & Ito 2008)."""
@@ -98,21 +101,17 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     fast, strong = limit_of(speeds[:1]), limit_of(omegas[:1])
     names = ["truth", *(entry.name for entry in subject.entries)]
 
+    def pictures(what: str, fields: Sequence[Floats], draw: Draw, limit: float) -> list[Markup]:
+        return [
+            image(draw(inside(subject.task, f), limit), walls.classes, f"{what} of {n}, frame {frame}")
+            for n, f in zip(names, fields, strict=True)
+        ]
+
     rows = [
-        (
-            what,
-            [
-                image(draw(inside(subject.task, f), limit), walls.classes, f"{what} of {n}, frame {frame}")
-                for n, f in zip(names, fields, strict=True)
-            ],
-        )
-        for what, fields, draw, limit in (
-            ("speed", speeds, sequential, fast),
-            ("vorticity", omegas, diverging, strong),
-            ("vorticity error", errors, diverging, strong),
-        )
+        ("speed", pictures("speed", speeds, sequential, fast)),
+        ("vorticity", pictures("vorticity", omegas, diverging, strong)),
+        ("vorticity error", [tag("span"), *pictures("vorticity error", errors, diverging, strong)[1:]]),
     ]
-    rows[-1][1][0] = tag("span")  # the truth has no error
     keys = [
         ramp("sequential", fast, "speed [length/frame]"),
         ramp("diverging", strong, "vorticity and its error [1/frame]", signed=True),

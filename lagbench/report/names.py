@@ -123,7 +123,6 @@ def written(text: str, x: float, y: float, kind: str) -> Markup:
 
 
 def _box(name: str, place: Place) -> Box:
-    """Return about what a name takes."""
     width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
     left = place[0] - width * place[2]
     return left, place[1] - 11, left + width, place[1] + 3
@@ -138,5 +137,4 @@ def _along(one: Point, other: Point) -> list[Box]:
 
 
 def _meet(one: Box, other: Box) -> bool:
-    """Tell whether two boxes overlap."""
     return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data import WALLS
 from lagbench.data.layout import resolve_root
 from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
@@ -140,7 +141,6 @@ def kind_of(number: int) -> str:
 
 
 def _spaced(numbers: Sequence[int], count: int) -> Sequence[int]:
-    """Return evenly spaced members, first and last included."""
     if len(numbers) <= count:
         return numbers
     return [numbers[round(i * (len(numbers) - 1) / (count - 1))] for i in range(count)]
@@ -155,23 +155,19 @@ def subject_of(
 ) -> Subject:
     """Return the subject of a report."""
     if not cards or len(cards) != len(predictions):
-        raise UsageError(
-            "a report needs score cards and their predictions",
-            expected="one file per score card, at least one",
-            got=f"{len(cards)} cards, {len(predictions)} files",
+        expected, got = (
+            "one file per score card, at least one",
+            f"{len(cards)} cards, {len(predictions)} files",
         )
+        raise UsageError("a report needs score cards and their predictions", expected=expected, got=got)
     folder, header = resolve_root(root), cards[0].header
     for card, path in zip(cards, predictions, strict=True):
         for name in SAME:
-            expected, got = getattr(header, name), getattr(card.header, name)
-            if expected != got:
-                raise UsageError(
-                    f"one report, two values of {name}",
-                    where=str(path),
-                    expected=expected,
-                    got=got,
-                    fix="report submissions to one data set together, others on their own",
-                )
+            one, two = getattr(header, name), getattr(card.header, name)
+            if one != two:
+                what = f"one report, two values of {name}"
+                fix = "report submissions to one data set together, others on their own"
+                raise UsageError(what, where=str(path), expected=one, got=two, fix=fix)
     described = rooted(folder, registry)
     task = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
@@ -182,8 +178,7 @@ def subject_of(
     return Subject(task=task, title=described.split(header.split).title, entries=tuple(entries))
 
 
-WALLS = ("left", "right", "bottom", "top")
-_ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))
+_ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))  # how walls slide
 
 
 @dataclass(frozen=True)
@@ -269,8 +264,7 @@ def _walls(truth: OpenScenario) -> Walls:
     speed = np.zeros((4, 2))
     if "wall_velocity" in file.variables:
         speed = np.abs(np.asarray(file.read("wall_velocity"), np.float64)).max(axis=0) * _ALONG
-    parameters = file.header.parameters
-    reynolds = parameters.get("reynolds_number")
+    parameters, reynolds = file.header.parameters, file.header.parameters.get("reynolds_number")
     marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
     if "frequency" in parameters:
         marks.append(f"frequency {parameters['frequency']}")

@@ -120,10 +120,7 @@ def scenario_table(subject: Subject) -> Markup:
 
 
 def verdict_table(subject: Subject) -> Markup:
-    """Return how entries compare with the leader: sign-flip tests of these weights, corrected by Holm.
-
-    Floors follow, and have no rank.
-    """
+    """Return sign-flip tests of entries against the leader, corrected by Holm; floors follow, unranked."""
     name = subject.ranking.name
     entries = {row.name: row for row in subject.rows if row.entry}
     placed = standings({method: row.scores[name] for method, row in entries.items()})
@@ -228,7 +225,6 @@ def _card(what: str, value: float, bounds: tuple[float, float], more: str) -> Ma
 
 
 def _beside(subject: Subject, row: Row) -> str:
-    """Return how the ranking metric stands beside the least floor."""
     metric = subject.ranking
     floors = [r for r in subject.rows if r.entry is None]
     if not floors or metric.direction is not Direction.LOWER:

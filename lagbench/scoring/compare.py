@@ -34,6 +34,8 @@ from .task import SUBMISSION
 SAME = ("split", "size", "dataset_sha256")
 """What two submissions must share."""
 
+AGAIN = "score the predictions again: lagbench score predictions.nc"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contestant:
@@ -96,15 +98,14 @@ class ComparisonResult:
 
     @property
     def _sample(self) -> str:
-        """What a verdict rests on, and what it is about."""
         p, one, two = self.metrics[self.ranking].test.p, *self.seeds
         if self.floor:
             what = f"{one} seeds" if one > 1 else "one seed: these weights, not the method"
         elif one == two == 1:
             what = "one seed each: these weights, not the methods"
         else:
-            single = 1 in self.seeds
-            what = f"{one} and {two} seeds" + (": of one seed its weights, not the method" if single else "")
+            what = f"{one} and {two} seeds"
+            what += ": of one seed its weights, not the method" if 1 in self.seeds else ""
         return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
 
     def as_json(self) -> dict[str, Any]:
@@ -233,12 +234,9 @@ def _contestant(
         _check_same(f"{name} and {other}", first.identity, one.identity, more=("method",))
     predictions = tuple(one.predictions_sha256 for one in held)
     if len(set(predictions)) < len(held):
-        raise UsageError(
-            "the same predictions twice",
-            where=str(source),
-            expected="another seed of the method in each folder",
-            fix="one file stands for one training: leave copies out",
-        )
+        expected = "another seed of the method in each folder"
+        fix = "one file stands for one training: leave copies out"
+        raise UsageError("the same predictions twice", where=str(source), expected=expected, fix=fix)
     common = [name for name in own[0] if all(name in scores for scores in own)]
     return Contestant(
         name=str(source),
@@ -278,7 +276,6 @@ def _seeds_of(path: Path) -> list[Path]:
 def _read(
     path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
 ) -> PublishedScores:
-    """Return what a scores.nc says, or what predictions score."""
     real = path.resolve()
     large = (length := real.stat().st_size) > MAX_SCORE_BYTES
     reason = f"{length} bytes, more than scores take" if large else unreadable_in_child([real]).get(real)
@@ -297,18 +294,14 @@ def _read(
             where=str(path),
             expected="what `lagbench score` or `lagbench submit` wrote, or a predictions.nc",
             got=f"as scores: {reason}; as predictions: {error.what}, {error.got}",
-            fix="score the predictions again: lagbench score predictions.nc",
+            fix=AGAIN,
         ) from error
 
 
 def _floor(beside: Contestant, name: str) -> Contestant:
-    return replace(
-        beside,
-        name=name,
-        identity={**beside.identity, "method": name},
-        predictions=("",),
-        scores={metric: (score,) for metric, score in beside.floors[name].items()},
-    )
+    identity = {**beside.identity, "method": name}
+    scores = {metric: (score,) for metric, score in beside.floors[name].items()}
+    return replace(beside, name=name, identity=identity, predictions=("",), scores=scores)
 
 
 def _check_same(
@@ -317,14 +310,10 @@ def _check_same(
     for key in (*SAME, *more):
         if (first := one[key]) != (second := two[key]):
             kind = DataError if key == "dataset_sha256" else UsageError
-            raise kind(
-                f"the two submissions differ in {key}",
-                where=where,
-                expected=first,
-                got=second,
-                fix="compare submissions to the same split, size and data set"
-                + (", and keep the seeds of each method in a folder of its own" if more else ""),
-            )
+            fix = "compare submissions to the same split, size and data set"
+            fix += ", and keep the seeds of each method in a folder of its own" if more else ""
+            what = f"the two submissions differ in {key}"
+            raise kind(what, where=where, expected=first, got=second, fix=fix)
 
 
 def _judged(one: Contestant, two: Contestant) -> list[str]:
@@ -337,22 +326,12 @@ def _judged(one: Contestant, two: Contestant) -> list[str]:
 
 
 def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:
-    return UnreadableFileError(
-        "scores without the row or the ranking metric",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="score the predictions again: lagbench score predictions.nc",
-    )
+    what = "scores without the row or the ranking metric"
+    return UnreadableFileError(what, where=where, expected=expected, got=got, fix=AGAIN)
 
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
     one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
-    lost = [sum(sum(score.undefined) for score in side) for side in (first, second)]
-    return MetricComparison(
-        metric=first[0].metric,
-        first=one,
-        second=two,
-        undefined=(lost[0], lost[1]),
-        test=compare_scores(first, second),
-    )
+    lost, gone = (sum(sum(score.undefined) for score in side) for side in (first, second))
+    test = compare_scores(first, second)
+    return MetricComparison(metric=first[0].metric, first=one, second=two, undefined=(lost, gone), test=test)

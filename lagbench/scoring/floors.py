@@ -37,14 +37,12 @@ TOLERANCE = 1e-4
 
 
 def measurable(size: Size, root: Path) -> tuple[str, ...]:
-    """Return the names of the floors that scoring measures itself where none are shipped.
-
-    Those that count for the best floor; what looks at train only where all of train is there.
-    """
+    """Return the names of the floors that scoring measures where none are shipped: those that count."""
     return tuple(floor.name for floor in _possible(size, root) if floor.counts)
 
 
 def _possible(size: Size, root: Path) -> list[Floor]:
+    """Return the floors of a size; what looks at train only where all of train is there."""
     trained = _has(size, root, "train")
     return [floor for floor in floors_of(size) if trained or not floor.reads_train]
 
@@ -71,10 +69,7 @@ def measured_sizes(
 def measured_again(
     size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
 ) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the shipped floors of a data set again: which were measured, and what differs in them.
-
-    What looks at train is measured only where all of train is there.
-    """
+    """Measure the shipped floors of a data set again: which were measured, and what differs in them."""
     names = tuple(floor.name for floor in _possible(size, root))
     known = {name: held for name, held in (shipped(size) or {}).items() if name in names}
     return names, differences(known, measure(size, root, floors=names, progress=progress))

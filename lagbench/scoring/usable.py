@@ -25,10 +25,7 @@ OF_NODES = "vorticity_nrmse"
 
 
 def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
-    """Return what is to be said of scenarios whose vorticity has no value in any frame.
-
-    It counts nodes, and names a grid of which all scenarios cover enough, where there is one.
-    """
+    """Return how many nodes scenarios without any vorticity cover, and a grid of which all cover enough."""
     setting = task.setting
     counts = [covered_nodes(_clouds(task, i)[0], setting.grid) for i in scenarios]
     cells = fitting_cells(
@@ -71,34 +68,31 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
     Only the first and last frames that are to be predicted are read, beside what checks the files.
     """
     for subset in ("test", "valid") if validated else ("test",):
+        counts, moves, sparse = set(), False, []
         try:
             task = load_scored_task(size, root, subset=subset)
-            yield from _faults(task)
+            for i in task.scenarios:
+                with task.opened(i) as opened:
+                    before = opened.scenario.last_given.position
+                clouds = _clouds(task, i)
+                counts.add(len(before))
+                moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
+                if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
+                    sparse.append(i)
+            if len(counts) > 1 and subset == "test":
+                yield (
+                    f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one"
+                    " number; put those of one number into test: lagbench adopt with folders train, valid and"
+                    " test"
+                )
+            if not moves:
+                yield (
+                    f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
+                    f" for {subset}: lagbench adopt with folders train, valid and test"
+                )
+            elif sparse and ranking_metric(task.size) == OF_NODES:
+                found = few_nodes(task, sparse)
+                yield f"{found.got}; {found.fix}"
         except LagbenchError as error:  # the training itself may do without what is missing here
             fix = f"; {error.fix}" if error.fix else ""
             yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"
-
-
-def _faults(task: ScoredTask) -> Iterator[str]:
-    subset, counts, moves, sparse = task.truth.subset, set(), False, []
-    for i in task.scenarios:
-        with task.opened(i) as opened:
-            before = opened.scenario.last_given.position
-        clouds = _clouds(task, i)
-        counts.add(len(before))
-        moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
-        if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
-            sparse.append(i)
-    if len(counts) > 1 and subset == "test":
-        yield (
-            f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one number;"
-            " put those of one number into test: lagbench adopt with folders train, valid and test"
-        )
-    if not moves:
-        yield (
-            f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
-            f" for {subset}: lagbench adopt with folders train, valid and test"
-        )
-    elif sparse and ranking_metric(task.size) == OF_NODES:
-        found = few_nodes(task, sparse)
-        yield f"{found.got}; {found.fix}"
