@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import torch
@@ -60,38 +60,23 @@ class Batch:
         """
         kept = range(self.frames)[frames]
         if not kept or kept.step != 1:
-            raise UsageError(
-                "a part of a batch is of consecutive frames",
-                where="Batch.part",
-                expected=f"some of {self.frames} frames, in steps of 1",
-                got=frames,
-            )
+            what = "a part of a batch is of consecutive frames"
+            expected = f"some of {self.frames} frames, in steps of 1"
+            raise UsageError(what, where="Batch.part", expected=expected, got=frames)
         first = kept[0]
         walls = None if self.wall_velocity is None else self.wall_velocity[:, first:]
         return replace(self, position=self.position[:, frames], wall_velocity=walls, frame=self.frame + first)
 
     def to(self, device: torch.device | str) -> Self:
         """Return the batch on a device."""
-        moved = {
-            field.name: value.to(device)
-            for field in fields(self)
-            if isinstance(value := getattr(self, field.name), Tensor)
-        }
-        return replace(self, **moved)
+        held = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **{name: value.to(device) for name, value in held.items()})
 
     def followed_by(self, position: Tensor) -> Self:
-        """Return the windows one frame later: their first frame leaves, the given one joins.
-
-        Args:
-            position: particle positions of the frame after the last [length], shape [particle, 2].
-        """
+        """Return the windows one frame later: the first leaves, positions of the next [particle, 2] join."""
         walls = None if self.wall_velocity is None else self.wall_velocity[:, 1:]
-        return replace(
-            self,
-            position=torch.cat([self.position[:, 1:], position[:, None]], dim=1),
-            wall_velocity=walls,
-            frame=self.frame + 1,
-        )
+        joined = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
+        return replace(self, position=joined, wall_velocity=walls, frame=self.frame + 1)
 
 
 def collate(windows: Sequence[Window]) -> Batch:
@@ -100,13 +85,10 @@ def collate(windows: Sequence[Window]) -> Batch:
     origins = [window.origin for window in windows if window.origin is not None]
     frames = {window.position.shape[1] for window in windows}
     if len(frames) != 1 or not {len(walls), len(origins)} <= {0, len(windows)}:
-        raise UsageError(
-            "windows do not fit side by side",
-            where="collate",
-            expected="windows of one split and one length",
-            got=f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
-            f" {len(origins)} with their first frame",
-        )
+        what, expected = "windows do not fit side by side", "windows of one split and one length"
+        got = f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
+        got += f" {len(origins)} with their first frame"
+        raise UsageError(what, where="collate", expected=expected, got=got)
     particles = torch.tensor([len(window.material) for window in windows])
     return Batch(
         position=torch.cat([window.position for window in windows]),

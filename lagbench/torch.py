@@ -110,12 +110,8 @@ class WindowSampler(Sampler[int]):
         self.rank = rank if rank is not None else torch.distributed.get_rank() if grouped else 0
         self.ranks = ranks if ranks is not None else torch.distributed.get_world_size() if grouped else 1
         if not 0 <= self.rank < self.ranks <= len(data):
-            raise UsageError(
-                "no window for a rank",
-                where="WindowSampler",
-                expected=f"0 <= rank < ranks <= {len(data)}",
-                got=f"rank {self.rank} of {self.ranks}",
-            )
+            expected, got = f"0 <= rank < ranks <= {len(data)}", f"rank {self.rank} of {self.ranks}"
+            raise UsageError("no window for a rank", where="WindowSampler", expected=expected, got=got)
         self.data = data  # what is drawn from
         self.seed = _natural(seed, "seed")  # seed of all epochs
         self.epoch = 0  # epoch that is drawn from
@@ -172,15 +168,13 @@ class WindowSampler(Sampler[int]):
 
 
 def _natural(value: object, name: str) -> int:
-    """Return a whole number that is not negative."""
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         number = -1
     if number < 0:
-        raise UsageError(
-            f"{name} does not fit", where="WindowSampler", expected="a whole number from 0", got=repr(value)
-        )
+        what, expected = f"{name} does not fit", "a whole number from 0"
+        raise UsageError(what, where="WindowSampler", expected=expected, got=repr(value))
     return number
 
 
@@ -220,12 +214,10 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
     for _ in range(frames):
         position = step(given)
         if not isinstance(position, Tensor) or position.shape != expected:
-            raise UsageError(
-                "a model returned no positions of the next frame",
-                where="roll_out, step",
-                expected=f"a tensor of shape {list(expected)}: [particle, 2]",
-                got=getattr(position, "shape", None) or type(position).__name__,
-            )
+            what = "a model returned no positions of the next frame"
+            shape = f"a tensor of shape {list(expected)}: [particle, 2]"
+            got = getattr(position, "shape", None) or type(position).__name__
+            raise UsageError(what, where="roll_out, step", expected=shape, got=got)
         given = given.followed_by(position)
         predicted.append(given.position[:, -1])  # a copy: the model may use the memory of its answer again
     return torch.stack(predicted, dim=1)
@@ -269,23 +261,17 @@ def predict(
     data = WindowDataset(split, subset=subset, size=size, root=root, future=0, registry=registry)
     task = data.size.task
     if history is not None and not 1 <= history <= task.input_frames:
-        raise UsageError(
-            "a model cannot see that many of the given frames",
-            where="predict",
-            expected=f"history from 1 to {task.input_frames}",
-            got=history,
-        )
+        what = "a model cannot see that many of the given frames"
+        expected = f"history from 1 to {task.input_frames}"
+        raise UsageError(what, where="predict", expected=expected, got=history)
     seen = slice(task.input_frames - (history or task.input_frames), None)
     needed = task.input_frames + task.horizon
     for scenario, first in zip(data.scenarios, data.starts, strict=False):
         if (held := data.size.frame_count(scenario)) < needed:
-            raise UsageError(
-                "a scenario is too short to be predicted",
-                where=f"predict, {data.size.split} {data.size.name}, scenario {scenario}",
-                expected=f"{needed} frames",
-                got=held,
-                fix="predict the subset test, whose scenarios are long enough",
-            )
+            what = "a scenario is too short to be predicted"
+            where = f"predict, {data.size.split} {data.size.name}, scenario {scenario}"
+            fix = "predict the subset test, whose scenarios are long enough"
+            raise UsageError(what, where=where, expected=f"{needed} frames", got=held, fix=fix)
         _, walls = data.store.constants(scenario)
         # The forcing is given for all frames, unlike the positions.
         forcing = None if walls is None else torch.from_numpy(walls.copy())

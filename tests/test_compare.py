@@ -6,7 +6,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,16 @@ def published(folder: Path, values: list[float], *, method: str, **changes: Any)
     return path
 
 
+def seeds_in(folder: Path, rows: Iterable[Iterable[float]], method: str, **changes: Any) -> Path:
+    """Write a folder of the seeds of a method; return it."""
+    for i, row in enumerate(rows):
+        path = published(
+            folder / str(i), list(row), method=method, **{"predictions_sha256": f"{method}{i}"} | changes
+        )
+        path.rename(folder / str(i) / "scores.json")
+    return folder
+
+
 def test_six_wins_of_six(tmp_path: Path) -> None:
     """Better in all of six scenarios: p = 2 / 2^6 = 0.03125, significant, said in words.
 
@@ -71,21 +81,22 @@ def test_six_wins_of_six(tmp_path: Path) -> None:
 
 
 def test_a_folder_of_seeds_is_a_method(tmp_path: Path) -> None:
-    """Three seeds against two: the two-way test over all of them, and means over seeds."""
+    """Three seeds against two: the two-way test over all of them, and means over seeds.
+
+    Against one seed the verdict speaks of its weights.
+    """
     rng = np.random.default_rng(0)
-    values = {"a": rng.gamma(9.0, size=(3, 8)), "b": rng.gamma(12.0, size=(2, 8))}
-    for method, seeds in values.items():
-        for i, row in enumerate(seeds):
-            place = tmp_path / method / str(i)
-            path = published(place, row.tolist(), method=method, predictions_sha256=f"{method}{i}")
-            path.rename(place / "scores.json")
-    result = compare(tmp_path / "a", tmp_path / "b")
+    a, b = rng.gamma(9.0, size=(3, 8)), rng.gamma(12.0, size=(2, 8))
+    several = seeds_in(tmp_path / "a", a, "a")
+    result = compare(several, seeds_in(tmp_path / "b", b, "b"))
     found = result.metrics["mse_avg"]
     assert result.seeds == found.test.seeds == (3, 2)
-    assert found.first == pytest.approx(values["a"].mean())
-    assert found.test.p == differ(values["a"], values["b"])
+    assert found.first == pytest.approx(a.mean())
+    assert found.test.p == differ(a, b)
     assert "3 and 2 seeds" in result.verdict
     assert result.as_json()["seeds"] == [3, 2]
+    one = compare(several, seeds_in(tmp_path / "c", b[:1], "c"))
+    assert ["weights" in verdict for verdict in (result.verdict, one.verdict)] == [False, True]
 
 
 def test_a_value_that_saturates_is_read_again(tmp_path: Path) -> None:
@@ -109,26 +120,16 @@ def test_from_a_folder_that_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_copies_are_no_seeds(tmp_path: Path) -> None:
-    """One file three times is one training: neither side takes it for several."""
+    """One file three times is one training, and the mean of two methods that of neither: both are refused."""
     other = published(tmp_path, [2.0] * 6, method="other")
-    for i in range(3):
-        path = published(tmp_path / "copies" / str(i), [1.0] * 6, method="a")
-        path.rename(tmp_path / "copies" / str(i) / "scores.json")
-    for sides in ((tmp_path / "copies", other), (other, tmp_path / "copies")):
-        with pytest.raises(UsageError) as told:
-            compare(*sides)
-        assert told.value.where == str(tmp_path / "copies")
-
-
-def test_one_seed_against_several_speaks_of_its_weights(tmp_path: Path) -> None:
-    """The verdict says so; several against several are methods."""
-    for method, seeds in {"a": 3, "b": 1, "c": 2}.items():
-        for i in range(seeds):
-            place, row = tmp_path / method / str(i), [1.0 + i, 2.0, 3.0, 4.0, 5.0, 6.0]
-            path = published(place, row, method=method, predictions_sha256=f"{method}{i}")
-            path.rename(place / "scores.json")
-    said = {name: compare(tmp_path / "a", tmp_path / name).verdict for name in ("b", "c")}
-    assert ["weights" in verdict for verdict in said.values()] == [True, False]
+    copies = seeds_in(tmp_path / "copies", [[1.0] * 6] * 3, "a", predictions_sha256="a")
+    mixed = seeds_in(tmp_path / "mixed", [[1.0] * 6], "a")
+    published(mixed, [1.0] * 6, method="b")
+    for folder in (copies, mixed):
+        for sides in ((folder, other), (other, folder)):
+            with pytest.raises(UsageError) as told:
+                compare(*sides)
+            assert str(folder) in str(told.value.where)
 
 
 def test_frames_without_a_value_are_told(tmp_path: Path) -> None:
@@ -140,23 +141,6 @@ def test_frames_without_a_value_are_told(tmp_path: Path) -> None:
     (shown,) = [row for table in comparison_tables(result) if table.title == "means" for row in table.rows]
     assert "19 frames undefined" in shown[1]
     assert "undefined" not in shown[2]
-
-
-def test_seeds_of_two_methods_are_not_one(tmp_path: Path) -> None:
-    """A folder that mixes methods is refused: the mean over them is that of neither."""
-    for method in ("a", "b"):
-        path = published(tmp_path / method, [1.0] * 6, method=method)
-        path.rename(tmp_path / method / "scores.json")
-    with pytest.raises(UsageError):
-        compare(tmp_path, tmp_path)
-
-
-def test_a_folder_without_scores(tmp_path: Path) -> None:
-    """What is named is the folder that was given."""
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(UnreadableFileError) as error:
-        compare(published(tmp_path, [1.0] * 6, method="a"), tmp_path / "empty")
-    assert error.value.where == str(tmp_path / "empty")
 
 
 @pytest.mark.parametrize(
@@ -192,11 +176,9 @@ def test_folders_files_and_predictions_agree(bench: ScoreBench, scored: dict[str
     assert by_folder.first == "still"
     assert compare(still_, still_).verdict == "both hold the same predictions"
     assert next(iter(by_folder.metrics)) == by_folder.ranking
-    result = compare(scored["still"], scored["straight"])
-    (short, means), (whole, _) = comparison_tables(result), comparison_tables(result, every=True)
+    (short, means), (whole, _) = comparison_tables(by_folder), comparison_tables(by_folder, every=True)
     assert short.rows[0][0].split()[0] == "vorticity_nrmse"
-    assert len(means.rows) == len(short.rows)
-    assert len(short.rows) < len(whole.rows) == len(result.metrics)
+    assert len(means.rows) == len(short.rows) < len(whole.rows) == len(by_folder.metrics)
 
 
 def test_files_of_a_leaderboard(
@@ -333,8 +315,10 @@ def test_malformed_scores_are_unreadable(tmp_path: Path, changes: dict[str, Any]
 
 def test_scores_that_are_not_there(tmp_path: Path) -> None:
     """A folder without any, JSON deeper than Python's stack, rows without the ranking metric."""
-    with pytest.raises(UnreadableFileError):
-        compare(tmp_path, tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UnreadableFileError) as error:
+        compare(published(tmp_path, [1.0] * 6, method="good"), tmp_path / "empty")
+    assert error.value.where == str(tmp_path / "empty")
     path = tmp_path / "scores.json"
     path.write_text("[" * 100_000)
     with pytest.raises(UnreadableFileError, match="RecursionError"):

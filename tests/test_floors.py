@@ -67,6 +67,15 @@ def predicted(name: str, held: Given) -> NDArray[np.float32]:
     return np.array(list(FLOORS[name].predict(held)))
 
 
+def own(size: Size, *, placement: str) -> Size:
+    """Return a split of a user's own: without generator, gravity or recorded scores."""
+    parameters = {name: value for name, value in size.parameters.items() if name != "gravity"}
+    grid = size.task.score_grid.model_copy(update={"placement": placement})
+    task = size.task.model_copy(update={"score_grid": grid})
+    told = {"split": "own", "name": "full", "generator": "none", "parameters": parameters, "task": task}
+    return size.model_copy(update=told)
+
+
 @pytest.mark.parametrize(
     ("split", "size", "names"),
     [
@@ -76,11 +85,20 @@ def predicted(name: str, held: Given) -> NDArray[np.float32]:
         ("fluid", "mini", "persistence constant-velocity free-flight analog coarse-solver"),
         ("multimaterial", "full", "persistence constant-velocity free-flight analog coarse-solver"),
         ("fluid", "tiny", "persistence constant-velocity free-flight analog"),
+        ("own", "cell_centres", "persistence constant-velocity frozen-field analog"),
+        ("own", "nodes", "persistence constant-velocity analog"),
     ],
 )
 def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
-    """Full boxes have the frozen field, free surfaces free flight; what is solved has a coarser grid."""
-    tier = load().size(split, size)
+    """Full boxes have the frozen field, free surfaces free flight; what is solved has a coarser grid.
+
+    A user's own split goes by its kind of box; without gravity there is no free flight, nothing is solved.
+    """
+    if split == "own":
+        tier = own(load().size("fluid", "mini"), placement=size)
+        assert shipped(tier) is None
+    else:
+        tier = load().size(split, size)
     assert " ".join(floor.name for floor in floors_of(tier)) == names
     solved = coarser(tier)
     assert solved is None or solved.grid < tier.grid
@@ -293,29 +311,6 @@ def test_the_coarse_solver_moves_all_particles() -> None:
         fallen = 0.5 * size.value("gravity") * size.frame_interval**2 * k * (k + 1)
         np.testing.assert_allclose(np.mean(block - frame, axis=0), [0.0, fallen], atol=1e-3)
         assert frame.shape == block.shape
-
-
-def own(size: Size, *, placement: str) -> Size:
-    """Return a split of a user's own: without generator, gravity or recorded scores."""
-    parameters = {name: value for name, value in size.parameters.items() if name != "gravity"}
-    grid = size.task.score_grid.model_copy(update={"placement": placement})
-    task = size.task.model_copy(update={"score_grid": grid})
-    told = {"split": "own", "name": "full", "generator": "none", "parameters": parameters, "task": task}
-    return size.model_copy(update=told)
-
-
-@pytest.mark.parametrize(
-    ("placement", "names"),
-    [
-        ("cell_centres", "persistence constant-velocity frozen-field analog"),
-        ("nodes", "persistence constant-velocity analog"),
-    ],
-)
-def test_floors_go_by_the_kind_of_box(placement: str, names: str) -> None:
-    """A full box has the frozen field; without gravity there is no free flight; nothing is solved."""
-    size = own(load().size("fluid", "mini"), placement=placement)
-    assert " ".join(floor.name for floor in floors_of(size)) == names
-    assert shipped(size) is None
 
 
 def test_an_analog_needs_all_of_train(bench: ScoreBench, copied: Callable[[], Path]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from metric_flows import SETTING, Floats, lattice, pair_of, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose
@@ -126,7 +126,6 @@ def turned(points: Floats, angle: float) -> Floats:
     return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
 
 
-@settings(deadline=None)
 @given(st.floats(-math.pi, math.pi), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_rigid_motion_is_no_error(angle: float, dx: float, dy: float) -> None:
     """A body that is turned and moved keeps its shape."""
@@ -134,7 +133,6 @@ def test_rigid_motion_is_no_error(angle: float, dx: float, dy: float) -> None:
     assert rigid_residual(x, turned(x, angle) + np.array([dx, dy])) < 1e-12
 
 
-@settings(deadline=None)
 @given(st.integers(0, 1000))
 def test_the_fit_is_the_best_of_all_angles(seed: int) -> None:
     """No angle found by searching fits better than the closed form."""
@@ -213,17 +211,15 @@ def test_connectivity_speaks_of_prediction_and_truth() -> None:
     assert not any(METRICS[name].applies(fluid) for name in METRICS if name.startswith(("shape", "connect")))
 
 
+SHIFT = st.floats(-0.5, 0.5, allow_subnormal=False)
+
+
 def cloud(seed: int, particles: int = 40) -> Floats:
     """Draw particles in the unit box."""
     return np.random.default_rng(seed).random((particles, 2))
 
 
-@settings(deadline=None)
-@given(
-    st.integers(0, 99),
-    st.floats(-0.5, 0.5, allow_subnormal=False),
-    st.floats(-0.5, 0.5, allow_subnormal=False),
-)
+@given(st.integers(0, 99), SHIFT, SHIFT)
 def test_a_shift_is_told_by_its_length(seed: int, dx: float, dy: float) -> None:
     """Shifted by s: every projection moves by s.d, and the mean of its square is |s|^2 / 2."""
     x = cloud(seed)
@@ -239,7 +235,6 @@ def test_a_scaled_cloud() -> None:
     assert sliced_wasserstein2(x, x.mean(axis=0) + 1.5 * r) == pytest.approx(expected, rel=1e-5)
 
 
-@settings(deadline=None)
 @given(st.integers(0, 99))
 def test_slices_never_exceed_the_exact_distance(seed: int) -> None:
     """In the plane SW2^2 <= W2^2 / 2, W2 from an exact assignment; particle order does not count."""

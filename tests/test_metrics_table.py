@@ -88,7 +88,7 @@ def test_chunks_in_any_order_give_the_same_bits(cuts: list[int], random: object)
     assert same_bits(functools.reduce(Tally.__add__, chunks), tallied())
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.randoms(use_true_random=False))
 def test_particle_order_changes_nothing(random: object) -> None:
     """Truth and prediction permuted alike have the same scores, but for the rounding of sums."""
@@ -245,9 +245,8 @@ def test_the_tables_of_the_design_are_complete() -> None:
     assert not any(math.isnan(found.mean) for found in scores(0.1).values())
     assert scores(0.1)["vorticity_mse"].per_frame.shape == (1, 52)
     assert scores(0.1)["vorticity_mse"].frames == tuple(range(2, 54))
-    expected = {
-        f"{of}_{law}" for of in ("position", "velocity", "vorticity") for law in ("mse", "mae", "rmse")
-    }
+    quantities = ("position", "velocity", "vorticity")
+    expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
     expected |= {f"vorticity_{name}" for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")}
     expected |= {"energy_ratio", "energy_retention", "energy_error", "momentum_error", "divergence_rms"}
     expected |= {"angular_momentum_error", "density_rmse", "sliced_w2", "sinkhorn_pot", "attribute_mse"}
@@ -285,27 +284,25 @@ NUMBER = 3
 ROOTLESS = (replace(OTHERS, statistic=None, of=("velocity_mse", "nothing_known")),)
 
 
-def with_entry_point(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Pretend that another package registers a name of this module."""
-    point = EntryPoint(name="others", value=f"{__name__}:{name}", group=table_module.GROUP)
+def with_entry_point(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    """Pretend that another package registers an object."""
+    point = EntryPoint(name="others", value=value, group=table_module.GROUP)
     monkeypatch.setattr(table_module, "installed", lambda group: [point])
 
 
 def test_another_package_adds_a_metric(monkeypatch: pytest.MonkeyPatch) -> None:
     """A single metric behind an entry point is scored like ours."""
-    with_entry_point(monkeypatch, "OTHERS")
+    with_entry_point(monkeypatch, f"{__name__}:OTHERS")
     assert available()["enstrophy_error"] is OTHERS
-    truth = rollout()
-    scenario = scenario_of(truth)
     metrics = select(["enstrophy_error"])
-    pieces = tally(pairs_of(scenario, truth, truth), metrics, scenario.setting.predicted_frames)
+    pieces = tally(pairs(), metrics, SETTING.predicted_frames)
     assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
 
 
 @pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS"])
 def test_a_bad_entry_point_is_named(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """A taken name, no metric, or one of statistics that nothing measures: refused, and said where it is."""
-    with_entry_point(monkeypatch, name)
+    with_entry_point(monkeypatch, f"{__name__}:{name}")
     with pytest.raises(UsageError, match=r"others|nothing_known"):
         available()
 
@@ -339,29 +336,37 @@ class Refusing:
         raise RuntimeError
 
 
-@pytest.mark.parametrize(
-    "value", [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400, Refusing()]
-)
-def test_what_is_no_number_is_told_with_its_metric(value: object) -> None:
-    """A statistic of another package that gives something else is named, and where it comes from."""
-    truth = rollout()
-    bad = replace(OTHERS, statistic=lambda pair: value)
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
-    with pytest.raises(WorkFailedError) as caught:
-        bad.measure(pair)
-    assert caught.value.where == f"{__name__}, enstrophy_error, frame {pair.frame}"
+NO_NUMBERS = [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400, Refusing()]
+STRANGE: list[tuple[str, Any]] = [
+    *(("statistic", lambda pair, value=value: value) for value in NO_NUMBERS),
+    ("statistic", lambda pair: sys.exit(0)),  # as one that parses arguments would
+    *(("defined", lambda pair, told=told: told) for told in (None, "no", np.array([True, False]))),
+]
 
 
-def test_a_metric_does_not_end_the_program() -> None:
-    """As one that parses arguments would: it is named as one that gives no number is, with any note."""
-    truth = rollout()
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
+@pytest.mark.parametrize(("what", "function"), STRANGE)
+def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> None:
+    """A metric of another package that gives something else is named, and where it comes from, with any note.
+
+    Whether it is defined must be true or false: a forgotten return would leave out every frame.
+    """
+    bad = replace(OTHERS, **{what: function})
     with pytest.raises(WorkFailedError) as caught:
-        replace(OTHERS, statistic=lambda pair: sys.exit(0)).measure(pair)
+        bad.measure(pairs()[0])
+    assert caught.value.where == f"{__name__}, enstrophy_error, frame 2"
     caught.value.add_note("scenario 3")
     again = pickle.loads(pickle.dumps(caught.value))
-    assert again.where == f"{__name__}, enstrophy_error, frame {pair.frame}, scenario 3"
+    assert again.where == f"{__name__}, enstrophy_error, frame 2, scenario 3"
     assert all("scenario 3" in str(error) for error in (caught.value, again))
+
+
+def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
+    """As a ufunc or a partial, whose name is told too; what is not defined is NaN."""
+    bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
+    with pytest.raises(WorkFailedError) as caught:
+        replace(OTHERS, statistic=bare).measure(pairs()[0])
+    assert "enstrophy_error" in str(caught.value.where)
+    assert math.isnan(replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0]))
 
 
 @pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
@@ -372,19 +377,16 @@ def test_all_that_a_metric_does_is_told_with_its_name(what: str, left: BaseExcep
     def fail(*_: object) -> Any:
         raise left
 
-    truth = rollout()
-    scenario = scenario_of(truth)
     bad: Any = replace(OTHERS, **{what: fail})
     with pytest.raises((WorkFailedError, KeyError)) as caught:
-        aggregate(
-            [bad], {0: tally(pairs_of(scenario, truth, truth), [bad], scenario.setting.predicted_frames)}
-        )
+        aggregate([bad], {0: tally(pairs(), [bad], SETTING.predicted_frames)})
     told = getattr(caught.value, "where", None) or caught.value.__notes__[0]
     assert "enstrophy_error" in told
 
 
-def test_what_a_metric_raises_keeps_what_it_came_from() -> None:
-    """A package's author sees the first error too."""
+@pytest.mark.parametrize("what", ["statistic", "defined"])
+def test_what_a_metric_raises_keeps_what_it_came_from(what: str) -> None:
+    """The error itself goes on, with metric and frame; a package's author sees the first error too."""
 
     def fail(_: FramePair) -> float:
         try:
@@ -392,52 +394,18 @@ def test_what_a_metric_raises_keeps_what_it_came_from() -> None:
         except KeyError:
             return [][0]
 
-    truth = rollout()
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
     with pytest.raises(IndexError) as caught:
-        replace(OTHERS, statistic=fail).measure(pair)
+        replace(OTHERS, **{what: fail}).measure(pairs()[0])
+    assert caught.value.__notes__ == ["in metric enstrophy_error, frame 2"]
     assert isinstance(caught.value.__context__, KeyError)
     assert not caught.value.__suppress_context__
-
-
-def test_a_metric_without_a_module_is_told_too() -> None:
-    """As a ufunc or a partial may be."""
-    truth = rollout()
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
-    bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
-    with pytest.raises(WorkFailedError) as caught:
-        replace(OTHERS, statistic=bare).measure(pair)
-    assert "enstrophy_error" in str(caught.value.where)
-
-
-def test_whether_a_metric_is_defined_is_true_or_false() -> None:
-    """A forgotten return would leave out every frame."""
-    truth = rollout()
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
-    for told in (None, "no", np.array([True, False])):
-        forgetful: Any = lambda pair, told=told: told  # noqa: E731
-        with pytest.raises(WorkFailedError):
-            replace(OTHERS, defined=forgetful).measure(pair)
-    assert math.isnan(replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pair))
 
 
 def test_a_module_that_would_end_the_program_is_told(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Not with exit code 0 and nothing done."""
     (tmp_path / "leaving.py").write_text("raise SystemExit")
     monkeypatch.syspath_prepend(tmp_path)
-    point = EntryPoint(name="others", value="leaving:METRICS", group=table_module.GROUP)
-    monkeypatch.setattr(table_module, "installed", lambda group: [point])
+    with_entry_point(monkeypatch, "leaving:METRICS")
     with pytest.raises(UsageError) as caught:
         available()
     assert caught.value.where == "entry point others = leaving:METRICS"
-
-
-@pytest.mark.parametrize("what", ["statistic", "defined"])
-def test_what_a_metric_raises_is_told_with_its_name_and_the_frame(what: str) -> None:
-    """The error itself goes on, with a note."""
-    truth = rollout()
-    bad = replace(OTHERS, **{what: lambda pair: 1 / (pair.frame - pair.frame)})
-    pair = pairs_of(scenario_of(truth), truth, truth)[0]
-    with pytest.raises(ZeroDivisionError) as caught:
-        bad.measure(pair)
-    assert caught.value.__notes__ == [f"in metric enstrophy_error, frame {pair.frame}"]

@@ -68,11 +68,10 @@ def scattered(card: ScoreCard) -> ScoreCard:
     fields[:, :, :, 26:] = np.nan  # the material fills less than two fifths of the box
     steps = 1e-3 * rng.standard_normal((2, FRAMES, PARTICLES, 2))
     film = (rng.random((1, 1, PARTICLES, 2)) + np.cumsum(steps, axis=1)).astype(np.float32)
-    preview = replace(noisy(card).preview, map_frames=(60, 599), vorticity=fields, film=film)
-    few = {"histogram": preview.histogram[:, :2], "histogram_range": preview.histogram_range[:2]}
-    preview = replace(preview, **few)
-    scores = {SUBMISSION: card.submission}  # floors have other scenarios than these
-    return replace(card, tallies={SUBMISSION: tallies}, scores=scores, skill=None, preview=preview)
+    large = noisy(card)
+    few = {"histogram": large.preview.histogram[:, :2], "histogram_range": large.preview.histogram_range[:2]}
+    preview = replace(large.preview, map_frames=(60, 599), vorticity=fields, film=film, **few)
+    return replace(large, tallies={SUBMISSION: tallies}, preview=preview)
 
 
 def test_full_submissions_take_300_kb(card: ScoreCard, tmp_path: Path) -> None:
@@ -87,7 +86,6 @@ def test_full_submissions_take_300_kb(card: ScoreCard, tmp_path: Path) -> None:
     expected = aggregate(select(again.tallies[54].names), made.tallies[SUBMISSION])
     for name, score in expected.items():
         assert again.scores()[name].mean == score.mean or math.isnan(score.mean)
-    path = tmp_path / "scores.nc"
     write_statistics(noisy(card), path)
     assert 200_000 < path.stat().st_size <= 300_000
 
@@ -147,8 +145,14 @@ def test_preview_shows_the_truth_beside_the_prediction(bench: ScoreBench, card: 
 
 
 def test_both_files_read_back(card: ScoreCard) -> None:
-    """What compare needs comes back from scores.json; of scores.nc every bit of the statistics."""
+    """What compare needs comes back from scores.json; of scores.nc every bit of the statistics and scores."""
     stored = read_statistics(card.files[1])
+    assert stored.predictions_sha256 == card.predictions_sha256
+    assert list(stored.scores()) == list(card.submission)
+    for name, score in stored.scores().items():
+        np.testing.assert_array_equal(score.values, card.submission[name].values, err_msg=name)
+        np.testing.assert_equal(score.interval, card.submission[name].interval)
+        assert score.undefined == card.submission[name].undefined, name
     for scenario, tally in card.tallies[SUBMISSION].items():
         again = stored.tallies[scenario]
         assert (again.names, again.frames) == (tally.names, tally.frames)

@@ -16,7 +16,6 @@ Memorising looks like this, and so does a leak from train to test.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,38 +78,27 @@ def nearest(given: Given) -> int:
             with _open(given, scenario) as file:
                 found[scenario] = distance(own, start_of(given_in(file, size, given.root)))
     if not found:
-        raise DataError(
-            "no scenario of train is as long as the task",
-            where=f"{size.split} {size.name}",
-            expected=f"{needed} frames",
-        )
+        what, where = "no scenario of train is as long as the task", f"{size.split} {size.name}"
+        raise DataError(what, where=where, expected=f"{needed} frames")
     return min(found, key=lambda scenario: (found[scenario], scenario))
 
 
 def predict(given: Given) -> Prediction:
     """Yield where the analog takes the particles."""
+    frames, now = given.predicted_frames, given.last
     with _open(given, nearest(given)) as file:
-        yield from _carried(given, file) if fills_box(given.size) else _matched(given, file)
-
-
-def _carried(given: Given, file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
-    """Move the particles as the analog's neighbours move from each frame to the next."""
-    last = given.predicted_frames[-1]
-    walls, now = wall_motion(file, given.size, last + 1), given.last
-    before = _frame(file, given.predicted_frames[0] - 1)
-    for frame in given.predicted_frames:
-        after = _frame(file, frame)
-        field = linear_field(*mirrored(given, before, after - before, walls[frame]))
-        now, before = given.inside(now + field(now)), after
-        yield now.astype("float32")
-
-
-def _matched(given: Given, file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
-    """Follow the analog's particles that are assigned to those given."""
-    theirs = _frame(file, given.predicted_frames[0] - 1)
-    partner = assigned(given.last, theirs, given.material, file.read("material"))
-    for frame in given.predicted_frames:
-        yield _frame(file, frame)[partner].astype("float32")
+        before = _frame(file, frames[0] - 1)
+        if not fills_box(given.size):
+            partner = assigned(now, before, given.material, file.read("material"))
+            for frame in frames:
+                yield _frame(file, frame)[partner].astype("float32")
+            return
+        walls = wall_motion(file, given.size, frames.stop)
+        for frame in frames:
+            after = _frame(file, frame)
+            field = linear_field(*mirrored(given, before, after - before, walls[frame]))
+            now, before = given.inside(now + field(now)), after
+            yield now.astype("float32")
 
 
 def assigned(
@@ -148,7 +136,6 @@ FLOOR = Floor(
     title="Analog",
     definition="The scenario of train whose given frames are nearest to those given here: its motion carries"
     " the particles of a full box, its matched particles are the answer on a free surface.",
-    applies=lambda _: True,
     predict=predict,
     reads_train=True,
 )

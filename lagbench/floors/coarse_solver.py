@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -47,8 +46,7 @@ def coarser(size: Size) -> Size | None:
 
 def predict(given: Given) -> Prediction:
     """Yield positions that the solver on the coarser grid finds."""
-    coarse = coarser(given.size)
-    if coarse is None:
+    if (coarse := coarser(given.size)) is None:
         raise ValueError(f"{given.size.split} {given.size.name} has no coarser size")
     return predict_with(given, coarse)
 
@@ -58,13 +56,24 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
     require("taichi", extra="generate")
     from lagbench.generators.constants import solver_constants
 
-    constants = solver_constants(coarse)
-    count = min(coarse.particles, len(given.last))
-    carriers = spread_subset(given.last, given.material, count)
-    solver = _solver(replace(constants, particles=count))
+    count, now = min(coarse.particles, len(given.last)), given.last.copy()
+    carriers = spread_subset(now, given.material, count)
+    others = np.setdiff1d(np.arange(len(now)), carriers)
+    leader = _leaders(given, carriers, others)
+    offset, before = now[others] - now[carriers][leader], now[carriers]
+    solver = _solver(replace(solver_constants(coarse), particles=count))
     solver.load([_state(given, carriers)])
-    paths = _paths(given, solver, coarse.substeps_per_frame)
-    yield from _all_moved(given, carriers, paths)
+    for frame in given.predicted_frames:
+        solver.advance(coarse.substeps_per_frame)
+        after = solver.position()[0].astype(np.float64)
+        if fills_box(given.size) and others.size:
+            field = linear_field(*mirrored(given, before, after - before, given.walls[frame]))
+            now[others] = now[others] + field(now[others])
+        else:
+            now[others] = after[leader] + offset
+        now[carriers], before = after, after
+        now = given.inside(now)
+        yield now.astype("float32")
 
 
 @functools.lru_cache(maxsize=1)
@@ -93,16 +102,13 @@ def spread_subset(position: Floats, material: NDArray[np.integer], count: int) -
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
-    """Return the last given frame as the solver starts from it."""
     from lagbench.generators.split import InitialState
 
     interval, count = given.size.frame_interval, len(carriers)
     if fills_box(given.size):
-        step = 1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])
-        velocity = step / interval
+        velocity = (1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])) / interval
     else:
-        fall = np.array([0.0, -0.5 * float(given.size.value("gravity")) * interval])
-        velocity = given.step / interval + fall
+        velocity = given.step / interval + [0.0, -0.5 * float(given.size.value("gravity")) * interval]
     # row 0 of a program never acts: row 1 is on the way to the first predicted frame
     walls = given.walls[given.predicted_frames[0] - 1 :] / interval
     return InitialState(
@@ -115,33 +121,6 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
         friction=float(str(given.parameters.get("friction", 0.0))),
         wall_velocity=walls if given.driven else walls[0],
     )
-
-
-def _paths(given: Given, solver: Solver, substeps: int) -> Iterator[Floats]:
-    """Yield the positions of the particles that carry mass, frame by frame."""
-    for _ in given.predicted_frames:
-        solver.advance(substeps)
-        yield solver.position()[0].astype(np.float64)
-
-
-def _all_moved(
-    given: Given, carriers: NDArray[np.intp], paths: Iterator[Floats]
-) -> Iterator[NDArray[np.float32]]:
-    """Yield the positions of all particles, those that carry mass where the solver has them."""
-    now = given.last.copy()
-    others = np.setdiff1d(np.arange(len(now)), carriers)
-    leader = _leaders(given, carriers, others)
-    offset = now[others] - now[carriers][leader]
-    before = now[carriers]
-    for frame, after in zip(given.predicted_frames, paths, strict=True):
-        if fills_box(given.size) and others.size:
-            field = linear_field(*mirrored(given, before, after - before, given.walls[frame]))
-            now[others] = now[others] + field(now[others])
-        else:
-            now[others] = after[leader] + offset
-        now[carriers], before = after, after
-        now = given.inside(now)
-        yield now.astype("float32")
 
 
 def _leaders(given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lagbench.data.registry import Size
-
 from .floor import Floor, Given, Prediction, fills_box
 
 
@@ -37,15 +35,10 @@ def on_parabolas(given: Given) -> Prediction:
         yield given.inside(given.last + k * given.step + g * (k * (k + 1) / 2)).astype("float32")
 
 
-def _falls(size: Size) -> bool:
-    return not fills_box(size) and "gravity" in size.parameters
-
-
 PERSISTENCE = Floor(
     name="persistence",
     title="Persistence",
     definition="The last given frame, repeated.",
-    applies=lambda _: True,
     predict=at_rest,
 )
 
@@ -53,7 +46,6 @@ CONSTANT_VELOCITY = Floor(
     name="constant-velocity",
     title="Constant velocity",
     definition="Every particle keeps its last given velocity and stops at the walls.",
-    applies=lambda _: True,
     predict=on_lines,
 )
 
@@ -61,6 +53,6 @@ FREE_FLIGHT = Floor(
     name="free-flight",
     title="Free flight",
     definition="Every particle falls freely from its last given velocity and stops at the walls.",
-    applies=_falls,
+    applies=lambda size: not fills_box(size) and "gravity" in size.parameters,
     predict=on_parabolas,
 )

@@ -82,10 +82,9 @@ class Floor:
     name: str  # name of its rows
     title: str  # the same for readers
     definition: str  # what it predicts, one sentence
-    applies: Callable[[Size], bool]  # whether a split and size has it
     predict: Callable[[Given], Prediction]
-    # whether it may be the best floor, which skill is measured against
-    counts: bool = True
+    applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it
+    counts: bool = True  # whether it may be the best floor, which skill is measured against
     reads_train: bool = False  # whether it looks at the scenarios of train
 
 
@@ -142,12 +141,12 @@ def mirrored(given: Given, points: Floats, values: Floats, walls: Floats) -> tup
     (left, right), (bottom, top) = given.size.bounds
     depth = DEPTH * np.sqrt((right - left) * (top - bottom) / len(points))
     places, speeds = [points], [values]
-    for wall, (axis, where) in enumerate([(0, left), (0, right), (1, bottom), (1, top)]):
+    for motion, axis, where in zip(walls, (0, 0, 1, 1), (left, right, bottom, top), strict=True):
         near = np.abs(points[:, axis] - where) < depth
         image, speed = points[near].copy(), values[near].copy()
         image[:, axis] = 2.0 * where - image[:, axis]
         if given.driven:
-            speed = 2.0 * walls[wall] - speed
+            speed = 2.0 * motion - speed
         else:
             speed[:, axis] *= -1.0
         places.append(image)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
 from lagbench.metrics.aggregate import Score
-from lagbench.metrics.metric import Metric
+from lagbench.metrics.metric import mean
 from lagbench.metrics.table import available
 
 FOLDER = Path(__file__).parent / "measured"
@@ -39,12 +39,6 @@ CURVES = (
     *("divergence_rms", "shape_error", "connectivity"),
 )
 """Metrics of which reports and boards draw curves."""
-
-KNOTS = 100
-"""Frames of a curve that are kept."""
-
-CORRELATED = 54
-"""Frame at which the correlation of vorticity is kept of every scenario; the last one of shorter tasks."""
 
 DIGITS, FRAME_DIGITS, CURVE_DIGITS = 5, 4, 3
 
@@ -64,7 +58,7 @@ class FloorScores:
 def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
     """Return the correlation of vorticity at frame 54, or the last one, shape [scenario]."""
     pearson = scores["vorticity_pearson"]
-    return pearson.at(min(CORRELATED, pearson.frames[-1]))
+    return pearson.at(min(54, pearson.frames[-1]))
 
 
 def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
@@ -80,16 +74,29 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
     held = _held(size, folder)
     if held is None:
         return None
-    frames, known = range(held["frames"][0], held["frames"][1] + 1), available()
-    return {
-        name: FloorScores(
-            name=name,
-            scores=dict(_scores(said, known, tuple(held["scenarios"]), frames, held["reported_frames"])),
+    first, last = held["frames"]
+    scenarios, frames, known = tuple(held["scenarios"]), range(first, last + 1), available()
+    none, found = [0] * len(scenarios), {}
+    for floor, said in held["floors"].items():
+        scores = {}
+        for name, values in said["values"].items():
+            if name not in known:
+                continue  # of a package that is not installed here
+            per_frame = np.full((1, len(frames)), np.nan)
+            if name in said["curves"]:
+                per_frame[0] = np.interp(frames, _knots(frames), _floats(said["curves"][name]))
+            if name in said["at"]:
+                reported = [frames.index(frame) for frame in held["reported_frames"]]
+                per_frame[0, reported] = _floats(said["at"][name])
+            undefined = tuple(said["undefined"].get(name, none))
+            scores[name] = Score(known[name], scenarios, tuple(frames), per_frame, _floats(values), undefined)
+        found[floor] = FloorScores(
+            name=floor,
+            scores=scores,
             seconds_per_frame=said["seconds_per_frame"],
             correlation=_floats(said["correlation"]),
         )
-        for name, said in held["floors"].items()
-    }
+    return found
 
 
 def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
@@ -99,7 +106,6 @@ def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
 
 
 def _held(size: Size, folder: Path) -> dict[str, Any] | None:
-    """Return what was measured on the data set that the registry describes."""
     path = shipped_path(size, folder)
     if size.measured is None or not path.is_file():
         return None
@@ -109,37 +115,15 @@ def _held(size: Size, folder: Path) -> dict[str, Any] | None:
 
 
 def _measured(size: Size, folder: Path) -> dict[str, Any]:
-    """Return what was measured on a data set; refuse one on which nothing was."""
     held = _held(size, folder)
     if held is None:
         raise DataError("no floors were measured on this data set", where=str(shipped_path(size, folder)))
     return held
 
 
-def _scores(
-    said: Mapping[str, Any],
-    known: Mapping[str, Metric],
-    scenarios: tuple[int, ...],
-    frames: range,
-    reported: Sequence[int],
-) -> Iterable[tuple[str, Score]]:
-    """Yield the scores of a floor; metrics that are not installed here are left out."""
-    none = [0] * len(scenarios)
-    for name, values in said["values"].items():
-        if name not in known:
-            continue
-        per_frame = np.full((1, len(frames)), np.nan)
-        if name in said["curves"]:
-            per_frame[0] = np.interp(frames, _knots(frames), _floats(said["curves"][name]))
-        if name in said["at"]:
-            per_frame[0, [frames.index(f) for f in reported]] = _floats(said["at"][name])
-        undefined = tuple(said["undefined"].get(name, none))
-        yield name, Score(known[name], scenarios, tuple(frames), per_frame, _floats(values), undefined)
-
-
 def _knots(frames: Sequence[int]) -> NDArray[np.intp]:
     """Return the frames at which a curve is kept, first and last included."""
-    return np.rint(np.linspace(frames[0], frames[-1], min(len(frames), KNOTS))).astype(np.intp)
+    return np.rint(np.linspace(frames[0], frames[-1], min(len(frames), 100))).astype(np.intp)
 
 
 def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
@@ -159,20 +143,17 @@ def write_shipped(
 
     With ``partial`` the other floors stay as they are, and so do all costs, which compare only within one
     run on one machine.
-
-    Raises:
-        DataError: partial, and no floors were measured on this data set.
     """
     first = next(iter(next(iter(floors.values())).scores.values()))
-    said, kept = {name: _said(floor, reported) for name, floor in floors.items()}, {}
+    said = {name: _said(floor, reported) for name, floor in floors.items()}
+    kept: dict[str, Any] = {}
     if partial:
         earlier = _measured(size, folder)
         known = earlier["floors"]
         for name in said.keys() & known.keys():
             said[name]["seconds_per_frame"] = known[name]["seconds_per_frame"]
         said = {**known, **said}
-        if "solver_seconds_per_frame" in earlier:
-            kept["solver_seconds_per_frame"] = earlier["solver_seconds_per_frame"]
+        kept = {name: cost for name, cost in earlier.items() if name == "solver_seconds_per_frame"}
     held = {
         "lagbench_floors": FORMAT,
         "split": size.split,
@@ -185,16 +166,18 @@ def write_shipped(
         **kept,
         "floors": said,
     }
-    path = shipped_path(size, folder)
-    write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
-    return path
+    return _write(size, held, folder)
 
 
 def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
     """Add what a frame costs the solver itself to the measured floors of a data set [s]."""
-    held, path = _measured(size, folder), shipped_path(size, folder)
+    held = _measured(size, folder)
     floors = held.pop("floors")
-    held |= {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}
+    return _write(size, held | {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors}, folder)
+
+
+def _write(size: Size, held: Mapping[str, Any], folder: Path) -> Path:
+    path = shipped_path(size, folder)
     write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
     return path
 
@@ -217,9 +200,7 @@ def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
 
 
 def _mean(values: NDArray[np.float64]) -> float:
-    """Return the mean over the scenarios that have a value."""
-    defined = values[np.isfinite(values)]
-    return float(np.mean(defined)) if defined.size else math.nan
+    return mean(values[np.isfinite(values)])
 
 
 def _number(value: float, digits: int) -> float | None:

@@ -40,12 +40,6 @@ RESAMPLES = 10_000
 FEWEST_FOR_INTERVAL = 4
 """Scenarios below which no interval is given: of three, Student's quantile alone doubles its width."""
 
-MOST_FREEDOM = 1000
-"""Degrees of freedom up to which Student's quantile is summed here."""
-
-NEWTON_STEPS = 12
-"""Steps to Student's quantile; from four on few change more than the last digits."""
-
 
 @dataclass(frozen=True, eq=False)
 class Tally:
@@ -83,13 +77,8 @@ class Tally:
         """Combine two pieces of the same scenario."""
         if (self.names, self.frames) != (other.names, other.frames):
             raise UsageError("tallies of different statistics or frames do not add")
-        return Tally(
-            self.names,
-            self.frames,
-            self.total + other.total,
-            self.weight + other.weight,
-            self.undefined + other.undefined,
-        )
+        total, weight = self.total + other.total, self.weight + other.weight
+        return Tally(self.names, self.frames, total, weight, self.undefined + other.undefined)
 
     @cached_property
     def _rows(self) -> Mapping[str, tuple[Floats, NDArray[np.bool_]]]:
@@ -227,12 +216,9 @@ def student_quantile(freedom: float, share: float) -> float:
 
     For whole degrees of freedom, which those of a single seed are, by Newton's method on the
     finite sums 26.7.3 and 26.7.4 of Abramowitz and Stegun: SciPy takes a quarter of a second to import.
-
-    Args:
-        freedom: degrees of freedom, above 0.
-        share: of the distribution that lies below, from 0.5 to 1.
+    Shares are from 0.5 to 1.
     """
-    whole = round(freedom) if 3 <= freedom <= MOST_FREEDOM else 0  # nan and inf are not rounded
+    whole = round(freedom) if 3 <= freedom <= 1000 else 0  # longer sums take longer; nan is not rounded
     if not whole or abs(freedom - whole) > 1e-9:
         from scipy.special import stdtrit
 
@@ -240,7 +226,7 @@ def student_quantile(freedom: float, share: float) -> float:
     odd, angle = whole % 2, 0.0
     # density of the angle atan(t / sqrt(freedom)) in units of that of its first term
     scale = math.exp(math.lgamma((whole + 1) / 2) - math.lgamma(whole / 2)) / math.sqrt(math.pi)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(12):  # from four steps on few change more than the last digits
         sine, cosine = math.sin(angle), math.cos(angle)
         term = sine * (cosine if odd else 1.0)
         within = term
@@ -338,37 +324,20 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
         return None
     scenarios = tuple(sorted(tallies))
     frames = tallies[scenarios[0]].frames
-    asked = np.stack([_measured(metric, tallies[i]) for i in scenarios])
+    asked = np.array([np.all([tallies[i].measured(name) for name in metric.of], axis=0) for i in scenarios])
     if metric.horizon > len(frames) or not asked.any():
         return None
     try:
-        series = np.stack([_series(metric, tallies[i]) for i in scenarios])
-        values = _over_frames(metric, series)
+        rows = [metric.series(*map(tallies[i].series, metric.of)) for i in scenarios]
+        series = np.stack([np.asarray(row, np.float64) for row in rows])
+        if metric.over_frames is mean and not np.isnan(series).any():
+            values = np.asarray(series.mean(axis=1))  # all rows at once, to the same bits
+        else:
+            values = np.array([metric.over_frames(row) for row in series])
     except (Exception, SystemExit) as error:
         metric.blame(error, "over all frames")
-    return Score(
-        metric=metric,
-        scenarios=scenarios,
-        frames=frames,
-        per_frame=series,
-        values=values,
-        undefined=tuple(np.count_nonzero(asked & np.isnan(series), axis=1).tolist()),
-    )
-
-
-def _series(metric: Metric, tally: Tally) -> Floats:
-    return np.asarray(metric.series(*(tally.series(name) for name in metric.of)), np.float64)
-
-
-def _measured(metric: Metric, tally: Tally) -> NDArray[np.bool_]:
-    first, *others = (tally.measured(name) for name in metric.of)
-    return functools.reduce(np.logical_and, others, first)
-
-
-def _over_frames(metric: Metric, series: Floats) -> Floats:
-    if metric.over_frames is mean and not np.isnan(series).any():
-        return np.asarray(series.mean(axis=1))  # all rows at once, to the same bits
-    return np.array([metric.over_frames(row) for row in series])
+    undefined = tuple(np.count_nonzero(asked & np.isnan(series), axis=1).tolist())
+    return Score(metric, scenarios, frames, series, values, undefined)
 
 
 def aggregate(metrics: Iterable[Metric], tallies: Mapping[int, Tally]) -> dict[str, Score]:

@@ -7,7 +7,7 @@ scenarios with such a body have these metrics; elsewhere they are expected gaps.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,27 +76,26 @@ class OverBodies:
         return bool(self._present(pair))
 
 
-def _metrics() -> Iterator[Metric]:
+METRICS = tuple(
+    Metric(
+        name=f"{statistic.__name__}{suffix}",
+        family="bodies",
+        unit=unit,
+        direction=direction,
+        perfect=perfect,
+        source="section 4.8.2",
+        summary=f"{summary}, {whose}",
+        statistic=OverBodies(statistic, materials),
+        applies=OverBodies(statistic, materials).applies,
+    )
     for statistic, unit, direction, perfect, summary in (
         (shape_error, "length", Direction.LOWER, 0.0, "Distance from the true shape after a rigid fit"),
         (connectivity, "1", Direction.HIGHER, 1.0, "Share of first neighbours within twice their distance"),
         (connectivity_true, "1", Direction.NONE, None, "Connectivity of the truth"),
-    ):
-        for materials in (ELASTIC, *((name,) for name in ELASTIC)):
-            whose = "" if materials is ELASTIC else f"_{materials[0]}"
-            over = OverBodies(statistic, materials)
-            yield Metric(
-                name=f"{statistic.__name__}{whose}",
-                family="bodies",
-                unit=unit,
-                direction=direction,
-                perfect=perfect,
-                source="section 4.8.2",
-                summary=f"{summary}, {'mean over elastic bodies' if materials is ELASTIC else materials[0]}",
-                statistic=over,
-                applies=over.applies,
-            )
-
-
-METRICS = tuple(_metrics())
+    )
+    for suffix, materials, whose in (
+        ("", ELASTIC, "mean over elastic bodies"),
+        *((f"_{name}", (name,), name) for name in ELASTIC),
+    )
+)
 """Metrics of this family."""

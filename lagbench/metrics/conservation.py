@@ -10,17 +10,23 @@ one mass; it cancels, and momenta are told over it.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
 from lagbench.data.grid import divergence
 
-from .frame import Floats, FramePair, Snapshot, average, dot, lengths
+from .frame import Floats, FramePair, Snapshot, dot, lengths, mean_squared_error
 from .metric import Direction, enough_nodes, floored_quotient, metric, metrics_of, quotient, total
 from .metric import root_mean_square as over_frames_rms
 
 MOVING = 0.01
 """Share of the truth's greatest kinetic energy from which on a frame counts as moving."""
+
+
+ENERGIES = ("energy_predicted", "energy_true")
+
+_error = partial(metric, unit="1", direction=Direction.LOWER)
 
 
 def kinetic_energy(snapshot: Snapshot, particle_mass: float) -> float:
@@ -40,13 +46,7 @@ def energy_predicted(pair: FramePair) -> float:
     return kinetic_energy(pair.prediction, pair.scenario.particle_mass)
 
 
-@metric(
-    unit="1",
-    direction=Direction.TARGET,
-    perfect=1.0,
-    source="Eq. 5.11",
-    of=("energy_predicted", "energy_true"),
-)
+@metric(unit="1", direction=Direction.TARGET, perfect=1.0, source="Eq. 5.11", of=ENERGIES)
 def energy_ratio(predicted: Floats, true: Floats) -> Floats:
     """Predicted over true kinetic energy where the truth has 1 % of its peak.
 
@@ -75,12 +75,7 @@ def _retained(pair: FramePair, snapshot: Snapshot) -> float:
     return kinetic_energy(snapshot, mass) / given if given > 0.0 else math.nan
 
 
-@metric(
-    unit="1",
-    direction=Direction.LOWER,
-    source="design section 8",
-    of=("energy_predicted", "energy_true"),
-)
+@_error(source="design section 8", of=ENERGIES)
 def energy_error(predicted: Floats, true: Floats) -> Floats:
     """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
 
@@ -119,7 +114,7 @@ def momentum_scale(pair: FramePair) -> float:
     return float(pair.truth.speeds.sum())
 
 
-@metric(unit="1", direction=Direction.LOWER, source="section 5.2", of=("momentum_gap", "momentum_scale"))
+@_error(source="section 5.2", of=("momentum_gap", "momentum_scale"))
 def momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of total momentum over its scale (at least 1e-3 of its greatest)."""
     return floored_quotient(gap, scale)
@@ -137,30 +132,20 @@ def angular_momentum_scale(pair: FramePair) -> float:
     return dot(lengths(pair.truth.arms), pair.truth.speeds)
 
 
-@metric(
-    unit="1",
-    direction=Direction.LOWER,
-    source="section 5.2, Eq. 5.1",
-    of=("angular_momentum_gap", "angular_momentum_scale"),
-)
+@_error(source="section 5.2, Eq. 5.1", of=("angular_momentum_gap", "angular_momentum_scale"))
 def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
     return floored_quotient(gap, scale)
 
 
-def root_mean_square(values: Floats) -> float:
-    """Return ``sqrt(mean(v^2))`` over nodes."""
-    return math.sqrt(average(values**2))
-
-
-@metric(unit="1", direction=Direction.LOWER, source="design section 8", over_frames=over_frames_rms)
+@_error(source="design section 8", over_frames=over_frames_rms)
 def density_rmse(pair: FramePair) -> float:
     """Root mean squared error of density relative to rest, over all nodes.
 
     All nodes of the grid, so that material in the wrong place shows both where it is missing
     and where it should not be. 0 is perfect; values of a box that is filled in part are small.
     """
-    return root_mean_square(pair.prediction.fields.density - pair.truth.fields.density)
+    return math.sqrt(mean_squared_error(pair.prediction.fields.density - pair.truth.fields.density))
 
 
 @metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
@@ -177,10 +162,10 @@ def divergence_rms_true(pair: FramePair) -> float:
 
 def _divergence(pair: FramePair, snapshot: Snapshot) -> float:
     spacing = pair.scenario.setting.grid.spacing
-    return root_mean_square(divergence(snapshot.fields.velocity, spacing)[pair.nodes])
+    return math.sqrt(mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes]))
 
 
-@metric(unit="%", direction=Direction.LOWER, source="design 2, section 4")
+@_error(unit="%", source="design 2, section 4")
 def outside_share(pair: FramePair) -> float:
     """Share of predicted particles that are past a wall."""
     return 100.0 * pair.outside

@@ -16,9 +16,6 @@ from lagbench.data.grid import Grid, Placement, fields
 
 from .metric import MINIMUM_NODES
 
-TRIED = range(4, 129)
-"""Cells across of the grids that are tried."""
-
 
 @dataclass(frozen=True)
 class Cloud:
@@ -37,12 +34,9 @@ def covered_nodes(cloud: Cloud, grid: Grid) -> int:
 
 
 def fitting_cells(clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int) -> int | None:
-    """Return the cells across, nearest to a number, of a grid of which each cloud covers enough nodes.
-
-    None where there is none; of two as near the coarser one. Clouds are asked for anew for each grid that
-    is tried, so that one is in memory at a time.
-    """
-    tried: list[int] = sorted({near, *TRIED}, key=lambda cells: (abs(cells - near), cells))
+    """Return the cells across of a grid that each cloud covers, the coarser of two as near; None: no grid."""
+    # clouds are asked for anew for each grid that is tried, so that one is in memory at a time
+    tried: list[int] = sorted({near, *range(4, 129)}, key=lambda cells: (abs(cells - near), cells))
     for cells in tried:
         grid = Grid(cells, placement)
         if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds()):

@@ -133,23 +133,10 @@ def energy_spectrum(velocity: Floats) -> Floats:
     return energy[1 : min(rows, columns)]
 
 
-def _within_box(pair: FramePair, velocity: Floats) -> Floats:
-    """Return the node velocity inside the rectangle of the truth's counted nodes."""
-    counted = pair.truth.fields.counted
-    x, y = (np.flatnonzero(counted.any(axis=axis)) for axis in (1, 0))
-    return velocity[x[0] : x[-1] + 1, y[0] : y[-1] + 1]
-
-
-def in_full_box_at_slow_frames(pair: FramePair) -> bool:
-    """Tell whether the material fills the box and this is a frame of interest or the last one."""
-    return pair.scenario.setting.full_box and at_slow_frames(pair)
-
-
-@metric(
+@_distance(
     unit="1",
-    direction=Direction.LOWER,
     source="design 2, section 4",
-    applies=in_full_box_at_slow_frames,
+    applies=lambda pair: pair.scenario.setting.full_box and at_slow_frames(pair),
     defined=enough_nodes,
 )
 def spectrum_error(pair: FramePair) -> float:
@@ -159,14 +146,14 @@ def spectrum_error(pair: FramePair) -> float:
     and noise at once. A ratio counts at most :data:`DECADES`, a prediction at rest exactly that.
     NaN where the truth rests.
     """
-    true, predicted = (
-        energy_spectrum(_within_box(pair, side.fields.velocity)) for side in (pair.truth, pair.prediction)
-    )
+    counted = pair.truth.fields.counted
+    x, y = (np.flatnonzero(counted.any(axis=axis)) for axis in (1, 0))
+    box = slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1)  # the rectangle that holds the counted nodes
+    true, predicted = (energy_spectrum(side.fields.velocity[box]) for side in (pair.truth, pair.prediction))
     told = true > 0.0
     if not told.any():
         return math.nan
-    bounds = 10.0**-DECADES, 10.0**DECADES
-    ratio = np.clip(predicted[told] / true[told], *bounds)
+    ratio = np.clip(predicted[told] / true[told], 10.0**-DECADES, 10.0**DECADES)
     return math.sqrt(float(np.mean(np.log10(ratio) ** 2)))
 
 

@@ -136,12 +136,6 @@ class Setting:
         return self.grid.placement is Placement.CELL_CENTRES
 
     @property
-    def centre(self) -> tuple[float, float]:
-        """Centre of the box [length]."""
-        (left, right), (bottom, top) = self.bounds
-        return (left + right) / 2.0, (bottom + top) / 2.0
-
-    @property
     def predicted_frames(self) -> range:
         """Absolute numbers of the frames that are scored."""
         return range(self.input_frames, self.input_frames + self.horizon)
@@ -173,7 +167,7 @@ class Snapshot:
     @cached_property
     def arms(self) -> Floats:
         """Positions relative to the centre of the box [length], shape [particle, 2]."""
-        return np.asarray(self.position - np.array(self.scenario.setting.centre), np.float64)
+        return np.asarray(self.position - np.mean(self.scenario.setting.bounds, axis=1), np.float64)
 
     @cached_property
     def fields(self) -> Fields:
@@ -208,11 +202,8 @@ class Scenario:
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""
         if self.given.ndim != 3 or len(self.given) < 2 or self.given.shape[1:] != (len(self.material), 2):
-            raise UsageError(
-                "the given frames do not fit the scenario",
-                expected=f"[2 or more frames, {len(self.material)} particles, 2]",
-                got=str(self.given.shape),
-            )
+            expected, got = f"[2 or more frames, {len(self.material)} particles, 2]", str(self.given.shape)
+            raise UsageError("the given frames do not fit the scenario", expected=expected, got=got)
 
     @cached_property
     def full(self) -> float:
@@ -247,17 +238,13 @@ class Scenario:
         """Return the snapshot of positions and those one frame before, both [particle, 2]."""
         # columns contiguous: sums over particles and the grid transfer run along them
         x, before = (np.asarray(a, np.float64, order="F") for a in (position, previous))
-        expected = (len(self.material), 2)
+        expected, got = (len(self.material), 2), f"{x.shape} and {before.shape}"
         if x.shape != expected or before.shape != expected:
-            raise UsageError(
-                "wrong shape of positions", expected=str(expected), got=f"{x.shape} and {before.shape}"
-            )
+            raise UsageError("wrong shape of positions", expected=str(expected), got=got)
         if not np.isfinite(x).all():
-            raise ChecksFailedError(
-                "positions are not finite",
-                got=f"{np.count_nonzero(~np.isfinite(x).all(axis=1))} of {len(x)} particles",
-                fix="freeze the rollout at its last finite frame",
-            )
+            got = f"{np.count_nonzero(~np.isfinite(x).all(axis=1))} of {len(x)} particles"
+            fix = "freeze the rollout at its last finite frame"
+            raise ChecksFailedError("positions are not finite", got=got, fix=fix)
         return Snapshot(x, x - before, self)
 
 

@@ -151,10 +151,9 @@ class Metric:
         try:
             object.__setattr__(self, "direction", Direction(self.direction))  # a package may give a text
         except ValueError:
-            what, known = f"metric {self.name!r} has no such direction", ", ".join(Direction)
-            raise UsageError(
-                what, expected=known, got=repr(self.direction), fix="name one of these"
-            ) from None
+            what, got = f"metric {self.name!r} has no such direction", repr(self.direction)
+            fault = UsageError(what, expected=", ".join(Direction), got=got, fix="name one of these")
+            raise fault from None
         given: object = self.of
         if isinstance(given, str):
             what = f"metric {self.name!r} follows from a text, not from a tuple of statistics"
@@ -196,26 +195,17 @@ class Metric:
         raise self._broken("a metric gave no number", place, "a float", value)
 
     def blame(self, error: Exception | SystemExit, place: str) -> NoReturn:
-        """Raise again what the metric raised, with its name and place.
-
-        Raises:
-            WorkFailedError: it would have ended the program.
-        """
+        """Raise again what the metric raised, with name and place; what would end the program as a fault."""
         if isinstance(error, SystemExit):
             raise self._broken("a metric would end the program", place, "a number", error) from error
         error.add_note(f"in metric {self.name}, {place}")
         raise error
 
     def _broken(self, what: str, place: str, expected: str, got: object) -> WorkFailedError:
-        """Return the error of a metric that does not do what it must."""
         package = getattr(self.series if self.statistic is None else self.statistic, "__module__", "?")
-        return WorkFailedError(
-            what,
-            where=f"{package}, {self.name}, {place}",
-            expected=expected,
-            got=f"{type(got).__name__}: {got!r:.60}",
-            fix="mend or uninstall the package that adds it",
-        )
+        where, told = f"{package}, {self.name}, {place}", f"{type(got).__name__}: {got!r:.60}"
+        fix = "mend or uninstall the package that adds it"
+        return WorkFailedError(what, where=where, expected=expected, got=told, fix=fix)
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 
 import numpy as np
 
@@ -40,16 +41,6 @@ def attribute_mse(pair: FramePair) -> float:
     return average(np.concatenate([pair.position_square, pair.velocity_square]) / std**2)
 
 
-def position_error(pair: FramePair) -> Floats:
-    """Return predicted minus true position [length], shape [particle, 2]."""
-    return pair.position_error
-
-
-def velocity_error(pair: FramePair) -> Floats:
-    """Return predicted minus true per-frame velocity [length/frame], shape [particle, 2]."""
-    return pair.velocity_error
-
-
 @dataclass(frozen=True)
 class ErrorMean:
     """Mean of a particle error over all particles, or over those of one material."""
@@ -65,20 +56,16 @@ class ErrorMean:
 
     def applies(self, pair: FramePair) -> bool:
         """Tell whether the split has several materials and the scenario has this one."""
-        scenario = pair.scenario
-        several = len(scenario.setting.materials) > 1
-        return self.material is None or (several and self.material in scenario.members)
+        several = len(pair.scenario.setting.materials) > 1
+        return self.material is None or (several and self.material in pair.scenario.members)
 
 
-def _errors(
-    quantity: str, unit: str, error: Callable[[FramePair], Floats], material: str | None
-) -> Iterator[Metric]:
-    """Yield MSE, MAE and RMSE of one quantity over one material."""
+def _errors(quantity: str, unit: str, material: str | None) -> Iterator[Metric]:
     whose = "all particles" if material is None else f"{material} particles"
     suffix = "" if material is None else f"_{material}"
     laws = {"mse": (mean_squared_error, SQUARED[unit], "3.3"), "mae": (mean_absolute_error, unit, "3.4")}
     for name, (law, law_unit, equation) in laws.items():
-        statistic = ErrorMean(error, law, material)
+        statistic = ErrorMean(attrgetter(f"{quantity}_error"), law, material)
         yield _error(
             name=f"{quantity}_{name}{suffix}",
             unit=law_unit,
@@ -116,21 +103,19 @@ def _over_rollouts() -> Iterator[Metric]:
             )
 
 
-EARLY = _error(
-    name="position_rmse_20",
-    unit="length",
-    source="design 2, section 4",
-    summary="Root mean squared position error of the first 20 frames, as LagrangeBench's MSE_20",
-    of=("position_mse",),
-    over_frames=lambda mse: math.sqrt(FirstFrames(20)(mse)),
-    per_frame=False,
-    horizon=20,
-)
-
 METRICS = (
-    *(m for name in (None, *MATERIALS) for m in _errors("position", "length", position_error, name)),
-    EARLY,
-    *(m for name in (None, *MATERIALS) for m in _errors("velocity", "length/frame", velocity_error, name)),
+    *(m for name in (None, *MATERIALS) for m in _errors("position", "length", name)),
+    _error(
+        name="position_rmse_20",
+        unit="length",
+        source="design 2, section 4",
+        summary="Root mean squared position error of the first 20 frames, as LagrangeBench's MSE_20",
+        of=("position_mse",),
+        over_frames=lambda mse: math.sqrt(FirstFrames(20)(mse)),
+        per_frame=False,
+        horizon=20,
+    ),
+    *(m for name in (None, *MATERIALS) for m in _errors("velocity", "length/frame", name)),
     attribute_mse,
     *_over_rollouts(),
 )

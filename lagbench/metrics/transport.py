@@ -6,6 +6,7 @@ Slow, so measured at a few frames only.
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +27,8 @@ ROUNDS = 500
 
 TOLERANCE = 1e-5
 """Marginal error at which the iterations stop, as in LagrangeBench."""
+
+_error = partial(metric, unit="length", direction=Direction.LOWER)
 
 
 def sliced_wasserstein2(x: ArrayLike, y: ArrayLike) -> float:
@@ -56,24 +59,21 @@ def sinkhorn_divergence(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
     def cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
         weights: list[NDArray[np.float64]] = [np.full(len(side), 1.0 / len(side)) for side in (a, b)]
         distances = ot.dist(a, b, metric="sqeuclidean")
-        found = ot.sinkhorn2(*weights, distances, reg=BLUR, numItermax=ROUNDS, stopThr=TOLERANCE, warn=False)
-        return float(found)
+        options = {"reg": BLUR, "numItermax": ROUNDS, "stopThr": TOLERANCE, "warn": False}
+        return float(ot.sinkhorn2(*weights, distances, **options))
 
     return max(0.0, cost(x, y) - (cost(x, x) + cost(y, y)) / 2.0)
 
 
 def at_cloud_frames(pair: FramePair) -> bool:
-    """Tell whether this is every tenth frame in which a truth with a surface is active.
-
-    Where fewer than ten are, it is the last of them.
-    """
+    """Tell whether this is every tenth frame in which a truth with a surface is active; of fewer the last."""
     if pair.scenario.setting.full_box:
         return False
     active = pair.scenario.active
     return pair.frame in (active[CLOUD_FRAMES - 1 :: CLOUD_FRAMES] or active[-1:])
 
 
-@metric(unit="length", direction=Direction.LOWER, source="design 2, section 4", applies=at_cloud_frames)
+@_error(source="design 2, section 4", applies=at_cloud_frames)
 def cloud_distance(pair: FramePair) -> float:
     """Sliced W2 of each material's cloud, by its share of particles, at every tenth active frame.
 
@@ -95,18 +95,14 @@ def at_slow_frames_of_clouds(pair: FramePair) -> bool:
     return pair.frame == setting.predicted_frames[-1] if setting.full_box else at_slow_frames(pair)
 
 
-@metric(unit="length", direction=Direction.LOWER, source="design section 8", applies=at_slow_frames_of_clouds)
+@_error(source="design section 8", applies=at_slow_frames_of_clouds)
 def sliced_w2(pair: FramePair) -> float:
     """Sliced Wasserstein-2 distance of the particle clouds, 64 directions."""
     return _distance(pair.truth.projections, pair.prediction.projections)
 
 
-@metric(
-    unit="length^2",
-    direction=Direction.LOWER,
-    source="LagrangeBench (Toshev et al. 2023)",
-    applies=at_slow_frames,
-    extra="transport",
+@_error(
+    unit="length^2", source="LagrangeBench (Toshev et al. 2023)", applies=at_slow_frames, extra="transport"
 )
 def sinkhorn_pot(pair: FramePair) -> float:
     """Sinkhorn divergence by POT, regularisation 0.1: blurred and slow, optional."""

@@ -49,8 +49,7 @@ class Scale:
         x = np.asarray(values, np.float64)
         if not self.log:
             return (x - self.low) / (self.high - self.low)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
+        logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
         low, high = math.log10(self.low), math.log10(self.high)
         return np.asarray((logs - low) / (high - low), np.float64)
 
@@ -163,7 +162,7 @@ class Plot:
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
         data = path_data(zip(self._columns(x), self._rows(y), strict=True))
-        self._add("path", title, d=data, class_=f"line {kind}")
+        self._path(data, f"line {kind}", title)
 
     def front(self, x: ArrayLike, y: ArrayLike) -> None:
         """Draw a line through dots, which their names keep off."""
@@ -179,7 +178,7 @@ class Plot:
         for run in _runs(known):
             there = zip(columns[run], above[run], strict=True)
             back = zip(columns[run][::-1], below[run][::-1], strict=True)
-            self._add("path", "", d=path_data([*there, *back]) + "Z", class_=f"band {kind}")
+            self._path(path_data([*there, *back]) + "Z", f"band {kind}")
 
     def steps(self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a histogram's outline; there is one edge more than heights."""
@@ -189,20 +188,19 @@ class Plot:
     def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
         """Draw a cloud of points."""
         points = zip(self._columns(x), self._rows(y), strict=True)
-        data = "".join(path_data([point]) for point in points)
-        self._add("path", "", d=data, class_=f"dots {kind}")
+        self._path("".join(path_data([point]) for point in points), f"dots {kind}")
 
     def level(self, value: float, label: str, *, above: bool = True) -> None:
         """Draw a horizontal line with a name at its right end."""
         row = float(self._rows(np.array([value]))[0])
-        self._add("path", "", d=path_data([(0, row), (self._across, row)]), class_="level")
+        self._path(path_data([(0, row), (self._across, row)]), "level")
         place = row - 5 if above else row + 13
         self._marks.append(tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end"))
 
     def upright(self, value: float, label: str) -> None:
         """Draw a vertical line with a name at its top."""
         column = float(self._columns(np.array([value]))[0])
-        self._add("path", "", d=path_data([(column, 0), (column, self._up)]), class_="level")
+        self._path(path_data([(column, 0), (column, self._up)]), "level")
         left = column > self._across / 2
         x, kind = (column - 5, "note end") if left else (column + 5, "note")
         self._marks.append(written(label, x, 11, kind))
@@ -222,11 +220,9 @@ class Plot:
                 name,
             ]
             kind = f"dot {spot.kind}".strip()
-            if spot.href is None:
-                mark = tag("g", *drawn, class_=kind, tabindex=0, role="img", aria_label=spot.said)
-            else:
-                mark = tag("a", *drawn, class_=kind, href=spot.href, aria_label=spot.said)
-            self._marks.append(mark)
+            reached = {"tabindex": 0, "role": "img"} if spot.href is None else {"href": spot.href}
+            element = "g" if spot.href is None else "a"
+            self._marks.append(tag(element, *drawn, class_=kind, **reached, aria_label=spot.said))
         self._marks += leads  # above the dots
 
     def svg(self, title: str, description: str) -> Markup:
@@ -241,8 +237,8 @@ class Plot:
         )
         return _canvas(self._height, title, description, *self._axes(), area, linked=self._linked)
 
-    def _add(self, name: str, title: str, **attributes: object) -> None:
-        self._marks.append(tag(name, *([tag("title", title)] if title else []), **attributes))
+    def _path(self, data: str, kind: str, title: str = "") -> None:
+        self._marks.append(tag("path", *([tag("title", title)] if title else []), d=data, class_=kind))
 
     def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
         return np.clip(self._x.share(x), -FAR, FAR) * self._across
@@ -251,7 +247,6 @@ class Plot:
         return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
 
     def _axes(self) -> list[Markup]:
-        """Return grid lines, tick labels and the names of the axes."""
         bottom, right = TOP + self._up, WIDTH - RIGHT
         drawn = []
         for tick in self._y.ticks:
@@ -262,11 +257,13 @@ class Plot:
             column = LEFT + float(self._columns(tick.value))
             drawn.append(tag("path", d=path_data([(column, bottom), (column, bottom + 4)]), class_="mark"))
             drawn.append(written(tick.label, column, bottom + 17, "tick middle"))
-        drawn.append(tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"))
         x_label, y_label = self._labels
-        drawn.append(written(_with_factor(x_label, self._x), right, self._height - 5, "label end"))
-        drawn.append(written(_with_factor(y_label, self._y), 2, 14, "label"))
-        return drawn
+        return [
+            *drawn,
+            tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"),
+            written(_with_factor(x_label, self._x), right, self._height - 5, "label end"),
+            written(_with_factor(y_label, self._y), 2, 14, "label"),
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -296,25 +293,20 @@ def bar_chart(bars: Sequence[Bar], scale: Scale, label: str, title: str, descrip
         drawn.append(written(tick.label, column, bottom + 16, "tick middle"))
     zero = place(0.0) if not scale.log else left
     for number, bar in enumerate(bars):
-        drawn += _bar(bar, number * ROW + 19, zero, place)
+        top = number * ROW + 19
+        name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
+        value = tag("tspan", f"  {bar.written}", class_="value")
+        drawn.append(tag("text", name, value, x=14, y=top - 5, class_="name"))
+        if np.isfinite(bar.value):
+            low, high = sorted((zero, place(bar.value)))
+            box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
+            drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
+        points = [(place(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
+        if points:
+            drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
     drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
     drawn.append(written(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end"))
     return _canvas(bottom + 40, title, description, *drawn)
-
-
-def _bar(bar: Bar, top: int, zero: float, place: object) -> list[Markup]:
-    at = place if callable(place) else float
-    name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
-    value = tag("tspan", f"  {bar.written}", class_="value")
-    drawn = [tag("text", name, value, x=14, y=top - 5, class_="name")]
-    if np.isfinite(bar.value):
-        low, high = sorted((zero, at(bar.value)))
-        box = {"x": f"{low:.1f}", "y": top, "width": f"{max(high - low, 1.0):.1f}", "height": BAR}
-        drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
-    points = [(at(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)]
-    if points:
-        drawn.append(tag("path", d="".join(path_data([p]) for p in points), class_="dots on"))
-    return drawn
 
 
 def _canvas(height: int, title: str, description: str, *drawn: object, linked: bool = False) -> Markup:

@@ -7,13 +7,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics.aggregate import Score, bootstrap_interval
+from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.metric import Direction, mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
 from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
 from .html import Figure, Markup, clipped, html, join, key, quantity, sentence, table, tag, text, words
-from .subject import Gallery, Moment, Row, Subject, kind_of
+from .subject import Gallery, Moment, Subject, kind_of
 
 Floats = NDArray[np.float64]
 
@@ -26,22 +26,22 @@ def error_curves(subject: Subject) -> Iterator[Figure]:
     several = len(subject.entries) > 1
     shared = " The axis is shared by all files." if several else ""
     first, last = subject.frames[0], subject.frames[-1]
-    for row in subject.rows:
+    for entry in subject.entries:
         for name in ("vorticity_mse" if subject.full_box else "attribute_mse", "position_rmse"):
-            if row.entry is None or name not in row.scores:
+            score = entry.card.submission.get(name)
+            if score is None:
                 continue
-            score = row.scores[name]
-            y = spanning([r.scores[name].per_frame for r in subject.rows if r.entry is not None])
+            y = spanning([other.card.submission[name].per_frame for other in subject.entries])
             scenarios = enumerate(zip(score.scenarios, score.per_frame, strict=True))
             series = [(f"scenario {number}", kind_of(i), values) for i, (number, values) in scenarios]
             plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric))
             for label, kind, values in series:
                 plot.line(subject.frames, values, kind, label)
-            said = f"Lines of {len(series)} test scenarios of {row.name} from frame {first} to {last}."
+            said = f"Lines of {len(series)} test scenarios of {entry.name} from frame {first} to {last}."
             yield _figure(
                 subject,
-                f"scenarios-{name.replace('_', '-')}-{row.entry.number}",
-                f"{words(name, capital=True)}, every test scenario" + (f": {row.name}" if several else ""),
+                f"scenarios-{name.replace('_', '-')}-{entry.number}",
+                f"{words(name, capital=True)}, every test scenario" + (f": {entry.name}" if several else ""),
                 "Fig. 5.10",
                 series,
                 plot.svg(f"{score.metric.name} over frames", said),
@@ -52,44 +52,60 @@ def error_curves(subject: Subject) -> Iterator[Figure]:
 
 def method_curves(subject: Subject) -> Iterator[Figure]:
     """Yield the methods side by side: mean over scenarios with its interval (Fig. 5.11)."""
+    said = f"Mean over {len(subject.scenarios)} test scenarios; the bands are 95 % bootstrap intervals over"
+    said += " scenarios. Grey: floors that cost nothing."
     for name, thesis in (
         ("vorticity_mse" if subject.full_box else "attribute_mse", "Fig. 5.11"),
         ("position_rmse", "Fig. 5.11"),
         ("velocity_rmse", "Fig. 5.11"),
         ("vorticity_pearson", "Fig. 5.13"),
     ):
-        rows = [row for row in subject.rows if name in row.scores]
-        if not rows:
-            continue
-        metric = rows[0].scores[name].metric
-        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-        twin = np.asarray(subject.task.twin_floor)
-        twinned = name == "position_rmse" and len(twin) == len(subject.frames)
-        y = spanning([*(values for _, _, values in series), *([twin] if twinned else [])])
-        if name == "vorticity_pearson":
-            y = linear(min(float(np.min(s[np.isfinite(s)], initial=0.0)) for _, _, s in series), 1.0)
-        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-        for row in rows:
-            if row.entry is not None:
-                columns = row.scores[name].per_frame.T
-                low, high = np.array([bootstrap_interval(column) for column in columns]).T
-                plot.band(subject.frames, low, high, row.kind)
-        _draw(subject, plot, series)
-        if twinned:
-            plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
-        if name == "vorticity_pearson":
-            plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
-        yield _figure(
-            subject,
-            f"methods-{name.replace('_', '-')}",
-            f"{words(metric.name, capital=True)} over frames",
-            thesis,
-            series,
-            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
-            f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios; the bands are 95 %"
-            " bootstrap intervals over scenarios. Grey: floors that cost nothing.",
-            more=[("twin", "twin of the solver")] if twinned else [],
-        )
+        yield from _by_method(subject, name, "methods", "over frames", thesis, said)
+
+
+def body_curves(subject: Subject) -> Iterator[Figure]:
+    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
+    said = "Mean over the scenarios with an elastic body."
+    for name in ("shape_error", "connectivity"):
+        yield from _by_method(subject, name, "bodies", "of jelly and rope", "section 4.8.2", said)
+
+
+def _by_method(subject: Subject, name: str, part: str, of: str, thesis: str, said: str) -> Iterator[Figure]:
+    """Yield the mean over scenarios of a metric, a line per method, where methods have it."""
+    rows, bodies = [row for row in subject.rows if name in row.scores], part == "bodies"
+    if not rows:
+        return
+    metric = rows[0].scores[name].metric
+    series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
+    if (true := rows[0].scores.get(f"{name}_true")) is not None:
+        series.insert(0, ("truth", "truth", _mean(true)))
+    twin = np.asarray(subject.task.twin_floor if name == "position_rmse" else ())
+    twinned = len(twin) == len(subject.frames)
+    drawn = [*(values for _, _, values in series), *([twin] if twinned else [])]
+    y = linear(0.0, 1.0) if name == "connectivity" else spanning(drawn, log=False if bodies else None)
+    if name == "vorticity_pearson":
+        y = linear(min(float(np.min(line[np.isfinite(line)], initial=0.0)) for line in drawn), 1.0)
+    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
+    for row in rows:
+        if row.entry is not None and not bodies:
+            low, high = np.array([*map(bootstrap_interval, row.scores[name].per_frame.T)]).T
+            plot.band(subject.frames, low, high, row.kind)
+    _draw(subject, plot, series)
+    if twinned:
+        plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
+    if name == "vorticity_pearson":
+        plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
+    methods = ", ".join(row.name for row in rows)
+    yield _figure(
+        subject,
+        f"{part}-{name.replace('_', '-')}",
+        f"{words(name, capital=True)} {of}",
+        thesis,
+        series,
+        plot.svg(f"{name} over frames", f"{metric.summary}, one line each for {methods}."),
+        f"{sentence(metric)} {said}",
+        more=[("twin", "twin of the solver")] if twinned else [],
+    )
 
 
 def energy_curves(subject: Subject) -> Iterator[Figure]:
@@ -132,31 +148,6 @@ def _energy_figure(
     return _figure(subject, name, title, thesis, series, drawn, said + more)
 
 
-def body_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
-    for name in ("shape_error", "connectivity"):
-        rows = [row for row in subject.rows if name in row.scores]
-        if not rows:
-            continue
-        metric = rows[0].scores[name].metric
-        series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-        true = rows[0].scores.get(f"{name}_true")
-        if true is not None:
-            series.insert(0, ("truth", "truth", _mean(true)))
-        y = linear(0.0, 1.0) if name == "connectivity" else spanning([s for _, _, s in series], log=False)
-        plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-        _draw(subject, plot, series)
-        yield _figure(
-            subject,
-            f"bodies-{name.replace('_', '-')}",
-            f"{words(metric.name, capital=True)} of jelly and rope",
-            "section 4.8.2",
-            series,
-            plot.svg(f"{metric.name} over frames", f"{metric.summary}, one line each for {_names(rows)}."),
-            f"{sentence(metric)} Mean over the scenarios with an elastic body.",
-        )
-
-
 def _draw(subject: Subject, plot: Plot, series: Series) -> None:
     """Draw lines, the first on top."""
     for label, kind, values in reversed(series):
@@ -184,13 +175,9 @@ def _figure(
         title=title,
         thesis=thesis,
         body=join([key([*((kind, label) for label, kind, _ in series), *more]), drawn]),
-        caption=join([caption]),
+        caption=caption,
         data=table([what, *(tag("span", f"frame {frame}") for frame in frames)], rows, label="Numbers"),
     )
-
-
-def _names(rows: Sequence[Row]) -> str:
-    return ", ".join(row.name for row in rows)
 
 
 def _frame_axis(subject: Subject) -> Scale:
@@ -198,11 +185,7 @@ def _frame_axis(subject: Subject) -> Scale:
 
 
 def _mean(score: Score) -> Floats:
-    """Return the mean over scenarios per frame, NaN where none has a value, shape [frame]."""
-    known = np.isfinite(score.per_frame)
-    count = known.sum(axis=0)
-    total = np.where(known, score.per_frame, 0.0).sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean_over_seeds(np.where(np.isfinite(score.per_frame), score.per_frame, np.nan))
 
 
 SHOWN = (
@@ -239,26 +222,19 @@ def bar_figures(subject: Subject) -> Iterator[Figure]:
         higher = metric.direction is Direction.HIGHER
         scale = linear(min(0.0, *known, 0.0), 1.0) if higher else spanning([np.array(known)], log=False)
         whole, said = f"{title} at frame {frame}", "; ".join(f"{bar.label}: {bar.written}" for bar in bars)
+        cells = [
+            [row.name, *map(html, (bar.value, *(bar.dots or unknown)))]
+            for row, bar in zip(rows, bars, strict=True)
+        ]
         yield Figure(
             name=f"bars-{name.replace('_', '-')}",
             title=whole,
             thesis=thesis,
             body=bar_chart(bars, scale, quantity(metric), whole, said),
-            caption=join(
-                [
-                    f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
-                    f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} is better;"
-                    f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest."
-                ]
-            ),
-            data=table(
-                ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
-                [
-                    [row.name, html(bar.value), *(html(v) for v in bar.dots or unknown)]
-                    for row, bar in zip(rows, bars, strict=True)
-                ],
-                label=title,
-            ),
+            caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} test scenarios at frame {frame},"
+            f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} is better;"
+            f" perfect is {metric.perfect:g}. A dash means undefined, as for a prediction at rest.",
+            data=table(["method", "mean", *(f"scenario {i}" for i in subject.scenarios)], cells, label=title),
         )
 
 
@@ -279,13 +255,8 @@ def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         title=f"Vorticity distribution at frame {subject.key_frame}",
         thesis="Fig. 5.12",
         body=join([key(items), _histogram(subject, moment)]),
-        caption=join(
-            [
-                "Share of the grid nodes per bin of vorticity [1/frame], scenario"
-                f" {scenario}. Black: the truth, whose range sets the bins; the first and the last bin hold"
-                " all that lies beyond."
-            ]
-        ),
+        caption=f"Share of the grid nodes per bin of vorticity [1/frame], scenario {scenario}. Black: the"
+        " truth, whose range sets the bins; the first and the last bin hold all that lies beyond.",
     )
     charts = [
         tag("div", tag("p", f"frame {held.frame}", class_="panels-title"), _histogram(subject, held))
@@ -296,20 +267,19 @@ def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         title="Vorticity distribution over time",
         thesis="Fig. 5.18",
         body=join([key(items), tag("div", *charts, class_="figures small")]),
-        caption=join(
-            [f"As the figure before, at other frames of scenario {scenario}; each frame has bins of its own."]
-        ),
+        caption=f"As the figure before, at other frames of scenario {scenario}; each frame has bins of its"
+        " own.",
         wide=True,
     )
 
 
 def _histogram(subject: Subject, moment: Moment) -> Markup:
-    series = [("truth", "truth", moment.pairs[0].true_vorticity)]
+    true = moment.pairs[0].true_vorticity
+    edges, heights = shares_of(true, true)
+    shares = [("truth", "truth", heights)]
     for entry, pair in zip(subject.entries, moment.pairs, strict=True):
-        series.append((entry.name, entry.kind, pair.predicted_vorticity))
-    edges, _ = shares_of(series[0][2], series[0][2])
-    shares = [(name, kind, shares_of(values, series[0][2])[1]) for name, kind, values in series]
-    top = max((float(heights.max()) for _, _, heights in shares), default=1.0)
+        shares.append((entry.name, entry.kind, shares_of(pair.predicted_vorticity, true)[1]))
+    top = max(float(heights.max()) for _, _, heights in shares)
     plot = Plot(
         linear(float(edges[0]), float(edges[-1]), tight=True),
         linear(0.0, top),
@@ -342,8 +312,7 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
     if not pairs[0].node_count:  # nodes are the truth's
         return
     # axes leave out the farthest nodes
-    farthest = [np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs]
-    reach = float(max(farthest))
+    reach = float(max(np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE) for pair in pairs))
     reach = reach if np.isfinite(reach) and 0.0 < reach < 1e300 else 1.0
     y, true = linear(-reach, reach), pairs[0].true_vorticity
     low, high = np.percentile(true, [FAR_QUANTILE, 100.0 - FAR_QUANTILE])
@@ -378,6 +347,6 @@ def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
             title=title,
             thesis=thesis,
             body=tag("div", *charts, class_="figures small"),
-            caption=join([f"{said} {told}{drawn}"]),
+            caption=f"{said} {told}{drawn}",
             wide=len(charts) > 1,
         )

@@ -7,7 +7,7 @@ itself, as in Jobard & Lefer (1997): it starts where no other has passed, and en
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -126,58 +126,39 @@ HEAD = 0.32  # length of its head, as a share of the arrow
 MOST = 3  # entries that are drawn: lines take room
 
 
-def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
-    """Yield arrows of truth, prediction and difference, one figure per entry (Fig. 5.22)."""
-    yield from _figures(subject, gallery, _arrows, "arrows", "Velocity arrows", "Fig. 5.22", difference=True)
-
-
-def stream_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
-    """Yield streamlines of truth and prediction, one figure per entry (Figs. 5.23, 5.24)."""
-    yield from _figures(
-        subject, gallery, _streams, "streamlines", "Streamlines", "Figs. 5.23, 5.24", difference=False
-    )
-
-
-def _figures(
-    subject: Subject,
-    gallery: Gallery,
-    draw: Callable[[Subject, Fields, Floats, float], Markup],
-    name: str,
-    title: str,
-    thesis: str,
-    *,
-    difference: bool,
-) -> Iterator[Figure]:
+def flow_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
+    """Yield arrows of truth, prediction and difference (5.22), then streamlines (5.23, 5.24), by entry."""
     scenario = subject.scenarios[0]
     moments = gallery.at(scenario, subject.times)
     limit = limit_of([np.sqrt((m.truth.fields.velocity**2).sum(axis=-1)) for m in moments])
-    said = f"Scenario {scenario}; colour is speed on the score grid, on one scale for all panels"
-    said += ", and so is the length of arrows. Difference: predicted − true." if difference else "."
+    colour = f"Scenario {scenario}; colour is speed on the score grid, on one scale for all panels"
+    length = ", and so is the length of arrows. Difference: predicted − true."
     left = [entry.name for entry in subject.entries[MOST:]]
-    for entry in subject.entries[:MOST]:
-        rows: list[tuple[str, list[Markup]]] = [("truth", []), (entry.name, [])]
-        rows += [("difference", [])] if difference else []
-        for moment in moments:
-            true = moment.truth.fields.velocity
-            predicted = moment.pairs[entry.number].predicted_fields.velocity
-            fields = {"truth": true, "prediction": predicted, "difference": predicted - true}
-            for (what, velocity), (_, panels) in zip(fields.items(), rows, strict=False):
-                drawn = draw(subject, moment.truth.fields, velocity, limit)
-                alt = f"{what}, frame {moment.frame}"
-                panels.append(vector(drawn, gallery.walls[scenario].classes, alt))
-        yield Figure(
-            name=f"{name}-{entry.number}",
-            title=f"{title} over time: {entry.name}",
-            thesis=thesis,
-            body=join(
-                [
-                    ramp("flow", limit, "speed [length/frame]"),
-                    grid([f"frame {m.frame}" for m in moments], rows, width=7.4),
-                ]
-            ),
-            caption=join([said + (f" Not drawn for want of room: {', '.join(left)}." if left else "")]),
-            wide=True,
-        )
+    more = f" Not drawn for want of room: {', '.join(left)}." if left else ""
+    for draw, name, title, thesis, said, shown in (
+        (_arrows, "arrows", "Velocity arrows", "Fig. 5.22", length, 3),
+        (_streams, "streamlines", "Streamlines", "Figs. 5.23, 5.24", ".", 2),
+    ):
+        for entry in subject.entries[:MOST]:
+            panels: dict[str, list[Markup]] = {}
+            for moment in moments:
+                true = moment.truth.fields.velocity
+                predicted = moment.pairs[entry.number].predicted_fields.velocity
+                fields = {"truth": true, "prediction": predicted, "difference": predicted - true}
+                for what, velocity in list(fields.items())[:shown]:
+                    drawn = draw(subject, moment.truth.fields, velocity, limit)
+                    panel = vector(drawn, gallery.walls[scenario].classes, f"{what}, frame {moment.frame}")
+                    panels.setdefault(what, []).append(panel)
+            rows = list(zip(("truth", entry.name, "difference"), panels.values(), strict=False))
+            drawn = grid([f"frame {moment.frame}" for moment in moments], rows, width=7.4)
+            yield Figure(
+                name=f"{name}-{entry.number}",
+                title=f"{title} over time: {entry.name}",
+                thesis=thesis,
+                body=join([ramp("flow", limit, "speed [length/frame]"), drawn]),
+                caption=f"{colour}{said}{more}",
+                wide=True,
+            )
 
 
 def _arrows(subject: Subject, fields: Fields, velocity: Floats, limit: float) -> Markup:
@@ -186,7 +167,8 @@ def _arrows(subject: Subject, fields: Fields, velocity: Floats, limit: float) ->
     every = max(1, -(-fields.grid.nodes // ARROWS))
     chosen = counted[((counted - every // 2) % every == 0).all(axis=1)]
     x, y = _places(subject, fields, chosen[:, 0].astype(float), chosen[:, 1].astype(float))
-    unit = SIDE * every * fields.grid.spacing / _width(subject) * LONGEST / limit
+    (left_wall, right_wall), _ = subject.task.size.bounds
+    unit = SIDE * every * fields.grid.spacing / (right_wall - left_wall) * LONGEST / limit
     u, v = velocity[chosen[:, 0], chosen[:, 1]].T
     capped = np.minimum(1.0, 1.5 * limit / np.maximum(np.hypot(u, v), 1e-300))  # runaways stay in sight
     lines: list[list[str]] = [[] for _ in range(LEVELS)]
@@ -224,15 +206,10 @@ def _streams(subject: Subject, fields: Fields, velocity: Floats, limit: float) -
 
 def _places(subject: Subject, fields: Fields, i: Floats, k: Floats) -> tuple[Floats, Floats]:
     """Return node numbers as coordinates of a panel, which shows the inside of the box."""
-    (left, _), (_, top) = subject.task.size.bounds
-    scale = SIDE / _width(subject)
+    (left, right), (_, top) = subject.task.size.bounds
+    scale = SIDE / (right - left)
     x, y = ((n + fields.grid.origin) * fields.grid.spacing for n in (i, k))
     return (x - left) * scale, (top - y) * scale
-
-
-def _width(subject: Subject) -> float:
-    (left, right), _ = subject.task.size.bounds
-    return right - left
 
 
 def _levels(speed: Floats, limit: float) -> NDArray[np.intp]:

@@ -13,6 +13,7 @@ import base64
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from unicodedata import east_asian_width
 
 from lagbench.metrics.metric import Metric
@@ -132,7 +133,7 @@ def interval(bounds: tuple[float, float]) -> Markup:
     low, high = bounds
     if math.isnan(low) or math.isnan(high):
         return Markup("")
-    return tag("span", join([text(low), text(high)], " … "), class_="ci")
+    return tag("span", f"{text(low)} … {text(high)}", class_="ci")
 
 
 def decimals(values: Sequence[float], step: float) -> list[str]:
@@ -171,13 +172,10 @@ def clipped(name: str, room: int = 34) -> str:
     >>> clipped("SuperGAT with a loss of six terms", room=12)
     'SuperGAT wi…'
     """
-    widths = [2 if east_asian_width(letter) in "WF" else 1 for letter in name]
-    if sum(widths) <= room:
+    ends = list(accumulate(2 if east_asian_width(letter) in "WF" else 1 for letter in name))
+    if not ends or ends[-1] <= room:
         return name
-    kept = 0
-    while sum(widths[: kept + 1]) < room:
-        kept += 1
-    return f"{name[:kept]}…"
+    return f"{name[: sum(end < room for end in ends)]}…"
 
 
 def unit(metric: Metric) -> str:
@@ -203,7 +201,7 @@ class Figure:
     title: str  # what it shows, a few words
     thesis: str  # the figure of the thesis that it corresponds to, as in "Fig. 5.10"
     body: Markup  # the drawing, with its key
-    caption: Markup  # what it shows, units, how to read it
+    caption: str  # what it shows, units, how to read it
     wide: bool = False  # whether it takes the whole width
     data: Markup | None = None  # its numbers as a table, where that is cheap
 
@@ -251,9 +249,8 @@ def grid(
 
 def image(png: bytes, kind: str, alt: str, *, smooth: bool = False) -> Markup:
     """Return a panel, of classes that tell moving walls, that shows a picture of the inside of the box."""
-    source = "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-    shown = tag("img", src=source, alt=alt, class_="smooth" if smooth else None)
-    return tag("span", shown, class_=kind)
+    source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
+    return tag("span", tag("img", src=source, alt=alt, class_="smooth" if smooth else None), class_=kind)
 
 
 def vector(drawn: Markup, kind: str, alt: str) -> Markup:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from .subject import Gallery, Moment, Subject, Walls, limit_of
 Floats = NDArray[np.float64]
 
 Bytes = NDArray[np.uint8]
+
+Draw = Callable[[Floats, float], bytes]
+"""From a field, shape [x node, y node], and the value of full colour to a picture."""
 
 CLOCKWISE, COUNTER, FAST = "#0072b2", "#d55e00", "#009e73"
 """Colours of negative and positive values and of great magnitudes (Okabe & Ito 2008)."""
@@ -52,17 +55,17 @@ def encode(index: Bytes, palette: Bytes) -> bytes:
 
 def diverging(field: NDArray[np.floating], limit: float) -> bytes:
     """Return a picture of signed values: blue below 0, vermilion above, clear at 0, full at the limit."""
-    return _coloured(field, limit, -1.0, _DIVERGING)
+    return _coloured(field, limit, _DIVERGING)
 
 
 def sequential(field: NDArray[np.floating], limit: float) -> bytes:
     """Return a picture of magnitudes: clear at 0, green at the limit."""
-    return _coloured(field, limit, 0.0, _SEQUENTIAL)
+    return _coloured(field, limit, _SEQUENTIAL)
 
 
-def _coloured(field: NDArray[np.floating], limit: float, least: float, palette: Bytes) -> bytes:
+def _coloured(field: NDArray[np.floating], limit: float, palette: Bytes) -> bytes:
     """Return values at nodes, NaN where there is none, shape [x node, y node], as rows from the top."""
-    share = np.clip(np.nan_to_num(field / limit, nan=0.0, posinf=1.0, neginf=-1.0), least, 1.0)
+    share = np.clip(np.nan_to_num(field / limit, nan=0.0), -1.0, 1.0)
     index = np.where(np.isnan(field), NOTHING, np.round(LEVELS + LEVELS * share))
     return encode(np.ascontiguousarray(index.T[::-1]).astype(np.uint8), palette)
 
@@ -81,11 +84,8 @@ _DIVERGING, _SEQUENTIAL = _ramp(CLOCKWISE, COUNTER), _ramp(FAST, FAST)
 
 def inside(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    grid_ = task.setting.grid
-    kept = []
-    for low, high in task.size.bounds:
-        room = 0.26 * grid_.spacing  # nodes on a wall are seen, those in it are not
-        kept.append((grid_.axis >= low - room) & (grid_.axis <= high + room))
+    axis, room = task.setting.grid.axis, 0.26 * task.setting.grid.spacing  # nodes in a wall are not seen
+    kept = [(axis >= low - room) & (axis <= high + room) for low, high in task.size.bounds]
     return field[np.ix_(*kept)]
 
 
@@ -101,17 +101,16 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
     fast, strong = limit_of(speeds[:1]), limit_of(omegas[:1])
     names = ["truth", *(entry.name for entry in subject.entries)]
 
-    def pictures(what: str, fields: Sequence[Floats], limit: float, *, signed: bool) -> list[Markup]:
-        draw = diverging if signed else sequential
+    def pictures(what: str, fields: Sequence[Floats], draw: Draw, limit: float) -> list[Markup]:
         return [
             image(draw(inside(subject.task, f), limit), walls.classes, f"{what} of {n}, frame {frame}")
             for n, f in zip(names, fields, strict=True)
         ]
 
     rows = [
-        ("speed", pictures("speed", speeds, fast, signed=False)),
-        ("vorticity", pictures("vorticity", omegas, strong, signed=True)),
-        ("vorticity error", [tag("span"), *pictures("vorticity error", errors, strong, signed=True)[1:]]),
+        ("speed", pictures("speed", speeds, sequential, fast)),
+        ("vorticity", pictures("vorticity", omegas, diverging, strong)),
+        ("vorticity error", [tag("span"), *pictures("vorticity error", errors, diverging, strong)[1:]]),
     ]
     keys = [
         ramp("sequential", fast, "speed [length/frame]"),
@@ -123,7 +122,7 @@ def field_figure(subject: Subject, gallery: Gallery) -> Figure:
         title=f"Fields side by side at frame {frame}",
         thesis="Fig. 5.17",
         body=join([*keys, grid(names, rows, width=8.5)]),
-        caption=join([_where(scenario, walls), grey]),
+        caption=_where(scenario, walls) + grey,
         wide=True,
     )
 
@@ -132,6 +131,7 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> Figure:
     """Return vorticity over time: truth, predictions, differences (Figs. 5.25 to 5.27)."""
     scenario = subject.scenarios[0]
     moments, walls = gallery.at(scenario, subject.times), gallery.walls[scenario]
+    frames = [f"frame {moment.frame}" for moment in moments]
     limit = limit_of([moment.true_vorticity for moment in moments])
 
     def picture(field: Floats, what: str, frame: int) -> Markup:
@@ -147,13 +147,8 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> Figure:
         name="vorticity",
         title="Vorticity over time",
         thesis="Figs. 5.25–5.27",
-        body=join(
-            [
-                ramp("diverging", limit, "vorticity [1/frame]", signed=True),
-                grid([f"frame {moment.frame}" for moment in moments], rows),
-            ]
-        ),
-        caption=join([_where(scenario, walls), " Difference: predicted − true, on the same scale."]),
+        body=join([ramp("diverging", limit, "vorticity [1/frame]", signed=True), grid(frames, rows)]),
+        caption=f"{_where(scenario, walls)} Difference: predicted − true, on the same scale.",
         wide=True,
     )
 
@@ -197,12 +192,11 @@ def _short(walls: Walls) -> list[str]:
 
 
 def _where(scenario: int, walls: Walls) -> str:
-    said = f"Scenario {scenario}"
     details = _short(walls)
     if walls.moving:
         verb = "walls move" if len(walls.moving) > 1 else "wall moves"
         details.append(f"{' and '.join(walls.moving)} {verb} (orange)")
-    return f"{said}: {', '.join(details)}." if details else f"{said}."
+    return f"Scenario {scenario}" + (f": {', '.join(details)}." if details else ".")
 
 
 def _vorticity(pair: FramePair) -> Floats:
@@ -227,7 +221,7 @@ def particle_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
         for i, entry in enumerate(subject.entries):
             panels = [_panel(subject, gallery, m, m.pairs[i].prediction, "prediction") for m in moments]
             rows.append((entry.name, panels))
-        present = np.unique(moments[0].setting_of.material).tolist()
+        present = np.unique(moments[0].truth.scenario.material).tolist()
         interval = subject.task.size.frame_interval
         seconds = [f"frame {m.frame}\u2002{m.frame * interval:.2f} s" for m in moments]
         said = "All particles by material, truth above predictions, inside the walls of the box."
@@ -239,14 +233,14 @@ def particle_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
             title=f"Particles, scenario {scenario}" + (f": {walls.mark}" if walls.mark else ""),
             thesis="Fig. 4.11" if len(present) == 1 and present[0] == 0 else "Figs. 4.12, 4.13",
             body=join([key([(f"m{m}", MATERIALS[m]) for m in present], kind="square"), grid(seconds, rows)]),
-            caption=join([said]),
+            caption=said,
             wide=True,
         )
 
 
 def _panel(subject: Subject, gallery: Gallery, moment: Moment, snapshot: Snapshot, what: str) -> Markup:
-    material, area = moment.setting_of.material, moment.setting_of.area
-    spacing = float(np.sqrt(area / len(material)))
+    material = snapshot.scenario.material
+    spacing = float(np.sqrt(snapshot.scenario.area / len(material)))
     png = paint(snapshot.position, material, subject.task.size.bounds, spacing)
     return image(png, gallery.walls[moment.scenario].classes, f"{what}, frame {moment.frame}", smooth=True)
 
@@ -284,14 +278,10 @@ def paint(
     return encode(np.where(filled > 0, entry, 0).astype(np.uint8), _PALETTE)
 
 
-def _palette() -> NDArray[np.uint8]:
-    """Return nothing, then every material in every opacity, shape [entry, 4]."""
-    table = np.zeros((1 + len(MATERIALS) * SHADES, 4), np.uint8)
-    for m, colour in enumerate(MATERIAL_COLOURS):
-        part = slice(1 + m * SHADES, 1 + (m + 1) * SHADES)
-        table[part, :3] = rgb(colour)
-        table[part, 3] = np.round(255.0 * np.arange(1, SHADES + 1) / SHADES)
-    return table
-
-
-_PALETTE = _palette()
+# nothing, then every material in every opacity, shape [entry, 4]
+_PALETTE = np.round(
+    [
+        (0, 0, 0, 0),
+        *((*rgb(colour), 255 * k / SHADES) for colour in MATERIAL_COLOURS for k in range(1, SHADES + 1)),
+    ]
+).astype(np.uint8)

@@ -71,19 +71,19 @@ class Names:
         for choose in (self._touching, self._led):
             for number in order:
                 others = dots[:number] + dots[number + 1 :]
-                if (drawn := choose(names[number], places[number], others)) is not None:
-                    found[number] = drawn
+                if (place := choose(names[number], places[number], others)) is not None:
+                    self._taken.append(_box(names[number], place))
+                    found[number] = written(names[number], place[0], place[1], _ANCHORS[place[2]])
             # Of those without a place the longest are the hardest to find one for.
             order = sorted((n for n in order if n not in found), key=lambda number: -len(names[number]))
         return [found.get(number, Markup("")) for number in range(len(names))], self._leads
 
-    def _touching(self, name: str, dot: Point, others: Sequence[Box]) -> Markup | None:
-        """Return a name in the first free place that touches its dot."""
-        found = next(self._free(name, dot, others, BESIDE), None)
-        return None if found is None else self._write(name, found)
+    def _touching(self, name: str, dot: Point, others: Sequence[Box]) -> Place | None:
+        """Return the first free place that touches a dot."""
+        return next(self._free(name, dot, others, BESIDE), None)
 
-    def _led(self, name: str, dot: Point, others: Sequence[Box]) -> Markup | None:
-        """Return a name with a line to its dot, a short one that crosses few other dots."""
+    def _led(self, name: str, dot: Point, others: Sequence[Box]) -> Place | None:
+        """Return a place with a line to the dot, which is drawn: a short one that crosses few other dots."""
         best, least = None, math.inf
         for place in self._free(name, dot, others, FARTHER):
             box = _box(name, place)
@@ -104,7 +104,7 @@ class Names:
         place, end, lead = best
         self._taken += lead
         self._leads.append(tag("path", d=path_data([dot, end]), class_="mark"))
-        return self._write(name, place)
+        return place
 
     def _free(self, name: str, dot: Point, others: Sequence[Box], tries: Sequence[Place]) -> Iterator[Place]:
         """Yield places of a name, tried from the middle of its dot, where it covers nothing."""
@@ -116,10 +116,6 @@ class Names:
             if inside and not any(_meet(box, one) for one in (*others, *self._taken)):
                 yield place
 
-    def _write(self, name: str, place: Place) -> Markup:
-        self._taken.append(_box(name, place))
-        return written(name, place[0], place[1], _ANCHORS[place[2]])
-
 
 def written(text: str, x: float, y: float, kind: str) -> Markup:
     """Return a text at a place, on its base line."""
@@ -127,7 +123,6 @@ def written(text: str, x: float, y: float, kind: str) -> Markup:
 
 
 def _box(name: str, place: Place) -> Box:
-    """Return about what a name takes."""
     width = sum(9.0 if letter.isupper() else 6.4 for letter in name)
     left = place[0] - width * place[2]
     return left, place[1] - 11, left + width, place[1] + 3
@@ -142,5 +137,4 @@ def _along(one: Point, other: Point) -> list[Box]:
 
 
 def _meet(one: Box, other: Box) -> bool:
-    """Tell whether two boxes overlap."""
     return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from itertools import accumulate
 from pathlib import Path
 
 from lagbench.atomic import check_writable, write_atomically
@@ -74,12 +75,13 @@ def check_folder(folder: str | Path) -> None:
     """Refuse a folder where no report can be written, or where one would replace a page of another kind."""
     check_writable(Path(folder), option="--report")
     path = Path(folder) / FILE_NAME
-    if path.is_file():
-        with path.open("rb") as stream:
-            head = stream.read(4 * len(SIGN))
-        if SIGN.encode() not in head:
-            fix = "name another folder, or remove the page"
-            raise UsageError("a page that is no report lies there", where="--report", got=str(path), fix=fix)
+    if not path.is_file():
+        return
+    with path.open("rb") as stream:
+        head = stream.read(4 * len(SIGN))
+    if SIGN.encode() not in head:
+        fix = "name another folder, or remove the page"
+        raise UsageError("a page that is no report lies there", where="--report", got=str(path), fix=fix)
 
 
 def render(subject: Subject) -> str:
@@ -105,10 +107,11 @@ def render(subject: Subject) -> str:
     said = "Where the flow rotates, how strongly, and how the prediction differs."
     vorticity = Section("vorticity", "Vorticity", said, fields)
     if subject.full_box:
-        arrows, streams = flow.arrow_figures(subject, gallery), flow.stream_figures(subject, gallery)
         over_time, every = maps.vorticity_figure(subject, gallery), maps.scenario_figure(subject, gallery)
-        said = "Truth and prediction as fields on the score grid."
-        motion = Section("flow", "The flow over time", said, [over_time, *arrows, *streams, every])
+        figures = [over_time, *flow.flow_figures(subject, gallery), every]
+        motion = Section(
+            "flow", "The flow over time", "Truth and prediction as fields on the score grid.", figures
+        )
     else:
         figures = [*maps.particle_figures(subject, gallery), *curves.body_curves(subject)]
         said = "What the particles do: truth above, predictions below."
@@ -135,11 +138,8 @@ def document(title: str, head: Markup, sections: Sequence[Section], foot: Markup
     """Return the page."""
     links = [tag("li", tag("a", section.title, href=f"#part-{section.name}")) for section in sections]
     contents = tag("nav", tag("ol", *links), class_="contents", aria_label="Contents")
-    first = 1
-    written = []
-    for section in sections:
-        written.append(_section(section, first))
-        first += len(section.figures)
+    firsts = accumulate((len(section.figures) for section in sections), initial=1)
+    written = [_section(section, first) for section, first in zip(sections, firsts, strict=False)]
     body = [
         tag("header", head),
         tag("div", contents, tag("main", *written), class_="columns"),

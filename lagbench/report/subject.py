@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data import WALLS
+from lagbench.data.layout import resolve_root
+from lagbench.data.local import rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
-from lagbench.metrics.frame import FramePair, Scenario, Snapshot
+from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
 from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
@@ -86,7 +88,7 @@ class Subject:
     @property
     def best_entry(self) -> Row:
         """The entry with the least loss in the ranking metric, the first of equals."""
-        metric, rows = self.ranking, [row for row in self.rows if row.entry is not None]
+        metric, rows = self.ranking, self.rows[: len(self.entries)]
         losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
         return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
 
@@ -128,10 +130,8 @@ class Subject:
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, the first and the last predicted one among them."""
         predicted = self.task.setting.predicted_frames
-        if len(self.frames_of_interest) >= TIMES:
-            chosen = _spaced(self.frames_of_interest, TIMES - 1)
-        else:
-            chosen = _spaced(tuple(predicted), TIMES)
+        many = len(self.frames_of_interest) >= TIMES
+        chosen = _spaced(self.frames_of_interest, TIMES - 1) if many else _spaced(predicted, TIMES)
         return tuple(sorted({*chosen, predicted[-1]}))
 
 
@@ -140,13 +140,10 @@ def kind_of(number: int) -> str:
     return f"s{number % COLOURS}" + (f" d{min(number // COLOURS, 3)}" if number >= COLOURS else "")
 
 
-def _spaced(numbers: Sequence[int], count: int) -> Iterator[int]:
-    """Yield evenly spaced members, first and last included."""
+def _spaced(numbers: Sequence[int], count: int) -> Sequence[int]:
     if len(numbers) <= count:
-        yield from numbers
-        return
-    for i in range(count):
-        yield numbers[round(i * (len(numbers) - 1) / (count - 1))]
+        return numbers
+    return [numbers[round(i * (len(numbers) - 1) / (count - 1))] for i in range(count)]
 
 
 def subject_of(
@@ -158,23 +155,19 @@ def subject_of(
 ) -> Subject:
     """Return the subject of a report."""
     if not cards or len(cards) != len(predictions):
-        raise UsageError(
-            "a report needs score cards and their predictions",
-            expected="one file per score card, at least one",
-            got=f"{len(cards)} cards, {len(predictions)} files",
+        expected, got = (
+            "one file per score card, at least one",
+            f"{len(cards)} cards, {len(predictions)} files",
         )
+        raise UsageError("a report needs score cards and their predictions", expected=expected, got=got)
     folder, header = resolve_root(root), cards[0].header
     for card, path in zip(cards, predictions, strict=True):
         for name in SAME:
-            expected, got = getattr(header, name), getattr(card.header, name)
-            if expected != got:
-                raise UsageError(
-                    f"one report, two values of {name}",
-                    where=str(path),
-                    expected=expected,
-                    got=got,
-                    fix="report submissions to one data set together, others on their own",
-                )
+            one, two = getattr(header, name), getattr(card.header, name)
+            if one != two:
+                what = f"one report, two values of {name}"
+                fix = "report submissions to one data set together, others on their own"
+                raise UsageError(what, where=str(path), expected=one, got=two, fix=fix)
     described = rooted(folder, registry)
     task = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
@@ -185,8 +178,7 @@ def subject_of(
     return Subject(task=task, title=described.split(header.split).title, entries=tuple(entries))
 
 
-WALLS = ("left", "right", "bottom", "top")
-_ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))
+_ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))  # how walls slide
 
 
 @dataclass(frozen=True)
@@ -215,11 +207,6 @@ class Moment:
     def truth(self) -> Snapshot:
         """The true particles."""
         return self.pairs[0].truth
-
-    @property
-    def setting_of(self) -> Scenario:
-        """What holds in all frames of the scenario."""
-        return self.pairs[0].scenario
 
     @cached_property
     def true_vorticity(self) -> NDArray[np.float64]:
@@ -277,8 +264,7 @@ def _walls(truth: OpenScenario) -> Walls:
     speed = np.zeros((4, 2))
     if "wall_velocity" in file.variables:
         speed = np.abs(np.asarray(file.read("wall_velocity"), np.float64)).max(axis=0) * _ALONG
-    parameters = file.header.parameters
-    reynolds = parameters.get("reynolds_number")
+    parameters, reynolds = file.header.parameters, file.header.parameters.get("reynolds_number")
     marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
     if "frequency" in parameters:
         marks.append(f"frequency {parameters['frequency']}")

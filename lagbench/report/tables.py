@@ -15,11 +15,10 @@ from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
-from lagbench.metrics.table import CHOSEN, FAMILIES
+from lagbench.metrics.table import CHOSEN, FAMILIES, METRICS
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
 from .html import Markup, html, interval, join, paragraph, table, tag, text, unit, words
-from .html import unit as unit_of
 from .subject import Row, Subject
 
 AT_FRAMES = ("vorticity_mae", "vorticity_mse", "vorticity_rmse", "vorticity_pearson", "vorticity_kl")
@@ -40,16 +39,15 @@ def score_table(subject: Subject) -> Markup:
 
 def every_metric(subject: Subject) -> Markup:
     """Return all metrics over the horizon, family by family."""
-    listed = {metric.name for family in FAMILIES.values() for metric in family}
-    parts = []
-    for family, metrics in FAMILIES.items():
-        names = [metric.name for metric in metrics if _anywhere(subject, metric.name)]
-        if names:
-            parts += [tag("h4", family.capitalize()), _score_rows(subject, names)]
-    others = [n for n in subject.entries[0].card.submission if n not in listed]
-    if others:
-        parts += [tag("h4", "Of other packages"), _score_rows(subject, others)]
-    return join(parts)
+    families = {
+        family.capitalize(): [metric.name for metric in metrics if _anywhere(subject, metric.name)]
+        for family, metrics in FAMILIES.items()
+    }
+    own = subject.entries[0].card.submission
+    families["Of other packages"] = [name for name in own if name not in METRICS]
+    return join(
+        join([tag("h4", family), _score_rows(subject, names)]) for family, names in families.items() if names
+    )
 
 
 def _anywhere(subject: Subject, name: str) -> bool:
@@ -64,14 +62,19 @@ def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
         scores = [row.scores.get(name) for row in rows]
         metric = rows[0].scores[name].metric
         best = _best(metric, [[] if score is None else score.values for score in scores])
-        line: list[object] = [_named(metric, ranks=name == subject.ranking.name)]
+        ranks = [" ", tag("span", "ranks", class_="flag ok")] if name == subject.ranking.name else []
+        broken = name.replace("_", "_\u200b")  # where a line may end
+        named = tag("span", broken, tag("span", unit(metric), class_="unit"), *ranks, class_="metric")
+        target = metric.direction is Direction.TARGET
+        aim = f"aims at {metric.perfect:g}" if target else _WORDS[metric.direction]
+        line: list[object] = [join([named, tag("span", f"{metric.summary}; {aim}", class_="sub")])]
         for i, score in enumerate(scores):
             undefined = sum(score.undefined) if score else 0
             lost = tag("span", f"{undefined} undefined", class_="ci") if undefined else ""
             number = tag("span", text(score.mean), class_="n best" if i in best else "n") if score else ""
             line.append(join([number, interval(score.interval), lost]) if score else "")
         cells.append(line)
-    return table(["metric", *(_heading(row) for row in rows)], cells, kind="scores", label="Scores")
+    return table(["metric", *map(_heading, rows)], cells, kind="scores", label="Scores")
 
 
 def _heading(row: Row) -> Markup:
@@ -92,51 +95,32 @@ def _best(metric: Metric, values: Sequence[Sequence[float] | Floats]) -> frozens
     return frozenset(i for i, loss in enumerate(losses) if text(loss) == least)
 
 
-def _judged(subject: Subject, name: str, rows: Sequence[Floats]) -> list[Floats]:
-    """Return values at a frame, none of floors whose mean alone is known where a metric aims at a value."""
-    aims = subject.rows[0].scores[name].metric.direction is Direction.TARGET
-    return [
-        rows[i][:0] if aims and len(rows[i]) < len(subject.scenarios) else rows[i] for i in range(len(rows))
-    ]
-
-
-def _named(metric: Metric, *, ranks: bool) -> Markup:
-    unit = tag("span", unit_of(metric), class_="unit")
-    aim = f"aims at {metric.perfect:g}" if metric.direction is Direction.TARGET else _WORDS[metric.direction]
-    flag = join([" ", tag("span", "ranks", class_="flag ok")]) if ranks else ""
-    name = tag("span", metric.name.replace("_", "_\u200b"), unit, flag, class_="metric")
-    return join([name, tag("span", f"{metric.summary}; {aim}", class_="sub")])
-
-
 def frame_table(subject: Subject) -> Markup:
     """Return the metrics of Tables 5.4 and 5.5 at the key frame, one row per method."""
     chosen = AT_FRAMES if subject.full_box else AT_FRAMES_FREE
     names = [name for name in chosen if _anywhere(subject, name)]
     frame = subject.key_frame
-    held = {name: [row.scores[name].at(frame) for row in subject.rows] for name in names}
-    means = {name: [mean(values) for values in rows] for name, rows in held.items()}
-    best = {n: _best(subject.rows[0].scores[n].metric, _judged(subject, n, rows)) for n, rows in held.items()}
-    cells = []
-    for i, row in enumerate(subject.rows):
-        numbers = [tag("span", text(means[n][i]), class_="n best" if i in best[n] else "n") for n in names]
-        cells.append([_heading(row), *numbers])
+    cells: list[list[object]] = [[_heading(row)] for row in subject.rows]
+    for name in names:
+        metric = subject.rows[0].scores[name].metric
+        held = [row.scores[name].at(frame) for row in subject.rows]
+        # of floors the mean alone is known, which says nothing where a metric aims at a value
+        aims, count = metric.direction is Direction.TARGET, len(subject.scenarios)
+        best = _best(metric, [values[:0] if aims and len(values) < count else values for values in held])
+        for i, (line, values) in enumerate(zip(cells, held, strict=True)):
+            line.append(tag("span", text(mean(values)), class_="n best" if i in best else "n"))
     return table(["method", *(words(n) for n in names)], cells, label=f"Scores at frame {frame}")
 
 
 def scenario_table(subject: Subject) -> Markup:
     """Return the ranking metric of every scenario, one row per method."""
     name = subject.ranking.name
-    cells = [
-        [_heading(row), *(html(value) for value in row.scores[name].values.tolist())] for row in subject.rows
-    ]
+    cells = [[_heading(row), *map(html, row.scores[name].values.tolist())] for row in subject.rows]
     return table(["method", *(str(i) for i in subject.scenarios)], cells, label=f"{name} per scenario")
 
 
 def verdict_table(subject: Subject) -> Markup:
-    """Return how entries compare with the leader: sign-flip tests of these weights, corrected by Holm.
-
-    Floors follow, and have no rank.
-    """
+    """Return sign-flip tests of entries against the leader, corrected by Holm; floors follow, unranked."""
     name = subject.ranking.name
     entries = {row.name: row for row in subject.rows if row.entry}
     placed = standings({method: row.scores[name] for method, row in entries.items()})
@@ -217,14 +201,9 @@ def head(subject: Subject) -> Markup:
             tiles.append(_card(words(name), mean(values), bootstrap_interval(values), said))
         else:
             tiles.append(_tile(words(name), score, TILE_NOTES.get(name, "mean over the horizon")))
-    return join(
-        [
-            tag("p", f"lagbench · score report · {size.split} {size.name}", class_="brand"),
-            tag("h1", names),
-            tag("p", lede, class_="lede"),
-            tag("ul", *tiles, class_="tiles"),
-        ]
-    )
+    brand = tag("p", f"lagbench · score report · {size.split} {size.name}", class_="brand")
+    tail = tag("p", lede, class_="lede"), tag("ul", *tiles, class_="tiles")
+    return join([brand, tag("h1", names), *tail])
 
 
 def stable_of(score: Score) -> str:
@@ -246,7 +225,6 @@ def _card(what: str, value: float, bounds: tuple[float, float], more: str) -> Ma
 
 
 def _beside(subject: Subject, row: Row) -> str:
-    """Return how the ranking metric stands beside the least floor."""
     metric = subject.ranking
     floors = [r for r in subject.rows if r.entry is None]
     if not floors or metric.direction is not Direction.LOWER:

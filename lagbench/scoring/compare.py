@@ -39,6 +39,8 @@ from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
 SAME = ("split", "size", "dataset_sha256")
 """What two submissions must share."""
 
+AGAIN = "score the predictions again: lagbench score predictions.nc"
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contestant:
@@ -101,15 +103,14 @@ class ComparisonResult:
 
     @property
     def _sample(self) -> str:
-        """What a verdict rests on, and what it is about."""
         p, one, two = self.metrics[self.ranking].test.p, *self.seeds
         if self.floor:
             what = f"{one} seeds" if one > 1 else "one seed: these weights, not the method"
         elif one == two == 1:
             what = "one seed each: these weights, not the methods"
         else:
-            single = 1 in self.seeds
-            what = f"{one} and {two} seeds" + (": of one seed its weights, not the method" if single else "")
+            what = f"{one} and {two} seeds"
+            what += ": of one seed its weights, not the method" if 1 in self.seeds else ""
         return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
 
     def as_json(self) -> dict[str, Any]:
@@ -183,13 +184,14 @@ def compare(
         fix = f"{floors}name scores, predictions or a folder of them"
         raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)
     two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
-    _check_same(one, two)
+    between = f"{one.name} and {two.name}"
+    _check_same(between, one.identity, two.identity)
     if floor is None and 0 < len(shared := set(one.predictions) & set(two.predictions)) < max(
         len(one.predictions), len(two.predictions)
     ):
         raise UsageError(
             "both sides have predictions of their own and the same ones",
-            where=f"{one.name} and {two.name}",
+            where=between,
             expected="other trainings on either side",
             got=f"{len(shared)} in common",
             fix="compare seeds of one method with those of another",
@@ -198,8 +200,11 @@ def compare(
     methods = one.identity["method"], two.identity["method"]
     names = told_apart(methods) if floor is None else [*told_apart(methods[:1], taken=(floor,)), floor]
     metrics = (metrics,) if isinstance(metrics, str) else metrics
-    wanted = [_known(name, judged) for name in metrics] or judged
-    order = sorted({one.ranking, *wanted}, key=lambda name: (name != one.ranking, judged.index(name)))
+    for name in metrics:
+        if name not in judged:
+            raise UsageError(f"no metric {name!r} to compare by", where="--metric", fix=nearest(name, judged))
+    wanted = {one.ranking, *(metrics or judged)}
+    order = sorted(wanted, key=lambda name: (name != one.ranking, judged.index(name)))
     found = {name: _compared(one.scores[name], two.scores[name]) for name in order}
     return ComparisonResult(
         split=one.identity["split"],
@@ -228,33 +233,23 @@ def _contestant(
                 str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME]
             )
         held.append(found)
-    first = held[0]
-    sides = [
-        Contestant(
-            name=f"{source} ({one.identity['method']})" if len(held) > 1 else str(source),
-            identity=one.identity,
-            predictions=(one.predictions_sha256,),
-            ranking=one.ranking,
-            scores={name: (score,) for name, score in one.scores[SUBMISSION].items()},
-            floors={row: scores for row, scores in one.scores.items() if row != SUBMISSION},
-        )
-        for one in held
-    ]
-    for side in sides[1:]:
-        _check_same(sides[0], side, more=("method",))
-    if len({one.predictions_sha256 for one in held}) < len(held):
-        raise UsageError(
-            "the same predictions twice",
-            where=str(source),
-            expected="another seed of the method in each folder",
-            fix="one file stands for one training: leave copies out",
-        )
-    common = [name for name in first.scores[SUBMISSION] if all(name in side.scores for side in sides)]
-    return replace(
-        sides[0],
+    first, own = held[0], [one.scores[SUBMISSION] for one in held]
+    name, *names = (f"{source} ({one.identity['method']})" for one in held)
+    for other, one in zip(names, held[1:], strict=True):
+        _check_same(f"{name} and {other}", first.identity, one.identity, more=("method",))
+    predictions = tuple(one.predictions_sha256 for one in held)
+    if len(set(predictions)) < len(held):
+        expected = "another seed of the method in each folder"
+        fix = "one file stands for one training: leave copies out"
+        raise UsageError("the same predictions twice", where=str(source), expected=expected, fix=fix)
+    common = [name for name in own[0] if all(name in scores for scores in own)]
+    return Contestant(
         name=str(source),
-        predictions=tuple(one.predictions_sha256 for one in held),
-        scores={name: tuple(side.scores[name][0] for side in sides) for name in common},
+        identity=first.identity,
+        predictions=predictions,
+        ranking=first.ranking,
+        scores={name: tuple(scores[name] for scores in own) for name in common},
+        floors={row: scores for row, scores in first.scores.items() if row != SUBMISSION},
     )
 
 
@@ -286,13 +281,9 @@ def _seeds_of(path: Path) -> list[Path]:
 def _read(
     path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
 ) -> PublishedScores:
-    """Return what a scores.nc says, or what predictions score."""
     real = path.resolve()
-    length = real.stat().st_size
-    if length > MAX_SCORE_BYTES:
-        reason: str | None = f"{length} bytes, more than scores take"
-    else:
-        reason = unreadable_in_child([real]).get(real)
+    large = (length := real.stat().st_size) > MAX_SCORE_BYTES
+    reason = f"{length} bytes, more than scores take" if large else unreadable_in_child([real]).get(real)
     if reason is None:
         return published(real)
     try:
@@ -308,33 +299,26 @@ def _read(
             where=str(path),
             expected="what `lagbench score` or `lagbench submit` wrote, or a predictions.nc",
             got=f"as scores: {reason}; as predictions: {error.what}, {error.got}",
-            fix="score the predictions again: lagbench score predictions.nc",
+            fix=AGAIN,
         ) from error
 
 
 def _floor(beside: Contestant, name: str) -> Contestant:
-    return replace(
-        beside,
-        name=name,
-        identity={**beside.identity, "method": name},
-        predictions=("",),
-        scores={metric: (score,) for metric, score in beside.floors[name].items()},
-    )
+    identity = {**beside.identity, "method": name}
+    scores = {metric: (score,) for metric, score in beside.floors[name].items()}
+    return replace(beside, name=name, identity=identity, predictions=("",), scores=scores)
 
 
-def _check_same(one: Contestant, two: Contestant, *, more: tuple[str, ...] = ()) -> None:
+def _check_same(
+    where: str, one: Mapping[str, str], two: Mapping[str, str], *, more: tuple[str, ...] = ()
+) -> None:
     for key in (*SAME, *more):
-        first, second = one.identity[key], two.identity[key]
-        if first != second:
+        if (first := one[key]) != (second := two[key]):
             kind = DataError if key == "dataset_sha256" else UsageError
-            raise kind(
-                f"the two submissions differ in {key}",
-                where=f"{one.name} and {two.name}",
-                expected=first,
-                got=second,
-                fix="compare submissions to the same split, size and data set"
-                + (", and keep the seeds of each method in a folder of its own" if more else ""),
-            )
+            fix = "compare submissions to the same split, size and data set"
+            fix += ", and keep the seeds of each method in a folder of its own" if more else ""
+            what = f"the two submissions differ in {key}"
+            raise kind(what, where=where, expected=first, got=second, fix=fix)
 
 
 def _judged(one: Contestant, two: Contestant) -> list[str]:
@@ -347,28 +331,12 @@ def _judged(one: Contestant, two: Contestant) -> list[str]:
 
 
 def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:
-    return UnreadableFileError(
-        "scores without the row or the ranking metric",
-        where=where,
-        expected=expected,
-        got=got,
-        fix="score the predictions again: lagbench score predictions.nc",
-    )
-
-
-def _known(name: str, judged: Collection[str]) -> str:
-    if name not in judged:
-        raise UsageError(f"no metric {name!r} to compare by", where="--metric", fix=nearest(name, judged))
-    return name
+    what = "scores without the row or the ranking metric"
+    return UnreadableFileError(what, where=where, expected=expected, got=got, fix=AGAIN)
 
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
     one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
-    lost = [sum(sum(score.undefined) for score in side) for side in (first, second)]
-    return MetricComparison(
-        metric=first[0].metric,
-        first=one,
-        second=two,
-        undefined=(lost[0], lost[1]),
-        test=compare_scores(first, second),
-    )
+    lost, gone = (sum(sum(score.undefined) for score in side) for side in (first, second))
+    test = compare_scores(first, second)
+    return MetricComparison(metric=first[0].metric, first=one, second=two, undefined=(lost, gone), test=test)

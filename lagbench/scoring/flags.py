@@ -20,14 +20,13 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import counted_nodes
 from lagbench.metrics.frame import FramePair, Scenario, average, dot, mean_square
-from lagbench.metrics.metric import mean
+from lagbench.metrics.metric import mean, quotient
 
 Floats = NDArray[np.float64]
 
@@ -48,11 +47,6 @@ class Trace:
     shifted: Mapping[int, Floats]
     occupancy: Floats  # nodes that the prediction fills over those that the truth fills [1], shape [frame]
     outside: Floats  # share of particles past a wall [1], shape [frame]
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Cross process borders, which a mapping proxy does not."""
-        first = (self.error, self.overlap, self.motion, self.predicted_motion)
-        return Trace, (*first, dict(self.shifted), self.occupancy, self.outside)
 
 
 class Tracer:
@@ -78,7 +72,9 @@ class Tracer:
             series["overlap"][i] = sum(map(dot, error.T, self._error.T)) / error.size
         series["motion"][i] = pair.truth.speed_square / error.size
         series["predicted_motion"][i] = pair.prediction.speed_square / error.size
-        series["occupancy"][i] = _occupancy(pair)
+        filled = counted_nodes(pair.prediction.fields.weight, pair.scenario.full)
+        full = max(1, int(np.count_nonzero(pair.truth.fields.counted)))
+        series["occupancy"][i] = int(np.count_nonzero(filled)) / full
         series["outside"][i] = pair.outside
         for back, earlier in enumerate(reversed(self._true), start=1):
             self._shifted[-back][i] = average(mean_square(predicted - earlier))
@@ -90,13 +86,7 @@ class Tracer:
 
     def result(self) -> Trace:
         """Return what was collected."""
-        return Trace(**self._series, shifted=MappingProxyType(self._shifted))
-
-
-def _occupancy(pair: FramePair) -> float:
-    filled = counted_nodes(pair.prediction.fields.weight, pair.scenario.full)
-    true = int(np.count_nonzero(pair.truth.fields.counted))
-    return int(np.count_nonzero(filled)) / max(1, true)
+        return Trace(**self._series, shifted=self._shifted)
 
 
 AUTOCORRELATION = 0.5
@@ -151,10 +141,12 @@ def evidence(trace: Trace) -> Evidence:
     """Return what the error of one scenario does from frame to frame."""
     error, before = trace.error[1:], trace.error[:-1]
     told = before > ROUNDING**2
-    cosine = _quotient(trace.overlap[1:], np.sqrt(error * before))[told]
-    fall = np.sqrt(_quotient(error, before))[told]
-    quarter = max(1, len(trace.error) // 4)
-    gains = {0: 1.0} | {shift: _gain(trace, shift) for shift in SHIFTS}
+    cosine = quotient(trace.overlap[1:], np.sqrt(error * before))[told]
+    fall = np.sqrt(quotient(error, before))[told]
+    quarter, gains = max(1, len(trace.error) // 4), {0: 1.0}
+    for shift, shifted in trace.shifted.items():
+        known = ~np.isnan(shifted)
+        gains[shift] = _root_ratio(float(np.sum(shifted[known])), float(np.sum(trace.error[known])))
     best = min(gains, key=lambda shift: math.inf if math.isnan(gains[shift]) else gains[shift])
     return Evidence(
         autocorrelation=mean(cosine),
@@ -174,56 +166,51 @@ def copy_suspect(traces: Sequence[Trace]) -> Flag:
     not seen.
     """
     found = [evidence(trace) for trace in traces]
-    reasons = []
-    exact = sum(e.exact for e in found)
-    if exact:
-        reasons.append(f"{exact} predicted frames are the truth, bit for bit")
-    if any(e.autocorrelation < AUTOCORRELATION for e in found):
-        reasons.append("the error of a frame does not follow from that of the frame before")
-    if any(e.drop < DROP for e in found):
-        reasons.append("the error drops within one frame")
-    if any(e.shift_gain < SHIFT_GAIN for e in found):
-        reasons.append("a shift in time removes most of the error")
-    if any(e.growth < GROWTH and e.steps < 1.0 for e in found):
-        reasons.append("the error stays within one frame's motion and does not accumulate")
-    best = min(found, key=lambda e: e.shift_gain)
-    return Flag(
-        name="copy_suspect",
-        raised=bool(reasons),
-        reasons=tuple(reasons),
-        evidence={
-            "exact_frames": float(exact),
-            "error_autocorrelation": _least(e.autocorrelation for e in found),
-            "error_drop": _least(e.drop for e in found),
-            "best_shift": float(best.shift),
-            "shift_gain": best.shift_gain,
-            "error_growth": _least(e.growth for e in found),
-            "error_in_steps": max(e.steps for e in found),
-        },
-    )
+    exact, best = sum(e.exact for e in found), min(found, key=lambda e: e.shift_gain)
+    told = {
+        f"{exact} predicted frames are the truth, bit for bit": exact > 0,
+        "the error of a frame does not follow from that of the frame before": any(
+            e.autocorrelation < AUTOCORRELATION for e in found
+        ),
+        "the error drops within one frame": any(e.drop < DROP for e in found),
+        "a shift in time removes most of the error": any(e.shift_gain < SHIFT_GAIN for e in found),
+        "the error stays within one frame's motion and does not accumulate": any(
+            e.growth < GROWTH and e.steps < 1.0 for e in found
+        ),
+    }
+    numbers = {
+        "exact_frames": float(exact),
+        "error_autocorrelation": _least(e.autocorrelation for e in found),
+        "error_drop": _least(e.drop for e in found),
+        "best_shift": float(best.shift),
+        "shift_gain": best.shift_gain,
+        "error_growth": _least(e.growth for e in found),
+        "error_in_steps": max(e.steps for e in found),
+    }
+    return _flag("copy_suspect", told, numbers)
+
+
+def _flag(name: str, told: Mapping[str, bool], numbers: Mapping[str, float]) -> Flag:
+    """Return a flag that is raised for what is true of the reasons."""
+    reasons = tuple(reason for reason, holds in told.items() if holds)
+    return Flag(name=name, raised=bool(reasons), reasons=reasons, evidence=numbers)
 
 
 def below_twin_floor(error: Floats, persistence: Floats, floor: Sequence[float]) -> Flag:
     """Judge whether a prediction is closer to the truth than the nudged twin of the solver.
 
     Where the twin has lost its way itself (its RMSE has come near that of persistence), a cautious
-    prediction may be closer than it; such frames do not count.
-
-    Args:
-        error: position RMSE per predicted frame, mean over scenarios [length], shape [frame].
-        persistence: that of persistence [length], shape [frame].
-        floor: that of the twin [length], one per frame; empty where it is not recorded.
+    prediction may be closer than it; such frames do not count. All are position RMSE per predicted frame,
+    mean over scenarios [length], shape [frame]; the floor is empty where it is not recorded.
     """
     name = "below_twin_floor"
     if len(floor) != len(error):
         return Flag(name=name, raised=None, reasons=("no twin floor is recorded",), evidence={})
     twin = np.asarray(floor, np.float64)
     regular = twin < TWIN_REGULAR * persistence
-    below = regular & (error < twin)
-    count = int(np.count_nonzero(below))
-    reasons = (f"{count} frames are closer to the truth than the solver's twin",) if count else ()
+    count = int(np.count_nonzero(regular & (error < twin)))
     numbers = {"frames_below": float(count), "frames_compared": float(np.count_nonzero(regular))}
-    return Flag(name=name, raised=count > 0, reasons=reasons, evidence=numbers)
+    return _flag(name, {f"{count} frames are closer to the truth than the solver's twin": count > 0}, numbers)
 
 
 def physics(traces: Sequence[Trace]) -> Flag:
@@ -231,19 +218,12 @@ def physics(traces: Sequence[Trace]) -> Flag:
     energy = _ratio(sum(np.sum(t.predicted_motion) for t in traces), sum(np.sum(t.motion) for t in traces))
     occupancy = float(np.mean([np.mean(t.occupancy) for t in traces]))
     outside = float(np.mean([np.mean(t.outside) for t in traces]))
-    reasons = []
-    if energy < ENERGY[0] or energy > ENERGY[1]:
-        reasons.append(f"{energy:.2g} times the truth's kinetic energy")
-    if occupancy < OCCUPANCY[0] or occupancy > OCCUPANCY[1]:
-        reasons.append(f"the particles fill {occupancy:.2g} times the truth's area")
-    numbers = {"energy": energy, "occupancy": occupancy, "outside": outside}
-    return Flag(name="physics", raised=bool(reasons), reasons=tuple(reasons), evidence=numbers)
-
-
-def _gain(trace: Trace, shift: int) -> float:
-    shifted = trace.shifted[shift]
-    known = ~np.isnan(shifted)
-    return _root_ratio(float(np.sum(shifted[known])), float(np.sum(trace.error[known])))
+    told = {
+        f"{energy:.2g} times the truth's kinetic energy": energy < ENERGY[0] or energy > ENERGY[1],
+        f"the particles fill {occupancy:.2g} times the truth's area": occupancy < OCCUPANCY[0]
+        or occupancy > OCCUPANCY[1],
+    }
+    return _flag("physics", told, {"energy": energy, "occupancy": occupancy, "outside": outside})
 
 
 def _least(values: Iterable[float]) -> float:
@@ -257,10 +237,3 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 def _root_ratio(numerator: float, denominator: float) -> float:
     return math.sqrt(_ratio(numerator, denominator))
-
-
-def _quotient(numerator: Floats, denominator: Floats) -> Floats:
-    """Return the quotient of two series, NaN where the second is 0, shape [frame]."""
-    result = np.full(len(numerator), np.nan)
-    np.divide(numerator, denominator, out=result, where=denominator > 0.0)
-    return result

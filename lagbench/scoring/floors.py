@@ -8,9 +8,11 @@ an interrupted measurement goes on where it stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,14 +37,12 @@ TOLERANCE = 1e-4
 
 
 def measurable(size: Size, root: Path) -> tuple[str, ...]:
-    """Return the names of the floors that scoring measures itself where none are shipped.
-
-    Those that count for the best floor; what looks at train only where all of train is there.
-    """
+    """Return the names of the floors that scoring measures where none are shipped: those that count."""
     return tuple(floor.name for floor in _possible(size, root) if floor.counts)
 
 
 def _possible(size: Size, root: Path) -> list[Floor]:
+    """Return the floors of a size; what looks at train only where all of train is there."""
     trained = _has(size, root, "train")
     return [floor for floor in floors_of(size) if trained or not floor.reads_train]
 
@@ -69,10 +69,7 @@ def measured_sizes(
 def measured_again(
     size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
 ) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the shipped floors of a data set again: which were measured, and what differs in them.
-
-    What looks at train is measured only where all of train is there.
-    """
+    """Measure the shipped floors of a data set again: which were measured, and what differs in them."""
     names = tuple(floor.name for floor in _possible(size, root))
     known = {name: held for name, held in (shipped(size) or {}).items() if name in names}
     return names, differences(known, measure(size, root, floors=names, progress=progress))
@@ -131,18 +128,11 @@ def _timed(frames: Iterator[NDArray[np.float32]], seconds: list[float]) -> Itera
 
 def _keep(found: FloorTallies, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    tallies = list(found.tallies.values())
+    first, *_ = tallies = list(found.tallies.values())
+    held: dict[str, Any] = {"floors": list(found.tallies), "names": first.names, "frames": first.frames}
+    held |= {part: [getattr(tally, part) for tally in tallies] for part in ("total", "weight", "undefined")}
     with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
-        np.savez(
-            file,
-            floors=np.array(list(found.tallies)),
-            names=np.array(tallies[0].names),
-            frames=np.array(tallies[0].frames),
-            total=np.stack([tally.total for tally in tallies]),
-            weight=np.stack([tally.weight for tally in tallies]),
-            undefined=np.stack([tally.undefined for tally in tallies]),
-            seconds_per_frame=np.array(list(found.seconds_per_frame.values())),
-        )
+        np.savez(file, **held, seconds_per_frame=list(found.seconds_per_frame.values()))
 
 
 def _kept(job: FloorJob, path: Path) -> FloorTallies:
@@ -172,22 +162,10 @@ def measure(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, FloorScores]:
-    """Measure the floors of a data set.
+    """Return the scores of floors of a data set, by default all, those of single frames by scenario.
 
-    Args:
-        size: the split and size; its test subset must be there, and train for ``analog``.
-        root: folder of all data sets.
-        floors: names of the floors; all that the size has when None.
-        workers: worker processes.
-        resume: whether to keep what is measured under the root, and take what is kept there.
-        progress: told how far the work is.
-
-    Returns:
-        Scores by name of the floor, those of the single frames with one row per scenario.
-
-    Raises:
-        DataError: the data are missing or damaged.
-        UsageError: a floor needs an extra that is not installed.
+    The test subset must be there, and train for ``analog``. With ``resume`` what is measured is kept under
+    the root, and what is kept there is taken.
     """
     task = load_scored_task(size, root)
     names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
@@ -204,33 +182,29 @@ def measure(
     meter = Meter(progress)
     meter.begin("measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs))
     found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
-    return {name: _together(name, found) for name in names}
-
-
-def _together(name: str, found: Sequence[FloorTallies]) -> FloorScores:
-    scores = aggregate(select(), {held.scenario: held.tallies[name] for held in found})
-    return FloorScores(
-        name=name,
-        scores=scores,
-        seconds_per_frame=float(np.median([held.seconds_per_frame[name] for held in found])),
-        correlation=correlation_of(scores),
-    )
+    floors_scores = {}
+    for name in names:
+        scores = aggregate(select(), {held.scenario: held.tallies[name] for held in found})
+        floors_scores[name] = FloorScores(
+            name=name,
+            scores=scores,
+            seconds_per_frame=float(np.median([held.seconds_per_frame[name] for held in found])),
+            correlation=correlation_of(scores),
+        )
+    return floors_scores
 
 
 def differences(
     expected: Mapping[str, FloorScores], found: Mapping[str, FloorScores]
 ) -> dict[str, tuple[str, ...]]:
     """Return by floor the metrics whose values per scenario differ, those that one lacks included."""
+    near = partial(np.allclose, rtol=TOLERANCE, atol=1e-12, equal_nan=True)
     unlike = {}
     for name in {**expected, **found}:
         one, two = (held[name].scores if name in held else {} for held in (expected, found))
         unlike[name] = tuple(
             metric
             for metric in {**one, **two}
-            if metric not in one
-            or metric not in two
-            or not np.allclose(
-                one[metric].values, two[metric].values, rtol=TOLERANCE, atol=1e-12, equal_nan=True
-            )
+            if not (metric in one and metric in two and near(one[metric].values, two[metric].values))
         )
     return {name: metrics for name, metrics in unlike.items() if metrics}

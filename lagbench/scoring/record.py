@@ -31,12 +31,7 @@ from .task import load_scored_task
 
 
 def record(
-    size: Size,
-    root: Path,
-    *,
-    workers: int = 1,
-    folder: Path = FOLDER,
-    floors: Collection[str] | None = None,
+    size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER, floors: Collection[str] | None = None
 ) -> Path:
     """Measure the floors of a data set, or some of them, and write them to the folder of shipped scores.
 
@@ -50,12 +45,11 @@ def record(
     if size.measured is None:
         raise DataError("the data set has no recorded hash", where=f"{size.split} {size.name}")
     setting = load_scored_task(size, root).setting
-    reported = sorted(setting.slow_frames.intersection(setting.predicted_frames))
     path = write_shipped(
         size,
         measure(size, root, floors=floors, workers=workers, resume=whole),
         dataset_sha256=size.measured.dataset_sha256,
-        reported=reported,
+        reported=sorted(setting.slow_frames.intersection(setting.predicted_frames)),
         folder=folder,
         partial=not whole,
     )
@@ -65,11 +59,7 @@ def record(
 
 
 def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
-    """Time the solver in a process of its own and write what a frame costs.
-
-    Raises:
-        WorkFailedError: the process failed.
-    """
+    """Time the solver in a process of its own and write what a frame costs."""
     options = ["--split", size.split, "--size", size.name, "--json"]
     command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -80,9 +70,8 @@ def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of this module; return its exit code."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--split")
     parser.add_argument("--size")
     parser.add_argument("--root", type=Path)

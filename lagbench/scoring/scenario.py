@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,62 +24,51 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import select
 from lagbench.store.copy import bring
 from lagbench.submission.format import Anatomy
-from lagbench.submission.predictions import Predictions, open_predictions
+from lagbench.submission.predictions import open_predictions
 from lagbench.work.pool import Report
 
 from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .flags import Trace, Tracer
-from .task import OpenScenario, ScoredTask
+from .task import FRAMES, PARTICLES, SUBMISSION, Preview, ScoredTask, as_stored
 
 
 class PreviewRecorder:
-    """Takes the pictures of one scenario, frame pair by frame pair."""
+    """Takes the pictures of one scenario, its ``preview``, frame pair by frame pair."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
-        setting = scenario.setting
-        frames = setting.predicted_frames
-        self._number, self._scenario = number, scenario
-        self._maps = tuple(sorted(setting.slow_frames.intersection(frames)))
-        self._film_frames = _spaced(frames, FRAMES)
-        self._particles = _spaced(range(len(scenario.material)), PARTICLES)
-        shape = (2, len(self._maps), setting.grid.nodes, setting.grid.nodes)
-        self._vorticity = np.full(shape, np.nan, np.float32)
-        self._histogram = np.full((*shape[:2], BINS), np.nan, np.float32)
-        self._range = np.full((shape[1], 2), np.nan, np.float32)
-        self._film = np.zeros((2, len(self._film_frames), len(self._particles), 2), np.float32)
+        setting, frames = scenario.setting, scenario.setting.predicted_frames
+        maps = tuple(sorted(setting.slow_frames.intersection(frames)))
+        film_frames = _spaced(frames, FRAMES)
+        particles = _spaced(range(len(scenario.material)), PARTICLES)
+        shape, nan = (2, len(maps), setting.grid.nodes, setting.grid.nodes), np.float32(np.nan)
+        self.preview = Preview(
+            scenario=number,
+            map_frames=maps,
+            vorticity=np.full(shape, nan),
+            histogram=np.full((*shape[:2], BINS), nan),
+            histogram_range=np.full((shape[1], 2), nan),
+            film_frames=film_frames,
+            particles=particles,
+            material=scenario.material[list(particles)].astype(np.int8),
+            film=np.zeros((2, len(film_frames), len(particles), 2), np.float32),
+        )
 
     def add(self, pair: FramePair) -> None:
         """Look at a frame; most are not pictured."""
-        if pair.frame in self._film_frames:
-            shown = list(self._particles)
-            i = self._film_frames.index(pair.frame)
-            self._film[0, i] = pair.truth.position[shown]
-            self._film[1, i] = np.clip(pair.prediction.position[shown], -1e6, 1e6)
-        if pair.frame in self._maps and pair.node_count:
-            self._map(self._maps.index(pair.frame), pair)
-
-    def _map(self, i: int, pair: FramePair) -> None:
-        truth, prediction = pair.true_vorticity, pair.predicted_vorticity
-        self._vorticity[0, i][pair.nodes] = truth
-        self._vorticity[1, i][pair.nodes] = np.clip(prediction, -1e30, 1e30)
-        shares = histograms(truth, prediction) if pair.truth_turns else None
-        if shares is not None:
-            self._histogram[:, i] = shares
-            self._range[i] = np.min(truth), np.max(truth)
-
-    def result(self) -> Preview:
-        """Return the pictures."""
-        return Preview(
-            scenario=self._number,
-            map_frames=self._maps,
-            vorticity=self._vorticity,
-            histogram=self._histogram,
-            histogram_range=self._range,
-            film_frames=self._film_frames,
-            particles=self._particles,
-            material=self._scenario.material[list(self._particles)].astype(np.int8),
-            film=self._film,
-        )
+        made = self.preview
+        if pair.frame in made.film_frames:
+            i, shown = made.film_frames.index(pair.frame), list(made.particles)
+            made.film[0, i] = pair.truth.position[shown]
+            made.film[1, i] = np.clip(pair.prediction.position[shown], -1e6, 1e6)
+        if pair.frame in made.map_frames and pair.node_count:
+            i = made.map_frames.index(pair.frame)
+            truth, prediction = pair.true_vorticity, pair.predicted_vorticity
+            made.vorticity[0, i][pair.nodes] = truth
+            made.vorticity[1, i][pair.nodes] = np.clip(prediction, -1e30, 1e30)
+            shares = histograms(truth, prediction) if pair.truth_turns else None
+            if shares is not None:
+                made.histogram[:, i] = shares
+                made.histogram_range[i] = np.min(truth), np.max(truth)
 
 
 def _spaced(numbers: range, count: int) -> tuple[int, ...]:
@@ -122,34 +110,24 @@ _selected = functools.cache(select)  # the search through installed packages tak
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
-    metrics = _selected(job.metrics)
-    with (
-        _told_of(job.scenario),
-        job.task.opened(job.scenario) as truth,
-        open_predictions(job.predictions, checked=job.anatomy) as predictions,
-    ):
-        scenario = truth.scenario
-        rows = {SUBMISSION: _predicted(predictions, job.scenario, scenario)}
-        rows |= {name: floor_snapshots(name, truth, job.task) for name in job.floors}
-        photographer = PreviewRecorder(job.scenario, scenario) if job.pictured else None
-        tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
-    return ScenarioScores(job.scenario, tallies, trace, photographer.result() if photographer else None)
-
-
-@contextmanager
-def _told_of(scenario: int) -> Iterator[None]:
-    """Name the scenario beside what a package's metric or our own code raises there."""
+    number, metrics = job.scenario, _selected(job.metrics)
     try:
-        yield
+        with (
+            job.task.opened(number) as truth,
+            open_predictions(job.predictions, checked=job.anatomy) as predictions,
+        ):
+            scenario = truth.scenario
+            frames = (frame for _, block in predictions.blocks(number) for frame in block)
+            rows = {SUBMISSION: snapshots(scenario, frames)}
+            for name in job.floors:
+                given = given_in(truth.file, job.task.size, job.task.truth.root)
+                rows[name] = snapshots(scenario, predicted_by(FLOORS[name], given))
+            photographer = PreviewRecorder(number, scenario) if job.pictured else None
+            tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
     except Exception as error:
-        error.add_note(f"scenario {scenario}")
+        error.add_note(f"scenario {number}")  # beside what a package's metric or our own code raises there
         raise
-
-
-def floor_snapshots(name: str, truth: OpenScenario, task: ScoredTask) -> Iterator[Snapshot]:
-    """Yield the snapshots that a floor predicts."""
-    given = given_in(truth.file, task.size, task.truth.root)
-    return snapshots(truth.scenario, predicted_by(FLOORS[name], given))
+    return ScenarioScores(number, tallies, trace, photographer.preview if photographer else None)
 
 
 def predicted_by(floor: Floor, given: Given) -> Prediction:
@@ -183,8 +161,3 @@ def measure_rows(
     names = [m.name for m in metrics if m.statistic is not None]
     tallies = {name: as_stored(Tally.of(names, frames, values)) for name, values in measured.items()}
     return tallies, tracer.result()
-
-
-def _predicted(predictions: Predictions, number: int, scenario: Scenario) -> Iterator[Snapshot]:
-    frames = (frame for _, block in predictions.blocks(number) for frame in block)
-    return snapshots(scenario, frames)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 
 from lagbench.draw.tables import Table
 from lagbench.floors.shipped import DIGITS
-from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 
@@ -26,27 +25,29 @@ ARROWS = {Direction.LOWER: " ↓", Direction.HIGHER: " ↑", Direction.TARGET: "
 
 
 def card_tables(card: ScoreCard, *, every: bool = False, floors: bool = False) -> Iterator[Table]:
-    """Yield the tables of a score card: over the horizon, at frames of interest, per scenario.
+    """Yield tables over the horizon, at frames of interest and per scenario, of every metric or the chosen.
 
-    Args:
-        card: the score card.
-        every: whether to show all metrics instead of the chosen ones.
-        floors: whether to show all floors instead of the best one.
+    With ``floors`` they stand beside all floors instead of the best one.
     """
-    names = list(card.submission) if every else _ranked_first(card, CHOSEN)
+    chosen = card.submission if every else dict.fromkeys((card.ranking, *CHOSEN))
+    names = [name for name in chosen if name in card.submission]
     at_frames = [n for n in names if card.submission[n].metric.per_frame] if every else SHOWN_AT_FRAMES
+    method, frames = card.header.method, card.reported_frames
     task = f"{card.header.split} {card.header.size}, {card.setting.horizon} frames"
     beside = [row for row in card.scores if row != SUBMISSION]
     if not floors:
         beside = [card.skill.floor] if card.skill else beside[:1]
-    yield _over_horizon(card, names, beside, f"{card.header.method} on {task}, mean over scenarios")
-    yield _at_frames(card, at_frames, f"{card.header.method} at frames, mean over scenarios")
-    yield _per_scenario(card, beside)
-
-
-def _ranked_first(card: ScoreCard, names: Collection[str]) -> list[str]:
-    ordered = dict.fromkeys((card.ranking, *names))
-    return [name for name in ordered if name in card.submission]
+    yield _over_horizon(card, names, beside, f"{method} on {task}, mean over scenarios")
+    rows: list[tuple[str, ...]] = [
+        (name, *(_number(mean(card.submission[name].at(frame))) for frame in frames))
+        for name in at_frames
+        if name in card.submission
+    ]
+    yield Table(f"{method} at frames, mean over scenarios", ("metric", *map(str, frames)), tuple(rows))
+    shown = [SUBMISSION, *beside]
+    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
+    rows = [(str(i), *map(_number, values)) for i, *values in zip(card.scenarios, *columns, strict=True)]
+    yield Table(f"{card.ranking} per scenario", ("scenario", *map(_head, shown)), tuple(rows))
 
 
 def _over_horizon(card: ScoreCard, names: Collection[str], floors: Collection[str], title: str) -> Table:
@@ -57,7 +58,9 @@ def _over_horizon(card: ScoreCard, names: Collection[str], floors: Collection[st
         score = card.submission[name]
         mark = " †" if any(score.undefined) else ""
         own = f"{_with_interval(score.mean, score.interval)}{mark}"
-        rows.append((_named(score.metric), own, *(_mean_of(card.scores[row], name) for row in floors)))
+        others = (card.scores[row].get(name) for row in floors)
+        means = ("-" if other is None else _number(other.mean) for other in others)
+        rows.append((_named(score.metric), own, *means))
     return Table(title, ("metric", f"{SUBMISSION} [95 %]", *map(_head, floors)), tuple(rows))
 
 
@@ -70,30 +73,6 @@ def _named(metric: Metric) -> str:
 def _head(name: str) -> str:
     """Return a name as the head of a column, in lines."""
     return "-\n".join(name.split("-"))
-
-
-def _mean_of(scores: Mapping[str, Score], name: str) -> str:
-    return _number(scores[name].mean) if name in scores else "-"
-
-
-def _at_frames(card: ScoreCard, names: Collection[str], title: str) -> Table:
-    frames = card.reported_frames
-    rows = [
-        (name, *(_number(mean(card.submission[name].at(frame))) for frame in frames))
-        for name in names
-        if name in card.submission
-    ]
-    return Table(title, ("metric", *map(str, frames)), tuple(rows))
-
-
-def _per_scenario(card: ScoreCard, floors: Collection[str]) -> Table:
-    shown = [SUBMISSION, *floors]
-    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
-    rows = [
-        (str(i), *map(_number, values))
-        for i, values in zip(card.scenarios, zip(*columns, strict=True), strict=True)
-    ]
-    return Table(f"{card.ranking} per scenario", ("scenario", *map(_head, shown)), tuple(rows))
 
 
 def flag_lines(card: ScoreCard) -> Iterator[str]:
@@ -129,25 +108,15 @@ def _against(card: ScoreCard, row: str) -> str:
         word, low, high = "better", -high, -low  # the bounds of what is printed: how much better
     else:
         word = "worse"
-    spread = [] if math.isnan(low) else [f"{_number(low)} to {_number(high)}"]
-    spread += [
-        f"{len(found.scenarios)} scenarios: no p-value" if math.isnan(found.p) else f"p = {found.p:.3g}"
-    ]
-    return f"{card.ranking} {word} by {_number(abs(found.difference))} ({', '.join(spread)})"
+    spread = "" if math.isnan(low) else f"{_number(low)} to {_number(high)}, "
+    p = f"{len(found.scenarios)} scenarios: no p-value" if math.isnan(found.p) else f"p = {found.p:.3g}"
+    return f"{card.ranking} {word} by {_number(abs(found.difference))} ({spread}{p})"
 
 
 def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Iterator[Table]:
-    """Yield the tables of a comparison: differences in the loss, negative favours the first; means.
-
-    Args:
-        result: the comparison.
-        every: whether to show all its metrics instead of the chosen ones.
-    """
-    shown = {
-        name: found
-        for name, found in result.metrics.items()
-        if every or name == result.ranking or name in CHOSEN
-    }
+    """Yield differences in the loss, negative favours the first, and means, of every metric or the chosen."""
+    chosen = result.metrics if every else (result.ranking, *CHOSEN)
+    shown = [found for name, found in result.metrics.items() if name in chosen]
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
     differences = tuple(
         (
@@ -155,7 +124,7 @@ def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Itera
             _with_interval(found.test.difference, found.test.interval),
             "-" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
         )
-        for found in shown.values()
+        for found in shown
     )
     # a loss is what is less for the better one, also where more of the metric is better
     yield Table(
@@ -169,7 +138,7 @@ def comparison_tables(result: ComparisonResult, *, every: bool = False) -> Itera
                 for value, lost in zip((found.first, found.second), found.undefined, strict=True)
             ),
         )
-        for found in shown.values()
+        for found in shown
     )
     yield Table("means", ("metric", _head(result.first), _head(result.second)), means)
 

@@ -26,17 +26,22 @@ OF_NODES = "vorticity_nrmse"
 
 
 def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
-    """Return what is to be said of scenarios whose vorticity has no value in any frame.
-
-    It counts nodes, and names a grid of which all scenarios cover enough, where there is one.
-    """
+    """Return how many nodes scenarios without any vorticity cover, and a grid of which all cover enough."""
     setting = task.setting
     counts = [covered_nodes(_clouds(task, i)[0], setting.grid) for i in scenarios]
-
-    def every() -> Iterator[Cloud]:
-        return (cloud for i in task.scenarios for cloud in _clouds(task, i))
-
-    cells = fitting_cells(every, setting.grid.placement, near=setting.grid.cells)
+    cells = fitting_cells(
+        lambda: (cloud for i in task.scenarios for cloud in _clouds(task, i)),
+        setting.grid.placement,
+        near=setting.grid.cells,
+    )
+    if cells is None:
+        fix = "more particles: they cover enough nodes of no grid"
+    else:
+        word = "coarser" if cells < setting.grid.cells else "finer"
+        described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
+        local = (task.truth.root / described).is_file()
+        here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
+        fix = f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
     least, most = min(counts), max(counts)
     return Finding(
         check="undefined",
@@ -46,18 +51,8 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
         expected=f"{MINIMUM_NODES} nodes with particles enough around them",
         got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios undefined:"
         f" {least if least == most else f'{least} to {most}'} nodes counted, {MINIMUM_NODES} needed",
-        fix=_regrid(task, cells),
+        fix=fix,
     )
-
-
-def _regrid(task: ScoredTask, cells: int | None) -> str:
-    if cells is None:
-        return "more particles: they cover enough nodes of no grid"
-    word = "coarser" if cells < task.setting.grid.cells else "finer"
-    described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
-    local = (task.truth.root / described).is_file()
-    here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
-    return f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
 
 
 def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
@@ -72,42 +67,33 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
     """Yield why predictions of a data set could not be scored or validated, with what mends it.
 
     Only the first and last frames that are to be predicted are read, beside what checks the files.
-
-    Args:
-        size: the split and size.
-        root: folder of all data sets.
-        validated: whether a training is validated on ``valid``.
     """
     for subset in ("test", "valid") if validated else ("test",):
+        counts, moves, sparse = set(), False, []
         try:
             task = load_scored_task(size, root, subset=subset)
-            yield from _faults(task)
+            for i in task.scenarios:
+                with task.opened(i) as opened:
+                    before = opened.scenario.last_given.position
+                clouds = _clouds(task, i)
+                counts.add(len(before))
+                moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
+                if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
+                    sparse.append(i)
+            if len(counts) > 1 and subset == "test":
+                yield (
+                    f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one"
+                    " number; put those of one number into test: lagbench adopt with folders train, valid and"
+                    " test"
+                )
+            if not moves:
+                yield (
+                    f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
+                    f" for {subset}: lagbench adopt with folders train, valid and test"
+                )
+            elif sparse and ranking_metric(task.size) == OF_NODES:
+                found = few_nodes(task, sparse)
+                yield f"{found.got}; {found.fix}"
         except LagbenchError as error:  # the training itself may do without what is missing here
             fix = f"; {error.fix}" if error.fix else ""
             yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"
-
-
-def _faults(task: ScoredTask) -> Iterator[str]:
-    subset, counts, moves = task.truth.subset, set(), False
-    sparse = []
-    for i in task.scenarios:
-        with task.opened(i) as opened:
-            before = opened.scenario.last_given.position
-        clouds = _clouds(task, i)
-        counts.add(len(before))
-        moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
-        if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
-            sparse.append(i)
-    if len(counts) > 1 and subset == "test":
-        yield (
-            f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one number;"
-            " put those of one number into test: lagbench adopt with folders train, valid and test"
-        )
-    if not moves:
-        yield (
-            f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
-            f" for {subset}: lagbench adopt with folders train, valid and test"
-        )
-    elif sparse and ranking_metric(task.size) == OF_NODES:
-        found = few_nodes(task, sparse)
-        yield f"{found.got}; {found.fix}"
