@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from lagbench.errors import UsageError
@@ -33,13 +35,20 @@ FAR = 1 << 20  # cells that are told apart on either side of the origin; what li
 
 @torch.no_grad()
 def radius_graph(
-    position: Tensor, radius: float, sample: Tensor | None = None, *, self_edges: bool = False
+    position: Tensor,
+    radius: float,
+    sample: Tensor | None = None,
+    *,
+    self_edges: bool = False,
+    most: int | None = None,
 ) -> Tensor:
-    """Connect all pairs of particles within a radius, itself included, without a cap on neighbours.
+    """Connect all pairs of particles within a radius, itself included.
 
     Return senders and receivers, int64, shape [2, edge]: both directions of every pair, sorted by receiver,
     then sender. Particles of different windows, which `sample` names in ascending order, are never
-    connected, and those whose position is no finite number have no edges.
+    connected, and those whose position is no finite number have no edges. With ``most``, a receiver hears
+    that many neighbours, the nearest; of equally far ones any. Time and memory are then bounded where
+    matter has collapsed to a point.
     """
     where = "radius_graph"
     if position.ndim != 2 or position.shape[1] != 2:
@@ -57,7 +66,11 @@ def radius_graph(
         )
     x = position.detach().double()
     window = torch.zeros(len(x), dtype=torch.int64, device=x.device) if sample is None else sample
-    if x.device.type == "cpu":
+    if most is not None:
+        edges = nearest_edges(x.cpu().numpy(), window.cpu().numpy(), radius, self_edges, most)
+        edges.sort()
+        edges = torch.from_numpy(edges).to(x.device)
+    elif x.device.type == "cpu":
         edges = edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)
         edges.sort()
         edges = torch.from_numpy(edges)
@@ -95,6 +108,25 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
     i, j = particle[i[near]], particle[j[near]]
     loops = [(kept << 32) | kept] if self_edges else []
     return xp.concatenate([(i << 32) | j, (j << 32) | i, *loops])
+
+
+def nearest_edges(
+    x: NDArray[np.float64], window: NDArray[np.int64], radius: float, self_edges: bool, most: int
+) -> NDArray[np.int64]:
+    """Return receiver * 2^32 + sender of every edge to one of the nearest ``most`` within the radius."""
+    kept = np.flatnonzero(np.isfinite(x).all(axis=1))
+    x, window = x[kept], window[kept]
+    apart = np.column_stack([x, 4.0 * radius * window])  # no two windows within the radius of each other
+    # itself is one of those found, but where more than that lie at its very place
+    beyond = radius * (1.0 + MARGIN)
+    _, found = KDTree(apart).query(apart, k=np.arange(1, most + 2), distance_upper_bound=beyond)
+    own = np.arange(len(x))[:, None]
+    j = np.minimum(found, len(x) - 1)
+    dx, dy = np.moveaxis(x[own] - x[j], -1, 0)
+    near = (found < len(x)) & (found != own) & (dx * dx + dy * dy <= radius * radius)
+    i, rank = np.nonzero(near & (near.cumsum(axis=1) <= most))
+    loops = [(kept << 32) | kept] if self_edges else []
+    return np.concatenate([(kept[i] << 32) | kept[j[i, rank]], *loops])
 
 
 MATERIALS = 4  # that datasets.yaml knows: 0 liquid, 1 jelly, 2 snow, 3 rope

@@ -187,6 +187,8 @@ class GraphNetworkOptions(Options):
     symmetry: Symmetry = Symmetry.NONE  # images that training windows are replaced by at random
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
+    # neighbours that a particle hears at most, the nearest; all within the radius when None
+    neighbours: int | None = Field(default=None, ge=1)
     # keep particles in the box, and their velocities true to that, in training and in rollouts
     clamp: bool = True
 
@@ -347,7 +349,8 @@ class GraphNetwork(Baseline):
 
     def edges(self, state: State) -> Tensor:
         """Search the neighbours: senders and receivers, int64, shape [2, edge]."""
-        return radius_graph(state.position.detach(), self.radius, state.sample)
+        most = self.options.neighbours
+        return radius_graph(state.position.detach(), self.radius, state.sample, most=most)
 
     def predict(
         self, state: State, edge_index: Tensor, generator: torch.Generator | None = None

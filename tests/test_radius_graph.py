@@ -174,3 +174,33 @@ def test_what_does_not_fit_is_refused(
     """Wrong shapes, a radius that is none and windows out of order are errors."""
     with pytest.raises(UsageError, match=words):
         radius_graph(position, radius, sample)
+
+
+@pytest.mark.parametrize("most", [1, 3, 7, 60])
+def test_the_nearest_neighbours_are_heard(most: int) -> None:
+    """Of the edges of brute force each receiver keeps the shortest; where all are kept, it is the same graph.
+
+    Twins at one place, windows, particles that are nowhere and loops as without a limit.
+    """
+    rng = np.random.default_rng(1)
+    x = rng.random((120, 2), np.float32)
+    x[40:52], x[100] = x[40], np.nan  # a heap of twelve
+    sample, radius = np.repeat([0, 1], 60), 0.25
+    senders, receivers = brute_force(x, radius, sample)
+    length = np.sum((x[senders].astype(float) - x[receivers].astype(float)) ** 2, axis=1)
+    found = radius_graph(torch.from_numpy(x), radius, torch.from_numpy(sample), most=most).numpy()
+    pairs = {(s, r): d for s, r, d in zip(senders, receivers, length, strict=True)}
+    assert len(set(map(tuple, found.T))) == found.shape[1]
+    assert np.array_equal(np.lexsort(found), np.arange(found.shape[1]))  # by receiver, then sender
+    for receiver in range(len(x)):
+        heard = sorted(pairs[s, receiver] for s in found[0, found[1] == receiver])
+        assert heard == sorted(length[receivers == receiver])[:most]
+    looped = radius_graph(torch.from_numpy(x), radius, self_edges=True, most=most).numpy()
+    assert set(looped[0, looped[0] == looped[1]]) == set(range(120)) - {100}
+
+
+def test_a_heap_takes_bounded_memory() -> None:
+    """Ten thousand particles at one place have the edges that are asked for, not a hundred million."""
+    found = radius_graph(torch.full((10_000, 2), 0.5), 0.01, most=4)
+    assert found.shape == (2, 40_000)
+    assert torch.equal(found[1].bincount(), torch.full((10_000,), 4))
