@@ -31,7 +31,14 @@ from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+    check_regular,
+)
 from lagbench.submission.budget import Budget, budget_in
 
 from .baseline import Baseline, Facts

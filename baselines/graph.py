@@ -67,13 +67,10 @@ def radius_graph(
     x = position.detach().double()
     window = torch.zeros(len(x), dtype=torch.int64, device=x.device) if sample is None else sample
     if most is not None:
-        edges = nearest_edges(x.cpu().numpy(), window.cpu().numpy(), radius, self_edges, most)
-        edges.sort()
-        edges = torch.from_numpy(edges).to(x.device)
+        near = nearest_edges(x.cpu().numpy(), window.cpu().numpy(), radius, self_edges, most)
+        edges = torch.from_numpy(np.sort(near)).to(x.device)
     elif x.device.type == "cpu":
-        edges = edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)
-        edges.sort()
-        edges = torch.from_numpy(edges)
+        edges = torch.from_numpy(np.sort(edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)))
     else:
         edges = edge_numbers(torch, x, window, radius, self_edges).sort().values
     return torch.stack([edges & 0xFFFFFFFF, edges >> 32])

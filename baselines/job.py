@@ -23,7 +23,7 @@ from torch import Tensor
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError
+from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_regular
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 

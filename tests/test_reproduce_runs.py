@@ -13,8 +13,8 @@ import pytest
 
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import runs, tables
-from lagbench.baselines.reproduce.plan import Plan, known_studies
+from lagbench.baselines.reproduce import tables
+from lagbench.baselines.reproduce.plan import Plan
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError

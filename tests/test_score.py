@@ -19,7 +19,6 @@ from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailed
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score import score
-from lagbench.scoring.task import SUBMISSION
 from lagbench.store.dataset import open_split
 from lagbench.submission import validate
 from lagbench.work.progress import Progress

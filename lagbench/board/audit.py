@@ -19,7 +19,7 @@ import yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
 from lagbench.submission.findings import Finding

@@ -143,7 +143,7 @@ def demo_model(
     from lagbench.board.entry import Meta
     from lagbench.board.submit import submit
     from lagbench.data.checksums import round_digits
-    from lagbench.data.layout import resolve_root
+    from lagbench.data.local import resolve_root
     from lagbench.scoring.score import score
 
     folder, board = resolve_root(root), demo_board(root)

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
-from lagbench.data.layout import resolve_root
-from lagbench.data.local import rooted
+from lagbench.data.local import resolve_root, rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score

@@ -29,7 +29,7 @@ from lagbench.work.pool import Report
 
 from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .flags import Trace, Tracer
-from .task import FRAMES, PARTICLES, SUBMISSION, Preview, ScoredTask, as_stored
+from .task import ScoredTask
 
 
 class PreviewRecorder:
