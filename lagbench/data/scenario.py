@@ -1,7 +1,8 @@
 """Open scenario files: header, arrays read when asked for, and their content hash.
 
 Whatever is wrong with a file becomes a DataError that names it and, where one can be told,
-the variable.
+the variable. h5py opens one in half the time that netCDF4 takes, and follows a link only where it is
+asked to: nothing that leads out of the file is opened.
 
 The variables of a scenario file, and what their attributes must say.
 
@@ -68,6 +69,16 @@ def _equal(wanted: object, found: object) -> bool:
     return isinstance(found, str) and wanted == found
 
 
+HIDDEN = frozenset(
+    (
+        *("CLASS", "NAME", "REFERENCE_LIST", "DIMENSION_LIST"),
+        *("_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties", "_nc3_strict"),
+    )
+)
+"""Attributes by which netCDF stores dimensions; it shows them to nobody."""
+
+NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+
 BLOCK_BYTES = 1 << 20
 """Files are streamed in pieces of about this size [bytes]."""
 
@@ -116,8 +127,6 @@ class ScenarioFile:
     """
 
     def __init__(self, path: Path, file: h5py.File) -> None:
-        from .netcdf import variables
-
         self.path = path
         self._file = file
         with _damage(path):
@@ -144,8 +153,6 @@ class ScenarioFile:
 
     def read(self, name: str, frames: slice | int = slice(None)) -> NDArray[Any]:
         """Return a variable, or some of its frames (entries along the first dimension)."""
-        from .netcdf import is_text
-
         with _damage(self.path, name):
             variable = self._variables[name]
             part = frames if variable.ndim else ()
@@ -163,8 +170,6 @@ class ScenarioFile:
 
     def check_attributes(self) -> None:
         """Refuse attributes that make other readers read other values."""
-        from .netcdf import attributes, dimensions
-
         for name, variable in sorted(self._variables.items()):
             with _damage(self.path, name):
                 found, wanted = attributes(variable), attributes_of(name, dimensions(variable, name))
@@ -182,8 +187,6 @@ class ScenarioFile:
 
     def computed_hasher(self) -> ContentHasher:
         """Return a hasher that has read the whole file."""
-        from .netcdf import dimensions, is_text
-
         header = self.header
         hasher = ContentHasher(header.key.identity(header.seed, header.parameters))
         for name, variable in sorted(self._variables.items()):
@@ -217,8 +220,6 @@ def rehash(path: Path) -> str:
 
 def check_scenario(path: Path, expected: str | None = None) -> str:
     """Recompute a file's content hash, compare it, and check what is not hashed."""
-    from .netcdf import attribute
-
     with read_scenario(path) as file:
         with _damage(path):
             digests = {name: attribute(held, "content_sha256") for name, held in file._variables.items()}
@@ -260,8 +261,6 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
 
 
 def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioHeader:
-    from .netcdf import attribute
-
     def said(name: str) -> Any:  # noqa: ANN401 - a text or a number
         value = attribute(file, name)
         if value is None:
@@ -305,3 +304,67 @@ def damaged(path: Path, got: str, variable: str | None = None, *, fix: str = _RE
     """Return the error that a file is damaged, or one of its variables."""
     where = str(path) if variable is None else f"{path}, variable {variable!r}"
     return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=fix)
+
+
+# --- what netCDF sees in an HDF5 file -------------------------------------------------------
+
+
+def variables(file: h5py.File) -> dict[str, h5py.Dataset]:
+    """Return the variables beside each other in a file; refuse links and what lies in other files."""
+    from .hdf5 import INSIDE, layout_of, members_of
+
+    members, count = members_of(file)
+    if count > len(members):
+        raise DataError(f"{count} members, of which {len(members)} are looked at")
+    found = {}
+    for name, kind in members.items():
+        if kind.endswith("link"):
+            raise DataError(f"{name!r} is a {kind}")
+        if kind != "variable":
+            continue
+        variable = file[name]
+        layout = layout_of(variable)
+        if layout not in INSIDE:
+            raise DataError(f"the values of {name!r} lie elsewhere: {layout}")
+        scale = attribute(variable, "CLASS") == "DIMENSION_SCALE"
+        if not (scale and str(attribute(variable, "NAME")).startswith(NO_VARIABLE)):
+            found[name] = variable
+    return found
+
+
+def dimensions(variable: h5py.Dataset, name: str) -> tuple[str, ...]:
+    """Return the names of a variable's dimensions; one that is a dimension itself has its own."""
+    if attribute(variable, "CLASS") == "DIMENSION_SCALE":
+        return (name,) if variable.ndim == 1 else ("",) * variable.ndim
+    from .hdf5 import dims_of
+
+    return dims_of(variable)
+
+
+def is_text(variable: h5py.Dataset) -> bool:
+    """Tell whether the values are texts, which single characters are not."""
+    import h5py
+
+    kind = h5py.check_string_dtype(variable.dtype)
+    return kind is not None and kind.length != 1
+
+
+def attributes(owner: h5py.HLObject) -> dict[str, object]:
+    """Return all attributes by name."""
+    return {name: attribute(owner, name) for name in owner.attrs if name not in HIDDEN}
+
+
+def attribute(owner: h5py.HLObject, name: str) -> object:
+    """Return a text or number, an array where there are several; None where there is none."""
+    import h5py
+
+    if not h5py.h5a.exists(owner.id, name.encode()):
+        return None
+    value = owner.attrs[name]
+    if isinstance(value, h5py.Empty):
+        return "" if value.dtype.kind in "SO" else np.empty(0, value.dtype)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, str):  # damaged bytes of texts of no set length come as lone surrogates
+        value = value.encode("utf-8", "surrogateescape")
+    return value.decode("utf-8", "replace").replace("\0", "") if isinstance(value, bytes) else value

@@ -122,7 +122,7 @@ class FrameStore:
         """Open a file; refuse one of another scenario, version or content."""
         import h5py
 
-        from lagbench.data.netcdf import variables
+        from lagbench.data.scenario import variables
 
         size, path = self._size, self._paths[scenario]
         if not path.is_file():
