@@ -73,7 +73,10 @@ class Batch:
         return replace(self, **{name: value.to(device) for name, value in held.items()})
 
     def followed_by(self, position: Tensor) -> Self:
-        """Return the windows one frame later: the first leaves, positions of the next [particle, 2] join."""
+        """Return the windows one frame later: the first frame leaves, the next one joins.
+
+        Its positions [length] have shape [particle, 2].
+        """
         walls = None if self.wall_velocity is None else self.wall_velocity[:, 1:]
         joined = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
         return replace(self, position=joined, wall_velocity=walls, frame=self.frame + 1)

@@ -30,6 +30,10 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
         preview = file["preview"]
         film = preview["film"]
         shape, attributes = film.shape, {name: film.attrs[name] for name in ("scale_factor", "add_offset")}
+        if kind.startswith("best floor "):
+            file.attrs["best_floor"] = kind.removeprefix("best floor ")
+            file.require_dataset("best_floor_value", file["scenario"].shape, "f8")[...] = 9.0
+            return
         if kind == "infinite":
             file["value"][0, 0, 0] = np.inf
             return
@@ -73,10 +77,12 @@ def hostile(path: Path, kind: str, secret: Path) -> None:
     [
         *("external link", "soft link", "external storage", "virtual", "bomb", "extra group", "strings"),
         *("infinite", "another type", "another shape", "packed twice"),
+        # it would stand in for the submission itself, another's file, or count though it must not
+        *("best floor submission", "best floor theirs.nc", "best floor coarse-solver"),
     ],
 )
 def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
-    """Nothing outside the file is shown, nothing is unpacked to gigabytes, no shape is believed."""
+    """Nothing outside the file is shown, nothing is unpacked to gigabytes, no shape or name is believed."""
     secret = own.folder.parent / "secret"
     secret.write_bytes(bytes(range(256)) * 400)
     path = own.folder / SCORES / "noisy.nc"

@@ -183,8 +183,11 @@ def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Find
     for path, how in sorted(changes.items()):
         verb = {"A": "added", "D": "removed", "T": "replaced by a link"}.get(how[:1], "changed")
         if path == Path(VERIFIED) or path.parts[0] == FLOORS:
-            lost = path.as_posix() in before
-            if not _only_own_lines_left(folder, start, own) if path == Path(VERIFIED) else lost:
+            if path == Path(VERIFIED):
+                touched = not _only_own_lines_left(folder, start, own)
+            else:
+                touched = path.as_posix() in before
+            if touched:
                 yield finding("base", path, verb, expected="what the maintainers keep, unchanged")
         elif path.parts[0] in (SUBMISSIONS, SCORES, WEIGHTS) and len(path.parts) == 4:
             method = path.stem.partition("_")[0]

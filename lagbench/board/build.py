@@ -173,14 +173,8 @@ def _row(
 ) -> Row:
     preview, ranking = held.stored[0].preview, held.stored[0].scores.ranking
     scores = {name: found.score for name, found in held.scores.items()}
-    better, known = (
-        None,
-        {
-            floor.name: floor.scores[ranking]
-            for floor in floors
-            if floor.name in COUNTING and ranking in floor.scores
-        },
-    )
+    known = {f.name: f.scores[ranking] for f in floors if f.name in COUNTING and ranking in f.scores}
+    better = None
     if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
         low, high = found.interval
         better = Value(

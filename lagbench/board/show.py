@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from typing import Any
 
 from lagbench.draw.tables import Table
@@ -59,7 +59,8 @@ def as_plain(board: Board) -> dict[str, Any]:
                 "ranking_metric": tab.ranking,
                 "rows": [_plain_row(row) for row in tab.rows],
                 "floors": [
-                    {"id": floor.name, "metrics": _plain_values(floor.values)} for floor in tab.floors
+                    {"id": floor.name, "metrics": {n: _plain(v) for n, v in floor.values.items()}}
+                    for floor in tab.floors
                 ],
             }
             for tab in board.tabs
@@ -79,14 +80,13 @@ def _plain_row(row: Row) -> dict[str, Any]:
         "flags": [flag.name for flag in row.flags],
         "cost": entry.cost and {**entry.cost.model_dump(), "speed_up": entry.cost.speed_up},
         "budget": entry.budget and entry.budget.model_dump(),
-        "skill": _plain_values({"skill": row.skill})["skill"] if row.skill else None,
-        "metrics": _plain_values(row.values),
+        "skill": row.skill and _plain(row.skill),
+        "metrics": {name: _plain(value) for name, value in row.values.items()},
     }
 
 
-def _plain_values(values: Mapping[str, Value]) -> dict[str, Any]:
-    keys = ("mean", "std", "low", "high")
-    return {name: {key: digits(getattr(value, key)) for key in keys} for name, value in values.items()}
+def _plain(value: Value) -> dict[str, float | None]:
+    return {name: digits(getattr(value, name)) for name in ("mean", "std", "low", "high")}
 
 
 def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:

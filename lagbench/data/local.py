@@ -45,8 +45,7 @@ def resolve_root(root: str | Path | None = None) -> Path:
 
     Args:
         root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
-            A URL (``s3://bucket/prefix``) stands for its working copy, see
-            :mod:`lagbench.data.layout`.
+            A URL (``s3://bucket/prefix``) stands for its working copy, see :mod:`.layout`.
 
     Raises:
         UsageError: no file system can have a folder of that name.

@@ -149,7 +149,7 @@ class ScenarioWriter:
                 "subset": key.subset,
                 **self._labels,
             }
-            self._file.setncatts(attributes | self._stated())
+            self._file.setncatts(attributes | self._parameter_attributes())
             self._stack = stack.pop_all()
         return self
 
@@ -179,9 +179,9 @@ class ScenarioWriter:
         self._parameters |= _checked(parameters, self.path)
         self._hasher.identity = self.key.identity(str(self._labels["seed"]), self._parameters)
         with _write_errors(self.path):
-            self._file.setncatts(self._stated())
+            self._file.setncatts(self._parameter_attributes())
 
-    def _stated(self) -> dict[str, object]:
+    def _parameter_attributes(self) -> dict[str, object]:
         return {**self._parameters, "hashed_parameters": " ".join(sorted(self._parameters))}
 
     def state_facts(self, facts: Mapping[str, float]) -> None:

@@ -321,7 +321,7 @@ class _Film:
         image = self._still.copy()
         for recording, painter, left in zip(self._recordings, self._painters, self._lefts, strict=True):
             image[TOP : TOP + SIDE, left : left + SIDE] = unpack(painter.paint(recording.scene(number)))
-        # Frame number and time at the bottom right, as wide as the last.
+        # Frame number and time at the bottom right, as wide as those of the last frame.
         interval, last = self._recordings[0].size.frame_interval, self._recordings[0].frames - 1
         places, digits = len(str(last)), len(f"{last * interval:.2f}")
         text = f"frame {number:>{places}}  {number * interval:>{digits}.2f} s"

@@ -73,7 +73,11 @@ def make_local_split(
     counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split of trajectories, of so many in each subset where ``counts`` tells, and load it."""
+    """Write a local split of the trajectories of train, valid and test; it appears whole or not at all.
+
+    The last part of ``output`` is the name of the split, ``command`` stands in the head of its description;
+    ``counts`` are the trajectories of each subset, where they are known before.
+    """
     folder = Path(os.path.abspath(expanded(output, "--output")))
     if about.name in load().splits:
         what = f"{about.name!r} is one of the splits of lagbench"

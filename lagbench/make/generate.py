@@ -149,8 +149,8 @@ class Generation:
     ) -> list[Result]:
         """Run a function that reads files, here or by the workers; the meter counts files."""
 
-        def count(files: int) -> None:
-            self._meter.count(files, scenarios=files)
+        def count(done: int) -> None:
+            self._meter.count(done, scenarios=done)
 
         return read_many(function, jobs, files, count, workers=self.workers, scheduler=self.scheduler)
 
@@ -160,7 +160,7 @@ class Generation:
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
         with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
-        tested = self.size.subsets["test"]
+        tested = self.size.subsets.get("test", ())
         twins = [i for i in self.kept if i in tested and i not in with_twin]
         self._bring(twins)
         costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))

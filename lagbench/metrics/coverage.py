@@ -34,8 +34,11 @@ def covered_nodes(cloud: Cloud, grid: Grid) -> int:
 
 
 def fitting_cells(clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int) -> int | None:
-    """Return the cells across of a grid that each cloud covers, the coarser of two as near; None: no grid."""
-    # clouds are asked for anew for each grid that is tried, so that one is in memory at a time
+    """Return the cells across, nearest to a number, of a grid of which each cloud covers enough nodes.
+
+    None where there is none; of two as near the coarser one. Clouds are asked for anew for each grid that
+    is tried, so that one is in memory at a time.
+    """
     tried: list[int] = sorted({near, *range(4, 129)}, key=lambda cells: (abs(cells - near), cells))
     for cells in tried:
         grid = Grid(cells, placement)

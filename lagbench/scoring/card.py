@@ -150,7 +150,9 @@ class ScoreCard:
     # statistics by row and scenario: of the submission, and of floors that were measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
     scores: Mapping[str, Mapping[str, Score]]  # scores by row (submission, then floors) and metric
-    skill: Skill | None  # how much better than the best floor; None where no floor that counts has a score
+    # how much better than the best floor, as scored: it does not follow a replaced `scores`; None where no
+    # floor that counts has a score
+    skill: Skill | None
     flags: tuple[Flag, ...]  # what a reader should know
     warnings: tuple[Finding, ...]  # findings of the validation that do not reject
     preview: Preview  # pictures of the first scenario

@@ -170,7 +170,7 @@ def compare(
     for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
         check_regular(path)  # before what is there is scored
     one = _contestant(first, root, workers, registry)
-    floor = str(second) if str(second) in one.floors else None
+    floor = str(second) if bare and str(second) in one.floors else None
     if floor is None and bare:
         if str(second) in FLOORS:
             raise UsageError(

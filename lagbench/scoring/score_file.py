@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
+from lagbench.floors.table import COUNTING
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
@@ -187,13 +188,14 @@ def read_statistics(path: Path) -> StoredScores:
             names = tuple(str(file.statistics).split())
             frames = tuple(file["frame"][:].tolist())
             scenarios = file["scenario"][:].tolist()
-            of_floor = np.empty(0)
-            if "best_floor" in file.ncattrs():
+            named = {*IDENTITY, "predictions_sha256", "ranking_metric", "best_floor"}
+            held = {name: file.getncattr(name) for name in named.intersection(file.ncattrs())}
+            floor, of_floor = held.get("best_floor"), np.empty(0)
+            if floor is not None:
                 of_floor = np.asarray(file["best_floor_value"][:], np.float64)
-                if of_floor.shape != (len(scenarios),) or np.isinf(of_floor).any():
+                if floor not in COUNTING or of_floor.shape != (len(scenarios),) or np.isinf(of_floor).any():
                     raise ValueError("not the scores of a floor")
             values, measured = file["value"][:].astype(np.float64), file["measured"][:]
-            held = {name: file.getncattr(name) for name in file.ncattrs()}
             return StoredScores(
                 identity={name: printable(held, name) for name in IDENTITY},
                 predictions_sha256=printable(held, "predictions_sha256"),
@@ -202,7 +204,7 @@ def read_statistics(path: Path) -> StoredScores:
                     scenario: _tally(names, frames, values[:, i], measured[:, i])
                     for i, scenario in enumerate(scenarios)
                 },
-                best_floor=printable(held, "best_floor") if "best_floor" in held else None,
+                best_floor=floor,
                 best_floor_values=of_floor,
             )
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type

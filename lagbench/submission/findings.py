@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UnreadableFileError
@@ -150,16 +150,25 @@ class Findings:
         """Note that checks could not be made, unless they were."""
         self._skipped.update({check: reason for check in checks if check not in self._made})
 
-    def error(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
-        """Add a finding that rejects the file."""
+    def error(
+        self,
+        check: str,
+        what: str,
+        *,
+        where: str,
+        expected: object,
+        got: object,
+        fix: str,
+        severity: Severity = Severity.ERROR,
+    ) -> None:
+        """Add a finding that rejects the file, or with another severity flags it."""
         self._made.add(check)
         said = {"what": what, "where": where, "expected": str(expected), "got": str(got), "fix": fix}
-        self._found.append(Finding(check=check, severity=Severity.ERROR, **said))
+        self._found.append(Finding(check=check, severity=severity, **said))
 
     def warning(self, check: str, what: str, *, where: str, expected: object, got: object, fix: str) -> None:
         """Add a finding that flags the file."""
-        self.error(check, what, where=where, expected=expected, got=got, fix=fix)
-        self._found.append(replace(self._found.pop(), severity=Severity.WARNING))
+        self.error(check, what, where=where, expected=expected, got=got, fix=fix, severity=Severity.WARNING)
 
     def failed(self, *checks: str) -> str | None:
         """Return the first of some checks that has an error."""

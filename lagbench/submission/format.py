@@ -162,7 +162,7 @@ def fits(name: str, value: object) -> bool:
 
 
 def require_fit(name: str, value: object) -> None:
-    """Refuse an attribute that may not have a value, before it is written."""
+    """Refuse a value that an attribute may not have, before it is written."""
     if not fits(name, value):
         raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
 

@@ -208,11 +208,13 @@ class Cluster:
     ) -> None:
         """Make the workers drop what they hold, and disconnect."""
         pending, self._pending = [future for _, future in self._pending.values()], {}
-        if pending and self._dask.status == "running":
-            with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
-                self._dask.cancel(pending)
-                self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
-        self._stack.__exit__(kind, error, trace)
+        try:
+            if pending and self._dask.status == "running":
+                with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
+                    self._dask.cancel(pending)
+                    self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
+        finally:
+            self._stack.__exit__(kind, error, trace)
 
     def submit(self, task: Task) -> None:
         """Send a task to the scheduler; also while :meth:`events` runs."""
