@@ -46,9 +46,11 @@ def radius_graph(
 
     Return senders and receivers, int64, shape [2, edge]: both directions of every pair, sorted by receiver,
     then sender. Particles of different windows, which `sample` names in ascending order, are never
-    connected, and those whose position is no finite number have no edges. With ``most``, a receiver hears
-    that many neighbours, the nearest; of equally far ones any. Time and memory are then bounded where
-    matter has collapsed to a point.
+    connected, and those whose position is no finite number have no edges.
+
+    With ``most``, a receiver hears that many neighbours, the nearest; of equally far ones any. So not all
+    pairs have both directions (SuperGAT's link loss takes what is not heard as unlinked). Where matter has
+    collapsed to a heap, memory is then bounded, and so is time unless thousands lie at the very same place.
     """
     where = "radius_graph"
     if position.ndim != 2 or position.shape[1] != 2:
@@ -97,8 +99,9 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
     past = xp.searchsorted(key, key + (stride + 2))
     start = xp.concatenate([own + 1, beside])
     count = xp.concatenate([above - (own + 1), past - beside])
-    i = repeat(xp.concatenate([own, own]), count)
-    j = xp.arange(len(i), device=x.device) + repeat(start - (xp.cumsum(count, 0) - count), count)
+    run = repeat(xp.arange(len(count), device=x.device), count)  # the one repeat: a GPU is waited for at each
+    i = run % len(own) if len(own) else run
+    j = xp.arange(len(run), device=x.device) + (start - (xp.cumsum(count, 0) - count))[run]
     along_x, along_y = xp.stack([x[:, 0], x[:, 1]])
     dx, dy = along_x[i] - along_x[j], along_y[i] - along_y[j]
     near = xp.where(dx * dx + dy * dy <= radius * radius)[0]
@@ -110,13 +113,20 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
 def nearest_edges(
     x: NDArray[np.float64], window: NDArray[np.int64], radius: float, self_edges: bool, most: int
 ) -> NDArray[np.int64]:
-    """Return receiver * 2^32 + sender of every edge to one of the nearest ``most`` within the radius."""
+    """Return receiver * 2^32 + sender of every edge to one of the nearest ``most`` within the radius.
+
+    ``x`` are positions [length], shape [particle, 2], ``window`` the number of the window of each.
+    """
     kept = np.flatnonzero(np.isfinite(x).all(axis=1))
     x, window = x[kept], window[kept]
+    if not len(x):
+        return np.empty(0, np.int64)
     apart = np.column_stack([x, 4.0 * radius * window])  # no two windows within the radius of each other
     # itself is one of those found, but where more than that lie at its very place
     beyond = radius * (1.0 + MARGIN)
-    _, found = KDTree(apart).query(apart, k=np.arange(1, most + 2), distance_upper_bound=beyond)
+    _, found = KDTree(apart).query(
+        apart, k=np.arange(1, min(most + 1, len(x)) + 1), distance_upper_bound=beyond
+    )
     own = np.arange(len(x))[:, None]
     j = np.minimum(found, len(x) - 1)
     dx, dy = np.moveaxis(x[own] - x[j], -1, 0)

@@ -237,9 +237,10 @@ class _Rollouts:
             radius = getattr(self._model, "radius", None)
             if radius is not None:  # search neighbours once more in some frames, and take the time
                 positions = torch.cat([one.position for one in found], dim=1).to(self._machine)
+                most = getattr(self._model.options, "neighbours", None)
                 for frame in range(0, len(positions), max(1, len(positions) // SEARCHES)):
                     started = self._now()
-                    radius_graph(positions[frame], float(radius), given.sample)
+                    radius_graph(positions[frame], float(radius), given.sample, most=most)
                     self._searches.append((self._now() - started) / len(found))
             yield from found
 

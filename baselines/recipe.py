@@ -164,6 +164,7 @@ LATER: Mapping[str, Mapping[str, object]] = {
         "conserve": False,
         "shape": [],
         "density": [],
+        "neighbours": None,
     },
 }
 """Options that records of earlier trainings lack, with what they did: such trainings can go on."""

@@ -245,10 +245,11 @@ class GraphNetwork(Baseline):
     @classmethod
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
         """Return the graph network with an operator; the same class for the same operator."""
-        if operator not in _CLASSES:
+        key = (cls, operator)
+        if key not in _CLASSES:
             names = {"operator": operator, "method": operator.method, "__doc__": operator.__doc__}
-            _CLASSES[operator] = type(f"{operator.__name__}Network", (cls,), names)
-        return _CLASSES[operator]
+            _CLASSES[key] = type(f"{operator.__name__}Network", (cls,), names)
+        return _CLASSES[key]
 
     @property
     def history(self) -> int:
@@ -370,4 +371,4 @@ class GraphNetwork(Baseline):
         return position.detach().clamp(low, high) + (position - position.detach())
 
 
-_CLASSES: dict[type[Operator], type[GraphNetwork]] = {}
+_CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

@@ -13,8 +13,8 @@ import pytest
 
 from lagbench.baselines import catalogue
 from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import tables
-from lagbench.baselines.reproduce.plan import Plan
+from lagbench.baselines.reproduce import runs, tables
+from lagbench.baselines.reproduce.plan import TABLES, Plan, known_studies
 from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -96,29 +96,30 @@ def test_studies_are_what_was_asked_for(
 
     What a row came to lies in one file, which suffices for its table, unless it is of other data.
     """
-    monkeypatch.setattr(tables, "TABLES", {"table_4_2": ("4.2", SPLIT)})
-    monkeypatch.setattr(tables, "study_rows", lambda _: STUDIES[:1])
+    monkeypatch.setitem(TABLES, "table_4_2", ("4.2", SPLIT))
+    for module in (runs, tables):
+        monkeypatch.setattr(module, "study_rows", lambda _: STUDIES[:1])
     places = {"root": generated.root, "runs": tmp_path / "runs", "output": tmp_path / "out"}
     small = ("training.steps=1", "model.widths=[4]")
     plan = Plan(size="tiny", settings=small, device="cpu", threads=1, registry=unmeasured, **places)
-    tables.make_studies(plan, "table_4_2")
+    runs.make_studies(plan, "table_4_2")
     home = plan.home(SPLIT)
     first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
-    tables.make_studies(plan, "table_4_2")
+    runs.make_studies(plan, "table_4_2")
     assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
-    known = tables.known_studies([home], plan.hash(SPLIT))
+    known = known_studies([home], plan.hash(SPLIT))
     held = known["mlp-4-2-1"]
     assert held["train"] > 0.0
     assert held["training"]["step"] == 1
     (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
     assert f"{held['valid']:.3g}" in row
-    assert tables.known_studies([home], "f" * 64) == {}
+    assert known_studies([home], "f" * 64) == {}
     stale, later = {**held, "training": {"dataset_sha256": "f" * 64}}, {**held, "train": 9.0}
     for other, expected in ((stale, held), (later, later)):
         (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
-        assert tables.known_studies([home, tmp_path], plan.hash(SPLIT)) == {"mlp-4-2-1": expected}
+        assert known_studies([home, tmp_path], plan.hash(SPLIT)) == {"mlp-4-2-1": expected}
     with pytest.raises(UsageError):
-        tables.make_studies(replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2")
+        runs.make_studies(replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2")
 
 
 @pytest.fixture
