@@ -74,7 +74,8 @@ def images(symmetry: Symmetry) -> Tensor:
 def field_image(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> Tensor:
     """Return the image of a field, shape [window, channel, x node, y node], in a box of that symmetry.
 
-    ``channels`` is what the image does to the values of a node, blocks of a diagonal matrix.
+    ``matrix`` is a signed permutation of the axes, shape [2, 2]; ``channels`` is what the image does to the
+    values of a node, blocks of a diagonal matrix.
     """
     turned: Tensor = torch.block_diag(*channels)  # type: ignore[no-untyped-call]
     with torch.autocast(field.device.type, enabled=False):

@@ -190,7 +190,8 @@ def edge_map(
 ) -> Tensor:
     """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
 
-    f is the rest of an MLP from its first hidden layer on, of which s and r are the parts of a particle.
+    f is the rest of an MLP from its first hidden layer on, of which s and r, shape [particle, hidden], are
+    the parts of a particle.
     """
     hidden = _gathered(edge_index, sender, receiver)
     hidden += linear(edge, weight)  # In place: an edge tensor of a full scenario is 32 MB.

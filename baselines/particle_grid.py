@@ -63,7 +63,7 @@ class ParticleGrid(nn.Module):
         return len(self.axis_x), len(self.axis_y)
 
     def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
-        """Return the nodes around particles [length], shape [particle, 2], in layers, int64, [particle]."""
+        """Return the nodes around positions [length], shape [particle, 2], in layers, int64, [particle]."""
         base, s = self._corner(position)
         column, row = base.long().unbind(dim=1)
         node = nine_nodes(layer, column, row, self.shape)
@@ -98,8 +98,8 @@ class ParticleGrid(nn.Module):
 
         the weak form of the material-point method (Sulsky, Chen and Schreyer 1994), with grad per cell; 0
         where there is no matter. As the b_i sum to 1 and the s_p are symmetric, momentum and angular momentum
-        of the nodes are kept. ``stress`` has components (xx, xy, yy), shape [particle, frame, 3]; where the
-        stencil is, is ``position``; ``mass`` is what :meth:`spread` returns of 1.
+        of the nodes are kept. ``stress`` has components (xx, xy, yy), shape [particle, frame, 3]; the
+        stencil is that of ``position``; ``mass`` is what :meth:`spread` returns of 1.
         """
         columns, rows = self.shape
         along_x, along_y = spline_slopes(self._corner(position)[1]).flatten(2)[..., None].unbind(dim=1)

@@ -53,7 +53,10 @@ class Shape:
 
     @classmethod
     def of(cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int) -> Shape:
-        """Return the clusters of bodies at X, each in a layer of its own; they reach one and a half cells."""
+        """Return the clusters of bodies at X [length], [particle, 2], each in a layer of its own.
+
+        They reach one and a half cells.
+        """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
         # A cluster whose arms do not add up to 0 turns a little in every frame: rounding would spin bodies.
@@ -105,7 +108,7 @@ class Density:
 
     @classmethod
     def of(cls, grid: ParticleGrid, position: Tensor, sample: Tensor, windows: int) -> Density:
-        """Return the density in windows whose particles have these positions in the first frame."""
+        """Return the density in windows of positions in the first frame [length], shape [particle, 2]."""
         inverse = 1.0 / grid.inside().clamp(min=LEAST)
         empty = cls(grid, inverse, sample, position.new_ones(windows))
         found, _ = empty.relative(grid.stencil(position.clamp(grid.low, grid.high), sample))
@@ -173,8 +176,8 @@ class Projection(nn.Module):
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
         """Return weights and options with our own start for all grids but those that stand first in both.
 
-        Limits are of materials, not of grids: they are kept. ``prefix`` is this module's name in the model of
-        weights and options, and a dot.
+        ``held`` has shape [grid, elastic material], ``push`` [grid]; ``limit``, [material], is kept.
+        ``prefix`` is this module's name in the model of weights and options, and a dot.
         """
         weights, options, own = dict(weights), dict(options), self.state_dict(prefix=prefix)
         for option, name in (("shape", "held"), ("density", "push")):  # what is of one grid each
@@ -187,7 +190,10 @@ class Projection(nn.Module):
         return {**own, **kept}, options
 
     def start(self, first: Tensor, material: Tensor, sample: Tensor, windows: int) -> Drawn:
-        """Return what windows are drawn to, from first frames; particles of one material are one body."""
+        """Return what windows are drawn to, from first frames [length], shape [particle, 2].
+
+        Materials and windows (``sample``) are int64, [particle]; particles of one material are one body.
+        """
         kind = torch.full((MATERIALS,), -1, device=material.device)
         kind[list(ELASTIC)] = torch.arange(len(ELASTIC), device=material.device)
         elastic = (kind[material] >= 0).nonzero()[:, 0]

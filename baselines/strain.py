@@ -39,9 +39,9 @@ class Rest:
     def of(
         cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int, *, solid: Tensor | None = None
     ) -> Rest:
-        """Return what F needs of X; bodies that do not mix have layers of their own.
+        """Return what F needs of X [length], shape [particle, 2].
 
-        ``solid`` says who shows a strain, bool, shape [particle]; all by default.
+        Bodies that do not mix have layers of their own. ``solid`` says who shows a strain, bool, shape [particle]; all by default.
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)

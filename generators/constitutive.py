@@ -27,6 +27,8 @@ _SHEAR_EPSILON = 1e-12
 def lame(young: float, poisson: float) -> tuple[float, float]:
     """Return Lame's constants of plane strain, mu = E / (2 (1 + nu)) and E nu / ((1 + nu) (1 - 2 nu)).
 
+    E is Young's modulus [mass/s^2], as are they; Poisson's ratio nu is below 1/2.
+
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
     """
@@ -108,7 +110,7 @@ def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
 def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> ti.f32:
     """Return exp(xi (1 - Jp)) within [low, high], caps within exp(-+EXPONENT_MAX): snow's factor on moduli.
 
-    Below Jp = 1 the snow is compacted and stiffer.
+    Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent`` is xi [1].
     """
     z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
     return bounded(exponential(z), low, high)
@@ -118,8 +120,8 @@ def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> t
 def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     """Clamp the principal stretches of F to [low, high]; return (elastic F, volume ratio).
 
-    Clamping q + r and q - r gives new q and r, by which rotation and reflection are scaled.
-    The second value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
+    F is the trial gradient; the limits are 1 - theta_c and 1 + theta_s. Clamping q + r and q - r gives new q
+    and r, by which rotation and reflection are scaled. The second value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
     clamped ones.
     """
     turn = rotation(f)
