@@ -41,7 +41,8 @@ class Rest:
     ) -> Rest:
         """Return what F needs of X [length], shape [particle, 2].
 
-        Bodies that do not mix have layers of their own. ``solid`` says who shows a strain, bool, shape [particle]; all by default.
+        Bodies that do not mix have layers of their own. ``solid`` says who shows a strain, bool, shape
+        [particle]; all by default.
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)

@@ -121,8 +121,8 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     """Clamp the principal stretches of F to [low, high]; return (elastic F, volume ratio).
 
     F is the trial gradient; the limits are 1 - theta_c and 1 + theta_s. Clamping q + r and q - r gives new q
-    and r, by which rotation and reflection are scaled. The second value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
-    clamped ones.
+    and r, by which rotation and reflection are scaled. The second value is
+    the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over clamped ones.
     """
     turn = rotation(f)
     q = turn[2]
