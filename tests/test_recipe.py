@@ -151,6 +151,17 @@ def test_trainings_of_before_an_option_go_on() -> None:
     assert after == before
 
 
+def test_committed_trainings_lack_no_option() -> None:
+    """What the records of committed weights do not say is what is done without it, so that they can go on."""
+    paths = Path(__file__).parents[1].glob("leaderboard/weights/*/*/*.json")
+    held = {path: json.loads(path.read_text(encoding="utf-8")).get("recipe") for path in sorted(paths)}
+    for path, recipe in {recipe["baseline"]: (p, recipe) for p, recipe in held.items() if recipe}.values():
+        settings = settings_of(recipe)
+        now = recipe_for(find(recipe["baseline"]), *path.parts[-3:-1], settings=settings).as_json()
+        lacking = {part: now[part].keys() - recipe[part].keys() for part in ("model", "training")}
+        assert lacking == {"model": set(), "training": set()}, path
+
+
 @pytest.mark.parametrize(
     ("name", "given"),
     [
