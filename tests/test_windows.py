@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,17 +83,26 @@ def same(a: Batch, b: Batch) -> bool:
 
 
 def test_every_window_is_the_stored_frames(train: Open) -> None:
-    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames."""
-    data = train()
-    assert len(data) == WINDOWS
+    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames.
+
+    Where it is asked for, each holds the scenario's frame 0, which batches put side by side.
+    """
+    data, more = train(), train(origin=True)
+    assert len(data) == len(more) == WINDOWS
     places = []
-    for window in (data[i] for i in range(len(data))):
+    for window, other in ((data[i], more[i]) for i in range(len(data))):
         frames = frames_of(window.scenario, FRAMES[window.scenario], PARTICLES[window.scenario])
         expected = frames[window.frame : window.frame + LENGTH]
         np.testing.assert_array_equal(window.position.numpy(), expected.transpose(1, 0, 2))
+        np.testing.assert_array_equal(other.origin, frames[0])
+        assert torch.equal(window.position, other.position)
         assert window.position.is_contiguous()
+        assert window.origin is None
         places.append((window.scenario, window.frame))
     assert places == [(i, f) for i, frames in FRAMES.items() for f in range(frames - LENGTH + 1)]
+    assert collate([more[3], more[40]]).origin[PARTICLES[0] :].equal(more[40].origin)
+    with pytest.raises(UsageError):
+        collate([more[3], data[40]])
 
 
 def test_material_and_walls(train: Open) -> None:
@@ -102,20 +112,6 @@ def test_material_and_walls(train: Open) -> None:
     assert window.material.dtype == torch.int64
     assert window.wall_velocity is not None
     assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
-
-
-def test_the_first_frame_comes_along_where_it_is_asked_for(train: Open) -> None:
-    """Every window of a scenario holds the scenario's frame 0; batches put them side by side."""
-    data = train(origin=True)
-    window, other = data[3], data[40]
-    assert window.origin is not None
-    for one in (window, other):
-        frames = frames_of(one.scenario, FRAMES[one.scenario], PARTICLES[one.scenario])
-        np.testing.assert_array_equal(one.origin, frames[0])
-    assert collate([window, other]).origin[len(window.origin) :].equal(other.origin)
-    assert train()[3].origin is None
-    with pytest.raises(UsageError):
-        collate([window, train()[40]])
 
 
 def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> None:
@@ -142,18 +138,14 @@ def test_arrays_tensors_and_open_split_agree(generated: GenerationResult, unmeas
     for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
         assert arrays.place(number) == (array.scenario, array.frame) == (tensor.scenario, tensor.frame)
         frames = truth.sel(scenario=array.scenario).isel(frame=slice(array.frame, array.frame + 5))
-        expected = frames.position.transpose("particle", "frame", "space").values
-        np.testing.assert_array_equal(array.position, expected)
-        np.testing.assert_array_equal(tensor.position.numpy(), expected)
-        first = truth.position.sel(scenario=array.scenario).isel(frame=0).values
-        np.testing.assert_array_equal(array.origin, first)
-        np.testing.assert_array_equal(tensor.origin, first)
-        np.testing.assert_array_equal(array.material, frames.material)
-        np.testing.assert_array_equal(tensor.material.numpy(), frames.material)
-        assert array.wall_velocity is not None
-        assert tensor.wall_velocity is not None
-        np.testing.assert_array_equal(array.wall_velocity, frames.wall_velocity)
-        np.testing.assert_array_equal(tensor.wall_velocity.numpy(), frames.wall_velocity)
+        expected = {
+            "position": frames.position.transpose("particle", "frame", "space"),
+            "origin": truth.position.sel(scenario=array.scenario).isel(frame=0),
+            **{name: frames[name] for name in ("material", "wall_velocity")},
+        }
+        for name, values in expected.items():
+            np.testing.assert_array_equal(getattr(array, name), values.values)
+            np.testing.assert_array_equal(getattr(tensor, name), values.values)
     truth.close()
 
 
@@ -224,8 +216,7 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
     """With one file open at a time, others are opened anew."""
 
     def open_scenarios() -> set[Path]:
-        held = {path for path in Path("/proc/self/fd").iterdir() if path.exists()}
-        return {path for path in held if path.resolve().suffix == ".nc"}
+        return {path for path in Path("/proc/self/fd").iterdir() if path.resolve().suffix == ".nc"}
 
     before = open_scenarios()
     monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
@@ -293,22 +284,15 @@ def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
         assert int(index) == -1
 
 
-def stream(sampler: WindowSampler) -> Iterator[int]:
-    """Yield windows of epoch after epoch."""
-    while True:
-        yield from sampler
-
-
 @pytest.mark.parametrize("drawn", [0, 1, 30, WINDOWS - 1, WINDOWS, WINDOWS + 3])
 def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
     """A sampler loaded from a state in mid-epoch draws on as the first would have."""
     first = WindowSampler(train(), seed=3)
-    run = stream(first)
-    for _ in range(drawn):
-        next(run)
+    run = itertools.chain.from_iterable(itertools.repeat(first))
+    assert len(list(itertools.islice(run, drawn))) == drawn
     second = WindowSampler(train(), seed=0)
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
-    resumed = stream(second)
+    resumed = itertools.chain.from_iterable(itertools.repeat(second))
     assert [next(resumed) for _ in range(2 * WINDOWS)] == [next(run) for _ in range(2 * WINDOWS)]
 
 
@@ -316,6 +300,7 @@ def test_ranks_share_out_one_order(train: Open, monkeypatch: pytest.MonkeyPatch)
     """Three ranks draw every third window of the one order each, together all but the last few.
 
     A rank that does not exist, and more ranks than windows, are errors. torch.distributed tells its own.
+    What two ranks have not drawn, one rank draws.
     """
     data = train()
     alone = WindowSampler(data, seed=1).order(0).tolist()
@@ -329,19 +314,11 @@ def test_ranks_share_out_one_order(train: Open, monkeypatch: pytest.MonkeyPatch)
     for name, value in {"is_initialized": True, "get_rank": 1, "get_world_size": 3}.items():
         monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
     assert list(WindowSampler(data, seed=1)) == parts[1]
-
-
-def test_a_state_outlives_a_change_of_ranks(train: Open) -> None:
-    """What two ranks have not drawn, one rank draws."""
-    data = train()
-    order = WindowSampler(data, seed=1).order(0).tolist()
-    two = WindowSampler(data, seed=1, rank=1, ranks=2)
-    drawn = iter(two)
-    for _ in range(5):
-        next(drawn)
-    one = WindowSampler(data, seed=1)
+    monkeypatch.undo()
+    two, one = WindowSampler(data, seed=1, rank=1, ranks=2), WindowSampler(data, seed=1)
+    assert len(list(itertools.islice(two, 5))) == 5
     one.load_state_dict(two.state_dict())
-    assert list(one) == order[10:]
+    assert list(one) == alone[10:]
 
 
 def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,10 +355,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     assert (sent.store.cached_bytes, len(sent.store._open)) == (0, 0)
     assert torch.equal(sent[0].position, first.position)
     batches = [
-        list(
-            DataLoader(data, 5, sampler=WindowSampler(data, seed=2), collate_fn=collate, num_workers=workers)
-        )
-        for workers in (0, 2)
+        list(DataLoader(data, 5, sampler=WindowSampler(data, seed=2), collate_fn=collate, num_workers=count))
+        for count in (0, 2)
     ]
     assert len(batches[0]) == 16
     assert all(same(a, b) for a, b in zip(*batches, strict=True))
@@ -390,9 +365,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
 def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
     """All test scenarios side by side, all frames or consecutive ones; unequal lengths do not go together."""
     paths = scenario_paths("cavity", size="tiny", root=root, registry=registry)
-    assert list(paths) == [4, 5]
     batch = scenario_batch(list(paths.values()), slice(3, 9))
-    assert (batch.windows, batch.frames) == (2, 6)
+    assert (list(paths), batch.windows, batch.frames) == ([4, 5], 2, 6)
     assert (batch.scenario.tolist(), batch.frame.tolist()) == ([4, 5], [3, 3])
     for row, i in enumerate(paths):
         expected = frames_of(i, 26, 8)[3:9].transpose(1, 0, 2)
@@ -547,15 +521,14 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
         seen.append(batch)
         return drifting(batch)
 
-    found = dict(
-        predict(step, "cavity", size="tiny", root=root, history=history, registry=registry, device="cpu")
-    )
+    where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
+    found = dict(predict(step, "cavity", history=history, device="cpu", **where))
     for wrong in (0, 7):  # none, or more than the task gives
         with pytest.raises(UsageError, match="from 1 to 6"):
-            next(predict(drifting, "cavity", size="tiny", root=root, history=wrong, registry=registry))
+            next(predict(drifting, "cavity", history=wrong, **where))
     task = registry.size("cavity", "tiny").task
     assert list(found) == [4, 5]
-    files = scenario_paths("cavity", size="tiny", root=root, registry=registry)
+    files = scenario_paths("cavity", **where)
     for row, (scenario, path) in enumerate(files.items()):
         whole = scenario_batch(path)
         start = task.input_frames - (history or task.input_frames)
