@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
-from submission_data import FRAMES, GIVEN, PARTICLES, TESTS, Bench, make_bench, truth
+from submission_data import FRAMES, GIVEN, PARTICLES, TESTS, Bench, make_bench, small, truth
 
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
@@ -33,11 +33,7 @@ from lagbench.submission import truth as module
 from lagbench.submission.task_checks import guess_frames, guess_scenarios
 from lagbench.submission.truth import Truth
 
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission."""
-    return make_bench(tmp_path_factory.mktemp("bench"))
+bench = small
 
 
 def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:

@@ -13,7 +13,7 @@ import pytest
 from bad_submissions import FAULTS, cpu_seconds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from submission_data import Bench, make_bench
+from submission_data import Bench, small
 
 from lagbench.submission import CHECKS, ValidationResult
 
@@ -30,10 +30,7 @@ def most() -> float:
     return max(MEBIBYTES, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1)
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission."""
-    return make_bench(tmp_path_factory.mktemp("bench"))
+bench = small
 
 
 @pytest.fixture
