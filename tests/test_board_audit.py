@@ -32,10 +32,14 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path, without=["flipping", "constant-velocity", "frozen-field", "analog"])
 
 
+def checked(bench: BoardBench, **options: Any) -> CheckResult:
+    """Check in this process."""
+    return check_board(bench.folder, registry=bench.registry, isolated=False, **options)
+
+
 def found(bench: BoardBench) -> list[str]:
     """Return the names of the checks that find something without either."""
-    result = check_board(bench.folder, registry=bench.registry, isolated=False)
-    return [finding.check for finding in result.findings]
+    return [finding.check for finding in checked(bench).findings]
 
 
 @pytest.fixture
@@ -46,8 +50,7 @@ def predictions(own: BoardBench) -> Path:
 
 def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
     """Check with predictions scored again."""
-    where = {"registry": bench.registry, "root": bench.data.root, "isolated": False}
-    return check_board(bench.folder, predictions=paths, **where, **options)
+    return checked(bench, predictions=paths, root=bench.data.root, **options)
 
 
 def verified(bench: BoardBench) -> set[str]:
@@ -138,7 +141,6 @@ def test_broken_predictions_are_opened_in_the_child_only(
     cut = tmp_path / "cut.nc"
     cut.write_bytes(predictions.read_bytes()[:-9999])
     own.edit("damped", set_mean)
-
     for module in (score, submitting):
         monkeypatch.setattr(module, "open_predictions", pytest.fail)
     result = rescored(own, cut)
@@ -176,8 +178,8 @@ def branch(home: Path, tmp_path: Path) -> BoardBench:
 
 def touched(bench: BoardBench, **options: Any) -> dict[str, str]:
     """Return where and got of what the check against main finds."""
-    result = check_board(bench.folder, registry=bench.registry, isolated=False, base="main", **options)
-    return {finding.where: finding.got for finding in result.findings if finding.check == "base"}
+    findings = checked(bench, base="main", **options).findings
+    return {finding.where: finding.got for finding in findings if finding.check == "base"}
 
 
 def new_entry(bench: BoardBench) -> None:
@@ -201,17 +203,21 @@ def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
 
 NOISY, DAMPED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc"
 
+
+def said(**keys: str) -> Callable[[BoardBench], object]:
+    """Return what writes keys into the entry of noisy."""
+    return lambda bench: bench.edit("noisy", lambda held: held.update(keys))
+
+
 CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
     "removed": (lambda b: b.entry("noisy").unlink(), NOISY, "removed"),
-    "touched": (lambda b: b.edit("noisy", lambda h: h.update(notes="other")), NOISY, "other notes"),
+    "touched": (said(notes="other"), NOISY, "other notes"),
     "superseded": (
-        lambda b: b.edit("noisy", lambda h: h.update(status="superseded", superseded_by="damped")),
-        *(NOISY, "superseded_by None -> 'damped'"),
+        said(status="superseded", superseded_by="damped"),
+        NOISY,
+        "superseded_by None -> 'damped'",
     ),
-    "withdrawn": (
-        lambda b: b.edit("noisy", lambda h: h.update(status="withdrawn")),
-        *(NOISY, "status None -> 'withdrawn'"),
-    ),
+    "withdrawn": (said(status="withdrawn"), NOISY, "status None -> 'withdrawn'"),
     "scores changed": (lambda b: (b.folder / DAMPED).write_bytes(b"x"), DAMPED, "changed"),
     "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
     "a seed added": (
@@ -239,15 +245,20 @@ def test_what_touches_others_is_named(name: str, branch: BoardBench) -> None:
     here = touched(branch)
     commit(branch)
     for found in (here, touched(branch)):
-        assert set(found) == {where}
-        assert got in found[where]
+        assert {path: got in text for path, text in found.items()} == {where: True}
 
 
-def test_ones_own_may_be_altered(branch: BoardBench) -> None:
-    """What the change says is its own is not named, other entries are."""
+def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
+    """What the change says is its own is not named, other entries are.
+
+    A repository's own settings are strangers' too: no program of theirs is started.
+    """
+    for setting in ("core.fsmonitor", "diff.external"):
+        git(branch.folder.parent, "config", setting, f"touch {tmp_path}/ran; false")
     branch.edit("noisy", lambda held: held.update(notes="other"))
     branch.entry("damped").unlink()
     assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
+    assert not (tmp_path / "ran").exists()
 
 
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
@@ -261,10 +272,9 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     branch.submit(own, replace=True)
     assert listed.read_bytes() == both  # its scores are those of before
     assert listed in branch.submit(branch.predict(still, "noisy"), replace=True).files
-    where = {"registry": branch.registry, "isolated": False, "base": "HEAD"}
 
     def told(*own: str) -> set[tuple[str, str]]:
-        return {(one.check, str(one.where)) for one in check_board(branch.folder, own=own, **where).findings}
+        return {(one.check, str(one.where)) for one in checked(branch, own=own, base="HEAD").findings}
 
     assert told("noisy") == set()
     assert ("base", "verified.yaml") in told()
@@ -312,17 +322,8 @@ def test_without_git_it_says_so(
 ) -> None:
     """An unknown revision, and a folder outside any repository, are a matter of usage."""
     with pytest.raises(UsageError) as error:
-        check_board(branch.folder, registry=branch.registry, isolated=False, base="nowhere")
+        checked(branch, base="nowhere")
     assert "--base" in str(error.value.where)
     outside = copied(home, tmp_path_factory.mktemp("outside"))
     with pytest.raises(UsageError):
-        check_board(outside.folder, registry=outside.registry, isolated=False, base="main")
-
-
-def test_settings_of_a_checkout_run_nothing(branch: BoardBench, tmp_path: Path) -> None:
-    """A repository's own settings are strangers' too: no program of theirs is started."""
-    git(branch.folder.parent, "config", "core.fsmonitor", f"touch {tmp_path}/ran; false")
-    git(branch.folder.parent, "config", "diff.external", f"touch {tmp_path}/ran; false")
-    branch.edit("noisy", lambda held: held.update(notes="other"))
-    assert touched(branch)
-    assert not (tmp_path / "ran").exists()
+        checked(outside, base="main")
