@@ -122,8 +122,8 @@ def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, prediction
     assert got == ["other position_mse", "[]", "{}"]
 
 
-def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
-    """A preview that is not of these predictions is found."""
+def test_pictures_and_statistics_are_compared(own: BoardBench, predictions: Path) -> None:
+    """A preview that is not of these predictions is found, and so is a statistic that is lacking."""
 
     def repaint(file: Any) -> None:
         film = file["preview"]["film"]
@@ -132,6 +132,12 @@ def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
 
     reform(own, repaint)
     assert [finding.got for finding in rescored(own, predictions).findings] == ["other film pictures"]
+    with netCDF4.Dataset(own.folder / SCORES / "noisy.nc", "a") as file:
+        names = file.statistics.split()
+        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
+    own.rehash("noisy")
+    findings = rescored(own, predictions).findings
+    assert "velocity_mse" in next(str(one.got) for one in findings if one.check == "rescored")
 
 
 def test_broken_predictions_are_opened_in_the_child_only(
@@ -304,17 +310,6 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
     assert ours == ["scores/cavity/tiny/verified.nc", "verified.yaml", f"{PLACE}/verified.yaml"]
     assert (own.folder / "verified.yaml").read_text() == "{}\n"
     assert found(own) == []
-
-
-def test_statistics_of_ours_are_all_there(own: BoardBench, predictions: Path) -> None:
-    """One that a score file lacks is told by scoring again."""
-    path = own.folder / SCORES / "noisy.nc"
-    with netCDF4.Dataset(path, "a") as file:
-        names = file.statistics.split()
-        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
-    own.rehash("noisy")
-    result = rescored(own, predictions)
-    assert "velocity_mse" in next(str(one.got) for one in result.findings if one.check == "rescored")
 
 
 def test_without_git_it_says_so(

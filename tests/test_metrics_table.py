@@ -118,15 +118,13 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
 
     One good frame, then 89 at rest without a correlation: one stable frame, not 90.
     """
-    found, stable = (score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in PEARSON)
+    names = ("vorticity_pearson", "stable_frames")
+    found, stable = (score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names)
     assert (found.mean, found.undefined) == (pytest.approx(0.8), (1,))
     assert math.isnan(found.at(3)[0])
     assert stable.mean == 1.0
     still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *[math.nan] * 89)})
     assert (still.mean, still.undefined) == (1.0, (89,))
-
-
-PEARSON = ("vorticity_pearson", "stable_frames")
 
 
 @pytest.mark.parametrize(
@@ -204,9 +202,6 @@ def scores(size: float) -> dict[str, Score]:
     return found
 
 
-JUDGED = pytest.mark.parametrize("name", [m.name for m in MEASURED if m.direction is not Direction.NONE])
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_metric_is_told(name: str) -> None:
     """Name, family, unit, direction and source are well formed; the summary is one line without a stop."""
@@ -221,18 +216,15 @@ def test_every_metric_is_told(name: str) -> None:
     assert (metric.direction is Direction.NONE) <= (metric.perfect is None)
 
 
-@JUDGED
-def test_truth_against_itself_is_perfect(name: str) -> None:
-    """The truth as its own prediction gets exactly the perfect value: 0 or 1, and no frame undefined."""
-    found = scores(0.0)[name]
-    expected = METRICS[name].perfect if name != "stable_frames" else 52.0
+@pytest.mark.parametrize("name", [m.name for m in MEASURED if m.direction is not Direction.NONE])
+def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(name: str) -> None:
+    """The truth as its own prediction gets exactly the perfect value: 0 or 1, and no frame undefined.
+
+    The loss never falls while the error grows tenfold and more, and rises over all.
+    """
+    metric, found = METRICS[name], scores(0.0)[name]
+    expected = metric.perfect if name != "stable_frames" else 52.0
     assert (found.mean, found.undefined) == (expected, (0,))
-
-
-@JUDGED
-def test_a_growing_error_is_a_growing_loss(name: str) -> None:
-    """The loss never falls while the error grows tenfold and more, and rises over all."""
-    metric = METRICS[name]
     losses = [metric.loss(scores(size)[name].mean) for size in (0.0, 0.1, 0.5, 2.5)]
     assert losses == sorted(losses)
     assert losses[-1] > losses[0]
@@ -242,8 +234,8 @@ def test_the_tables_of_the_design_are_complete() -> None:
     """Everything that design section 8 lists has an entry, and the rollout of these tests has them all."""
     assert set(scores(0.1)) == {m.name for m in MEASURED}
     assert not any(math.isnan(found.mean) for found in scores(0.1).values())
-    assert scores(0.1)["vorticity_mse"].per_frame.shape == (1, 52)
-    assert scores(0.1)["vorticity_mse"].frames == tuple(range(2, 54))
+    mse = scores(0.1)["vorticity_mse"]
+    assert (mse.per_frame.shape, mse.frames) == ((1, 52), tuple(range(2, 54)))
     quantities = ("position", "velocity", "vorticity")
     expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
     expected |= {f"vorticity_{name}" for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")}

@@ -60,10 +60,11 @@ def test_taylor_green_vorticity_follows_its_closed_form() -> None:
     assert_allclose(omega, damping * 0.02 * np.pi * np.outer(wave, wave), rtol=1e-3)
 
 
-def test_correlation_and_slope_are_scipys() -> None:
+def test_correlation_slope_and_residuals_are_scipys_and_numpys() -> None:
     """Eq. 5.21 is scipy.stats.pearsonr, the slope that of linregress.
 
-    Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2.
+    Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2. Mean, std, greatest size and
+    percentiles are those of r = predicted - true (Eq. 5.22).
     """
     pair = swirls(0.7, noise=0.003)
     x, y = pair.true_vorticity, pair.predicted_vorticity
@@ -72,6 +73,12 @@ def test_correlation_and_slope_are_scipys() -> None:
     assert tilt == pytest.approx(scipy.stats.linregress(x, y - x).slope, rel=1e-9)
     assert pearson(np.array([1.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0])) == pytest.approx(0.5)
     assert slope(np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 6.0])) == pytest.approx(2.0)
+    residual = y - x
+    names = ("mean", "std", "max", "p05", "p25", "p50", "p75", "p95")
+    found = measured(pair, *(f"vorticity_residual_{name}" for name in names))
+    percentiles = [np.percentile(residual, q) for q in (5, 25, 50, 75, 95)]
+    expected = [residual.mean(), residual.std(), np.abs(residual).max(), *percentiles]
+    assert_allclose(found, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 1e9])
@@ -82,16 +89,6 @@ def test_a_constant_field_has_no_correlation(constant: float) -> None:
     assert np.isnan([pearson(x, y), pearson(y, x), slope(y, x)]).all()
     with pytest.warns(scipy.stats.ConstantInputWarning):
         assert math.isnan(scipy.stats.pearsonr(x, y).statistic)
-
-
-def test_residual_moments_and_percentiles_are_numpys() -> None:
-    """Mean, std, greatest size and percentiles of r = predicted - true (Eq. 5.22)."""
-    pair = swirls(0.9, noise=0.002)
-    r = pair.predicted_vorticity - pair.true_vorticity
-    names = ("mean", "std", "max", "p05", "p25", "p50", "p75", "p95")
-    found = measured(pair, *(f"vorticity_residual_{name}" for name in names))
-    percentiles = [np.percentile(r, q) for q in (5, 25, 50, 75, 95)]
-    assert_allclose(found, [r.mean(), r.std(), np.abs(r).max(), *percentiles], rtol=1e-12)
 
 
 RELATIVE = [f"vorticity_{name}" for name in ("pearson", "residual_slope", "kl", "kl_hist", "kl_hist_abs")]
@@ -148,21 +145,17 @@ def test_fewer_than_sixteen_nodes_are_undefined() -> None:
     assert not math.isnan(METRICS["density_rmse"].measure(small))
 
 
-def test_divergence_per_node_is_scipys_entropy() -> None:
-    """Eqs. 5.23-5.25: scipy.stats.entropy normalises its arguments itself.
+def test_divergences_are_scipys_entropy() -> None:
+    """Eqs. 5.23-5.25, per node and of NumPy's histogram: SciPy normalises its arguments itself.
 
-    P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812.
+    P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812. There are 64 bins over the truth's
+    range, the outer ones open, half a count added to each.
     """
-    pair = swirls(0.8, noise=0.002)
+    pair = swirls(1.3, noise=0.002)
     p, q = (np.abs(w) + 1e-10 for w in (pair.true_vorticity, pair.predicted_vorticity))
     assert measured(pair, "vorticity_kl") == pytest.approx([scipy.stats.entropy(p, q)], rel=1e-9)
     p, q = normalised(np.array([-1.0, 3.0])), normalised(np.array([2.0, -2.0]))
     assert kl(p, q) == pytest.approx(0.130812, abs=1e-6)
-
-
-def test_histogram_divergence_is_numpys_histogram() -> None:
-    """64 bins over the truth's range, the outer ones open, half a count added to each."""
-    pair = swirls(1.3, noise=0.002)
     for name, of in (("vorticity_kl_hist", np.asarray), ("vorticity_kl_hist_abs", np.abs)):
         x, y = of(pair.true_vorticity), of(pair.predicted_vorticity)
         edges = np.linspace(x.min(), x.max(), 65)
@@ -244,15 +237,14 @@ def test_the_spectrum_is_scipys_cosine_transform() -> None:
     assert_allclose(energy_spectrum(velocity), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("scale", "decades"), [(1.0, 0.0), (10.0, 2.0), (0.1, 2.0), (0.0, 6.0)])
-def test_spectrum_error_is_in_decades_of_energy(scale: float, decades: float) -> None:
-    """Ten times the speed is a hundred times the energy in every shell; rest counts six decades."""
-    pair = replace(swirls(scale), frame=3)
-    assert measured(pair, "spectrum_error") == pytest.approx([decades], abs=1e-9)
-
-
 def test_the_spectrum_forgives_place_and_punishes_smoothing() -> None:
-    """A mirrored flow has the same energy at every scale; one that lost its small eddies has not."""
+    """A mirrored flow has the same energy at every scale; one that lost its small eddies has not.
+
+    Ten times the speed is a hundred times the energy in every shell, two decades; rest counts six.
+    """
+    for scale, decades in {1.0: 0.0, 10.0: 2.0, 0.1: 2.0, 0.0: 6.0}.items():
+        pair = replace(swirls(scale), frame=3)
+        assert measured(pair, "spectrum_error") == pytest.approx([decades], abs=1e-9)
     rng = np.random.default_rng(4)
     x = lattice(40)
     u = 0.01 * swirl(x) + 0.003 * rng.standard_normal(x.shape)

@@ -54,8 +54,8 @@ def test_texts_of_charts_lie_within_them(running: Browser, report: Path, width: 
     assert size.min() >= 7.0
 
 
-def test_heads_break_at_no_letter(running: Browser, report: Path) -> None:
-    """A name without a space or hyphen is on one line of its head, and so is every floor's."""
+def test_heads_break_at_no_letter_and_the_page_prints(running: Browser, report: Path) -> None:
+    """A name without a space or hyphen is on one line of its head, as every floor's is; a PDF has pages."""
     page = running.open(report, width=1280)
     heads = (
         "[...document.querySelectorAll('thead th, tbody th')].flatMap(th => [...th.querySelectorAll('span')])"
@@ -65,10 +65,6 @@ def test_heads_break_at_no_letter(running: Browser, report: Path) -> None:
         ".filter(s => s.matches('.muted') || !/[ -]/.test(s.textContent)).map(s => s.textContent)"
     )
     assert broken == []
-
-
-def test_page_prints(running: Browser, report: Path) -> None:
-    """Printing gives a PDF of some pages."""
-    pdf = running.open(report, width=1280).pdf()
+    pdf = page.pdf()
     assert pdf.startswith(b"%PDF")
     assert 3 <= pdf.count(b"/Type /Page\n") <= 40

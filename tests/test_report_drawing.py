@@ -188,12 +188,15 @@ def test_histogram_shares() -> None:
 
 Colour = NDArray[np.float64]
 
-CVD = {
+CVD_ROWS = {
     "protanopia": "0.152286 1.052583 -0.204868 0.114503 0.786281 0.099216 -0.003882 -0.048116 1.051998",
     "deuteranopia": "0.367322 0.860646 -0.227968 0.280085 0.672501 0.047413 -0.011820 0.042940 0.968881",
     "tritanopia": "1.255528 -0.076749 -0.178779 -0.078411 0.930809 0.147602 0.004733 0.691367 0.303900",
 }
 """Machado, Oliveira & Fernandes (2009), Table 1, full severity, on linear RGB, row by row."""
+
+CVD = {name: np.array(rows.split(), np.float64).reshape(3, 3) for name, rows in CVD_ROWS.items()}
+"""What a deficiency makes of a linear colour."""
 
 SHEET = files("lagbench.report").joinpath("style.css").read_text("utf-8")
 
@@ -202,11 +205,6 @@ def linear_rgb(digits: str) -> Colour:
     """Return a colour of six hexadecimal digits in linear RGB."""
     srgb = np.frombuffer(bytes.fromhex(digits), np.uint8) / 255.0
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def matrix(deficiency: str) -> Colour:
-    """Return what a deficiency makes of a linear colour, shape [3, 3]."""
-    return np.array(CVD[deficiency].split(), np.float64).reshape(3, 3)
 
 
 def scheme(dark: bool) -> dict[str, Colour]:
@@ -254,7 +252,7 @@ def test_text_can_be_read_and_speeds_are_ordered(dark: bool) -> None:
 def test_series_stay_apart(dark: bool, deficiency: str) -> None:
     """Any two series differ by 10 in L*a*b* for colour-blind readers (2 is just noticeable)."""
     colours = scheme(dark)
-    seen = [lab(matrix(deficiency) @ colours[f"c{k}"]) for k in range(6)]
+    seen = [lab(CVD[deficiency] @ colours[f"c{k}"]) for k in range(6)]
     for (i, one), (k, two) in itertools.combinations(enumerate(seen), 2):
         assert np.linalg.norm(one - two) >= 10.0, (i, k)
 
@@ -262,6 +260,6 @@ def test_series_stay_apart(dark: bool, deficiency: str) -> None:
 @pytest.mark.parametrize("vision", CVD)
 def test_materials_stay_apart(vision: str) -> None:
     """For colour-blind readers any two materials differ by 0.2 of the RGB cube's side at least."""
-    seen = [np.clip(matrix(vision) @ linear_rgb(c.removeprefix("#")), 0.0, 1.0) for c in MATERIAL_COLOURS]
+    seen = [np.clip(CVD[vision] @ linear_rgb(c.removeprefix("#")), 0.0, 1.0) for c in MATERIAL_COLOURS]
     back = [np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055) for c in seen]
     assert min(np.linalg.norm(one - two) for one, two in itertools.combinations(back, 2)) > 0.2

@@ -159,20 +159,6 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
         assert ranges == [None, f"bytes={third}-", f"bytes={2 * third}-"]
 
 
-def test_an_interrupted_download_goes_on(server: Mirror, here: Path) -> None:
-    """What came before the connection was lost is not asked for again by the next command."""
-    server.faults = {FIRST: "drops"}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fetch, "MOST_ATTEMPTS", 1)
-        with pytest.raises(objects.ConnectionLostError):
-            download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
-    server.faults, server.asked = {}, []
-    assert not (here / "own/full/v1" / FIRST).exists()
-    assert download("own", root=here, mirror=server.url, scenarios="0").downloaded == (0,)
-    third = (here / "own/full/v1" / FIRST).stat().st_size // 3
-    assert server.asked[-1] == (f"/own/full/v1/{FIRST}", f"bytes={third}-")
-
-
 @pytest.mark.parametrize(
     ("faults", "error"),
     [
@@ -220,20 +206,28 @@ def test_a_line_that_stays_broken(server: Mirror, here: Path, fault: str, useful
     assert server.count(FIRST) == fetch.ATTEMPTS + useful
 
 
-@pytest.mark.parametrize("name", ["manifest.json", FIRST])
-def test_a_slow_store_is_refused(
-    server: Mirror, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch, name: str
+@pytest.mark.parametrize(("name", "fault"), [(LIST, "slow"), (FIRST, "slow"), (FIRST, "drops")])
+def test_an_interrupted_download_goes_on(
+    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch, name: str, fault: str
 ) -> None:
-    """A hundred bytes a second are below the least rate; the next command goes on from what came."""
+    """What came before the connection was lost, or given up, is not asked for again by the next command.
+
+    A hundred bytes a second are below the least rate.
+    """
     monkeypatch.setattr(fetch, "PATIENCE", 0.3)
-    server.faults = {name: "slow"}
-    with pytest.raises(objects.TooSlowError) as caught:
+    monkeypatch.setattr(fetch, "MOST_ATTEMPTS", 1)
+    server.faults = {name: fault}
+    with pytest.raises(objects.TooSlowError if fault == "slow" else objects.ConnectionLostError) as caught:
         download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
     assert (caught.value.exit_code, caught.value.where) == (5, f"{server.url}/own/full/v1/{name}")
+    assert not (here / "own/full/v1" / FIRST).exists()
     server.faults = {}
     result = download("own", root=here, mirror=server.url, scenarios="0")
-    whole = (original.folder / "full/v1" / FIRST).stat().st_size
-    assert result.bytes == whole if name == "manifest.json" else 0 < result.bytes < whole
+    whole = (here / "own/full/v1" / FIRST).stat().st_size
+    assert result.downloaded == (0,)
+    assert result.bytes == whole if name == LIST else 0 < result.bytes < whole
+    if fault == "drops":
+        assert server.asked[-1] == (f"/own/full/v1/{FIRST}", f"bytes={whole // 3}-")
 
 
 @pytest.mark.parametrize(

@@ -103,19 +103,21 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
     assert collate([more[3], more[40]]).origin[PARTICLES[0] :].equal(more[40].origin)
     with pytest.raises(UsageError):
         collate([more[3], data[40]])
+    both = train(subset=["test", "train"])  # windows of several subsets follow each other
+    assert len(both) == WINDOWS + 2 * 20
+    assert [both.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
 
 
-def test_material_and_walls(train: Open) -> None:
-    """A window holds the particles' materials and its own frames of the walls' velocity."""
+def test_material_and_walls(tmp_path: Path, train: Open) -> None:
+    """A window holds the particles' materials and its own frames of the walls' velocity.
+
+    Without material all is liquid, without moving walls there is no velocity of walls.
+    """
     window = train(history=2, future=0)[3]
     assert window.material.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
     assert window.material.dtype == torch.int64
     assert window.wall_velocity is not None
     assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
-
-
-def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> None:
-    """Without material all is liquid, without moving walls there is no velocity of walls."""
     for i, frames in FRAMES.items():
         path, _ = write_scenario(tmp_path, make_key(i, subset="train"), frames=frames, walls=False)
         with h5py.File(path, "a") as file:
@@ -242,13 +244,6 @@ def test_the_systems_limit_of_files_is_no_damage(train: Open) -> None:
     assert data[0].scenario == data.place(0)[0]
 
 
-def test_several_subsets(train: Open) -> None:
-    """Windows of several subsets follow each other."""
-    data = train(subset=["test", "train"])
-    assert len(data) == WINDOWS + 2 * 20
-    assert [data.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
-
-
 def test_every_epoch_draws_every_window_once(train: Open) -> None:
     """Epochs are different orders of all windows; seed and epoch alone decide them."""
     data = train()
@@ -265,13 +260,21 @@ def test_every_epoch_draws_every_window_once(train: Open) -> None:
 
 @pytest.mark.parametrize("odd", [-1, 1.5, None, "1"])
 def test_places_that_there_are_not(train: Open, odd: Any) -> None:
-    """Seeds, epochs and positions are whole numbers from 0: others would draw windows twice."""
+    """Seeds, epochs and positions are whole numbers from 0: others would draw windows twice.
+
+    The last position is the end of the epoch itself; what is refused moves nothing.
+    """
     with pytest.raises(UsageError):
         WindowSampler(train(), seed=odd)
     sampler = WindowSampler(train(), seed=0)
-    for state in ({"epoch": odd, "position": 0}, {"epoch": 0, "position": odd}):
+    sampler.seek(np.int64(3), np.int64(WINDOWS))  # type: ignore[arg-type]
+    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
+    for epoch, position in ((odd, 0), (0, odd), (4, WINDOWS + 1)):
         with pytest.raises(UsageError):
-            sampler.load_state_dict({"seed": 0, **state})
+            sampler.load_state_dict({"seed": 9, "epoch": epoch, "position": position})
+    with pytest.raises(UsageError):
+        sampler.seek(4, WINDOWS + 1)
+    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": WINDOWS}
 
 
 def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
@@ -402,8 +405,11 @@ def test_what_is_not_there_is_said(
         WindowDataset(**given, root=root, registry=registry)
 
 
-def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open) -> None:
-    """Files of another id or length, and bytes that are no netCDF file, are data errors."""
+def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open, registry: Registry) -> None:
+    """Files of another id or length, or of other values than the registry's hash names, are data errors.
+
+    So are bytes that are no netCDF file.
+    """
     for i, frames in FRAMES.items():
         write_scenario(tmp_path, make_key(i, subset="train"), frames=frames + (i == 1))
     folder = next(tmp_path.rglob("train"))
@@ -419,15 +425,11 @@ def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open)
     assert isinstance(data[60], Window)
     with pytest.raises(IndexError):
         data[WINDOWS]
-
-
-def test_another_content_hash_is_refused(root: Path, registry: Registry) -> None:
-    """A file whose values are not those that the registry's hash names is a data error."""
-    measured = SimpleNamespace(scenario_sha256={0: "0" * 16})
+    measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
-    store = store_windows.FrameStore(size, {0: next(root.rglob("0000.nc"))})
+    store = store_windows.FrameStore(size, {2: folder / "0002.nc"})
     with pytest.raises(DataError, match=r"(?s)not that of the registry.*content hash 0{16}"):
-        store.frames(0, 0, 2)
+        store.frames(2, 0, 2)
 
 
 def drifting(batch: Batch) -> torch.Tensor:
@@ -470,37 +472,19 @@ def test_a_rollout_feeds_on_itself(train: Open) -> None:
     assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
 
 
-@pytest.mark.parametrize("wrong", [lambda p: p[None], lambda p: p[:-1], lambda p: p[:, :1], np.asarray])
-def test_what_a_model_returns_has_the_shape_of_positions(
-    train: Open, wrong: Callable[[torch.Tensor], Any]
-) -> None:
-    """[window, particle, 2], a particle too few, one axis, NumPy's are refused, and so are no frames."""
-    given = collate([train(history=2, future=2)[0]]).part(slice(2))
-    with pytest.raises(UsageError):
-        roll_out(lambda seen: wrong(seen.position[:, -1]), given, 2)
-    with pytest.raises(UsageError):
-        roll_out(drifting, given, 0)
-
-
-def test_no_place_beyond_an_epoch(train: Open) -> None:
-    """The last one is the end itself; what is refused moves nothing."""
-    data = train(history=2, future=1)
-    sampler = WindowSampler(data, seed=0)
-    sampler.seek(np.int64(3), np.int64(len(data)))  # type: ignore[arg-type]
-    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
-    with pytest.raises(UsageError):
-        sampler.seek(4, len(data) + 1)
-    with pytest.raises(UsageError):
-        sampler.load_state_dict({"seed": 9, "epoch": 4, "position": len(data) + 1})
-    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": len(data)}
-
-
 def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
     """Beyond it no wall moves as it did: a model that takes the last velocity known would be wrong unseen.
 
-    A model may use the memory of its answer again: every frame is kept as it was returned.
+    A model may use the memory of its answer again: every frame is kept as it was returned. Answers of another
+    shape than positions (an axis more, a particle too few, one axis) or of NumPy, and no frames, are refused.
     """
     given = collate([train(history=2, future=3)[0]]).part(slice(2))
+    shapes: list[Callable[[Any], Any]] = [lambda p: p[None], lambda p: p[:-1], lambda p: p[:, :1], np.asarray]
+    for wrong in shapes:
+        with pytest.raises(UsageError):
+            roll_out(lambda seen, wrong=wrong: wrong(seen.position[:, -1]), given, 2)
+    with pytest.raises(UsageError):
+        roll_out(drifting, given, 0)
     memory = torch.empty_like(given.position[:, -1])
     found = roll_out(drifting, given, 3)
     assert found.shape[1] == 3
