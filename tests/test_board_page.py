@@ -216,7 +216,10 @@ def test_beside_and_beyond_an_aim_do_not_cancel(board: Board) -> None:
 
 
 def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
-    """A link each where the entry has one, and to nothing but the web."""
+    """A link each where the entry has one, and to nothing but the web.
+
+    Weights beside the entry have one a seed, to where the leaderboard's folder keeps them.
+    """
     for row in board.tabs[0].rows:
         line = re.findall(f'<tr[^>]*data-entry="{row.id}".*?</tr>', page)[0]
         links = re.findall(r'<a href="(http[^"]*)"[^>]*>(\w+)</a>', line)
@@ -224,10 +227,6 @@ def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
         assert {name: address for address, name in links} == {k: v for k, v in wanted.items() if v}
     bad = with_entry(board.tabs[0].rows[0], code="javascript:alert(1)")
     assert 'href="javascript' not in with_rows(board, bad)
-
-
-def test_weights_beside_an_entry_are_led_to(board: Board) -> None:
-    """One link a seed, to where the leaderboard's folder keeps them."""
     row = board.tabs[0].rows[0]
     score = row.entry.score.model_copy(update={"files": 2 * row.entry.score.files[:1]})
     weights, made = Weights(path="x", sha256="0" * 64), row.entry.predictions[0]

@@ -117,7 +117,10 @@ def found(own: BoardBench) -> set[str]:
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
-    """Weights and records of both seeds are copied and named by hash, and the entry has their mean budget."""
+    """Weights and records of both seeds are copied and named by hash, and the entry has their mean budget.
+
+    They go to their seeds in any order, and of some only; those of others stay while the predictions do.
+    """
     runs = [trained(own, 0), trained(own, 3)]
     submitted(own, *runs)
     entry = read_entry(own.entry("drift"))
@@ -132,12 +135,8 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
     assert entry.budget is not None
     assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (48, 0.1, None)  # tiny
     assert found(own) == set()
-
-
-def test_weights_go_to_their_seeds(own: BoardBench) -> None:
-    """In any order, and of some seeds only; those of others stay while the predictions do."""
-    runs = [trained(own, 0), trained(own, 3)]
     first, second = (run / "weights.pt" for run in runs)
+    own.entry("drift").unlink()
     submitted(own, *runs, weights=(second, first))
     assert hashes(own) == [file_sha256(first), file_sha256(second)]
     submitted(own, *runs, weights=(second,), replace=True)

@@ -89,18 +89,17 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
 
 
-def test_students_quantile_is_scipys() -> None:
-    """For whole degrees of freedom, for whole ones but for rounding, and for others."""
+def test_quantiles_are_numpys_and_scipys() -> None:
+    """Student's: for whole degrees of freedom, for whole ones but for rounding, and for others.
+
+    Of samples: to the bit, ends and middle included.
+    """
     for freedom in (*range(3, 60), 500, 1000, 1001, 19.000000000000004, 2.5, 7.3, np.inf, np.nan):
         theirs = pytest.approx(stdtrit(freedom, 0.975), rel=1e-12, nan_ok=True)
         assert student_quantile(freedom, 0.975) == theirs
-
-
-@pytest.mark.parametrize("count", [2, 3, 101, 10_000])
-def test_quantiles_are_numpys(count: int) -> None:
-    """To the bit, ends and middle included."""
-    values, shares = np.random.default_rng(count).normal(size=count), (0.0, 0.025, 0.3, 0.5, 0.975, 1.0)
-    assert quantiles(values, shares) == np.quantile(values, shares).tolist()
+    for count in (2, 3, 101, 10_000):
+        values, shares = np.random.default_rng(count).normal(size=count), (0.0, 0.025, 0.3, 0.5, 0.975, 1.0)
+        assert quantiles(values, shares) == np.quantile(values, shares).tolist()
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:

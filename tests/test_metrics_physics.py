@@ -47,19 +47,16 @@ def test_energy_by_hand() -> None:
     assert [scores[name].mean for name in names] == pytest.approx([4.0, 4.0, 1.0, 3.0])
 
 
-def test_energies_of_a_truth_that_slows() -> None:
+def test_energies_of_a_truth_that_slows_or_rests() -> None:
     """E_true = 1, 0: the second frame is scaled by 1e-3, so an excess of 1e-4 there is 0.1.
 
-    Of 0.9 and 1 % of the peak, the peak, then nothing, the ratio takes the second and third frame.
+    Of 0.9 and 1 % of the peak, the peak, then nothing, the ratio takes the second and third frame. No ratio,
+    retention or error exists where the truth never moves; its frames are counted.
     """
     found = METRICS["energy_error"].series(np.array([0.5, 1e-4]), np.array([1.0, 0.0]))
     np.testing.assert_allclose(found, [0.5, 0.1])
     found = METRICS["energy_ratio"].series(np.array([5.0, 0.03, 9.0, 7.0]), np.array([0.009, 0.01, 1.0, 0.0]))
     np.testing.assert_allclose(found, [math.nan, 3.0, 9.0, math.nan])
-
-
-def test_energy_of_a_truth_at_rest_is_undefined() -> None:
-    """No ratio, retention or error exists where the truth never moves; its frames are counted."""
     x = np.repeat(lattice(10)[None], 5, axis=0)
     scores = scores_of(x, x + 0.001 * np.arange(5)[:, None, None])
     energies = ("energy_ratio", "energy_retention", "energy_error")

@@ -149,8 +149,11 @@ def test_painted_particles() -> None:
     assert shown[..., 3].sum() / 255 == pytest.approx(2 * full, rel=0.03)
 
 
-def test_streamlines_of_a_solid_rotation_are_circles() -> None:
-    """Along each line the distance from the middle stays; together they reach most of the box."""
+def test_streamlines_of_a_rotation_are_circles_and_end_where_nothing_counts() -> None:
+    """Along each line the distance from the middle stays; together they reach most of the box.
+
+    A uniform flow stops at nodes that do not count; a flow at rest has none.
+    """
     x, y = np.mgrid[-16.0:17.0, -16.0:17.0]
     lines = streamlines(np.stack([-y, x], axis=-1), np.ones((33, 33), bool))
     assert len(lines) > 5
@@ -161,10 +164,6 @@ def test_streamlines_of_a_solid_rotation_are_circles() -> None:
         np.testing.assert_allclose(line.speed, radius, rtol=1e-6)
         turning = x[:-1] * np.diff(y) - y[:-1] * np.diff(x)
         assert (turning > 0).all()  # with the flow, not against it
-
-
-def test_streamlines_end_where_nothing_counts() -> None:
-    """A uniform flow stops at nodes that do not count; a flow at rest has none."""
     velocity = np.broadcast_to([1.0, 0.0], (20, 20, 2))
     counted = np.broadcast_to(np.arange(20)[:, None] < 10, (20, 20))
     lines = streamlines(velocity, counted)

@@ -136,19 +136,14 @@ def test_releases_have_one_address(
     assert here == there
 
 
-def test_a_placeholder_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As long as nothing is released nobody is asked, and the error says what is missing."""
-    monkeypatch.setattr(archive, "open_object", None)
-    with pytest.raises(UsageError) as caught:
-        download(SPLIT, SIZE, root=tmp_path, or_generate=False)
+def test_nobody_is_asked(server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Local splits are nobody's business; a placeholder is no address, and the error says what is missing."""
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "open_object", None)
+        with pytest.raises(UsageError) as caught:
+            download(SPLIT, SIZE, root=here, or_generate=False)
     assert (caught.value.exit_code, caught.value.where) == (2, f"{SPLIT} {SIZE}")
     assert archive.RELEASES in str(caught.value.got)
-
-
-def test_local_splits_are_asked_of_nobody(
-    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their names and hashes are nobody's business."""
     monkeypatch.setenv(archive.RELEASES_VARIABLE, server.url)
     with pytest.raises(UsageError):
         download("own", root=here)

@@ -115,8 +115,13 @@ def test_all_findings_are_reported_together(bench: Bench) -> None:
     assert result.exit_code == 4
 
 
-def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_path: Path) -> None:
-    """Two checks are skipped and give the command; for scoring that is an error of exit code 4."""
+def test_without_the_data_set_what_needs_no_truth_is_checked(
+    unmeasured: Registry, bench: Bench, tmp_path: Path
+) -> None:
+    """Two checks are skipped and give the command; for scoring that is an error of exit code 4.
+
+    A registry that nobody measured cannot vouch: the check says so and does not reject.
+    """
     elsewhere = replace(bench, root=tmp_path)
     result = elsewhere.validate(bench.valid)
     assert result.exit_code == 0
@@ -126,15 +131,9 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_p
     assert required.exit_code == 4
     with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
         required.check()
-
-
-def test_without_a_recorded_hash_the_check_warns(unmeasured: Registry, bench: Bench, tmp_path: Path) -> None:
-    """A registry that nobody measured cannot vouch: the check says so and does not reject."""
-    path = bench.copy("unmeasured.nc")
-    result = validate(path, root=tmp_path, registry=unmeasured, isolated=False)
+    result = validate(bench.valid, root=tmp_path, registry=unmeasured, isolated=False)
     flag = next(f for f in result.findings if f.check == "dataset")
-    assert flag.severity is Severity.WARNING
-    assert "datasets.yaml" in flag.got
+    assert (flag.severity, "datasets.yaml" in flag.got) == (Severity.WARNING, True)
 
 
 @pytest.mark.parametrize(
@@ -239,8 +238,11 @@ def test_a_change_after_the_check_is_seen(own: Bench, hashed: mock.Mock) -> None
     assert (caught.value.exit_code, hashed.mock_calls) == (4, [mock.call(path)])
 
 
-def test_notes_of_another_machine_count_for_nothing(own: Bench, tmp_path: Path, hashed: mock.Mock) -> None:
-    """Values are hashed once; where a folder is copied with its notes its files are hashed again."""
+def test_other_notes_count_for_nothing(own: Bench, tmp_path: Path, hashed: mock.Mock) -> None:
+    """Values are hashed once; where a folder is copied with its notes its files are hashed again.
+
+    So they are where the notes are damaged, which are written anew.
+    """
     truth_of(own).check()
     truth_of(own).check()
     assert hashed.call_count == 3
@@ -248,15 +250,11 @@ def test_notes_of_another_machine_count_for_nothing(own: Bench, tmp_path: Path, 
     shutil.copytree(own.root, root)
     Truth(own.registry.size("cavity", "tiny"), root).check()
     assert hashed.call_count == 6
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"test/0004.nc": 1}', '{"test/0004.nc": [1]}', "[" * 10**5])
-def test_damaged_notes_are_no_notes(own: Bench, text: str) -> None:
-    """The files are hashed, and the notes written anew."""
     notes = truth_of(own).folder / NOTES_NAME
-    notes.write_text(text)
-    truth_of(own).check()
-    assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in (3, 4, 5)}
+    for text in ("", "[]", "{", '{"test/0004.nc": 1}', '{"test/0004.nc": [1]}', "[" * 10**5):
+        notes.write_text(text)
+        truth_of(own).check()
+        assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in TESTS}
 
 
 def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
