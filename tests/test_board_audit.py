@@ -207,7 +207,7 @@ def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
     assert touched(branch) == {}
 
 
-NOISY, DAMPED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc"
+NOISY, DAMPED, LISTED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc", "verified.yaml"
 
 
 def said(**keys: str) -> Callable[[BoardBench], object]:
@@ -235,10 +235,7 @@ CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
         *(NOISY, "link"),
     ),
     "made a bomb": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), NOISY, "another content"),
-    "verified claimed": (
-        lambda b: (b.folder / "verified.yaml").write_text(f"{NOISY}: x\n"),
-        *("verified.yaml", "changed"),
-    ),
+    "verified claimed": (lambda b: (b.folder / LISTED).write_text(f"{NOISY}: x\n"), LISTED, "changed"),
     "floors changed": (lambda b: (b.folder / FLOOR).unlink(), FLOOR, "removed"),
 }
 

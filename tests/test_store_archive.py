@@ -188,13 +188,9 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        ("chopped", objects.TruncatedError),
-        ("ends early", objects.TruncatedError),
-        ("announces more", objects.TruncatedError),
+        *((fault, objects.TruncatedError) for fault in ("chopped", "ends early", "announces more")),
         ("drops always", LagbenchError),
-        ("page", objects.NotDataError),
-        ("hidden page", objects.NotDataError),
-        ("endless", objects.NotDataError),
+        *((fault, objects.NotDataError) for fault in ("page", "hidden page", "endless")),
         ("busy", objects.StoreUnreachableError),
     ],
 )

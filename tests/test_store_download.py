@@ -162,14 +162,10 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
 @pytest.mark.parametrize(
     ("faults", "error"),
     [
-        ({FIRST: "page"}, objects.NotDataError),
-        ({FIRST: "hidden page"}, objects.NotDataError),
-        ({FIRST: "nowhere"}, objects.NotDataError),
-        ({FIRST: "announces more"}, objects.WrongLengthError),
-        ({FIRST: "announces less"}, objects.WrongLengthError),
-        ({FIRST: "chopped"}, objects.WrongLengthError),
+        *(({FIRST: fault}, objects.NotDataError) for fault in ("page", "hidden page", "nowhere")),
+        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("announces more", "announces less")),
+        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("chopped", "endless")),
         ({FIRST: "ends early"}, objects.TruncatedError),
-        ({FIRST: "endless"}, objects.WrongLengthError),
         ({FIRST: "flipped"}, objects.WrongContentError),
         # where the store has no manifest lengths are not known, but content is
         ({FIRST: "announces more", LIST: "gone"}, objects.TruncatedError),
@@ -177,8 +173,7 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
         ({FIRST: "chopped", LIST: "gone"}, objects.WrongContentError),
         ({FIRST: "endless", LIST: "gone"}, objects.WrongLengthError),
         # a login page in place of the manifest is told before any file is asked for
-        ({LIST: "page"}, objects.NotDataError),
-        ({LIST: "hidden page"}, objects.NotDataError),
+        *(({LIST: fault}, objects.NotDataError) for fault in ("page", "hidden page")),
     ],
 )
 def test_each_lie_has_its_error_and_leaves_nothing(
@@ -234,9 +229,8 @@ def test_an_interrupted_download_goes_on(
     ("fault", "error"),
     [
         ("gone", objects.NotInStoreError),
-        ("busy", objects.StoreUnreachableError),
-        ("forbidden", objects.StoreUnreachableError),
-        ("elsewhere", objects.StoreUnreachableError),  # a redirection leads to no file of this machine
+        # a redirection elsewhere leads to no file of this machine
+        *((fault, objects.StoreUnreachableError) for fault in ("busy", "forbidden", "elsewhere")),
     ],
 )
 def test_no_generate_stops_where_the_store_does(
