@@ -52,9 +52,8 @@ def trained(
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}-{share}"
     folder.mkdir()
-    said = {"training": training, "parameters": parameters}
+    said = {"training": training, "parameters": parameters, "seed": seed, "budget": BUDGET.model_dump_json()}
     labels = {key: held for key, held in said.items() if held is not None}
-    labels |= {"seed": seed, "budget": BUDGET.model_dump_json()}
 
     def between(truth: Any, n: int, h: int) -> Any:
         return truth[n : n + h] + (share + 0.1 * seed) * (noisy(truth, n, h) - truth[n : n + h])

@@ -93,12 +93,6 @@ PARTICLES = {
 }
 
 
-@pytest.fixture(scope="module")
-def bench_of(home: Path) -> Callable[[str], ReportBench]:
-    """A function that returns the bench of a split."""
-    return lambda split: make_report_bench(home, split)
-
-
 def scored(
     bench: ReportBench, folder: Path, *methods: tuple[str, Method], **labels: Any
 ) -> tuple[list[ScoreCard], list[Path], dict[str, Any]]:
@@ -174,9 +168,9 @@ def test_every_figure_is_there_and_can_be_read_aloud(page: Callable[[str], str],
         assert spoken or "role" not in drawing.attributes
 
 
-def test_strangers_text_is_shown_not_run(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_strangers_text_is_shown_not_run(home: Path, tmp_path: Path) -> None:
     """Hostile names of methods, files and trainings stand on the page as text."""
-    bench = bench_of("curl-noise")
+    bench = make_report_bench(home, "curl-noise")
     paths = [
         bench.submit(tmp_path / f"{i} '\"<b>&.nc", noisy, name, training=name, device=name)
         for i, name in enumerate(HOSTILE)
@@ -209,11 +203,9 @@ def test_any_text_survives_escaping(words: str) -> None:
     assert tag("p", Markup("<b>x</b>")) == "<p><b>x</b></p>"
 
 
-def test_same_bytes_every_time(
-    bench_of: Callable[[str], ReportBench], page: Callable[[str], str], tmp_path: Path
-) -> None:
+def test_same_bytes_every_time(home: Path, page: Callable[[str], str], tmp_path: Path) -> None:
     """The same predictions give the same page wherever they lie; no folder stands in it."""
-    bench = bench_of("multimaterial")
+    bench = make_report_bench(home, "multimaterial")
     first = bench.report(tmp_path / "there", METHODS).read_text("utf-8")
     assert first == page("multimaterial")
     assert str(tmp_path) not in first
@@ -221,11 +213,9 @@ def test_same_bytes_every_time(
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_undefined_and_huge_numbers_are_drawn_around(
-    bench_of: Callable[[str], ReportBench], tmp_path: Path, split: str
-) -> None:
+def test_undefined_and_huge_numbers_are_drawn_around(home: Path, tmp_path: Path, split: str) -> None:
     """A prediction at rest has no correlation, a runaway leaves every axis: the page holds both."""
-    page = bench_of(split).report(tmp_path, {"rest": still, "odd": runaway}).read_text("utf-8")
+    page = make_report_bench(home, split).report(tmp_path, {"rest": still, "odd": runaway}).read_text("utf-8")
     reading = read_html(page)
     assert not reading.faults
     for element in reading.elements:
@@ -236,12 +226,10 @@ def test_undefined_and_huge_numbers_are_drawn_around(
     assert set(expected_figures(split)) <= set(reading.ids)
 
 
-def test_scores_on_the_page_are_those_of_the_card(
-    bench_of: Callable[[str], ReportBench], tmp_path: Path
-) -> None:
+def test_scores_on_the_page_are_those_of_the_card(home: Path, tmp_path: Path) -> None:
     """The mean of the ranking metric stands in the table, and no interval of two scenarios."""
     labels = {"parameters": 1_600_000, "seconds_per_frame": 0.25}
-    (card,), paths, where = scored(bench_of("cavity"), tmp_path, ("damped", damped), **labels)
+    (card,), paths, where = scored(make_report_bench(home, "cavity"), tmp_path, ("damped", damped), **labels)
     page = write_report(tmp_path, [card], paths, **where)
     reading = read_html(page.read_text("utf-8"))
     ranked = [scores[card.ranking] for scores in card.scores.values()]
@@ -258,9 +246,11 @@ def test_scores_on_the_page_are_those_of_the_card(
         assert flag.name.replace("_", " ") in everything
 
 
-def test_floors_have_no_rank(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_floors_have_no_rank(home: Path, tmp_path: Path) -> None:
     """Two submissions, both worse than the floors, are ranked 1 and 2, and floors stand below without."""
-    page = bench_of("curl-noise").report(tmp_path, {"m0": noisy, "m1": noisy}).read_text("utf-8")
+    page = (
+        make_report_bench(home, "curl-noise").report(tmp_path, {"m0": noisy, "m1": noisy}).read_text("utf-8")
+    )
     (part,) = re.findall(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
     rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", part)]
     ranks = [row[1] for row in rows[1:]]
@@ -269,27 +259,30 @@ def test_floors_have_no_rank(bench_of: Callable[[str], ReportBench], tmp_path: P
     assert len(ranks) > 4
 
 
-def test_methods_of_one_name_are_told_apart(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_methods_of_one_name_are_told_apart(home: Path, tmp_path: Path) -> None:
     """Two files of one method get numbers, so does one with a floor's name."""
     methods = (("gns", damped), ("gns", noisy), ("persistence", still))
-    cards, paths, where = scored(bench_of("curl-noise"), tmp_path, *methods)
+    cards, paths, where = scored(make_report_bench(home, "curl-noise"), tmp_path, *methods)
     page = write_report(tmp_path, cards, paths, **where)
     heading = read_html(page.read_text("utf-8")).named("h1")[0].text
     assert heading == "gns (1) · gns (2) · persistence (1)"
 
 
-def test_cards_must_belong_together(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_cards_must_belong_together(home: Path, tmp_path: Path) -> None:
     """No card, a card without its file, and two data sets are refused."""
-    one, two = (scored(bench_of(split), tmp_path / split, ("a", still)) for split in ("curl-noise", "cavity"))
+    one, two = (
+        scored(make_report_bench(home, split), tmp_path / split, ("a", still))
+        for split in ("curl-noise", "cavity")
+    )
     for cards, files in (([], []), (one[0], []), (one[0] + two[0], one[1] + two[1])):
         with pytest.raises(UsageError):
             write_report(tmp_path, cards, files, **one[2])
     assert not (tmp_path / "index.html").exists()
 
 
-def test_pages_of_others_stay(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_pages_of_others_stay(home: Path, tmp_path: Path) -> None:
     """A report replaces a report, and no other page."""
-    cards, paths, where = scored(bench_of("cavity"), tmp_path, ("a", still))
+    cards, paths, where = scored(make_report_bench(home, "cavity"), tmp_path, ("a", still))
     for _ in range(2):
         page = write_report(tmp_path / "report", cards, paths, **where)
     page.write_text("<!doctype html><title>My thesis</title>")
