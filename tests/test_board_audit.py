@@ -66,14 +66,12 @@ def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Pa
     assert (one.entry, one.difference) == (Path(PLACE, "noisy.yaml"), 0.0)
     assert not (own.folder / "verified.yaml").exists()
     assert rescored(own, predictions, recording=True).recorded == (f"{PLACE}/noisy.yaml",)
-    assert verified(own) == {"noisy"}
-    assert found(own) == []
+    assert (verified(own), found(own)) == ({"noisy"}, [])
     before = (own.folder / "verified.yaml").read_bytes()
     rescored(own, predictions, recording=True)
     assert (own.folder / "verified.yaml").read_bytes() == before
     reform(own, scale("vorticity_mse", 0.5))
-    assert verified(own) == set()
-    assert found(own) == ["verified"]
+    assert (verified(own), found(own)) == (set(), ["verified"])
 
 
 def test_metrics_of_packages_decide_nothing(

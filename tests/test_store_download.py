@@ -151,8 +151,7 @@ def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
     """Broken connections are taken up by range, or from the start where the server knows no ranges."""
     server.faults = {FIRST: fault}
-    result = download("own", root=here, mirror=server.url)
-    assert result.complete
+    assert download("own", root=here, mirror=server.url).complete
     ranges = [wanted for path, wanted in server.asked if path.endswith(FIRST)]
     if fault == "drops":
         third = (here / "own/full/v1" / FIRST).stat().st_size // 3
