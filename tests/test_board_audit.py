@@ -102,8 +102,8 @@ def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Pat
     reform(own, scale("vorticity_mse", 0.5))
     assert found(own) == []
     result = rescored(own, predictions, recording=True)
-    assert [(f.check, f.got) for f in result.findings] == [("rescored", "other vorticity_mse")]
-    assert (result.confirmed, result.recorded) == ((), ())
+    told = [(one.check, one.got) for one in result.findings]
+    assert (told, result.confirmed, result.recorded) == ([("rescored", "other vorticity_mse")], (), ())
     own.entry("noisy").unlink()
     (own.folder / SCORES / "noisy.nc").unlink()
     assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
@@ -303,8 +303,7 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
         own.submit(own.predict(still, "new"), replace=True, **about)
     ours = [name for name in moved if "verified" in name and ".submit-" not in name]
     assert ours == ["scores/cavity/tiny/verified.nc", "verified.yaml", f"{PLACE}/verified.yaml"]
-    assert (own.folder / "verified.yaml").read_text() == "{}\n"
-    assert found(own) == []
+    assert ((own.folder / "verified.yaml").read_text(), found(own)) == ("{}\n", [])
 
 
 def test_without_git_it_says_so(

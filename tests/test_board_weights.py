@@ -128,9 +128,8 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
         assert made.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
         file = own.folder / made.weights.path
         assert file.read_bytes() == (run / "weights.pt").read_bytes()
-        assert file_sha256(file) == made.weights.sha256
+        assert (file_sha256(file), made.budget) == (made.weights.sha256, BUDGET)
         assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
-        assert made.budget == BUDGET
     assert entry.budget is not None
     assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (48, 0.1, None)  # tiny
     assert found(own) == set()

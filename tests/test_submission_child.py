@@ -40,13 +40,14 @@ def behave(how):
 bench = small
 
 
-@pytest.fixture(autouse=True)
-def _jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A module ``jobs`` that children can import."""
     (tmp_path / "jobs.py").write_text(JOBS)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}")
 
 
+@pytest.mark.usefixtures("jobs")
 @pytest.mark.parametrize(
     ("how", "said"),
     [
@@ -64,6 +65,7 @@ def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> No
     assert said in str(stopped)
 
 
+@pytest.mark.usefixtures("jobs")
 def test_a_child_that_answers_waits_or_raises() -> None:
     """What JSON can hold goes there and back, in the order of requests.
 
