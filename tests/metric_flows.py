@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.grid import Grid
-from lagbench.metrics import FramePair, Scenario, Setting, snapshots
+from lagbench.metrics import METRICS, FramePair, Scenario, Setting, snapshots
 
 Floats = NDArray[np.float64]
 
@@ -83,3 +83,8 @@ def pair_of(
     scenario = scenario_of(np.stack([x - 2 * u, x - u]), material=material, **changes)
     predicted = scenario.snapshot(y, y - np.asarray(predicted_velocity, np.float64))
     return FramePair(scenario, 2, scenario.snapshot(x, x - u), predicted)
+
+
+def measured(pair: FramePair, *names: str) -> list[float]:
+    """Measure metrics of one pair."""
+    return [METRICS[name].measure(pair) for name in names]

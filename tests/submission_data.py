@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scenario_factory import frames_of, make_key, write_scenario
 
@@ -84,6 +85,12 @@ def make_bench(folder: Path) -> Bench:
         seed=7,
     )
     return Bench(folder, root, registry_path, valid)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A small data set and a valid submission; modules that test submissions call it ``bench``."""
+    return make_bench(tmp_path_factory.mktemp("bench"))
 
 
 def _registry(hashes: dict[int, str]) -> str:

@@ -32,10 +32,14 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path, without=["flipping", "constant-velocity", "frozen-field", "analog"])
 
 
+def checked(bench: BoardBench, **options: Any) -> CheckResult:
+    """Check in this process."""
+    return check_board(bench.folder, registry=bench.registry, isolated=False, **options)
+
+
 def found(bench: BoardBench) -> list[str]:
     """Return the names of the checks that find something without either."""
-    result = check_board(bench.folder, registry=bench.registry, isolated=False)
-    return [finding.check for finding in result.findings]
+    return [finding.check for finding in checked(bench).findings]
 
 
 @pytest.fixture
@@ -46,8 +50,7 @@ def predictions(own: BoardBench) -> Path:
 
 def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
     """Check with predictions scored again."""
-    where = {"registry": bench.registry, "root": bench.data.root, "isolated": False}
-    return check_board(bench.folder, predictions=paths, **where, **options)
+    return checked(bench, predictions=paths, root=bench.data.root, **options)
 
 
 def verified(bench: BoardBench) -> set[str]:
@@ -63,14 +66,12 @@ def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Pa
     assert (one.entry, one.difference) == (Path(PLACE, "noisy.yaml"), 0.0)
     assert not (own.folder / "verified.yaml").exists()
     assert rescored(own, predictions, recording=True).recorded == (f"{PLACE}/noisy.yaml",)
-    assert verified(own) == {"noisy"}
-    assert found(own) == []
+    assert (verified(own), found(own)) == ({"noisy"}, [])
     before = (own.folder / "verified.yaml").read_bytes()
     rescored(own, predictions, recording=True)
     assert (own.folder / "verified.yaml").read_bytes() == before
     reform(own, scale("vorticity_mse", 0.5))
-    assert verified(own) == set()
-    assert found(own) == ["verified"]
+    assert (verified(own), found(own)) == (set(), ["verified"])
 
 
 def test_metrics_of_packages_decide_nothing(
@@ -101,8 +102,8 @@ def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Pat
     reform(own, scale("vorticity_mse", 0.5))
     assert found(own) == []
     result = rescored(own, predictions, recording=True)
-    assert [(f.check, f.got) for f in result.findings] == [("rescored", "other vorticity_mse")]
-    assert (result.confirmed, result.recorded) == ((), ())
+    told = [(one.check, one.got) for one in result.findings]
+    assert (told, result.confirmed, result.recorded) == ([("rescored", "other vorticity_mse")], (), ())
     own.entry("noisy").unlink()
     (own.folder / SCORES / "noisy.nc").unlink()
     assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
@@ -119,8 +120,8 @@ def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, prediction
     assert got == ["other position_mse", "[]", "{}"]
 
 
-def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
-    """A preview that is not of these predictions is found."""
+def test_pictures_and_statistics_are_compared(own: BoardBench, predictions: Path) -> None:
+    """A preview that is not of these predictions is found, and so is a statistic that is lacking."""
 
     def repaint(file: Any) -> None:
         film = file["preview"]["film"]
@@ -129,6 +130,12 @@ def test_pictures_are_compared(own: BoardBench, predictions: Path) -> None:
 
     reform(own, repaint)
     assert [finding.got for finding in rescored(own, predictions).findings] == ["other film pictures"]
+    with netCDF4.Dataset(own.folder / SCORES / "noisy.nc", "a") as file:
+        names = file.statistics.split()
+        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
+    own.rehash("noisy")
+    findings = rescored(own, predictions).findings
+    assert "velocity_mse" in next(str(one.got) for one in findings if one.check == "rescored")
 
 
 def test_broken_predictions_are_opened_in_the_child_only(
@@ -138,7 +145,6 @@ def test_broken_predictions_are_opened_in_the_child_only(
     cut = tmp_path / "cut.nc"
     cut.write_bytes(predictions.read_bytes()[:-9999])
     own.edit("damped", set_mean)
-
     for module in (score, submitting):
         monkeypatch.setattr(module, "open_predictions", pytest.fail)
     result = rescored(own, cut)
@@ -176,8 +182,8 @@ def branch(home: Path, tmp_path: Path) -> BoardBench:
 
 def touched(bench: BoardBench, **options: Any) -> dict[str, str]:
     """Return where and got of what the check against main finds."""
-    result = check_board(bench.folder, registry=bench.registry, isolated=False, base="main", **options)
-    return {finding.where: finding.got for finding in result.findings if finding.check == "base"}
+    findings = checked(bench, base="main", **options).findings
+    return {finding.where: finding.got for finding in findings if finding.check == "base"}
 
 
 def new_entry(bench: BoardBench) -> None:
@@ -199,19 +205,23 @@ def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
     assert touched(branch) == {}
 
 
-NOISY, DAMPED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc"
+NOISY, DAMPED, LISTED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc", "verified.yaml"
+
+
+def said(**keys: str) -> Callable[[BoardBench], object]:
+    """Return what writes keys into the entry of noisy."""
+    return lambda bench: bench.edit("noisy", lambda held: held.update(keys))
+
 
 CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
     "removed": (lambda b: b.entry("noisy").unlink(), NOISY, "removed"),
-    "touched": (lambda b: b.edit("noisy", lambda h: h.update(notes="other")), NOISY, "other notes"),
+    "touched": (said(notes="other"), NOISY, "other notes"),
     "superseded": (
-        lambda b: b.edit("noisy", lambda h: h.update(status="superseded", superseded_by="damped")),
-        *(NOISY, "superseded_by None -> 'damped'"),
+        said(status="superseded", superseded_by="damped"),
+        NOISY,
+        "superseded_by None -> 'damped'",
     ),
-    "withdrawn": (
-        lambda b: b.edit("noisy", lambda h: h.update(status="withdrawn")),
-        *(NOISY, "status None -> 'withdrawn'"),
-    ),
+    "withdrawn": (said(status="withdrawn"), NOISY, "status None -> 'withdrawn'"),
     "scores changed": (lambda b: (b.folder / DAMPED).write_bytes(b"x"), DAMPED, "changed"),
     "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
     "a seed added": (
@@ -223,10 +233,7 @@ CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
         *(NOISY, "link"),
     ),
     "made a bomb": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), NOISY, "another content"),
-    "verified claimed": (
-        lambda b: (b.folder / "verified.yaml").write_text(f"{NOISY}: x\n"),
-        *("verified.yaml", "changed"),
-    ),
+    "verified claimed": (lambda b: (b.folder / LISTED).write_text(f"{NOISY}: x\n"), LISTED, "changed"),
     "floors changed": (lambda b: (b.folder / FLOOR).unlink(), FLOOR, "removed"),
 }
 
@@ -239,15 +246,20 @@ def test_what_touches_others_is_named(name: str, branch: BoardBench) -> None:
     here = touched(branch)
     commit(branch)
     for found in (here, touched(branch)):
-        assert set(found) == {where}
-        assert got in found[where]
+        assert {path: got in text for path, text in found.items()} == {where: True}
 
 
-def test_ones_own_may_be_altered(branch: BoardBench) -> None:
-    """What the change says is its own is not named, other entries are."""
+def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
+    """What the change says is its own is not named, other entries are.
+
+    A repository's own settings are strangers' too: no program of theirs is started.
+    """
+    for setting in ("core.fsmonitor", "diff.external"):
+        git(branch.folder.parent, "config", setting, f"touch {tmp_path}/ran; false")
     branch.edit("noisy", lambda held: held.update(notes="other"))
     branch.entry("damped").unlink()
     assert set(touched(branch, own=["noisy"])) == {f"{PLACE}/damped.yaml"}
+    assert not (tmp_path / "ran").exists()
 
 
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
@@ -261,10 +273,9 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     branch.submit(own, replace=True)
     assert listed.read_bytes() == both  # its scores are those of before
     assert listed in branch.submit(branch.predict(still, "noisy"), replace=True).files
-    where = {"registry": branch.registry, "isolated": False, "base": "HEAD"}
 
     def told(*own: str) -> set[tuple[str, str]]:
-        return {(one.check, str(one.where)) for one in check_board(branch.folder, own=own, **where).findings}
+        return {(one.check, str(one.where)) for one in checked(branch, own=own, base="HEAD").findings}
 
     assert told("noisy") == set()
     assert ("base", "verified.yaml") in told()
@@ -292,19 +303,7 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
         own.submit(own.predict(still, "new"), replace=True, **about)
     ours = [name for name in moved if "verified" in name and ".submit-" not in name]
     assert ours == ["scores/cavity/tiny/verified.nc", "verified.yaml", f"{PLACE}/verified.yaml"]
-    assert (own.folder / "verified.yaml").read_text() == "{}\n"
-    assert found(own) == []
-
-
-def test_statistics_of_ours_are_all_there(own: BoardBench, predictions: Path) -> None:
-    """One that a score file lacks is told by scoring again."""
-    path = own.folder / SCORES / "noisy.nc"
-    with netCDF4.Dataset(path, "a") as file:
-        names = file.statistics.split()
-        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
-    own.rehash("noisy")
-    result = rescored(own, predictions)
-    assert "velocity_mse" in next(str(one.got) for one in result.findings if one.check == "rescored")
+    assert ((own.folder / "verified.yaml").read_text(), found(own)) == ("{}\n", [])
 
 
 def test_without_git_it_says_so(
@@ -312,17 +311,8 @@ def test_without_git_it_says_so(
 ) -> None:
     """An unknown revision, and a folder outside any repository, are a matter of usage."""
     with pytest.raises(UsageError) as error:
-        check_board(branch.folder, registry=branch.registry, isolated=False, base="nowhere")
+        checked(branch, base="nowhere")
     assert "--base" in str(error.value.where)
     outside = copied(home, tmp_path_factory.mktemp("outside"))
     with pytest.raises(UsageError):
-        check_board(outside.folder, registry=outside.registry, isolated=False, base="main")
-
-
-def test_settings_of_a_checkout_run_nothing(branch: BoardBench, tmp_path: Path) -> None:
-    """A repository's own settings are strangers' too: no program of theirs is started."""
-    git(branch.folder.parent, "config", "core.fsmonitor", f"touch {tmp_path}/ran; false")
-    git(branch.folder.parent, "config", "diff.external", f"touch {tmp_path}/ran; false")
-    branch.edit("noisy", lambda held: held.update(notes="other"))
-    assert touched(branch)
-    assert not (tmp_path / "ran").exists()
+        checked(outside, base="main")

@@ -50,11 +50,10 @@ def test_nothing_is_wrong_with_what_submit_writes(home: Path) -> None:
     assert (result.findings, result.entries) == ((), 3)
 
 
-def halve(path: Path, statistic: str = "vorticity_mse") -> None:
+def halve(path: Path) -> None:
     """Halve a statistic in a score file."""
     with netCDF4.Dataset(path, "r+") as file:
-        row = file.statistics.split().index(statistic)
-        file["value"][row] = 0.5 * file["value"][row]
+        scale("vorticity_mse", 0.5)(file)
 
 
 def link(path: Path, target: Path) -> None:
@@ -83,10 +82,10 @@ def disguised(bench: BoardBench) -> None:
     bench.rehash("other")
 
 
-def verify(bench: BoardBench, path: str, scores: str) -> None:
-    """Write a list of verified entries."""
-    line = {"scores": [scores], "lagbench": "0.1.0", "date": "2026-01-31"}
-    (bench.folder / "verified.yaml").write_text(yaml.safe_dump({path: line}))
+def verify(bench: BoardBench, method: str) -> None:
+    """Write a list of verified entries, with scores that nobody has."""
+    line = {"scores": ["0" * 64], "lagbench": "0.1.0", "date": "2026-01-31"}
+    (bench.folder / "verified.yaml").write_text(yaml.safe_dump({f"{PLACE}/{method}.yaml": line}))
 
 
 def superseded(bench: BoardBench, one: str, two: str) -> None:
@@ -97,6 +96,11 @@ def superseded(bench: BoardBench, one: str, two: str) -> None:
 def put(*place: str | int, **changes: object) -> Callable[[BoardBench], object]:
     """Return what writes keys into the entry of noisy, at a place of it."""
     return lambda bench: bench.edit("noisy", lambda held: reduce(getitem, place, held).update(changes))
+
+
+def text(held: str, path: str = f"{PLACE}/noisy.yaml") -> Callable[[BoardBench], object]:
+    """Return what writes a file of the folder, the entry of noisy unless told otherwise."""
+    return lambda bench: (bench.folder / path).write_text(held)
 
 
 DAMAGE: dict[str, Callable[[BoardBench], object]] = {
@@ -114,9 +118,7 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "schema: name of 10 kB": put(name="n" * 10_000),
     "schema: blank name": put(name="\u3164"),
     "schema: path outside": put("predictions", 0, path="../../secret"),
-    "schema: number in base 60": lambda b: b.entry("noisy").write_text(
-        f"parameters: {':'.join(['59'] * 300)}:1.5\n"
-    ),
+    "schema: number in base 60": text(f"parameters: {':'.join(['59'] * 300)}:1.5\n"),
     "date: date to come": put(date="2999-01-01"),
     "name: look-alike of an entry": put(name="D\u0430MPED"),
     "name: look-alike of a floor": put(name="Persistence"),
@@ -137,9 +139,9 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
         (b.folder / "x.nc").symlink_to(b.entry("noisy")),
         put("predictions", 0, path="x.nc")(b),
     ),
-    "verified: verified without an entry": lambda b: verify(b, f"{PLACE}/nobody.yaml", "0" * 64),
-    "verified: verified with other scores": lambda b: verify(b, f"{PLACE}/noisy.yaml", "0" * 64),
-    "verified: list that is none": lambda b: (b.folder / "verified.yaml").write_text("- a\n"),
+    "verified: verified without an entry": lambda b: verify(b, "nobody"),
+    "verified: verified with other scores": lambda b: verify(b, "noisy"),
+    "verified: list that is none": text("- a\n", "verified.yaml"),
     # what may happen to files
     "score_file: edited score file": lambda b: halve(b.folder / NOISY),
     "score: edited score file, hash forged": lambda b: (
@@ -170,23 +172,21 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "folder: folder that is a link": lambda b: (b.folder / "submissions" / "fluid").symlink_to(
         "/etc", target_is_directory=True
     ),
-    "folder: other files": lambda b: (b.folder / PLACE / "evil.py").write_text("import os"),
-    "folder: other files beside the page": lambda b: (b.folder / "index.js").write_text("alert(1)"),
+    "folder: other files": text("import os", f"{PLACE}/evil.py"),
+    "folder: other files beside the page": text("alert(1)", "index.js"),
     "folder: folder of its own": lambda b: ((b.folder / "more").mkdir(), (b.folder / "more/a.yaml").touch()),
     "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to("/etc/passwd"),
-    "folder: name that a log would obey": lambda b: (b.folder / PLACE / "a\n::warning::x.yaml").write_text(
-        "a: 1"
-    ),
+    "folder: name that a log would obey": text("a: 1", f"{PLACE}/a\n::warning::x.yaml"),
     "folder stray: entry at another depth": lambda b: b.entry("noisy").rename(
         b.folder / "submissions/noisy.yaml"
     ),
     "readable: entry of 100 MB": lambda b: os.truncate(b.entry("noisy"), 100_000_000),
-    "readable: YAML with aliases": lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
+    "readable: YAML with aliases": text("a: &a [x]\nb: *a\n"),
     "place: place": lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"),
     "floor: unknown floor": lambda b: shutil.copyfile(
         b.folder / FLOOR, b.folder / "floors/cavity/tiny/ceiling.nc"
     ),
-    "floor: broken floor": lambda b: (b.folder / FLOOR).write_bytes(b"CDF"),
+    "floor: broken floor": text("CDF", FLOOR),
     "floor: floor of another split": lambda b: (
         (b.folder / "floors/fluid/tiny").mkdir(parents=True),
         shutil.copy(b.folder / FLOOR, b.folder / "floors/fluid/tiny"),
@@ -240,13 +240,12 @@ def test_later_entries_may_supersede_twins(own: BoardBench) -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        *(
-            ("GNS", "GN\u0405"),
-            ("SuperGAT", "\u0405uperG\u0410T"),
-            ("MLP 10", "mlp-l0"),
-            ("Caf\u00e9", "Cafe"),
-        ),
-        *(("\uff27\uff2e\uff33", "GNS"), ("\u0391\u0392", "AB")),
+        ("GNS", "GN\u0405"),
+        ("SuperGAT", "\u0405uperG\u0410T"),
+        ("MLP 10", "mlp-l0"),
+        ("Caf\u00e9", "Cafe"),
+        ("\uff27\uff2e\uff33", "GNS"),
+        ("\u0391\u0392", "AB"),
     ],
 )
 def test_names_that_look_alike(one: str, other: str) -> None:
@@ -273,8 +272,7 @@ def test_a_stale_page_is_found(own: BoardBench) -> None:
     """No page, an edited one, a link and a page of other entries are stale; a new build mends it."""
     assert found(own, page=True) == ["page"]
     page = build(own.folder, registry=own.registry).page
-    assert found(own, page=True) == []
-    assert build(own.folder, registry=own.registry).written == ()
+    assert (found(own, page=True), build(own.folder, registry=own.registry).written) == ([], ())
     data = page.read_bytes()
     page.write_bytes(data.replace(b"noisy", b"nOisy", 1))
     assert found(own, page=True) == ["page"]

@@ -37,6 +37,9 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
     return copied(home, tmp_path)
 
 
+KEPT, GLIDE = (f"weights/cavity/tiny/{name}_0" for name in ("drift", "glide"))
+"""Weights and record of a run, and those of another method, without their endings."""
+
 OURS = "cavity tiny train, recipe cavity/tiny, step 6"
 """What `lagbench predict` says of the training of `trained`."""
 
@@ -49,9 +52,8 @@ def trained(
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}-{share}"
     folder.mkdir()
-    said = {"training": training, "parameters": parameters}
+    said = {"training": training, "parameters": parameters, "seed": seed, "budget": BUDGET.model_dump_json()}
     labels = {key: held for key, held in said.items() if held is not None}
-    labels |= {"seed": seed, "budget": BUDGET.model_dump_json()}
 
     def between(truth: Any, n: int, h: int) -> Any:
         return truth[n : n + h] + (share + 0.1 * seed) * (noisy(truth, n, h) - truth[n : n + h])
@@ -90,10 +92,21 @@ def first(own: BoardBench) -> Path:
     return run
 
 
-def hashes(own: BoardBench) -> list[str | None]:
+def hashes(own: BoardBench, method: str = "drift") -> list[str | None]:
     """Return the SHA-256 of the weights of each seed, as the entry has them."""
-    made = read_entry(own.entry("drift")).predictions
+    made = read_entry(own.entry(method)).predictions
     return [one.weights.sha256 if one.weights else None for one in made]
+
+
+def lying(own: BoardBench) -> dict[str, bytes]:
+    """Return name and content of the weights and records on the board."""
+    return {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")}
+
+
+def claim(own: BoardBench, path: str, source: Path) -> None:
+    """Let the entry glide name a file as its weights, with the hash of another."""
+    said = {"path": path, "sha256": file_sha256(source)}
+    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
 
 
 def found(own: BoardBench) -> set[str]:
@@ -103,7 +116,10 @@ def found(own: BoardBench) -> set[str]:
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
-    """Weights and records of both seeds are copied and named by hash, and the entry has their mean budget."""
+    """Weights and records of both seeds are copied and named by hash, and the entry has their mean budget.
+
+    They go to their seeds in any order, and of some only; those of others stay while the predictions do.
+    """
     runs = [trained(own, 0), trained(own, 3)]
     submitted(own, *runs)
     entry = read_entry(own.entry("drift"))
@@ -112,18 +128,13 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
         assert made.weights.path == f"weights/cavity/tiny/drift_{seed}.pt"
         file = own.folder / made.weights.path
         assert file.read_bytes() == (run / "weights.pt").read_bytes()
-        assert file_sha256(file) == made.weights.sha256
+        assert (file_sha256(file), made.budget) == (made.weights.sha256, BUDGET)
         assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
-        assert made.budget == BUDGET
     assert entry.budget is not None
     assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (48, 0.1, None)  # tiny
     assert found(own) == set()
-
-
-def test_weights_go_to_their_seeds(own: BoardBench) -> None:
-    """In any order, and of some seeds only; those of others stay while the predictions do."""
-    runs = [trained(own, 0), trained(own, 3)]
     first, second = (run / "weights.pt" for run in runs)
+    own.entry("drift").unlink()
     submitted(own, *runs, weights=(second, first))
     assert hashes(own) == [file_sha256(first), file_sha256(second)]
     submitted(own, *runs, weights=(second,), replace=True)
@@ -131,65 +142,51 @@ def test_weights_go_to_their_seeds(own: BoardBench) -> None:
     own.entry("drift").unlink()
     submitted(own, *runs, weights=(second,))
     assert hashes(own) == [None, file_sha256(second)]
-    (own.folder / "weights/cavity/tiny/drift_0.pt").unlink()
-    (own.folder / "weights/cavity/tiny/drift_0.json").unlink()
+    for end in ("pt", "json"):
+        (own.folder / f"{KEPT}.{end}").unlink()
     assert found(own) == set()
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
     """Weights stay with their predictions, and go with them: an entry leaves none behind."""
-    lying = {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")}
-    assert len(lying) == 2
-    again = submitted(own, first, weights=(), replace=True)
-    assert {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")} == lying
-    assert (again.removed, found(own)) == ((), set())
-    later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
-    assert {path.name for path in later.removed} == set(lying)
-    assert not list((own.folder / "weights").rglob("*.*"))
-    assert found(own) == set()
-
-
-def test_records_go_with_their_weights(own: BoardBench, first: Path) -> None:
-    """New weights without a record leave none of the old; those of the board keep theirs."""
-    file = own.folder / "weights/cavity/tiny/drift_0.pt"
-    submitted(own, first, weights=(file,), replace=True)
-    assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
-    (first / "training.json").unlink()
+    before, file = lying(own), own.folder / f"{KEPT}.pt"
+    assert json.loads(before["drift_0.json"]) == {"step": 6}
+    for weights in ((), (file,)):  # those of the board, told or not, keep their record
+        again = submitted(own, first, weights=weights, replace=True)
+        assert (lying(own), again.removed, found(own)) == (before, (), set())
+    (first / "training.json").unlink()  # new weights without a record leave none of the old
     assert submitted(own, first, replace=True).removed == (file.with_suffix(".json"),)
-    assert found(own) == set()
+    assert (list(lying(own)), found(own)) == (["drift_0.pt"], set())
+    later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
+    assert (later.removed, lying(own), found(own)) == ((file,), {}, set())
 
 
 @pytest.mark.parametrize("damage", ["lost", "edited", "linked"])
 def test_only_sound_weights_are_kept(own: BoardBench, first: Path, damage: str) -> None:
     """What is wrong with those of before is mended by submitting anew."""
-    file = own.folder / "weights/cavity/tiny/drift_0.pt"
+    file = own.folder / f"{KEPT}.pt"
+    file.unlink()
     if damage == "edited":
         file.write_bytes(b"1")
-    if damage in ("lost", "linked"):
-        file.unlink()
     if damage == "linked":
         file.symlink_to(first / "weights.pt")
     submitted(own, first, weights=(), replace=True)
-    assert read_entry(own.entry("drift")).predictions[0].weights is None
-    assert found(own) == set()
+    assert (hashes(own), found(own)) == ([None], set())
 
 
 def test_weights_of_another_are_not_kept(own: BoardBench, first: Path) -> None:
     """Nor those that lie elsewhere: what the old entry says of them is not believed."""
     second = trained(own, 0, share=0.3)
     submitted(own, second, weights=(), method="glide")
-    source, target = (own.folder / f"weights/cavity/tiny/{name}_0.pt" for name in ("drift", "glide"))
+    source, target = own.folder / f"{KEPT}.pt", own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
-    for path in ("weights/cavity/tiny/glide_0.pt", "weights/cavity/tiny/drift_0.pt"):
-        said = {"path": path, "sha256": file_sha256(source)}
-        own.edit("glide", lambda held, said=said: held["predictions"][0].update(weights=said))
+    for path, alone in ((GLIDE, False), (KEPT, False), (KEPT, True)):
+        if alone:
+            target.unlink(missing_ok=True)
+            own.entry("drift").unlink()  # nobody else's now, and still not in its place
+        claim(own, f"{path}.pt", source)
         submitted(own, second, weights=(), method="glide", replace=True)
-        assert read_entry(own.entry("glide")).predictions[0].weights is None
-    target.unlink(missing_ok=True)
-    own.entry("drift").unlink()  # nobody else's now, and still not in its place
-    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
-    submitted(own, second, weights=(), method="glide", replace=True)
-    assert read_entry(own.entry("glide")).predictions[0].weights is None
+        assert hashes(own, "glide") == [None]
 
 
 def test_a_new_name_takes_the_weights_along(own: BoardBench, first: Path) -> None:
@@ -293,10 +290,9 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
         submitted(own, second, method="glide")
     assert caught.value.where == str(second / "weights.pt")
     submitted(own, second, weights=(), method="glide")
-    source, target = (own.folder / f"weights/cavity/tiny/{name}_0.pt" for name in ("drift", "glide"))
+    source, target = own.folder / f"{KEPT}.pt", own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
-    said = {"path": "weights/cavity/tiny/glide_0.pt", "sha256": file_sha256(source)}
-    own.edit("glide", lambda held: held["predictions"][0].update(weights=said))
+    claim(own, f"{GLIDE}.pt", source)
     assert found(own) == {"weights"}
 
 
@@ -316,23 +312,21 @@ def test_other_weights_are_refused(own: BoardBench) -> None:
     assert own.state() == before
 
 
-KEPT = "weights/cavity/tiny/drift_0"
-"""Weights and record of a run, without their endings."""
+def put(end: str, data: bytes) -> Callable[[BoardBench], object]:
+    """Return what writes the weights or the record of the run anew."""
+    return lambda bench: (bench.folder / f"{KEPT}.{end}").write_bytes(data)
+
 
 DAMAGE: dict[str, Callable[[BoardBench], object]] = {
-    "weights: edited": lambda b: (file := b.folder / f"{KEPT}.pt").write_bytes(file.read_bytes()[:-1] + b"x"),
+    "weights: edited": lambda b: put("pt", lying(b)["drift_0.pt"][:-1] + b"x")(b),
     "weights: lost": lambda b: (b.folder / f"{KEPT}.pt").unlink(),
     "weights: those of another method": lambda b: b.edit(
         "drift", lambda held: held["predictions"][0]["weights"].update(path="weights/cavity/tiny/a_0.pt")
     ),
     "weights: of no entry": lambda b: (b.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1"),
-    "weights: long record": lambda b: (b.folder / f"{KEPT}.json").write_text(
-        json.dumps({"note": "x" * kept.MOST_RECORD})
-    ),
-    "weights: record nested far deeper than one is": lambda b: (b.folder / f"{KEPT}.json").write_text(
-        "[" * 100_000
-    ),
-    "weights: JSON that is no record": lambda b: (b.folder / f"{KEPT}.json").write_text("[1]"),
+    "weights: long record": put("json", json.dumps({"note": "x" * kept.MOST_RECORD}).encode()),
+    "weights: record nested far deeper than one is": put("json", b"[" * 100_000),
+    "weights: JSON that is no record": put("json", b"[1]"),
     "budget: track claimed": lambda b: b.edit("drift", lambda held: held["budget"].update(track="converged")),
     "budget: track claimed without a budget": lambda b: b.edit(
         "noisy", lambda held: held.update(budget={"track": "equal compute"})
@@ -358,7 +352,7 @@ def test_what_is_no_record_is_not_copied(own: BoardBench, monkeypatch: pytest.Mo
     ):
         (run / name).write_text(json.dumps(held))
         submitted(own, run, replace=True)
-        assert [path.suffix for path in (own.folder / "weights").rglob("*.*")] == [".pt"]
+        assert list(lying(own)) == ["drift_0.pt"]
         (run / name).unlink()
     assert found(own) == set()
     monkeypatch.setattr(kept, "MOST_BYTES", 1000)
@@ -447,12 +441,11 @@ def test_only_sound_active_entries_get_seeds(own: BoardBench, monkeypatch: pytes
     """Not a withdrawn one, nor one whose weights changed, nor one that changed while files were scored."""
     runs = [trained(own, seed) for seed in (0, 3, 5)]
     submitted(own, runs[0])
-    file = own.folder / "weights/cavity/tiny/drift_0.pt"
-    held = file.read_bytes()
-    file.write_bytes(held + b"more")
+    held = lying(own)["drift_0.pt"]
+    put("pt", held + b"more")(own)
     with pytest.raises(ChecksFailedError, match="weights"):
         submitted(own, runs[1], add=True)
-    file.write_bytes(held)
+    put("pt", held)(own)
     own.edit("drift", lambda entry: entry.update(status="withdrawn", reason="a mistake"))
     with pytest.raises(UsageError, match="active"):
         submitted(own, runs[1], add=True)

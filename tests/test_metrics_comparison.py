@@ -62,15 +62,14 @@ def test_ties_by_rounding_count() -> None:
         assert sign_flip_p(np.linspace(1.0, 2.0, n)) == pytest.approx(2.0 ** (1 - n), rel=1e-12)
 
 
-@pytest.mark.parametrize("differences", [[], [1.0] * 41, [1.0, math.nan], [1.0, math.inf]])
-def test_differences_that_no_p_value_fits(differences: list[float]) -> None:
-    """Nothing to compare, more than can be enumerated, or no numbers are refused."""
-    with pytest.raises(UsageError):
-        sign_flip_p(differences)
+def test_losses_that_no_p_value_fits() -> None:
+    """Nothing to compare, more than can be enumerated, and no numbers are refused, and so is infinity.
 
-
-def test_infinite_losses_are_refused() -> None:
-    """They are no evidence: a p-value of 0 would be below the least there is."""
+    It is no evidence: a p-value of 0 would be below the least there is.
+    """
+    for differences in ([], [1.0] * 41, [1.0, math.nan], [1.0, math.inf]):
+        with pytest.raises(UsageError):
+            sign_flip_p(differences)
     plain, infinite = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, math.inf, 4.0, 5.0, 6.0]
     for first, second in ((plain, infinite), (infinite, plain), ([plain, infinite], [plain, plain])):
         with pytest.raises(UsageError):
@@ -90,19 +89,17 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
 
 
-def test_students_quantile_is_scipys() -> None:
-    """For whole degrees of freedom, for whole ones but for rounding, and for others."""
-    for freedom in (*range(3, 60), 500, 1000, 1001, 19.000000000000004, 2.5, 7.3):
-        assert student_quantile(freedom, 0.975) == pytest.approx(stdtrit(freedom, 0.975), rel=1e-12)
-    for freedom in (np.inf, np.nan):
-        assert student_quantile(freedom, 0.975) == pytest.approx(stdtrit(freedom, 0.975), nan_ok=True)
+def test_quantiles_are_numpys_and_scipys() -> None:
+    """Student's: for whole degrees of freedom, for whole ones but for rounding, and for others.
 
-
-@pytest.mark.parametrize("count", [2, 3, 101, 10_000])
-def test_quantiles_are_numpys(count: int) -> None:
-    """To the bit, ends and middle included."""
-    values, shares = np.random.default_rng(count).normal(size=count), (0.0, 0.025, 0.3, 0.5, 0.975, 1.0)
-    assert quantiles(values, shares) == np.quantile(values, shares).tolist()
+    Of samples: to the bit, ends and middle included.
+    """
+    for freedom in (*range(3, 60), 500, 1000, 1001, 19.000000000000004, 2.5, 7.3, np.inf, np.nan):
+        theirs = pytest.approx(stdtrit(freedom, 0.975), rel=1e-12, nan_ok=True)
+        assert student_quantile(freedom, 0.975) == theirs
+    for count in (2, 3, 101, 10_000):
+        values, shares = np.random.default_rng(count).normal(size=count), (0.0, 0.025, 0.3, 0.5, 0.975, 1.0)
+        assert quantiles(values, shares) == np.quantile(values, shares).tolist()
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:
@@ -145,10 +142,11 @@ def test_intervals_repeat_and_scale() -> None:
         assert all(math.isnan(bound) for bound in bootstrap_interval(few))
 
 
-def test_differ_is_a_t_test() -> None:
+def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
     """Methods whose seeds alone scatter: Welch's test of their means, by SciPy.
 
-    Three equal seeds of each: SciPy's paired test over scenarios.
+    Three equal seeds of each: SciPy's paired test over scenarios. One seed, weights against weights: exact
+    over scenarios; a missing scenario is left out, five claim nothing.
     """
     a, b = np.array([1.0, 1.2, 1.5]), np.array([2.0, 2.6, 2.1, 2.9])
     ours = differ(np.repeat(a[:, None], 12, axis=1), np.repeat(b[:, None], 12, axis=1))
@@ -156,11 +154,6 @@ def test_differ_is_a_t_test() -> None:
     a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
     ours = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
     assert ours == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
-
-
-def test_differ_with_one_seed_is_the_sign_flip_test() -> None:
-    """Weights against weights: exact over scenarios; a missing scenario is left out, five claim nothing."""
-    a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
     assert differ(a, b) == differ([a], [b]) == sign_flip_p(a - b)
     a[2] = math.nan
     assert differ(a, b) == sign_flip_p(np.delete(a - b, 2))
@@ -203,11 +196,8 @@ def test_comparison_over_common_scenarios() -> None:
     one = score_of(9.0, *range(1, 7))
     two = score_of(*range(2, 8), 99.0, first=1)
     found = compare(one, two)
-    assert found.scenarios == (1, 2, 3, 4, 5, 6)
-    assert found.difference == -1.0
-    assert found.interval == (-1.0, -1.0)
-    assert found.p == 2.0**-5
-    assert found.significant
+    assert (found.scenarios, found.difference, found.interval) == ((1, 2, 3, 4, 5, 6), -1.0, (-1.0, -1.0))
+    assert (found.p, found.significant) == (2.0**-5, True)
     assert compare(one, score_of(math.nan, 1.0)).scenarios == (1,)
     five = compare(score_of(*[1.0] * 5), score_of(*[2.0] * 5))  # its smallest p would be 0.0625
     assert math.isnan(five.p)
@@ -219,14 +209,12 @@ def test_direction_decides_who_is_better() -> None:
 
     Nothing is won by divergence of its own, and metrics do not mix.
     """
-    higher = compare(*(score_of(v, v, metric="vorticity_pearson") for v in (0.9, 0.8)))
-    nearer = compare(*(score_of(v, v, metric="energy_ratio") for v in (0.9, 1.3)))
-    assert higher.difference == pytest.approx(-0.1)
-    assert nearer.difference == pytest.approx(-0.2)
-    with pytest.raises(UsageError):
-        compare(score_of(1.0, metric="energy_true"), score_of(1.0, metric="energy_true"))
-    with pytest.raises(UsageError):
-        compare(score_of(1.0), score_of(1.0, metric="vorticity_mae"))
+    for metric, values, gain in (("vorticity_pearson", (0.9, 0.8), 0.1), ("energy_ratio", (0.9, 1.3), 0.2)):
+        better = compare(*(score_of(v, v, metric=metric) for v in values))
+        assert better.difference == pytest.approx(-gain)
+    for metric, other in (("energy_true", "energy_true"), ("vorticity_mse", "vorticity_mae")):
+        with pytest.raises(UsageError):
+            compare(score_of(1.0, metric=metric), score_of(1.0, metric=other))
 
 
 def test_ranks_are_numbers_in_order() -> None:
@@ -239,9 +227,8 @@ def test_ranks_are_numbers_in_order() -> None:
     found = standings({**scores, "b": score_of(*a[:7], 8.5, 9.5), "a": score_of(*a)})
     assert {name: place.rank for name, place in found.items()} == {"a": 1, "b": 2, "c": 3, "d": 4}
     assert {name for name, place in found.items() if place.tied} == {"b"}
-    assert math.isnan(found["a"].p)
-    assert found["b"].p == 0.5
-    assert found["c"].p == found["d"].p == pytest.approx(3 * 2.0**-8)
+    each = [found[name].p for name in "abcd"]
+    assert each == pytest.approx([math.nan, 0.5, 3 * 2.0**-8, 3 * 2.0**-8], nan_ok=True)
 
 
 def test_ranks_without_significance_or_values() -> None:
@@ -272,11 +259,8 @@ def test_one_training_used_in_two_ways_is_paired() -> None:
 
 def test_seeds_of_a_method_are_compared_together() -> None:
     """Two seeds against one: means over seeds, number of seeds stated, p of the two-way test."""
-    seeds = [score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0)]
-    other = score_of(*(v + 10.0 for v in range(1, 8)))
-    found = compare(seeds, other)
-    assert found.seeds == (2, 1)
-    assert found.difference == pytest.approx(-9.5)
-    values = [score.values for score in seeds]
+    *seeds, other = (score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0, 10.0))
+    found, values = compare(seeds, other), [score.values for score in seeds]
+    assert (found.seeds, found.difference) == ((2, 1), pytest.approx(-9.5))
     assert found.p == differ(values, other.values)
     assert found.interval == bootstrap_interval(values, minus=other.values)

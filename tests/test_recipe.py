@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import json
 import math
 from dataclasses import replace
@@ -59,12 +60,11 @@ def test_every_recipe_is_right(name: str) -> None:
 def test_operators_share_their_recipes() -> None:
     """The six operators have one recipe on every split; they differ in the steps alone, by their cost."""
     operators = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
-    for split in ("cavity", "curl-noise", "fluid", "multimaterial"):
-        for size in ("tiny", "mini", "full"):
-            found = [recipe_for(find(name), split, size) for name in operators]
-            budgets = [one.training.model_copy(update={"steps": 1}) for one in found]
-            assert all(one.model == found[0].model for one in found)
-            assert all(one == budgets[0] for one in budgets)
+    splits = ("cavity", "curl-noise", "fluid", "multimaterial")
+    for split, size in itertools.product(splits, ("tiny", "mini", "full")):
+        recipes = [recipe_for(find(name), split, size) for name in operators]
+        found = [(one.model, one.training.model_copy(update={"steps": 1})) for one in recipes]
+        assert all(one == found[0] for one in found)
 
 
 OTHER = {
@@ -123,9 +123,8 @@ def test_layers(entry: Entry, tmp_path: Path) -> None:
     """
     plain = recipe_for(entry, "cavity", "tiny")
     assert (plain.training.steps, plain.training.epochs, plain.training.batch) == (7, None, 4)
-    assert plain.model["start"] == 0.5
     long = recipe_for(entry, "cavity", "tiny", variant="long", settings=["training.batch=9"], seed=5)
-    assert long.model["start"] == 2.0
+    assert (plain.model["start"], long.model["start"]) == (0.5, 2.0)
     assert (long.training.batch, long.training.seed) == (9, 5)
     assert (long.training.schedule.factor, long.training.schedule.every) == (0.5, 10)
     starred = recipe_for(entry, "fluid", "mini")
@@ -146,8 +145,8 @@ def test_trainings_of_before_an_option_go_on() -> None:
     assert not {"ema", "compile"} & set(before["training"])
     changes = ["model.strain=true", "training.ema=0.9", "training.compile=true"]
     after = recipe_for(entry, "fluid", "tiny", settings=changes).as_json()
-    assert (after["model"].pop("strain"), after["training"].pop("ema")) == (True, 0.9)
-    assert after["training"].pop("compile") is True
+    before["model"] |= {"strain": True}
+    before["training"] |= {"ema": 0.9, "compile": True}
     assert after == before
 
 
@@ -198,9 +197,7 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
     assert settings_of({**good, "model": None}) == ("training.steps=7",)
     for odd in ("x" * 1000, "a\n\x1b[31m\ud800", "2026-99-99", "\u00e4", [[0] * 1000], {"steps": {"a": "b"}}):
         (told,) = settings_of({**good, "training": {**good["training"], "steps": odd, "unknown": 1}}) or ("",)
-        assert len(told) < 250
-        assert told.isprintable()
-        assert told.isascii()
+        assert (len(told) < 250, told.isprintable(), told.isascii()) == (True, True, True)
     assert settings_of(None) == settings_of([good]) == ()
 
 
@@ -216,31 +213,31 @@ def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "message"),
+    ("setting", "message"),
     [
-        (["training.learning_rat=1"], "did you mean 'learning_rate'"),
-        (["training.schedule.evry=1"], "did you mean 'every'"),
-        (["training.schedule=cosin"], "schedule"),
-        (["model.strat=1"], "did you mean 'start'"),
-        (["modle.start=1"], "model.KEY=VALUE"),
-        (["model.start"], "model.KEY=VALUE"),
-        (["training.batch=[1"], "no YAML"),
-        (["training.batch=0"], "greater than 0"),
-        (["training.windows=[test]"], "never on test"),
-        (["training.windows=[train, valid]"], "not on valid"),
-        (["training.learning_rate=.inf"], "finite"),
-        (["training.opening_share=true"], "opening_share"),
-        (["training.schedule.factor=yes"], "schedule.factor"),
-        (["training.steps=on"], "training.steps"),
-        (["training.clip=no"], "training.clip"),
-        (["training.precision=off"], "'bf16'"),
-        (["model.start=true"], "model.start"),
+        ("training.learning_rat=1", "did you mean 'learning_rate'"),
+        ("training.schedule.evry=1", "did you mean 'every'"),
+        ("training.schedule=cosin", "schedule"),
+        ("model.strat=1", "did you mean 'start'"),
+        ("modle.start=1", "model.KEY=VALUE"),
+        ("model.start", "model.KEY=VALUE"),
+        ("training.batch=[1", "no YAML"),
+        ("training.batch=0", "greater than 0"),
+        ("training.windows=[test]", "never on test"),
+        ("training.windows=[train, valid]", "not on valid"),
+        ("training.learning_rate=.inf", "finite"),
+        ("training.precision=off", "'bf16'"),
+        ("training.opening_share=true", "opening_share"),
+        ("training.schedule.factor=yes", "schedule.factor"),
+        ("training.steps=on", "training.steps"),
+        ("training.clip=no", "training.clip"),
+        ("model.start=true", "model.start"),
     ],
 )
-def test_mistakes_in_settings(entry: Entry, settings: list[str], message: str) -> None:
+def test_mistakes_in_settings(entry: Entry, setting: str, message: str) -> None:
     """A wrong setting is a usage error that names key and remedy."""
     with pytest.raises(UsageError, match=message):
-        recipe_for(entry, "cavity", "tiny", settings=settings)
+        recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
 def test_no_such_recipe(entry: Entry) -> None:
@@ -344,9 +341,8 @@ def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.warns(UserWarning, match="adds no baseline") as told:
         found = every_entry()
     words = " ".join(str(warning.message) for warning in told)
-    assert all(name in words for name in ("'half'", "'broken'", "'Bad Name/x'"))
+    assert all(f"'{name}'" in words and name not in found for name in ("half", "broken", "Bad Name/x"))
     assert "mlp" in found
-    assert not {"half", "broken", "Bad Name/x"} & found.keys()
     for name, reason in (("half", "history, forward, start, advance"), ("broken", "cannot be loaded")):
         with pytest.warns(UserWarning, match="Bad Name/x"), pytest.raises(UsageError, match=reason):
             find(name)

@@ -10,15 +10,17 @@ import tomllib
 from collections.abc import Callable
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from html_check import Reading, read_html
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from made_up import (
     METHODS,
     SPLITS,
+    Method,
     ReportBench,
     damped,
     make_report_bench,
@@ -41,6 +43,7 @@ from lagbench.report.maps import inside
 from lagbench.report.report import write_report
 from lagbench.report.subject import Subject, limit_of
 from lagbench.report.tables import stable_of
+from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth
 
@@ -90,10 +93,14 @@ PARTICLES = {
 }
 
 
-@pytest.fixture(scope="module")
-def bench_of(home: Path) -> Callable[[str], ReportBench]:
-    """A function that returns the bench of a split."""
-    return lambda split: make_report_bench(home, split)
+def scored(
+    bench: ReportBench, folder: Path, *methods: tuple[str, Method], **labels: Any
+) -> tuple[list[ScoreCard], list[Path], dict[str, Any]]:
+    """Submit and score methods by name, and return what a report is written from."""
+    paths = [
+        bench.submit(folder / f"{i}.nc", method, name, **labels) for i, (name, method) in enumerate(methods)
+    ]
+    return [bench.card(path) for path in paths], paths, {"root": bench.root, "registry": bench.registry}
 
 
 @pytest.fixture(scope="module")
@@ -141,8 +148,11 @@ def test_page_is_whole_and_harmless(page: Callable[[str], str], split: str) -> N
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_every_figure_is_there(page: Callable[[str], str], split: str) -> None:
-    """Each figure of the thesis has its counterpart, with a caption that names it."""
+def test_every_figure_is_there_and_can_be_read_aloud(page: Callable[[str], str], split: str) -> None:
+    """Each figure of the thesis has its counterpart, with a caption that names it.
+
+    Pictures have a text, drawings a title, charts a description too.
+    """
     reading = read_html(page(split))
     figures = {e.attributes["id"]: e for e in reading.named("figure")}
     for name, thesis in expected_figures(split).items():
@@ -151,24 +161,16 @@ def test_every_figure_is_there(page: Callable[[str], str], split: str) -> None:
     numbers = [e.text for e in reading.of_class("number")]
     assert numbers == [f"Figure {k}" for k in range(1, len(figures) + 1)]
     assert len(reading.named("figcaption")) == len(figures)
-
-
-@pytest.mark.parametrize("split", SPLITS)
-def test_everything_can_be_read_aloud(page: Callable[[str], str], split: str) -> None:
-    """Pictures have a text, drawings a title, charts a description too."""
-    reading = read_html(page(split))
     assert all(image.attributes.get("alt") for image in reading.named("img"))
-    charts, titled = reading.of_class("chart"), page(split).count("<desc>")
-    assert charts
-    assert titled == len(charts)
+    assert page(split).count("<desc>") == len(reading.of_class("chart")) > 0
     for drawing in reading.named("svg"):
         spoken = drawing.attributes.get("aria-hidden") == "true" or drawing.text
         assert spoken or "role" not in drawing.attributes
 
 
-def test_strangers_text_is_shown_not_run(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_strangers_text_is_shown_not_run(home: Path, tmp_path: Path) -> None:
     """Hostile names of methods, files and trainings stand on the page as text."""
-    bench = bench_of("curl-noise")
+    bench = make_report_bench(home, "curl-noise")
     paths = [
         bench.submit(tmp_path / f"{i} '\"<b>&.nc", noisy, name, training=name, device=name)
         for i, name in enumerate(HOSTILE)
@@ -180,12 +182,16 @@ def test_strangers_text_is_shown_not_run(bench_of: Callable[[str], ReportBench],
     assert not reading.faults
     assert_harmless(reading)
     heading = reading.named("h1")[0].text
-    for card in cards:
-        assert card.header.method in heading
+    assert all(card.header.method in heading for card in cards)
     assert "0 '" in reading.named("pre")[0].text
 
 
+PLAIN = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
+"""Letters, signs and line breaks, none of which is replaced."""
+
+
 @given(st.text())
+@example(PLAIN)
 def test_any_text_survives_escaping(words: str) -> None:
     """What stands in an element and an attribute is the text itself, but for what cannot be shown."""
     reading = read_html(tag("p", words, title=words))
@@ -193,21 +199,13 @@ def test_any_text_survives_escaping(words: str) -> None:
     (element,) = reading.elements
     assert element.attributes["title"] == element.text
     for shown, meant in zip(element.text, words, strict=True):
-        assert shown == meant or shown in "\ufffd?"
-
-
-def test_plain_text_is_untouched() -> None:
-    """Letters, signs and line breaks are not replaced."""
-    words = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
-    assert read_html(tag("p", words)).elements[0].text == words
+        assert shown == meant or (shown in "\ufffd?" and words != PLAIN)
     assert tag("p", Markup("<b>x</b>")) == "<p><b>x</b></p>"
 
 
-def test_same_bytes_every_time(
-    bench_of: Callable[[str], ReportBench], page: Callable[[str], str], tmp_path: Path
-) -> None:
+def test_same_bytes_every_time(home: Path, page: Callable[[str], str], tmp_path: Path) -> None:
     """The same predictions give the same page wherever they lie; no folder stands in it."""
-    bench = bench_of("multimaterial")
+    bench = make_report_bench(home, "multimaterial")
     first = bench.report(tmp_path / "there", METHODS).read_text("utf-8")
     assert first == page("multimaterial")
     assert str(tmp_path) not in first
@@ -215,11 +213,9 @@ def test_same_bytes_every_time(
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_undefined_and_huge_numbers_are_drawn_around(
-    bench_of: Callable[[str], ReportBench], tmp_path: Path, split: str
-) -> None:
+def test_undefined_and_huge_numbers_are_drawn_around(home: Path, tmp_path: Path, split: str) -> None:
     """A prediction at rest has no correlation, a runaway leaves every axis: the page holds both."""
-    page = bench_of(split).report(tmp_path, {"rest": still, "odd": runaway}).read_text("utf-8")
+    page = make_report_bench(home, split).report(tmp_path, {"rest": still, "odd": runaway}).read_text("utf-8")
     reading = read_html(page)
     assert not reading.faults
     for element in reading.elements:
@@ -230,76 +226,60 @@ def test_undefined_and_huge_numbers_are_drawn_around(
     assert set(expected_figures(split)) <= set(reading.ids)
 
 
-def test_scores_on_the_page_are_those_of_the_card(
-    bench_of: Callable[[str], ReportBench], tmp_path: Path
-) -> None:
+def test_scores_on_the_page_are_those_of_the_card(home: Path, tmp_path: Path) -> None:
     """The mean of the ranking metric stands in the table, and no interval of two scenarios."""
-    bench = bench_of("cavity")
-    path = bench.submit(tmp_path / "p.nc", damped, "damped", parameters=1_600_000, seconds_per_frame=0.25)
-    card = bench.card(path)
-    page = write_report(tmp_path, [card], [path], root=bench.root, registry=bench.registry)
+    labels = {"parameters": 1_600_000, "seconds_per_frame": 0.25}
+    (card,), paths, where = scored(make_report_bench(home, "cavity"), tmp_path, ("damped", damped), **labels)
+    page = write_report(tmp_path, [card], paths, **where)
     reading = read_html(page.read_text("utf-8"))
     ranked = [scores[card.ranking] for scores in card.scores.values()]
     means = [element.text for element in reading.of_class("n")]
-    intervals = [element.text for element in reading.of_class("ci")]
     assert means[: len(ranked)] == [text(score.mean) for score in ranked]
     assert np.isnan([score.interval for score in ranked]).all()
-    assert not [element for element in intervals if "…" in element]
+    assert not any("…" in element.text for element in reading.of_class("ci"))
     everything = " ".join(e.text for e in reading.named("main"))
-    for said in (card.predictions_sha256, card.header.dataset_sha256, "lagbench score p.nc --report report"):
-        assert said in everything
-    assert "1\u202f600\u202f000" in everything
-    for flag in card.flags:
-        assert flag.name.replace("_", " ") in everything
+    said = (card.predictions_sha256, card.header.dataset_sha256, "lagbench score 0.nc --report report")
+    flags = (flag.name.replace("_", " ") for flag in card.flags)
+    assert [words for words in (*said, "1\u202f600\u202f000", *flags) if words not in everything] == []
 
 
-def test_floors_have_no_rank(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_floors_have_no_rank(home: Path, tmp_path: Path) -> None:
     """Two submissions, both worse than the floors, are ranked 1 and 2, and floors stand below without."""
-    bench = bench_of("curl-noise")
-    paths = [bench.submit(tmp_path / f"{i}.nc", noisy, f"m{i}") for i in range(2)]
-    cards = [bench.card(path) for path in paths]
-    page = write_report(tmp_path, cards, paths, root=bench.root, registry=bench.registry).read_text("utf-8")
-    part = re.search(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
-    assert part is not None
-    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", part[0])]
+    bench = make_report_bench(home, "curl-noise")
+    page = bench.report(tmp_path, {"m0": noisy, "m1": noisy}).read_text("utf-8")
+    (part,) = re.findall(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
+    rows = [re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", part)]
     ranks = [row[1] for row in rows[1:]]
-    assert ranks[:2] == ["1", "2"]
-    assert set(ranks[2:]) == {""}
-    assert len(ranks) > 4
+    assert (ranks[:2], set(ranks[2:]), len(ranks) > 4) == (["1", "2"], {""}, True)
 
 
-def test_methods_of_one_name_are_told_apart(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_methods_of_one_name_are_told_apart(home: Path, tmp_path: Path) -> None:
     """Two files of one method get numbers, so does one with a floor's name."""
-    bench = bench_of("curl-noise")
-    methods = [("gns", damped), ("gns", noisy), ("persistence", still)]
-    paths = [bench.submit(tmp_path / f"{i}.nc", method, name) for i, (name, method) in enumerate(methods)]
-    cards = [bench.card(path) for path in paths]
-    page = write_report(tmp_path, cards, paths, root=bench.root, registry=bench.registry)
+    methods = (("gns", damped), ("gns", noisy), ("persistence", still))
+    cards, paths, where = scored(make_report_bench(home, "curl-noise"), tmp_path, *methods)
+    page = write_report(tmp_path, cards, paths, **where)
     heading = read_html(page.read_text("utf-8")).named("h1")[0].text
     assert heading == "gns (1) · gns (2) · persistence (1)"
 
 
-def test_cards_must_belong_together(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_cards_must_belong_together(home: Path, tmp_path: Path) -> None:
     """No card, a card without its file, and two data sets are refused."""
-    one, two = bench_of("curl-noise"), bench_of("cavity")
-    first, second = one.submit(tmp_path / "1.nc", still, "a"), two.submit(tmp_path / "2.nc", still, "b")
-    cards = [one.card(first), two.card(second)]
-    for held, files in (([], []), (cards[:1], []), (cards, [first, second])):
+    benches = [make_report_bench(home, split) for split in ("curl-noise", "cavity")]
+    one, two = (scored(bench, tmp_path / bench.size.split, ("a", still)) for bench in benches)
+    for cards, files in (([], []), (one[0], []), (one[0] + two[0], one[1] + two[1])):
         with pytest.raises(UsageError):
-            write_report(tmp_path, held, files, root=one.root, registry=one.registry)
+            write_report(tmp_path, cards, files, **one[2])
     assert not (tmp_path / "index.html").exists()
 
 
-def test_pages_of_others_stay(bench_of: Callable[[str], ReportBench], tmp_path: Path) -> None:
+def test_pages_of_others_stay(home: Path, tmp_path: Path) -> None:
     """A report replaces a report, and no other page."""
-    bench = bench_of("cavity")
-    path = bench.submit(tmp_path / "1.nc", still, "a")
-    held = {"root": bench.root, "registry": bench.registry}
+    cards, paths, where = scored(make_report_bench(home, "cavity"), tmp_path, ("a", still))
     for _ in range(2):
-        page = write_report(tmp_path / "report", [bench.card(path)], [path], **held)
+        page = write_report(tmp_path / "report", cards, paths, **where)
     page.write_text("<!doctype html><title>My thesis</title>")
     with pytest.raises(UsageError) as caught:
-        write_report(tmp_path / "report", [bench.card(path)], [path], **held)
+        write_report(tmp_path / "report", cards, paths, **where)
     assert (caught.value.where, caught.value.got) == ("--report", str(page))
     assert "My thesis" in page.read_text()
 
@@ -307,15 +287,10 @@ def test_pages_of_others_stay(bench_of: Callable[[str], ReportBench], tmp_path: 
 def subject_on(split: str, size_name: str) -> Subject:
     """Return a subject without entries: enough to ask which frames are shown."""
     size = load().size(split, size_name)
-    task = size.task
-    setting = Setting(
-        grid=Grid(task.score_grid.cells),
-        input_frames=task.input_frames,
-        horizon=task.horizon,
-        frames_of_interest=task.frames_of_interest,
-        attribute_std=(1.0, 1.0, 1.0, 1.0),
-        radius=task.radius,
-    )
+    told = {
+        name: getattr(size.task, name) for name in ("input_frames", "horizon", "frames_of_interest", "radius")
+    }
+    setting = Setting(grid=Grid(size.task.score_grid.cells), attribute_std=(1.0,) * 4, **told)
     scored = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
     return Subject(task=scored, title=split, entries=())
 
@@ -333,9 +308,9 @@ def test_frames_are_those_of_the_thesis(split: str, frame: int, size: str) -> No
     subject = subject_on(split, size)
     predicted = subject.task.setting.predicted_frames
     assert size == "tiny" or subject.key_frame == frame
-    assert len(subject.times) == 6
+    first, *between, last = subject.times
+    assert (first, len(between), last) == (predicted[0], 4, predicted[-1])
     assert list(subject.times) == sorted(subject.times)
-    assert (subject.times[0], subject.times[-1]) == (predicted[0], predicted[-1])
     if (split, size) == ("cavity", "full"):
         assert subject.histogram_frames == (6, 9, 18, 21, 48, 51)
 

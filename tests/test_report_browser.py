@@ -20,11 +20,6 @@ def report(request: pytest.FixtureRequest, home: Path) -> Path:
     return page_of(home, request.param)
 
 
-def brightness(png: bytes) -> float:
-    """Return the median brightness of a picture, from 0 to 1."""
-    return float(np.median(np.asarray(Image.open(io.BytesIO(png)).convert("L")))) / 255.0
-
-
 @pytest.mark.parametrize("width", [1280, 390, 320])
 @pytest.mark.parametrize("dark", [False, True])
 def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark: bool) -> None:
@@ -34,11 +29,10 @@ def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark:
     assert page.value("document.images.length") > 5
     assert page.value("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
     assert page.value("document.scripts.length") == 0
-    picture = page.screenshot()
-    assert (brightness(picture) < 0.3) is dark
-    assert (
-        len(np.unique(np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).reshape(-1, 3), axis=0)) > 50
-    )
+    with Image.open(io.BytesIO(page.screenshot())) as picture:
+        brightness = float(np.median(np.asarray(picture.convert("L")))) / 255.0
+        colours = np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)
+    assert ((brightness < 0.3), len(colours) > 50) == (dark, True)
     page.press("Tab")
     assert page.focus_shows("a[href^='#part-']")
     assert page.messages == []
@@ -60,8 +54,8 @@ def test_texts_of_charts_lie_within_them(running: Browser, report: Path, width: 
     assert size.min() >= 7.0
 
 
-def test_heads_break_at_no_letter(running: Browser, report: Path) -> None:
-    """A name without a space or hyphen is on one line of its head, and so is every floor's."""
+def test_heads_break_at_no_letter_and_the_page_prints(running: Browser, report: Path) -> None:
+    """A name without a space or hyphen is on one line of its head, as every floor's is; a PDF has pages."""
     page = running.open(report, width=1280)
     heads = (
         "[...document.querySelectorAll('thead th, tbody th')].flatMap(th => [...th.querySelectorAll('span')])"
@@ -71,10 +65,6 @@ def test_heads_break_at_no_letter(running: Browser, report: Path) -> None:
         ".filter(s => s.matches('.muted') || !/[ -]/.test(s.textContent)).map(s => s.textContent)"
     )
     assert broken == []
-
-
-def test_page_prints(running: Browser, report: Path) -> None:
-    """Printing gives a PDF of some pages."""
-    pdf = running.open(report, width=1280).pdf()
+    pdf = page.pdf()
     assert pdf.startswith(b"%PDF")
     assert 3 <= pdf.count(b"/Type /Page\n") <= 40

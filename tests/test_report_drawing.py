@@ -94,10 +94,9 @@ def test_axes_hold_their_range(low: float, width: float, count: int) -> None:
 
 def test_axes_of_errors() -> None:
     """Wide ranges are logarithmic, narrow or signed ones linear from 0; NaN gives an axis too."""
-    assert spanning([np.geomspace(1e-4, 1.0, 20)]).log
-    assert not spanning([[0.5, 1.0]]).log
-    assert spanning([[0.5, 1.0]]).low == 0.0
-    assert not spanning([[-1.0, 1e-6, 1.0]]).log
+    wide, narrow, signed = map(spanning, ([np.geomspace(1e-4, 1.0, 20)], [[0.5, 1.0]], [[-1.0, 1e-6, 1.0]]))
+    assert [axis.log for axis in (wide, narrow, signed)] == [True, False, False]
+    assert narrow.low == 0.0
     for empty in ([], [[math.nan]], [[0.0]], [[math.inf, 1e301]]):
         axis = spanning(empty)
         assert axis.high > axis.low
@@ -120,20 +119,19 @@ def test_numbers_are_right(value: float) -> None:
     assert float(f"{mantissa}e{exponent}") == pytest.approx(value, rel=5.1e-3, abs=1e-300)
 
 
-def test_signed_pictures() -> None:
-    """Blue below 0, vermilion above, clear at 0, grey where nothing is; x goes right, y up."""
+def test_pictures() -> None:
+    """Blue below 0, vermilion above, clear at 0, grey where nothing is; x goes right, y up.
+
+    Of magnitudes the opacity grows with the value up to the limit.
+    """
     field = np.array([[-1.0, 0.0], [0.5, np.nan]])  # [x, y]
     shown = pixels(diverging(field, 1.0))
     assert shown.shape == (2, 2, 4)
-    assert shown[1, 0].tolist() == [0x00, 0x72, 0xB2, 255]  # x = 0, y = 0: lower left
     assert shown[0, 0, 3] == 0
-    assert shown[1, 1].tolist() == [0xD5, 0x5E, 0x00, round(255 * 0.5)]
     assert shown[0, 1].tolist() == [128, 128, 128, 34]
+    # x = 0, y = 0: lower left
+    assert shown[1].tolist() == [[0x00, 0x72, 0xB2, 255], [0xD5, 0x5E, 0x00, round(255 * 0.5)]]
     assert pixels(diverging(np.full((1, 1), np.inf), 1.0))[0, 0].tolist() == [0xD5, 0x5E, 0x00, 255]
-
-
-def test_pictures_of_magnitudes() -> None:
-    """Opacity grows with the value up to the limit."""
     shown = pixels(sequential(np.linspace(0.0, 2.0, LEVELS + 1)[:, None], 1.0))[0, :, 3].astype(int)
     assert shown[0] == 0
     assert (np.diff(shown) >= 0).all()
@@ -145,14 +143,17 @@ def test_painted_particles() -> None:
     position = np.array([[0.25, 0.75], [0.75, 0.25], [1.5, 0.5]])
     shown = pixels(paint(position, np.array([0, 3, 1]), ((0.0, 1.0), (0.0, 1.0)), 0.1))
     assert shown.shape == (SIDE, SIDE, 4)
-    assert shown[SIDE // 4, SIDE // 4].tolist() == [0x00, 0x72, 0xB2, 255]
-    assert shown[3 * SIDE // 4, 3 * SIDE // 4].tolist() == [0xE6, 0x9F, 0x00, 255]
+    places = [SIDE // 4, 3 * SIDE // 4]
+    assert shown[places, places].tolist() == [[0x00, 0x72, 0xB2, 255], [0xE6, 0x9F, 0x00, 255]]
     full = math.pi * (0.5 * 1.3 * 0.1 * SIDE) ** 2
     assert shown[..., 3].sum() / 255 == pytest.approx(2 * full, rel=0.03)
 
 
-def test_streamlines_of_a_solid_rotation_are_circles() -> None:
-    """Along each line the distance from the middle stays; together they reach most of the box."""
+def test_streamlines_of_a_rotation_are_circles_and_end_where_nothing_counts() -> None:
+    """Along each line the distance from the middle stays; together they reach most of the box.
+
+    A uniform flow stops at nodes that do not count; a flow at rest has none.
+    """
     x, y = np.mgrid[-16.0:17.0, -16.0:17.0]
     lines = streamlines(np.stack([-y, x], axis=-1), np.ones((33, 33), bool))
     assert len(lines) > 5
@@ -163,10 +164,6 @@ def test_streamlines_of_a_solid_rotation_are_circles() -> None:
         np.testing.assert_allclose(line.speed, radius, rtol=1e-6)
         turning = x[:-1] * np.diff(y) - y[:-1] * np.diff(x)
         assert (turning > 0).all()  # with the flow, not against it
-
-
-def test_streamlines_end_where_nothing_counts() -> None:
-    """A uniform flow stops at nodes that do not count; a flow at rest has none."""
     velocity = np.broadcast_to([1.0, 0.0], (20, 20, 2))
     counted = np.broadcast_to(np.arange(20)[:, None] < 10, (20, 20))
     lines = streamlines(velocity, counted)
@@ -181,23 +178,24 @@ def test_histogram_shares() -> None:
     rng = np.random.Generator(np.random.PCG64(3))
     truth, guess = rng.random(500), 3.0 * rng.random(500) - 1.0
     edges, shares = shares_of(guess, truth)
-    assert (edges[0], edges[-1]) == (truth.min(), truth.max())
+    assert (edges[0], edges[-1], shares.sum()) == (truth.min(), truth.max(), pytest.approx(100.0))
     expected = 100.0 * np.histogram(guess, edges)[0] / 500
-    assert shares.sum() == pytest.approx(100.0)
     np.testing.assert_allclose(shares[1:-1], expected[1:-1])
-    assert shares[0] > expected[0]
-    assert shares[-1] > expected[-1]
+    assert (shares[[0, -1]] > expected[[0, -1]]).all()
     assert shares_of(np.array([]), np.array([]))[1].sum() == 0.0
 
 
 Colour = NDArray[np.float64]
 
-CVD = {
+CVD_ROWS = {
     "protanopia": "0.152286 1.052583 -0.204868 0.114503 0.786281 0.099216 -0.003882 -0.048116 1.051998",
     "deuteranopia": "0.367322 0.860646 -0.227968 0.280085 0.672501 0.047413 -0.011820 0.042940 0.968881",
     "tritanopia": "1.255528 -0.076749 -0.178779 -0.078411 0.930809 0.147602 0.004733 0.691367 0.303900",
 }
 """Machado, Oliveira & Fernandes (2009), Table 1, full severity, on linear RGB, row by row."""
+
+CVD = {name: np.array(rows.split(), np.float64).reshape(3, 3) for name, rows in CVD_ROWS.items()}
+"""What a deficiency makes of a linear colour."""
 
 SHEET = files("lagbench.report").joinpath("style.css").read_text("utf-8")
 
@@ -206,11 +204,6 @@ def linear_rgb(digits: str) -> Colour:
     """Return a colour of six hexadecimal digits in linear RGB."""
     srgb = np.frombuffer(bytes.fromhex(digits), np.uint8) / 255.0
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def matrix(deficiency: str) -> Colour:
-    """Return what a deficiency makes of a linear colour, shape [3, 3]."""
-    return np.array(CVD[deficiency].split(), np.float64).reshape(3, 3)
 
 
 def scheme(dark: bool) -> dict[str, Colour]:
@@ -237,9 +230,15 @@ def lab(colour: Colour) -> Colour:
 
 
 @pytest.mark.parametrize("dark", [False, True])
-def test_text_can_be_read(dark: bool) -> None:
-    """Text has the contrast of WCAG AA (4.5), lines and arrows that of graphics or nearly so."""
+def test_text_can_be_read_and_speeds_are_ordered(dark: bool) -> None:
+    """Text has the contrast of WCAG AA (4.5), lines and arrows that of graphics or nearly so.
+
+    The faster an arrow, the farther it is from the background.
+    """
     colours = scheme(dark)
+    ratios = [contrast(colours[f"q{k}"], colours["paper"]) for k in range(6)]
+    assert ratios[0] > 1.3
+    assert ratios == sorted(ratios)
     for back in ("paper", "card"):
         for name in ("ink", "soft", "muted", "accent", "good", "warn", "bad"):
             assert contrast(colours[name], colours[back]) >= 4.5, name
@@ -252,7 +251,7 @@ def test_text_can_be_read(dark: bool) -> None:
 def test_series_stay_apart(dark: bool, deficiency: str) -> None:
     """Any two series differ by 10 in L*a*b* for colour-blind readers (2 is just noticeable)."""
     colours = scheme(dark)
-    seen = [lab(matrix(deficiency) @ colours[f"c{k}"]) for k in range(6)]
+    seen = [lab(CVD[deficiency] @ colours[f"c{k}"]) for k in range(6)]
     for (i, one), (k, two) in itertools.combinations(enumerate(seen), 2):
         assert np.linalg.norm(one - two) >= 10.0, (i, k)
 
@@ -260,15 +259,6 @@ def test_series_stay_apart(dark: bool, deficiency: str) -> None:
 @pytest.mark.parametrize("vision", CVD)
 def test_materials_stay_apart(vision: str) -> None:
     """For colour-blind readers any two materials differ by 0.2 of the RGB cube's side at least."""
-    seen = [np.clip(matrix(vision) @ linear_rgb(c.removeprefix("#")), 0.0, 1.0) for c in MATERIAL_COLOURS]
+    seen = [np.clip(CVD[vision] @ linear_rgb(c.removeprefix("#")), 0.0, 1.0) for c in MATERIAL_COLOURS]
     back = [np.where(c <= 0.0031308, 12.92 * c, 1.055 * c ** (1 / 2.4) - 0.055) for c in seen]
     assert min(np.linalg.norm(one - two) for one, two in itertools.combinations(back, 2)) > 0.2
-
-
-@pytest.mark.parametrize("dark", [False, True])
-def test_speeds_are_ordered(dark: bool) -> None:
-    """The faster, the farther from the background."""
-    colours = scheme(dark)
-    ratios = [contrast(colours[f"q{k}"], colours["paper"]) for k in range(6)]
-    assert ratios == sorted(ratios)
-    assert ratios[0] > 1.3

@@ -97,8 +97,8 @@ def test_the_same_files_give_the_same_bytes(
         assert names == ["manifest.json", *sorted(names[1:])]
         assert {(m.uid, m.gid, m.uname, m.mtime, m.mode) for m in tar} == {(0, 0, "", 0, 0o644)}
         tar.extractall(tmp_path / "out", filter="data")
-    for name in names:
-        assert (tmp_path / "out" / name).read_bytes() == (generated.root / DATA / name).read_bytes()
+    out, there = tmp_path / "out", generated.root / DATA
+    assert all((out / name).read_bytes() == (there / name).read_bytes() for name in names)
 
 
 @pytest.mark.parametrize("harm", ["missing", "flipped"])
@@ -129,25 +129,21 @@ def test_releases_have_one_address(
     assert (result.downloaded, result.mirror) == ((0, 1, 2, 3, 4), running.url)
     assert (result.verdict, result.complete) == ("equal to datasets.yaml", True)
     assert running.count(".nc") == 0
-    kept = [path.relative_to(tmp_path / "here") for path in (tmp_path / "here").rglob("*.nc")]
-    assert len(kept) == 5
-    for name in kept:
-        assert (tmp_path / "here" / name).read_bytes() == (generated.root / name).read_bytes()
+    here, there = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.nc")}
+        for root in (tmp_path / "here", generated.root)
+    )
+    assert here == there
 
 
-def test_a_placeholder_is_no_address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As long as nothing is released nobody is asked, and the error says what is missing."""
-    monkeypatch.setattr(archive, "open_object", None)
-    with pytest.raises(UsageError) as caught:
-        download(SPLIT, SIZE, root=tmp_path, or_generate=False)
+def test_nobody_is_asked(server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Local splits are nobody's business; a placeholder is no address, and the error says what is missing."""
+    with monkeypatch.context() as patch:
+        patch.setattr(archive, "open_object", None)
+        with pytest.raises(UsageError) as caught:
+            download(SPLIT, SIZE, root=here, or_generate=False)
     assert (caught.value.exit_code, caught.value.where) == (2, f"{SPLIT} {SIZE}")
     assert archive.RELEASES in str(caught.value.got)
-
-
-def test_local_splits_are_asked_of_nobody(
-    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Their names and hashes are nobody's business."""
     monkeypatch.setenv(archive.RELEASES_VARIABLE, server.url)
     with pytest.raises(UsageError):
         download("own", root=here)
@@ -172,8 +168,7 @@ def test_only_what_is_missing_is_asked_for(server: Mirror, here: Path, fault: st
         server.faults = {".tar": fault}
     last = fetched(server.url, here)
     assert {*first.downloaded, *last.downloaded} == {0, 1, 2, 3}
-    assert last.kept == first.downloaded
-    assert last.complete
+    assert (last.kept, last.complete) == (first.downloaded, True)
     if not fault:
         assert any(wanted for path, wanted in server.asked if path.endswith(".tar"))
 
@@ -185,21 +180,16 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
     assert fetched(server.url, here).complete
     ranges = [wanted for path, wanted in server.asked if path.endswith(".tar")]
     if fault == "drops":
-        (whole,) = server.folder.glob("*.tar")
-        third = whole.stat().st_size // 3
+        third = next(server.folder.glob("*.tar")).stat().st_size // 3
         assert ranges == [None, f"bytes={third}-", f"bytes={2 * third}-"]
 
 
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        ("chopped", objects.TruncatedError),
-        ("ends early", objects.TruncatedError),
-        ("announces more", objects.TruncatedError),
+        *((fault, objects.TruncatedError) for fault in ("chopped", "ends early", "announces more")),
         ("drops always", LagbenchError),
-        ("page", objects.NotDataError),
-        ("hidden page", objects.NotDataError),
-        ("endless", objects.NotDataError),
+        *((fault, objects.NotDataError) for fault in ("page", "hidden page", "endless")),
         ("busy", objects.StoreUnreachableError),
     ],
 )
@@ -208,13 +198,11 @@ def test_a_lying_server(server: Mirror, here: Path, fault: str, error: type[Lagb
     server.faults = {".tar": fault}
     with pytest.raises(error) as caught:
         fetched(server.url, here)
-    (whole,) = server.folder.glob("*.tar")
-    assert caught.value.where == f"{server.url}/{whole.name}"
+    assert caught.value.where == f"{server.url}/{next(server.folder.glob('*.tar')).name}"
     if issubclass(error, DataError):
         assert not [name for name in left(here) if "partial" in name]
     server.faults = {}
-    result = fetched(server.url, here)
-    assert result.complete
+    assert fetched(server.url, here).complete
     assert is_right(here)
 
 
@@ -267,8 +255,7 @@ def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -
     with pytest.raises(error) as caught:
         fetched(server.url, here)
     assert (type(caught.value), caught.value.exit_code) == (error, 4)
-    assert caught.value.where is not None
-    assert caught.value.where.startswith(f"{server.url}/{packed.name}")
+    assert str(caught.value.where).startswith(f"{server.url}/{packed.name}")
     with tarfile.open(packed) as tar:
         assert left(here) <= {f"own/full/v1/{name}" for name in tar.getnames()}
     assert not (left(here) and lie == "another data set")  # it is refused before any file is taken

@@ -21,7 +21,7 @@ from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import fetch, objects
 
-FIRST = "train/0000.nc"
+FIRST, LIST = "train/0000.nc", "manifest.json"
 
 
 @pytest.fixture(autouse=True)
@@ -65,8 +65,7 @@ def test_all_files_come_and_are_right(
     assert result.complete
     assert result.dataset_sha256 == original.dataset_sha256
     assert result.bytes == sum(path.stat().st_size for path in here.rglob("*.nc"))
-    notes = ".verified.json"
-    assert left(here) == {"0000.nc", "0001.nc", "0002.nc", "0003.nc", "manifest.json", notes}
+    assert left(here) == {*(f"000{i}.nc" for i in range(4)), LIST, ".verified.json"}
     assert lagbench.verify("own", root=here, complete=True).warnings == ()
     with lagbench.open_split("own", root=here) as one, lagbench.open_split(str(original.folder)) as two:
         np.testing.assert_array_equal(one["position"].values, two["position"].values)
@@ -152,74 +151,43 @@ def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
     """Broken connections are taken up by range, or from the start where the server knows no ranges."""
     server.faults = {FIRST: fault}
-    result = download("own", root=here, mirror=server.url)
-    assert result.complete
+    assert download("own", root=here, mirror=server.url).complete
     ranges = [wanted for path, wanted in server.asked if path.endswith(FIRST)]
     if fault == "drops":
-        assert len(ranges) == 3
-        assert ranges[0] is None
-        whole = (here / "own/full/v1" / FIRST).stat().st_size
-        assert ranges[1:] == [f"bytes={whole // 3}-", f"bytes={2 * (whole // 3)}-"]
-
-
-def test_an_interrupted_download_goes_on(server: Mirror, here: Path) -> None:
-    """What came before the connection was lost is not asked for again by the next command."""
-    server.faults = {FIRST: "drops"}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(fetch, "MOST_ATTEMPTS", 1)
-        with pytest.raises(objects.ConnectionLostError):
-            download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
-    server.faults, server.asked = {}, []
-    assert not (here / "own/full/v1" / FIRST).exists()
-    result = download("own", root=here, mirror=server.url, scenarios="0")
-    assert result.downloaded == (0,)
-    third = (here / "own/full/v1" / FIRST).stat().st_size // 3
-    assert server.asked[-1] == (f"/own/full/v1/{FIRST}", f"bytes={third}-")
+        third = (here / "own/full/v1" / FIRST).stat().st_size // 3
+        assert ranges == [None, f"bytes={third}-", f"bytes={2 * third}-"]
 
 
 @pytest.mark.parametrize(
-    ("fault", "manifest", "error"),
+    ("faults", "error"),
     [
-        ("page", True, objects.NotDataError),
-        ("hidden page", True, objects.NotDataError),
-        ("nowhere", True, objects.NotDataError),
-        ("announces more", True, objects.WrongLengthError),
-        ("announces less", True, objects.WrongLengthError),
-        ("chopped", True, objects.WrongLengthError),
-        ("ends early", True, objects.TruncatedError),
-        ("endless", True, objects.WrongLengthError),
-        ("flipped", True, objects.WrongContentError),
+        *(({FIRST: fault}, objects.NotDataError) for fault in ("page", "hidden page", "nowhere")),
+        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("announces more", "announces less")),
+        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("chopped", "endless")),
+        ({FIRST: "ends early"}, objects.TruncatedError),
+        ({FIRST: "flipped"}, objects.WrongContentError),
         # where the store has no manifest lengths are not known, but content is
-        ("announces more", False, objects.TruncatedError),
-        ("announces less", False, objects.WrongContentError),
-        ("chopped", False, objects.WrongContentError),
-        ("endless", False, objects.WrongLengthError),
+        ({FIRST: "announces more", LIST: "gone"}, objects.TruncatedError),
+        ({FIRST: "announces less", LIST: "gone"}, objects.WrongContentError),
+        ({FIRST: "chopped", LIST: "gone"}, objects.WrongContentError),
+        ({FIRST: "endless", LIST: "gone"}, objects.WrongLengthError),
+        # a login page in place of the manifest is told before any file is asked for
+        *(({LIST: fault}, objects.NotDataError) for fault in ("page", "hidden page")),
     ],
 )
 def test_each_lie_has_its_error_and_leaves_nothing(
-    server: Mirror, here: Path, fault: str, manifest: bool, error: type[LagbenchError]
+    server: Mirror, here: Path, faults: dict[str, str], error: type[LagbenchError]
 ) -> None:
     """No file of that name, no temporary one; the message names the address; other files stay right."""
-    server.faults = {FIRST: fault} | ({} if manifest else {"manifest.json": "gone"})
+    server.faults = faults
     with pytest.raises(error) as caught:
         download("own", root=here, mirror=server.url, connections=1)
-    assert type(caught.value) is error
-    assert caught.value.where == f"{server.url}/own/full/v1/{FIRST}"
-    assert caught.value.exit_code == 4
-    assert not left(here) & {"0000.nc"}
-    assert not [name for name in left(here) if "partial" in name]
+    assert (type(caught.value), caught.value.exit_code) == (error, 4)
+    assert caught.value.where == f"{server.url}/own/full/v1/{next(iter(faults))}"
+    assert not [name for name in left(here) if name == "0000.nc" or "partial" in name]
+    assert FIRST in faults or server.count(".nc") == 0
     server.faults = {}
     assert download("own", root=here, mirror=server.url).complete
-
-
-@pytest.mark.parametrize("fault", ["page", "hidden page"])
-def test_a_page_as_manifest(server: Mirror, here: Path, fault: str) -> None:
-    """A login page in place of the manifest is told before any file is asked for."""
-    server.faults = {"manifest.json": fault}
-    with pytest.raises(objects.NotDataError) as caught:
-        download("own", root=here, mirror=server.url)
-    assert caught.value.where == f"{server.url}/own/full/v1/manifest.json"
-    assert server.count(".nc") == 0
 
 
 @pytest.mark.parametrize(("fault", "useful"), [("drops always", 0), ("drops and starts over", 1)])
@@ -232,30 +200,36 @@ def test_a_line_that_stays_broken(server: Mirror, here: Path, fault: str, useful
     assert server.count(FIRST) == fetch.ATTEMPTS + useful
 
 
-@pytest.mark.parametrize("name", ["manifest.json", FIRST])
-def test_a_slow_store_is_refused(
-    server: Mirror, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch, name: str
+@pytest.mark.parametrize(("name", "fault"), [(LIST, "slow"), (FIRST, "slow"), (FIRST, "drops")])
+def test_an_interrupted_download_goes_on(
+    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch, name: str, fault: str
 ) -> None:
-    """A hundred bytes a second are below the least rate; the next command goes on from what came."""
+    """What came before the connection was lost, or given up, is not asked for again by the next command.
+
+    A hundred bytes a second are below the least rate.
+    """
     monkeypatch.setattr(fetch, "PATIENCE", 0.3)
-    server.faults = {name: "slow"}
-    with pytest.raises(objects.TooSlowError) as caught:
+    monkeypatch.setattr(fetch, "MOST_ATTEMPTS", 1)
+    server.faults = {name: fault}
+    with pytest.raises(objects.TooSlowError if fault == "slow" else objects.ConnectionLostError) as caught:
         download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
-    assert caught.value.exit_code == 5
-    assert caught.value.where == f"{server.url}/own/full/v1/{name}"
+    assert (caught.value.exit_code, caught.value.where) == (5, f"{server.url}/own/full/v1/{name}")
+    assert not (here / "own/full/v1" / FIRST).exists()
     server.faults = {}
     result = download("own", root=here, mirror=server.url, scenarios="0")
-    whole = (original.folder / "full/v1" / FIRST).stat().st_size
-    assert result.bytes == whole if name == "manifest.json" else 0 < result.bytes < whole
+    whole = (here / "own/full/v1" / FIRST).stat().st_size
+    assert result.downloaded == (0,)
+    assert result.bytes == whole if name == LIST else 0 < result.bytes < whole
+    if fault == "drops":
+        assert server.asked[-1] == (f"/own/full/v1/{FIRST}", f"bytes={whole // 3}-")
 
 
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
         ("gone", objects.NotInStoreError),
-        ("busy", objects.StoreUnreachableError),
-        ("forbidden", objects.StoreUnreachableError),
-        ("elsewhere", objects.StoreUnreachableError),  # a redirection leads to no file of this machine
+        # a redirection elsewhere leads to no file of this machine
+        *((fault, objects.StoreUnreachableError) for fault in ("busy", "forbidden", "elsewhere")),
     ],
 )
 def test_no_generate_stops_where_the_store_does(
@@ -291,13 +265,12 @@ def test_what_is_no_address(here: Path, address: str) -> None:
     assert str(caught.value.where).startswith(address)
 
 
-def test_addresses_are_percent_encoded(original: LocalSplit, here: Path) -> None:
+def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
     """A folder of any name can be asked for; what is encoded already is asked for as it stands."""
-    with serving(original.folder.parent) as running:
-        for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
-            with pytest.raises(objects.NotInStoreError):
-                download("own", root=here, mirror=f"{running.url}/{typed}", or_generate=False)
-            assert running.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
+    for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
+        with pytest.raises(objects.NotInStoreError):
+            download("own", root=here, mirror=f"{server.url}/{typed}", or_generate=False)
+        assert server.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
 
 
 def test_simulated_splits_come_from_a_store_or_are_simulated(
@@ -305,17 +278,14 @@ def test_simulated_splits_come_from_a_store_or_are_simulated(
 ) -> None:
     """Files that a store has not are simulated: the data set is that of datasets.yaml all the same."""
     told: list[str] = []
+    where = {"root": tmp_path, "workers": 1, "announce": told.append}
     with serving(generated.root) as running:
         running.faults = {"0003.nc": "gone"}
-        result = download(
-            "curl-noise", "tiny", mirror=running.url, root=tmp_path, workers=1, announce=told.append
-        )
-    assert result.downloaded == (0, 1, 2, 4)
-    assert result.generated == (3,)
-    assert result.verdict == "equal to datasets.yaml"
-    assert result.dataset_sha256 == generated.dataset_sha256
-    assert len(told) == 1
-    assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in told[0]
+        result = download("curl-noise", "tiny", mirror=running.url, **where)
+    assert (result.downloaded, result.generated) == ((0, 1, 2, 4), (3,))
+    assert (result.verdict, result.dataset_sha256) == ("equal to datasets.yaml", generated.dataset_sha256)
+    (one,) = told
+    assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in one
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()
 
 

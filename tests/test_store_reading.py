@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import xarray as xr
 from conftest import SIZE, SPLIT
 from object_stores import Store, files, holding, machine
-from typer.testing import CliRunner
+from typer.testing import Result
 
 import lagbench
-from lagbench.__main__ import app
 from lagbench.baselines.facts import facts_of
 from lagbench.data.layout import as_url, url_of
 from lagbench.data.local import resolve_root
@@ -73,6 +72,13 @@ def here(url: str) -> list[str]:
     return sorted(name.removeprefix(f"{FOLDER}/") for name in files(resolve_root(url)))
 
 
+def without(text: bytes, key: str, value: object) -> bytes:
+    """Return a manifest without the files of a scenario or subset."""
+    held = json.loads(text)
+    held["files"] = [entry for entry in held["files"] if entry[key] != value]
+    return json.dumps(held).encode()
+
+
 def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
     """The arrays are those of the folder; a second look fetches nothing; what the store lacks is named."""
     with (
@@ -111,14 +117,14 @@ def test_baselines_and_exports_read_from_a_store(
     assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
     assert here(url) == ["manifest.json", "train/0000.nc"]
     found = copy.scenario_files(tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid"))
-    assert [path.read_bytes() for path in found.values()] == [
-        (generated.folder / name).read_bytes() for name in ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
-    ]
-    made = [
-        export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny)
+    names = ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
+    there = [(generated.folder / name).read_bytes() for name in names]
+    assert [path.read_bytes() for path in found.values()] == there
+    far, near = (
+        files(export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny).folder)
         for name, root in (("far", url), ("near", generated.root))
-    ]
-    assert files(made[0].folder) == files(made[1].folder)
+    )
+    assert far == near
 
 
 def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
@@ -130,68 +136,57 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
 
 
 def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:
-    """A damaged file comes again; an object that is gone is named, but over HTTP, which lists nothing."""
+    """A damaged file comes again; an object that is gone is named, but over HTTP, which lists nothing.
+
+    Files that are in the working copy alone make no data set of the store whole, be it one or all.
+    """
     verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
     path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
     path.write_bytes(path.read_bytes()[:-9] + bytes(9))
     verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    good = store.read(f"{FOLDER}/valid/0002.nc")
     store.remove(f"{FOLDER}/valid/0002.nc")
     if not store.server:
         with pytest.raises(DataError) as caught:
             verify(SPLIT, SIZE, root=store.url, registry=tiny)
         assert str(caught.value.where).endswith("scenarios 2")
-
-
-def test_an_emptied_store_is_not_whole(store: Store, tiny: Registry) -> None:
-    """Files that are in the working copy alone make no data set of the store whole, be it one or all."""
-    whole = verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny)
-    assert not whole.problems
-    manifest = json.loads(store.read(MANIFEST))
-    manifest["files"] = [entry for entry in manifest["files"] if entry["scenario"] != 3]
-    store.put(MANIFEST, json.dumps(manifest).encode())
+    store.put(f"{FOLDER}/valid/0002.nc", good)
+    store.put(MANIFEST, without(store.read(MANIFEST), "scenario", 3))
     lost = verify(SPLIT, SIZE, root=store.url, registry=tiny)
     assert "scenario 3 is in the working copy alone, not in the store" in lost.problems
     store.remove(MANIFEST)
     assert len(verify(SPLIT, SIZE, root=store.url, registry=tiny).problems) == 5
 
 
-@pytest.mark.parametrize("change", ["flipped", "shorter", "other scenario"])
-def test_other_content_is_refused(folder: Store, tiny: Registry, change: str) -> None:
-    """The error names the object, and no file of it is left."""
+def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
+    """The error names the object, and no file of it is left: a bit changed, too short, another scenario."""
     good, other = (folder.read(f"{FOLDER}/test/{name}.nc") for name in ("0003", "0004"))
-    bad = {
-        "flipped": good[:-9] + bytes([good[-9] ^ 1]) + good[-8:],
-        "shorter": good[:-1],
-        "other scenario": other,
-    }
-    folder.put(f"{FOLDER}/test/0003.nc", bad[change])
-    with pytest.raises((WrongContentError, WrongLengthError)) as caught:
-        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
-    assert caught.value.where == f"{folder.url}/{FOLDER}/test/0003.nc"
-    assert {*here(folder.url)} <= {"test/0004.nc"}
+    for bad in (good[:-9] + bytes([good[-9] ^ 1]) + good[-8:], good[:-1], other):
+        folder.put(f"{FOLDER}/test/0003.nc", bad)
+        with pytest.raises((WrongContentError, WrongLengthError)) as caught:
+            lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+        assert caught.value.where == f"{folder.url}/{FOLDER}/test/0003.nc"
+        assert {*here(folder.url)} <= {"test/0004.nc"}
+        shutil.rmtree(resolve_root(folder.url) / FOLDER)
 
 
 @pytest.mark.parametrize(
-    ("change", "of_files", "error"),
+    ("key", "value", "error"),
     [
-        ({}, {"content_sha256": "0" * 64}, WrongContentError),
-        ({}, {"bytes": 300_000_000}, WrongLengthError),
-        ({"split": "../../../elsewhere"}, {}, NotDataError),
-        ({"size": "mini"}, {}, NotDataError),
-        ({"version": "7.0.0"}, {}, NotDataError),
+        ("content_sha256", "0" * 64, WrongContentError),
+        ("bytes", 300_000_000, WrongLengthError),
+        ("split", "../../../elsewhere", NotDataError),
+        ("size", "mini", NotDataError),
+        ("version", "7.0.0", NotDataError),
     ],
 )
 def test_what_a_manifest_cannot_say_is_refused(
-    folder: Store,
-    tmp_path: Path,
-    change: dict[str, object],
-    of_files: dict[str, object],
-    error: type[DataError],
+    folder: Store, tmp_path: Path, key: str, value: object, error: type[DataError]
 ) -> None:
     """Other hashes than those of datasets.yaml, endless files, names that lead elsewhere: nothing comes."""
-    text = json.loads(folder.read(MANIFEST)) | change
-    for entry in text["files"]:
-        entry |= of_files
+    text = json.loads(folder.read(MANIFEST))
+    for part in text["files"] if key in ("content_sha256", "bytes") else [text]:
+        part[key] = value
     folder.put(MANIFEST, json.dumps(text).encode())
     before = set(tmp_path.rglob("manifest.json"))
     with pytest.raises(error):
@@ -219,9 +214,7 @@ def test_what_only_the_copy_has_stays_known(
     shutil.copytree(generated.root, resolve_root(folder.url), dirs_exist_ok=True)
     (resolve_root(folder.url) / FOLDER / "test/0003.nc").unlink()
     full = folder.read(MANIFEST)
-    less = json.loads(full)
-    less["files"] = [entry for entry in less["files"] if entry["subset"] != "train"]
-    folder.put(MANIFEST, json.dumps(less).encode())
+    folder.put(MANIFEST, without(full, "subset", "train"))
     lagbench.open_split(SPLIT, size=SIZE, root=folder.url).close()
     assert (resolve_root(folder.url) / MANIFEST).read_bytes() == full
 
@@ -241,16 +234,13 @@ def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.Monke
     assert [as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)] == [None] * 5
 
 
-def test_the_command_line_takes_a_url(url: str, tiny: Registry, tmp_path: Path) -> None:
+def test_the_command_line_takes_a_url(url: str, run: Callable[..., Result], tmp_path: Path) -> None:
     """List, template, verify and info work on a store as on a folder; the list says where it is."""
-    runner = CliRunner()
-
-    def call(*words: str) -> str:
-        done = runner.invoke(app, [*words, "--root", url], catch_exceptions=False)
-        assert done.exit_code == 0, done.output
-        return done.output
-
-    assert url in call("list").replace("\n", "")
-    assert "2 scenarios" in call("template", SPLIT, "--size", SIZE, "--output", str(tmp_path / "p.nc"))
-    assert "data set hash:" in call("verify", SPLIT, "--size", SIZE)
-    assert "Path" not in call("info", SPLIT, "--size", SIZE)
+    one = (SPLIT, "--size", SIZE)
+    more = {"list": (), "template": (*one, "--output", tmp_path / "p.nc"), "verify": one, "info": one}
+    done = {word: run(word, *words, "--root", url) for word, words in more.items()}
+    assert [result.exit_code for result in done.values()] == [0, 0, 0, 0]
+    assert url in done["list"].output.replace("\n", "")
+    assert "2 scenarios" in done["template"].output
+    assert "data set hash:" in done["verify"].output
+    assert "Path" not in done["info"].output

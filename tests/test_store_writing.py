@@ -9,10 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
-from exchange_readers import straight_runs
 from object_stores import files, fill, machine, objects, put, remove
 
 from lagbench.atomic import write_atomically
@@ -22,7 +20,8 @@ from lagbench.data.local import resolve_root
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, WorkFailedError
-from lagbench.exchange import adopt, download
+from lagbench.exchange import download
+from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.store import publication
 from lagbench.store.objects import Objects
@@ -133,9 +132,7 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
     result = run(full)
     assert (result.simulated, result.kept, result.missing) == ((), (0, 1, 2, 3, 4), ())
     assert result.dataset_sha256 == generated.dataset_sha256
-    assert objects(full) == before
-    assert wrote == []
-    assert [*files(result.root)] == [MANIFEST]
+    assert (objects(full), wrote, [*files(result.root)]) == (before, [], [MANIFEST])
 
 
 def test_the_manifest_comes_last(
@@ -177,10 +174,9 @@ def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
     put(full, f"{FOLDER}/train/0001.nc", b"half")
     run(simulated_here(full))
     assert objects(full) == files(generated.root)
-    names = [name for name, _ in wrote]
-    assert names[:2] == ["manifest.json", "train/0001.nc"]
-    assert "train/0001.nc" not in named(wrote[0][1]["manifest.json"])
-    assert names[-1] == "manifest.json"
+    (first, there), (second, _), *_, (last, _) = wrote
+    assert (first, second, last) == ("manifest.json", "train/0001.nc", "manifest.json")
+    assert "train/0001.nc" not in named(there["manifest.json"])
     put(full, MANIFEST, b"{}")
     run(full)
     assert objects(full) == files(generated.root)
@@ -215,9 +211,7 @@ def test_two_writers_do_no_harm(
     result = run(url)
     assert (result.simulated, result.complete) == ((), True)
     found, wanted = objects(url), files(generated.root)
-    assert {name: found[name] for name in wanted if name.endswith(".nc")} == {
-        name: data for name, data in wanted.items() if name.endswith(".nc")
-    }
+    assert all(found[name] == data for name, data in wanted.items() if name.endswith(".nc"))
 
 
 def leave_only(root: Path, *subsets: str) -> None:
@@ -236,8 +230,7 @@ def test_a_dry_run_only_looks(full: str, run: Run) -> None:
     before = objects(full)
     result = run(full, dry_run=True)
     assert (result.simulated, result.kept) == ((2,), (0, 1, 3, 4))
-    assert objects(full) == before
-    assert files(result.root) == {}
+    assert (objects(full), files(result.root)) == (before, {})
 
 
 def test_a_file_that_changed_is_not_put(url: str, run: Run, simulated_here: Fill) -> None:
@@ -251,20 +244,16 @@ def test_a_file_that_changed_is_not_put(url: str, run: Run, simulated_here: Fill
     assert f"{FOLDER}/train/0000.nc" not in objects(url)
 
 
-def test_a_download_goes_into_a_store(tmp_path: Path, url: str) -> None:
+def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
     """What a mirror has arrives there with its manifest; a second call fetches nothing."""
-    np.save(tmp_path / "runs.npy", np.stack(straight_runs(4, frames=12)))
-    own = adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
     (resolve_root(url) / "own").mkdir(parents=True)
-    shutil.copy(own.folder / "split.yaml", resolve_root(url) / "own")
-    result = download("own", root=url, mirror=tmp_path.as_uri())
+    shutil.copy(original.folder / "split.yaml", resolve_root(url) / "own")
+    result = download("own", root=url, mirror=original.folder.parent.as_uri())
     assert (result.downloaded, result.complete) == ((0, 1, 2, 3), True)
-    there = {name.removeprefix("own/"): data for name, data in objects(url).items()}
-    scenarios = {name: data for name, data in files(own.folder).items() if name.endswith(".nc")}
-    assert there == {**scenarios, "full/v1/manifest.json": there["full/v1/manifest.json"]}
-    assert named(there["full/v1/manifest.json"]) == [
-        f"{subset}/{i:04d}.nc" for i, subset in enumerate(["train", "train", "valid", "test"])
-    ]
+    there = {name.removeprefix("own/full/v1/"): data for name, data in objects(url).items()}
+    manifest = there.pop("manifest.json")
+    assert named(manifest) == ["train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc"]
+    assert there == {name: (original.folder / "full/v1" / name).read_bytes() for name in named(manifest)}
     again = download("own", root=url, mirror="file:///nowhere")
     assert (again.downloaded, again.kept) == ((), (0, 1, 2, 3))
 
@@ -277,9 +266,9 @@ def test_what_was_made_anew_is_not_fetched_back(
     size, root = unmeasured.size(SPLIT, SIZE), resolve_root(full)
     path = root / FOLDER / "train/0000.nc"
     path.write_bytes(path.read_bytes() + b"\0")
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
     with publication.publication(size, root) as store:
         assert store is not None
-        manifest = read_manifest(root, SPLIT, SIZE, 2)
         assert manifest is not None
         first = manifest.files[0]
         new = first.model_copy(update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)})

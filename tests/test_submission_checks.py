@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import h5py
 import numpy as np
@@ -16,13 +18,12 @@ from bad_submissions import FAULTS
 from faulty import positions, rows, store
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
-from submission_data import FRAMES, GIVEN, PARTICLES, Bench, make_bench, truth
+from submission_data import FRAMES, GIVEN, PARTICLES, TESTS, Bench, make_bench, small, truth
 
 from lagbench.data.layout import NOTES_NAME
 from lagbench.data.registry import Registry
-from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
 from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
@@ -32,20 +33,16 @@ from lagbench.submission import truth as module
 from lagbench.submission.task_checks import guess_frames, guess_scenarios
 from lagbench.submission.truth import Truth
 
-Values = NDArray[np.float32]
+bench = small
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission."""
-    return make_bench(tmp_path_factory.mktemp("bench"))
-
-
-def changed(bench: Bench, edit: Callable[[Values], Values]) -> ValidationResult:
-    """Validate the valid file with other positions."""
+def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:
+    """Validate the valid file with other positions, all of them or those of a place."""
     path = bench.copy("changed.nc")
     with h5py.File(path, "r+") as file:
-        store(file, edit(positions(file)))
+        values = positions(file)
+        values[place] = new
+        store(file, values)
     return bench.validate(path)
 
 
@@ -54,12 +51,7 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
 
     The wall is at 0.9375 and a solver cell is 0.125 wide: 1.06 passes, 1.07 does not.
     """
-
-    def edit(values: Values) -> Values:
-        values[1, 4, 9, 0] = 1.5
-        return values
-
-    result = changed(bench, edit)
+    result = changed(bench, 1.5, (1, 4, 9, 0))
     flag = next(f for f in result.findings if f.check == "in_domain")
     assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
     assert flag.where == "first in scenario 4, frame 7, particle 9"
@@ -67,8 +59,7 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
     assert "0.09%" in flag.what
     assert "0.562" in flag.got
     for place, flagged in ((1.06, False), (1.07, True)):
-        result = changed(bench, lambda values, place=place: np.full_like(values, place))  # type: ignore[misc]
-        assert ("in_domain" in {f.check for f in result.warnings}) == flagged
+        assert ("in_domain" in {f.check for f in changed(bench, place).warnings}) == flagged
 
 
 def test_jumps_are_flagged(bench: Bench) -> None:
@@ -80,17 +71,11 @@ def test_jumps_are_flagged(bench: Bench) -> None:
     source = truth_of(bench)
     everything = source.largest_displacement(4, enough=np.inf)
     assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
-    result = changed(bench, lambda x: np.concatenate([x[:, :4], x[:, 4:, ::-1]], axis=1))
+    result = changed(bench, np.stack([truth(i)[4:, ::-1] for i in TESTS]), np.s_[:, 4:])
     assert {f.check for f in result.findings} == {"max_displacement"}
     assert [f.where.split(",")[1].strip() for f in result.warnings] == ["from frame 6 to 7"] * 3
     assert result.exit_code == 0
-
-    def edit(values: Values) -> Values:
-        values[1, :, 9] = source.given(4)[-1, 9]
-        values[1, :, 9, 0] += 15 * everything
-        return values
-
-    result = changed(bench, edit)
+    result = changed(bench, source.given(4)[-1, 9] + [15 * everything, 0.0], np.s_[1, :, 9])
     assert [f.check for f in result.findings] == ["max_displacement"]
     assert result.warnings[0].where == f"scenario 4, from frame {GIVEN - 1} to {GIVEN}, particle 9"
     assert result.exit_code == 0
@@ -104,29 +89,18 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     steps = np.diff(np.concatenate([source.given(3), truth(3)]).astype("f8"), axis=0)
     assert limit == pytest.approx(10 * np.sqrt((steps**2).sum(-1)).max())
     for factor in (0.9, 1.1):
-
-        def edit(values: Values, factor: float = factor) -> Values:
-            values[0] = source.given(3)[-1] + np.array([factor * limit, 0], np.float32)
-            return values
-
-        result = changed(bench, edit)
+        result = changed(bench, source.given(3)[-1] + np.array([factor * limit, 0], np.float32), 0)
         assert result.exit_code == 0
         flagged.append([float(f.got) for f in result.warnings if f.check == "discontinuous_start"])
     assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
 
 
-def test_a_sound_file_opens_the_truth_once(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sound_file_opens_the_truth_once(bench: Bench) -> None:
     """Three scenarios whose first frames tell all that the checks ask: three openings."""
-    opened: list[int] = []
-    really = Truth.open
-
-    def counted(self: Truth, scenario: int) -> ScenarioFile:
-        opened.append(scenario)
-        return really(self, scenario)
-
-    monkeypatch.setattr(Truth, "open", counted)
-    result = bench.validate(bench.copy("sound.nc"))
-    assert (result.exit_code, opened) == (0, [3, 4, 5])
+    with mock.patch.object(Truth, "open", autospec=True, side_effect=Truth.open) as opened:
+        result = bench.validate(bench.copy("sound.nc"))
+    assert result.exit_code == 0
+    assert [scenario for (_, scenario), _ in opened.call_args_list] == [3, 4, 5]
 
 
 def test_all_findings_are_reported_together(bench: Bench) -> None:
@@ -141,8 +115,13 @@ def test_all_findings_are_reported_together(bench: Bench) -> None:
     assert result.exit_code == 4
 
 
-def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_path: Path) -> None:
-    """Two checks are skipped and give the command; for scoring that is an error of exit code 4."""
+def test_without_the_data_set_what_needs_no_truth_is_checked(
+    unmeasured: Registry, bench: Bench, tmp_path: Path
+) -> None:
+    """Two checks are skipped and give the command; for scoring that is an error of exit code 4.
+
+    A registry that nobody measured cannot vouch: the check says so and does not reject.
+    """
     elsewhere = replace(bench, root=tmp_path)
     result = elsewhere.validate(bench.valid)
     assert result.exit_code == 0
@@ -152,15 +131,9 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(bench: Bench, tmp_p
     assert required.exit_code == 4
     with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
         required.check()
-
-
-def test_without_a_recorded_hash_the_check_warns(unmeasured: Registry, bench: Bench, tmp_path: Path) -> None:
-    """A registry that nobody measured cannot vouch: the check says so and does not reject."""
-    path = bench.copy("unmeasured.nc")
-    result = validate(path, root=tmp_path, registry=unmeasured, isolated=False)
+    result = validate(bench.valid, root=tmp_path, registry=unmeasured, isolated=False)
     flag = next(f for f in result.findings if f.check == "dataset")
-    assert flag.severity is Severity.WARNING
-    assert "datasets.yaml" in flag.got
+    assert (flag.severity, "datasets.yaml" in flag.got) == (Severity.WARNING, True)
 
 
 @pytest.mark.parametrize(
@@ -230,17 +203,10 @@ def change(path: Path, *, keep_times: bool = False) -> None:
 
 
 @pytest.fixture
-def hashed(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Files whose values are hashed during a test."""
-    found: list[Path] = []
-    check = module.check_scenario
-
-    def listen(path: Path) -> str:
-        found.append(path)
-        return check(path)
-
-    monkeypatch.setattr(module, "check_scenario", listen)
-    return found
+def hashed() -> Iterator[mock.Mock]:
+    """What is called with every file whose values are hashed during a test."""
+    with mock.patch.object(module, "check_scenario", side_effect=module.check_scenario) as listening:
+        yield listening
 
 
 @pytest.mark.parametrize("damage", ["cut", "another scenario", "one value, all attributes kept"])
@@ -261,41 +227,40 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(own: Bench, damage: st
     assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 
-def test_a_change_after_the_check_is_seen(own: Bench, hashed: list[Path]) -> None:
+def test_a_change_after_the_check_is_seen(own: Bench, hashed: mock.Mock) -> None:
     """What was noted counts for the bytes that were hashed, also where the times were put back."""
     assert own.validate(own.valid).valid
     path = truth_of(own).path(4)
     change(path, keep_times=True)
-    hashed.clear()
+    hashed.reset_mock()
     with pytest.raises(DataError) as caught:
         truth_of(own).check()
-    assert (caught.value.exit_code, hashed) == (4, [path])
+    assert (caught.value.exit_code, hashed.mock_calls) == (4, [mock.call(path)])
 
 
-def test_notes_of_another_machine_count_for_nothing(own: Bench, tmp_path: Path, hashed: list[Path]) -> None:
-    """Values are hashed once; where a folder is copied with its notes its files are hashed again."""
+def test_other_notes_count_for_nothing(own: Bench, tmp_path: Path, hashed: mock.Mock) -> None:
+    """Values are hashed once; where a folder is copied with its notes its files are hashed again.
+
+    So they are where the notes are damaged, which are written anew.
+    """
     truth_of(own).check()
     truth_of(own).check()
-    assert len(hashed) == 3
+    assert hashed.call_count == 3
     root = tmp_path / "copy"
     shutil.copytree(own.root, root)
     Truth(own.registry.size("cavity", "tiny"), root).check()
-    assert len(hashed) == 6
-
-
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"test/0004.nc": 1}', '{"test/0004.nc": [1]}', "[" * 10**5])
-def test_damaged_notes_are_no_notes(own: Bench, text: str) -> None:
-    """The files are hashed, and the notes written anew."""
+    assert hashed.call_count == 6
     notes = truth_of(own).folder / NOTES_NAME
-    notes.write_text(text)
-    truth_of(own).check()
-    assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in (3, 4, 5)}
+    for text in ("", "[]", "{", '{"test/0004.nc": 1}', '{"test/0004.nc": [1]}', "[" * 10**5):
+        notes.write_text(text)
+        truth_of(own).check()
+        assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in TESTS}
 
 
 def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
     """A file that agrees with itself, but not with datasets.yaml."""
     size = truth_of(own).size
-    other = size.measured.model_copy(update={"scenario_sha256": {3: "0" * 16, 4: "0" * 16, 5: "0" * 16}})
+    other = size.measured.model_copy(update={"scenario_sha256": dict.fromkeys(TESTS, "0" * 16)})
     with pytest.raises(DataError) as caught:
         Truth(size.model_copy(update={"measured": other}), own.root).check()
     assert caught.value.expected == "0" * 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from submission_data import Bench, make_bench
+from submission_data import Bench, small
 
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
@@ -17,10 +17,9 @@ ROOM = {"seconds": 5.0, "wall": 600.0}
 JOBS = """
 import os, signal, sys, time
 
-def echo(value):
-    return value
-
 def behave(how):
+    if not isinstance(how, str):
+        return how
     if how == "sleep":
         time.sleep(60)
     elif how == "burn":
@@ -38,10 +37,7 @@ def behave(how):
 """
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission."""
-    return make_bench(tmp_path_factory.mktemp("bench"))
+bench = small
 
 
 @pytest.fixture
@@ -49,13 +45,6 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A module ``jobs`` that children can import."""
     (tmp_path / "jobs.py").write_text(JOBS)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}")
-
-
-@pytest.mark.usefixtures("jobs")
-def test_answers_come_in_the_order_of_requests() -> None:
-    """What JSON can hold goes there and back."""
-    values = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
-    assert in_child("jobs.echo", values, **ROOM) == (values, None)
 
 
 @pytest.mark.usefixtures("jobs")
@@ -77,8 +66,14 @@ def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> No
 
 
 @pytest.mark.usefixtures("jobs")
-def test_a_child_that_waits_or_raises() -> None:
-    """One is stopped by the clock, since it computes nothing; the other is exit code 5 with its last line."""
+def test_a_child_that_answers_waits_or_raises() -> None:
+    """What JSON can hold goes there and back, in the order of requests.
+
+    One that waits is stopped by the clock, since it computes nothing; an error is exit code 5 with its last
+    line.
+    """
+    asked = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
+    assert in_child("jobs.behave", asked, **ROOM) == (asked, None)
     values, stopped = in_child("jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0)
     assert values in ([], [""])  # on a busy machine it may not even have begun
     assert stopped == "no end after 4 s"

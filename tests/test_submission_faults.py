@@ -13,7 +13,7 @@ import pytest
 from bad_submissions import FAULTS, cpu_seconds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from submission_data import Bench, make_bench
+from submission_data import Bench, small
 
 from lagbench.submission import CHECKS, ValidationResult
 
@@ -30,10 +30,7 @@ def most() -> float:
     return max(MEBIBYTES, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1)
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission."""
-    return make_bench(tmp_path_factory.mktemp("bench"))
+bench = small
 
 
 @pytest.fixture
@@ -124,14 +121,10 @@ def check_mutation(bench: Bench, peaks: list[float], changes: list[tuple[float, 
 
 BYTES = given(changes=MUTATIONS, keep=st.just(1.0) | st.floats(0, 1))
 RELAXED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
-test_changed_bytes_never_escape_the_checks = settings(
-    max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED
-)(BYTES(check_mutation))
-test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(
-    settings(max_examples=200, deadline=None, database=None, suppress_health_check=RELAXED)(
-        BYTES(check_mutation)
-    )
-)
+FEW = settings(max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED)
+MANY = settings(FEW, max_examples=200)
+test_changed_bytes_never_escape_the_checks = FEW(BYTES(check_mutation))
+test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(MANY(BYTES(check_mutation)))
 
 
 @pytest.mark.slow

@@ -74,26 +74,21 @@ def order(world: World, scenario: int) -> NDArray[np.intp]:
     return rng(scenario).permutation(world.size.particles)
 
 
-def permuted_within(world: World, scenario: int) -> Floats:
-    """The truth with the particles of each material in another order."""
+def within(world: World, scenario: int) -> NDArray[np.intp]:
+    """Another order of the particles of each material."""
     order = np.arange(world.size.particles)
     for kind in np.unique(world.material[scenario]):
         held = np.flatnonzero(world.material[scenario] == kind)
         order[held] = rng(scenario).permutation(held)
-    return world.truth(scenario)[:, order]
+    return order
 
 
-def partly_permuted(world: World, scenario: int) -> Floats:
-    """The truth with a third of the particles in another order."""
+def a_third(world: World, scenario: int) -> NDArray[np.intp]:
+    """Another order of a third of the particles."""
     order = np.arange(world.size.particles)
     some = rng(scenario).choice(order, len(order) // 3, replace=False)
     order[np.sort(some)] = some
-    return world.truth(scenario)[:, order]
-
-
-def early(world: World, scenario: int) -> Floats:
-    """The last given frame first, then the truth."""
-    return world.truth(scenario, late=-1)
+    return order
 
 
 def following(world: World, scenario: int) -> int:
@@ -104,13 +99,14 @@ def following(world: World, scenario: int) -> int:
 
 MISTAKES: dict[str, tuple[Predict, str]] = {
     "permuted": (lambda w, i: w.truth(i)[:, order(w, i)], "order"),
-    "permuted within materials": (permuted_within, "order"),
-    "a third permuted": (partly_permuted, "order"),
+    "permuted within materials": (lambda w, i: w.truth(i)[:, within(w, i)], "order"),
+    "a third permuted": (lambda w, i: w.truth(i)[:, a_third(w, i)], "order"),
     "under the next number": (lambda w, i: np.roll(w.truth(i), 1, axis=1), "order"),
     # permuted, and predicted to stand still
     "permuted and wrong": (lambda w, i: np.broadcast_to(w.last(i)[order(w, i)], w.truth(i).shape), "order"),
     "y first": (lambda w, i: w.truth(i)[..., ::-1], "swapped"),
-    "early": (early, "shifted"),
+    # the last given frame first, then the truth
+    "early": (lambda w, i: w.truth(i, late=-1), "shifted"),
     # without its first frame; the last one is repeated
     "late": (lambda w, i: np.concatenate([w.truth(i)[1:], w.truth(i)[-1:]]), "shifted"),
     "steps": (lambda w, i: np.diff(np.concatenate([w.last(i)[None], w.truth(i)]), axis=0), "displacements"),
@@ -128,8 +124,7 @@ def test_a_mistake_is_named(world: World, tmp_path: Path, name: str) -> None:
     """The check ``start`` refuses it, by its own name."""
     predict, word = MISTAKES[name]
     result = world.validate(tmp_path / "p.nc", predict)
-    assert {finding.check for finding in result.errors} == {"start"}
-    assert all(word in finding.what for finding in result.errors)
+    assert {(finding.check, word in finding.what) for finding in result.errors} == {("start", True)}
     assert result.exit_code == 1
 
 
@@ -185,7 +180,7 @@ def test_what_is_no_mistake(world: World, tmp_path: Path) -> None:
     assert not validate(made.path, root=world.root, isolated=False).findings
     assert not world.validate(tmp_path / "p.nc", lambda held, i: held.truth(i)).findings
     first = min(world.positions)
-    result = world.validate(tmp_path / "p.nc", lambda w, i: early(w, i) if i == first else w.truth(i))
+    result = world.validate(tmp_path / "p.nc", lambda w, i: w.truth(i, late=-1 if i == first else 0))
     assert result.valid
     assert [finding.check for finding in result.warnings] == ["start"]
 
@@ -197,6 +192,5 @@ def test_frames_and_particles_mixed_up_are_named() -> None:
     path = given[:, None] + 0.002 * np.cumsum(rng.standard_normal((60, 10, 2)), axis=1)
     wrong, right = path.reshape(10, 60, 2), path.transpose(1, 0, 2)
     bounds = ((0.0, 1.0), (0.0, 1.0))
-    found = mistake(Start(given, right[0], wrong[0], wrong[1], 10), bounds, {})
-    assert "mixed up" in found.what
+    assert "mixed up" in mistake(Start(given, right[0], wrong[0], wrong[1], 10), bounds, {}).what
     assert mistake(Start(given, right[0], right[0], right[1], 10), bounds, {}) is None

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
 import resource
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -82,44 +83,41 @@ def same(a: Batch, b: Batch) -> bool:
 
 
 def test_every_window_is_the_stored_frames(train: Open) -> None:
-    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames."""
-    data = train()
-    assert len(data) == WINDOWS
+    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames.
+
+    Where it is asked for, each holds the scenario's frame 0, which batches put side by side.
+    """
+    data, more = train(), train(origin=True)
+    assert len(data) == len(more) == WINDOWS
     places = []
-    for window in (data[i] for i in range(len(data))):
+    for window, other in ((data[i], more[i]) for i in range(len(data))):
         frames = frames_of(window.scenario, FRAMES[window.scenario], PARTICLES[window.scenario])
         expected = frames[window.frame : window.frame + LENGTH]
         np.testing.assert_array_equal(window.position.numpy(), expected.transpose(1, 0, 2))
+        np.testing.assert_array_equal(other.origin, frames[0])
+        assert torch.equal(window.position, other.position)
         assert window.position.is_contiguous()
+        assert window.origin is None
         places.append((window.scenario, window.frame))
     assert places == [(i, f) for i, frames in FRAMES.items() for f in range(frames - LENGTH + 1)]
+    assert collate([more[3], more[40]]).origin[PARTICLES[0] :].equal(more[40].origin)
+    with pytest.raises(UsageError):
+        collate([more[3], data[40]])
+    both = train(subset=["test", "train"])  # windows of several subsets follow each other
+    assert len(both) == WINDOWS + 2 * 20
+    assert [both.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
 
 
-def test_material_and_walls(train: Open) -> None:
-    """A window holds the particles' materials and its own frames of the walls' velocity."""
+def test_material_and_walls(tmp_path: Path, train: Open) -> None:
+    """A window holds the particles' materials and its own frames of the walls' velocity.
+
+    Without material all is liquid, without moving walls there is no velocity of walls.
+    """
     window = train(history=2, future=0)[3]
     assert window.material.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
     assert window.material.dtype == torch.int64
     assert window.wall_velocity is not None
     assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
-
-
-def test_the_first_frame_comes_along_where_it_is_asked_for(train: Open) -> None:
-    """Every window of a scenario holds the scenario's frame 0; batches put them side by side."""
-    data = train(origin=True)
-    window, other = data[3], data[40]
-    assert window.origin is not None
-    for one in (window, other):
-        frames = frames_of(one.scenario, FRAMES[one.scenario], PARTICLES[one.scenario])
-        np.testing.assert_array_equal(one.origin, frames[0])
-    assert collate([window, other]).origin[len(window.origin) :].equal(other.origin)
-    assert train()[3].origin is None
-    with pytest.raises(UsageError):
-        collate([window, train()[40]])
-
-
-def test_files_without_material_or_moving_walls(tmp_path: Path, train: Open) -> None:
-    """Without material all is liquid, without moving walls there is no velocity of walls."""
     for i, frames in FRAMES.items():
         path, _ = write_scenario(tmp_path, make_key(i, subset="train"), frames=frames, walls=False)
         with h5py.File(path, "a") as file:
@@ -142,18 +140,14 @@ def test_arrays_tensors_and_open_split_agree(generated: GenerationResult, unmeas
     for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
         assert arrays.place(number) == (array.scenario, array.frame) == (tensor.scenario, tensor.frame)
         frames = truth.sel(scenario=array.scenario).isel(frame=slice(array.frame, array.frame + 5))
-        expected = frames.position.transpose("particle", "frame", "space").values
-        np.testing.assert_array_equal(array.position, expected)
-        np.testing.assert_array_equal(tensor.position.numpy(), expected)
-        first = truth.position.sel(scenario=array.scenario).isel(frame=0).values
-        np.testing.assert_array_equal(array.origin, first)
-        np.testing.assert_array_equal(tensor.origin, first)
-        np.testing.assert_array_equal(array.material, frames.material)
-        np.testing.assert_array_equal(tensor.material.numpy(), frames.material)
-        assert array.wall_velocity is not None
-        assert tensor.wall_velocity is not None
-        np.testing.assert_array_equal(array.wall_velocity, frames.wall_velocity)
-        np.testing.assert_array_equal(tensor.wall_velocity.numpy(), frames.wall_velocity)
+        expected = {
+            "position": frames.position.transpose("particle", "frame", "space"),
+            "origin": truth.position.sel(scenario=array.scenario).isel(frame=0),
+            **{name: frames[name] for name in ("material", "wall_velocity")},
+        }
+        for name, values in expected.items():
+            np.testing.assert_array_equal(getattr(array, name), values.values)
+            np.testing.assert_array_equal(getattr(tensor, name), values.values)
     truth.close()
 
 
@@ -224,8 +218,7 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
     """With one file open at a time, others are opened anew."""
 
     def open_scenarios() -> set[Path]:
-        held = {path for path in Path("/proc/self/fd").iterdir() if path.exists()}
-        return {path for path in held if path.resolve().suffix == ".nc"}
+        return {path for path in Path("/proc/self/fd").iterdir() if path.resolve().suffix == ".nc"}
 
     before = open_scenarios()
     monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
@@ -251,13 +244,6 @@ def test_the_systems_limit_of_files_is_no_damage(train: Open) -> None:
     assert data[0].scenario == data.place(0)[0]
 
 
-def test_several_subsets(train: Open) -> None:
-    """Windows of several subsets follow each other."""
-    data = train(subset=["test", "train"])
-    assert len(data) == WINDOWS + 2 * 20
-    assert [data.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
-
-
 def test_every_epoch_draws_every_window_once(train: Open) -> None:
     """Epochs are different orders of all windows; seed and epoch alone decide them."""
     data = train()
@@ -274,13 +260,21 @@ def test_every_epoch_draws_every_window_once(train: Open) -> None:
 
 @pytest.mark.parametrize("odd", [-1, 1.5, None, "1"])
 def test_places_that_there_are_not(train: Open, odd: Any) -> None:
-    """Seeds, epochs and positions are whole numbers from 0: others would draw windows twice."""
+    """Seeds, epochs and positions are whole numbers from 0: others would draw windows twice.
+
+    The last position is the end of the epoch itself; what is refused moves nothing.
+    """
     with pytest.raises(UsageError):
         WindowSampler(train(), seed=odd)
     sampler = WindowSampler(train(), seed=0)
-    for state in ({"epoch": odd, "position": 0}, {"epoch": 0, "position": odd}):
+    sampler.seek(np.int64(3), np.int64(WINDOWS))  # type: ignore[arg-type]
+    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
+    for epoch, position in ((odd, 0), (0, odd), (4, WINDOWS + 1)):
         with pytest.raises(UsageError):
-            sampler.load_state_dict({"seed": 0, **state})
+            sampler.load_state_dict({"seed": 9, "epoch": epoch, "position": position})
+    with pytest.raises(UsageError):
+        sampler.seek(4, WINDOWS + 1)
+    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": WINDOWS}
 
 
 def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
@@ -293,22 +287,15 @@ def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
         assert int(index) == -1
 
 
-def stream(sampler: WindowSampler) -> Iterator[int]:
-    """Yield windows of epoch after epoch."""
-    while True:
-        yield from sampler
-
-
 @pytest.mark.parametrize("drawn", [0, 1, 30, WINDOWS - 1, WINDOWS, WINDOWS + 3])
 def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
     """A sampler loaded from a state in mid-epoch draws on as the first would have."""
     first = WindowSampler(train(), seed=3)
-    run = stream(first)
-    for _ in range(drawn):
-        next(run)
+    run = itertools.chain.from_iterable(itertools.repeat(first))
+    assert len(list(itertools.islice(run, drawn))) == drawn
     second = WindowSampler(train(), seed=0)
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
-    resumed = stream(second)
+    resumed = itertools.chain.from_iterable(itertools.repeat(second))
     assert [next(resumed) for _ in range(2 * WINDOWS)] == [next(run) for _ in range(2 * WINDOWS)]
 
 
@@ -316,6 +303,7 @@ def test_ranks_share_out_one_order(train: Open, monkeypatch: pytest.MonkeyPatch)
     """Three ranks draw every third window of the one order each, together all but the last few.
 
     A rank that does not exist, and more ranks than windows, are errors. torch.distributed tells its own.
+    What two ranks have not drawn, one rank draws.
     """
     data = train()
     alone = WindowSampler(data, seed=1).order(0).tolist()
@@ -329,19 +317,11 @@ def test_ranks_share_out_one_order(train: Open, monkeypatch: pytest.MonkeyPatch)
     for name, value in {"is_initialized": True, "get_rank": 1, "get_world_size": 3}.items():
         monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
     assert list(WindowSampler(data, seed=1)) == parts[1]
-
-
-def test_a_state_outlives_a_change_of_ranks(train: Open) -> None:
-    """What two ranks have not drawn, one rank draws."""
-    data = train()
-    order = WindowSampler(data, seed=1).order(0).tolist()
-    two = WindowSampler(data, seed=1, rank=1, ranks=2)
-    drawn = iter(two)
-    for _ in range(5):
-        next(drawn)
-    one = WindowSampler(data, seed=1)
+    monkeypatch.undo()
+    two, one = WindowSampler(data, seed=1, rank=1, ranks=2), WindowSampler(data, seed=1)
+    assert len(list(itertools.islice(two, 5))) == 5
     one.load_state_dict(two.state_dict())
-    assert list(one) == order[10:]
+    assert list(one) == alone[10:]
 
 
 def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,10 +358,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     assert (sent.store.cached_bytes, len(sent.store._open)) == (0, 0)
     assert torch.equal(sent[0].position, first.position)
     batches = [
-        list(
-            DataLoader(data, 5, sampler=WindowSampler(data, seed=2), collate_fn=collate, num_workers=workers)
-        )
-        for workers in (0, 2)
+        list(DataLoader(data, 5, sampler=WindowSampler(data, seed=2), collate_fn=collate, num_workers=count))
+        for count in (0, 2)
     ]
     assert len(batches[0]) == 16
     assert all(same(a, b) for a, b in zip(*batches, strict=True))
@@ -390,9 +368,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
 def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
     """All test scenarios side by side, all frames or consecutive ones; unequal lengths do not go together."""
     paths = scenario_paths("cavity", size="tiny", root=root, registry=registry)
-    assert list(paths) == [4, 5]
     batch = scenario_batch(list(paths.values()), slice(3, 9))
-    assert (batch.windows, batch.frames) == (2, 6)
+    assert (list(paths), batch.windows, batch.frames) == ([4, 5], 2, 6)
     assert (batch.scenario.tolist(), batch.frame.tolist()) == ([4, 5], [3, 3])
     for row, i in enumerate(paths):
         expected = frames_of(i, 26, 8)[3:9].transpose(1, 0, 2)
@@ -428,8 +405,11 @@ def test_what_is_not_there_is_said(
         WindowDataset(**given, root=root, registry=registry)
 
 
-def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open) -> None:
-    """Files of another id or length, and bytes that are no netCDF file, are data errors."""
+def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open, registry: Registry) -> None:
+    """Files of another id or length, or of other values than the registry's hash names, are data errors.
+
+    So are bytes that are no netCDF file.
+    """
     for i, frames in FRAMES.items():
         write_scenario(tmp_path, make_key(i, subset="train"), frames=frames + (i == 1))
     folder = next(tmp_path.rglob("train"))
@@ -445,15 +425,11 @@ def test_another_scenario_under_its_name_is_refused(tmp_path: Path, train: Open)
     assert isinstance(data[60], Window)
     with pytest.raises(IndexError):
         data[WINDOWS]
-
-
-def test_another_content_hash_is_refused(root: Path, registry: Registry) -> None:
-    """A file whose values are not those that the registry's hash names is a data error."""
-    measured = SimpleNamespace(scenario_sha256={0: "0" * 16})
+    measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
-    store = store_windows.FrameStore(size, {0: next(root.rglob("0000.nc"))})
+    store = store_windows.FrameStore(size, {2: folder / "0002.nc"})
     with pytest.raises(DataError, match=r"(?s)not that of the registry.*content hash 0{16}"):
-        store.frames(0, 0, 2)
+        store.frames(2, 0, 2)
 
 
 def drifting(batch: Batch) -> torch.Tensor:
@@ -496,37 +472,19 @@ def test_a_rollout_feeds_on_itself(train: Open) -> None:
     assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
 
 
-@pytest.mark.parametrize("wrong", [lambda p: p[None], lambda p: p[:-1], lambda p: p[:, :1], np.asarray])
-def test_what_a_model_returns_has_the_shape_of_positions(
-    train: Open, wrong: Callable[[torch.Tensor], Any]
-) -> None:
-    """[window, particle, 2], a particle too few, one axis, NumPy's are refused, and so are no frames."""
-    given = collate([train(history=2, future=2)[0]]).part(slice(2))
-    with pytest.raises(UsageError):
-        roll_out(lambda seen: wrong(seen.position[:, -1]), given, 2)
-    with pytest.raises(UsageError):
-        roll_out(drifting, given, 0)
-
-
-def test_no_place_beyond_an_epoch(train: Open) -> None:
-    """The last one is the end itself; what is refused moves nothing."""
-    data = train(history=2, future=1)
-    sampler = WindowSampler(data, seed=0)
-    sampler.seek(np.int64(3), np.int64(len(data)))  # type: ignore[arg-type]
-    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
-    with pytest.raises(UsageError):
-        sampler.seek(4, len(data) + 1)
-    with pytest.raises(UsageError):
-        sampler.load_state_dict({"seed": 9, "epoch": 4, "position": len(data) + 1})
-    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": len(data)}
-
-
 def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
     """Beyond it no wall moves as it did: a model that takes the last velocity known would be wrong unseen.
 
-    A model may use the memory of its answer again: every frame is kept as it was returned.
+    A model may use the memory of its answer again: every frame is kept as it was returned. Answers of another
+    shape than positions (an axis more, a particle too few, one axis) or of NumPy, and no frames, are refused.
     """
     given = collate([train(history=2, future=3)[0]]).part(slice(2))
+    shapes: list[Callable[[Any], Any]] = [lambda p: p[None], lambda p: p[:-1], lambda p: p[:, :1], np.asarray]
+    for wrong in shapes:
+        with pytest.raises(UsageError):
+            roll_out(lambda seen, wrong=wrong: wrong(seen.position[:, -1]), given, 2)
+    with pytest.raises(UsageError):
+        roll_out(drifting, given, 0)
     memory = torch.empty_like(given.position[:, -1])
     found = roll_out(drifting, given, 3)
     assert found.shape[1] == 3
@@ -547,15 +505,14 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
         seen.append(batch)
         return drifting(batch)
 
-    found = dict(
-        predict(step, "cavity", size="tiny", root=root, history=history, registry=registry, device="cpu")
-    )
+    where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
+    found = dict(predict(step, "cavity", history=history, device="cpu", **where))
     for wrong in (0, 7):  # none, or more than the task gives
         with pytest.raises(UsageError, match="from 1 to 6"):
-            next(predict(drifting, "cavity", size="tiny", root=root, history=wrong, registry=registry))
+            next(predict(drifting, "cavity", history=wrong, **where))
     task = registry.size("cavity", "tiny").task
     assert list(found) == [4, 5]
-    files = scenario_paths("cavity", size="tiny", root=root, registry=registry)
+    files = scenario_paths("cavity", **where)
     for row, (scenario, path) in enumerate(files.items()):
         whole = scenario_batch(path)
         start = task.input_frames - (history or task.input_frames)
