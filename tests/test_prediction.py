@@ -24,6 +24,7 @@ from lagbench.baselines.baseline import Batch, Facts
 from lagbench.baselines.catalogue import every_entry, find
 from lagbench.baselines.checkpoint import Checkpoint, load, save
 from lagbench.baselines.facts import facts_of
+from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM
@@ -156,6 +157,28 @@ def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: Generati
     for row, position in enumerate(given.values()):
         assert (written(never.path)[row] == position[5].astype(np.float32)).all()
     assert set(never.diverged.values()) == {6}
+
+
+def test_the_search_that_is_timed_is_the_models(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where matter has collapsed, only the neighbours that the model hears are searched."""
+    facts = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    options = {"latent": 4, "layers": 1, "neighbours": 3}
+    model = find("gns").model.build(options, facts)
+    stored = Checkpoint(
+        baseline="gns", options=options, facts=facts, weights=model.state_dict(), training={"recipe": RECIPE}
+    )
+    save(tmp_path / "weights.pt", stored)
+    asked = []
+
+    def search(*given: Any, most: int | None) -> Tensor:
+        asked.append(most)
+        return radius_graph(*given, most=most)
+
+    monkeypatch.setattr(prediction, "radius_graph", search)
+    predict(tmp_path / "weights.pt", tmp_path / "p.nc", root=generated.root, threads=1, registry=unmeasured)
+    assert set(asked) == {3}
 
 
 @pytest.mark.parametrize(("batch", "seconds"), [(1, 1.0), (2, 1.5)])
