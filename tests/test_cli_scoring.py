@@ -77,6 +77,7 @@ def test_a_template_keeps_what_is_there(run: Run, predictions: Path, tmp_path: P
     assert predictions.read_bytes() == b"the work of a week"
     assert run(*words, "--overwrite").exit_code == 0
     assert run("validate", predictions).exit_code == 0
+    assert run("template", SPLIT, "-o", tmp_path, "--overwrite").exit_code == 2
     nothing = run("template", SPLIT, "-o", tmp_path / "u.nc", "--root", tmp_path / "empty")
     assert nothing.exit_code == 2
     assert f"lagbench generate --split {SPLIT} --size" in nothing.stderr

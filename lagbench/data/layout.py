@@ -1,13 +1,12 @@
-"""Where data sets live: the path of every scenario below a root folder.
+"""Where data sets live below a root folder: the path of every scenario.
 
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside the
 subsets. Nothing here writes to the disk.
 
-The local folder that stands for a root folder in an object store.
-
-netCDF4 and HDF5 read and write files, so a root given as a URL (``s3://bucket/prefix``) becomes a
-folder of the user's cache, named from the URL, that says in ``store.json`` what it is a copy of.
-Everything works on that folder; ``lagbench.store`` brings objects there and puts them back.
+A root folder in an object store has a local folder that stands for it: netCDF4 and HDF5 read and write
+files, so a root given as a URL (``s3://bucket/prefix``) becomes a folder of the user's cache, named from
+the URL, that says in ``store.json`` what it is a copy of. Everything works on that folder;
+``lagbench.store`` brings objects there and puts them back.
 """
 
 from __future__ import annotations

@@ -2,13 +2,11 @@
 
 Whatever is wrong with a file becomes a DataError that names it and, where one can be told,
 the variable. h5py opens one in half the time that netCDF4 takes, and follows a link only where it is
-asked to: nothing that leads out of the file is opened.
+asked to: nothing that leads out of the file is opened. What netCDF would show of it stands at the end.
 
-The variables of a scenario file, and what their attributes must say.
-
-Attributes do not enter the content hash, yet readers compute with them: ``scale_factor`` or
-other ``units`` change what xarray returns although no stored value changed. So a variable has
-exactly the attributes given here.
+:data:`ATTRIBUTES` are the variables of a scenario file, and what their attributes must say. They do not
+enter the content hash, yet readers compute with them: ``scale_factor`` or other ``units`` change what
+xarray returns although no stored value changed. So a variable has exactly the attributes given here.
 """
 
 from __future__ import annotations

@@ -375,18 +375,18 @@ def template(
         DataError: test scenarios are missing or damaged, or their data set has no recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
-    if Path(output).exists() and not overwrite:
-        fix = "write elsewhere: -o template.nc; or replace it: --overwrite"
-        raise UsageError("there is such a file already", where=str(output), fix=fix)
+    folder_there = Path(output).is_dir()
+    if folder_there or (Path(output).exists() and not overwrite):
+        what = "the output is a folder" if folder_there else "there is such a file already"
+        fix = "write elsewhere: -o template.nc" + ("" if folder_there else "; or replace it: --overwrite")
+        raise UsageError(what, where=str(output), fix=fix)
     entry, folder, described = locate(split, size, root=root, registry=registry)
     _bring(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
-    writer = PredictionsWriter(
-        output, split=entry.split, size=entry.name, method="persistence", root=folder, registry=described
-    )
     ids, frames = tuple(sorted(entry.subsets["test"])), frames_to_predict(entry)
-    with writer:
+    named: dict[str, Any] = {"split": entry.split, "size": entry.name, "method": "persistence"}
+    with PredictionsWriter(output, **named, root=folder, registry=described) as writer:
         for scenario in ids:
             writer.add(scenario, np.broadcast_to(truth.given(scenario)[-1], writer.shape))
     return TemplateResult(
