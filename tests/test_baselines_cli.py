@@ -96,6 +96,8 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
     with netCDF4.Dataset("predictions.nc") as data:
         assert "model.clamp=false" in data.getncattr("training")
     assert "without the neighbour search" in predicted.stdout
+    assert "in place of" not in predicted.stdout
+    assert "in place of" in lagbench(*predict).stdout
     assert "next: lagbench score predictions.nc" in predicted.stdout
     scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
     assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]

@@ -223,6 +223,7 @@ def predict(
     from lagbench.baselines.predict import predict as run
 
     timed: SolverBench | None = None
+    replaced = output.is_file()
 
     def time_solver(split: str, size: str) -> float | None:
         nonlocal timed
@@ -243,7 +244,7 @@ def predict(
             solver=time_solver if solver else None,
             progress=draw,
         )
-    told = _predicted(result, timed, f" --root {root}" if root else "")
+    told = _predicted(result, timed, replaced, f" --root {root}" if root else "")
     show({**vars(result), "solver": timed}, told, as_json=as_json, quiet=quiet)
 
 
@@ -263,10 +264,14 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
         return None
 
 
-def _predicted(result: PredictionResult, solver: SolverBench | None, where: str) -> Iterator[str]:
+def _predicted(
+    result: PredictionResult, solver: SolverBench | None, replaced: bool, where: str
+) -> Iterator[str]:
     trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
     trained += "".join(f", {setting}" for setting in result.settings)
     yield f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames"
+    if replaced:
+        yield "  in place of the predictions that were there"
     yield (
         f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
         f" without the neighbour search) on {result.device}"
