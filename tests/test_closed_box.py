@@ -47,6 +47,7 @@ def test_a_regular_lattice_stays_at_rest() -> None:
     np.testing.assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_transfers_conserve_momentum() -> None:
     """Without pressure, viscosity and shift nothing changes the momentum of a patch off the walls."""
     constants = parameters(particles=4000, grid=40, modulus=1e-30, shift=0.0, velocity_relaxation=0.2)

@@ -38,6 +38,7 @@ def test_drivers_give_the_same_bits(threads: int) -> None:
         np.testing.assert_equal(own, after(NO_SLIP, [state], 450))
 
 
+@pytest.mark.slow
 def test_threads_lose_no_contribution() -> None:
     """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose none of them."""
     constants = parameters(particles=20_000, modulus=1e-30)
