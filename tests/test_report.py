@@ -237,6 +237,7 @@ def test_scores_on_the_page_are_those_of_the_card(home: Path, tmp_path: Path) ->
     assert means[: len(ranked)] == [text(score.mean) for score in ranked]
     assert np.isnan([score.interval for score in ranked]).all()
     assert not any("…" in element.text for element in reading.of_class("ci"))
+    assert "the bands are" not in page.read_text("utf-8")
     everything = " ".join(e.text for e in reading.named("main"))
     said = (card.predictions_sha256, card.header.dataset_sha256, "lagbench score 0.nc --report report")
     flags = (flag.name.replace("_", " ") for flag in card.flags)

@@ -112,7 +112,7 @@ def test_all_findings_are_reported_together(bench: Bench) -> None:
         del file.attrs["method"]
     result = bench.validate(path)
     assert [f.check for f in result.errors] == ["format", "dataset", "scenarios", "finite"]
-    assert result.exit_code == 4
+    assert (result.verdict, result.exit_code) == ("not valid", 4)
 
 
 def test_without_the_data_set_what_needs_no_truth_is_checked(
@@ -221,6 +221,7 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(own: Bench, damage: st
         change(path)
     result = own.validate(own.valid)
     assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
+    assert (result.valid, result.verdict) == (False, "not judged")
     assert str(path) in result.errors[0].where
     names = "" if damage == "cut" else " --split cavity --size tiny --subset test"
     assert f"lagbench generate{names}" in result.errors[0].fix

@@ -75,7 +75,7 @@ def validate(
         f"{counted(len(result.errors), 'error')}, {counted(len(result.warnings), 'warning')}, "
         f"{counted(len(result.passed), 'check')} passed"
     )
-    words.append(f"{result.path}: {'valid' if result.valid else 'not valid'}, {counts}")
+    words.append(f"{result.path}: {result.verdict}, {counts}")
     show(result, words, as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.metric import Direction, mean
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
@@ -52,8 +52,10 @@ def error_curves(subject: Subject) -> Iterator[Figure]:
 
 def method_curves(subject: Subject) -> Iterator[Figure]:
     """Yield the methods side by side: mean over scenarios with its interval (Fig. 5.11)."""
-    said = f"Mean over {len(subject.scenarios)} test scenarios; the bands are 95 % bootstrap intervals over"
-    said += " scenarios. Grey: floors that cost nothing."
+    said = f"Mean over {len(subject.scenarios)} test scenarios"
+    if len(subject.scenarios) >= FEWEST_FOR_INTERVAL:
+        said += "; the bands are 95 % bootstrap intervals over scenarios"
+    said += ". Grey: floors that cost nothing."
     for name, thesis in (
         ("vorticity_mse" if subject.full_box else "attribute_mse", "Fig. 5.11"),
         ("position_rmse", "Fig. 5.11"),

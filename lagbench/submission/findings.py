@@ -102,6 +102,13 @@ class ValidationResult:
         return not self.errors
 
     @property
+    def verdict(self) -> str:
+        """The word for people: ``not judged`` where the data set here is not that of the file, or damaged."""
+        if self.valid:
+            return "valid"
+        return "not judged" if {f.check for f in self.errors} == {"dataset"} else "not valid"
+
+    @property
     def exit_code(self) -> int:
         """0 valid, 3 unreadable, 4 made from another data set or no data set here, else 1."""
         return self._failure().exit_code if self.errors else 0
@@ -118,7 +125,7 @@ class ValidationResult:
             return
         first = self.errors[0]
         others = f" (and {len(self.errors) - 1} more)" if len(self.errors) > 1 else ""
-        what = f"{self.path} is not valid: [{first.check}] {first.what}{others}"
+        what = f"{self.path} is {self.verdict}: [{first.check}] {first.what}{others}"
         where, expected, got, fix = first.where, first.expected, first.got, first.fix
         raise self._failure()(what, where=where, expected=expected, got=got, fix=fix)
 
