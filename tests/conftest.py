@@ -35,6 +35,7 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
+from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
 from lagbench.submission.format import Anatomy
@@ -53,6 +54,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
 
 OUTCOMES, DRAW = scored._outcomes, cards._draw
 Names = tuple[str, ...]
+READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
 
 SPLIT, SIZE = "curl-noise", "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
@@ -154,13 +156,34 @@ def floors_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def stored_once() -> Iterator[None]:
+    """Read score files of equal bytes once: a board's commands read all of them several times."""
+    known: dict[Hashable, Stored] = {}
+
+    def read(path: Path, size: Size | None = None) -> Stored:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_SCORE_BYTES:
+            return read_stored(path, size)
+        key = file_sha256(path), size and repr(size)
+        if key not in known:
+            known[key] = read_stored(path, size)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in READERS:
+            patch.setattr(f"lagbench.board.{module}.read_stored", read)
+        yield
+
+
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take what is above back for one test: workers of its own, the child, floors anew, pictures."""
+    """Take what is above back for one test: workers of its own, the child, floors, files, pictures."""
     for module in ("make.generate", "make.verify"):
         monkeypatch.setattr(f"lagbench.{module}.Pool", Pool)
     for module in ("scoring.score", "board.submit"):
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
+    for module in READERS:
+        monkeypatch.setattr(f"lagbench.board.{module}.read_stored", read_stored)
     monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
     monkeypatch.setattr(cards, "_draw", DRAW)
 
