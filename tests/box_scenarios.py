@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.draws import fill, quantise
-from lagbench.generators.solver import Device, Solver, build
-from lagbench.generators.split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from lagbench.generators.solver import Device, build
+from lagbench.generators.split import ClosedBoxParameters, InitialState
 from lagbench.work.machine import available_cores
 
 ALL_LIDS = (0.3, -0.2, 0.25, -0.35)
@@ -72,13 +72,7 @@ def scenario(
 _compiled = functools.cache(build)
 
 
-def compiled(
-    constants: ClosedBoxParameters | FreeSurfaceParameters,
-    *,
-    device: Device = Device.CPU,
-    scenarios: int = 1,
-    threads: int | None = None,
-) -> Solver:
+def compiled(constants: Any, device: Device = Device.CPU, scenarios: int = 1, threads: Any = None) -> Any:
     """Return the solver of these arguments, built once; to load states sets it back."""
     threads = 1 if device is Device.CPU else threads or available_cores()
     return _compiled(constants, device=device, scenarios=scenarios, threads=threads)
@@ -88,7 +82,7 @@ def loaded(
     constants: ClosedBoxParameters, states: Sequence[InitialState], **options: Device | int
 ) -> ClosedBox:
     """Return a solver with fresh scenarios; the next call with its arguments takes it over."""
-    solver = cast("ClosedBox", compiled(constants, scenarios=len(states), **cast("Any", options)))
+    solver: ClosedBox = compiled(constants, scenarios=len(states), **options)
     solver.load(states)
     return solver
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
 
 import numpy as np
 from box_scenarios import compiled
@@ -58,7 +57,7 @@ def start(
     constants: FreeSurfaceParameters, states: Sequence[InitialState], **options: Device | int
 ) -> FreeSurface:
     """Return a solver that holds some scenarios; the next call with its arguments takes it over."""
-    solver = cast("FreeSurface", compiled(constants, scenarios=len(states), **cast("Any", options)))
+    solver: FreeSurface = compiled(constants, scenarios=len(states), **options)
     solver.load(states)
     return solver
 

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +32,6 @@ from lagbench.generators.split import InitialState
 from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.card import SUBMISSION, best_floor
 from lagbench.scoring.floors import measurable
-
-if TYPE_CHECKING:
-    from lagbench.generators.closed_box import ClosedBox
 
 Floats = NDArray[np.float64]
 
@@ -186,7 +183,7 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
     np.testing.assert_allclose(field(beyond)[0], corner @ gradient)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the floor take the solver that is there."""
     monkeypatch.setattr(coarse_solver, "_solver", compiled)
@@ -263,7 +260,6 @@ def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
     np.testing.assert_array_equal(chosen, spread_subset(points, material, 576))
 
 
-@pytest.mark.usefixtures("compile_once")
 def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     """With the grid, time step and particles of its own size it moves them as the solver does."""
     size = load().size("fluid", "tiny")
@@ -283,7 +279,6 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
         np.testing.assert_array_equal(frame, solver.position()[0])
 
 
-@pytest.mark.usefixtures("compile_once")
 def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     """A solver that is told each frame's walls before it moves there goes the same way, to the bit."""
     size = load().size("cavity", "tiny")
@@ -296,7 +291,7 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     held = given("cavity", np.stack([place] * n), area=(right - left) * (top - bottom))
     held = replace(held, walls=walls, parameters={"viscosity": 1e-3})
     found = list(predict_with(held, size))
-    solver = cast("ClosedBox", compiled(replace(solver_constants(size), particles=len(place))))
+    solver = compiled(replace(solver_constants(size), particles=len(place)))
     still = {"affine": np.zeros((len(place), 2, 2)), "material": held.material, "area": held.area}
     still |= {"velocity": np.zeros_like(place), "wall_velocity": np.zeros((4, 2)), "viscosity": 1e-3}
     solver.load([InitialState(position=place, **still)])
@@ -306,7 +301,6 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
         np.testing.assert_array_equal(frame, solver.position()[0])
 
 
-@pytest.mark.usefixtures("compile_once")
 def test_the_coarse_solver_moves_all_particles() -> None:
     """A falling block on the coarser grid falls as a whole: bodies in flight keep their parabola."""
     size = load().size("fluid", "mini")

@@ -183,7 +183,7 @@ def test_plan_refuses_what_cannot_work(case: Case, settings: dict[str, Any], wor
     assert "expected" in str(caught.value)
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let every experiment take the solver that is there."""
     monkeypatch.setattr(experiment, "build", compiled)
@@ -195,7 +195,6 @@ def _arguments(folder: Path, *more: str) -> list[str]:
     return [*base, "--json", str(folder / "result.json"), *more]
 
 
-@pytest.mark.usefixtures("compile_once")
 def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
     """Ghia's points with his values, errors that follow from them, checks, energy that grows.
 
@@ -221,7 +220,6 @@ def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
     assert [check["substep"] for check in found["checks"]] == [300]
 
 
-@pytest.mark.usefixtures("compile_once")
 def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
     """The energy falls once the lid stops; at Re 250 there is no table, so errors are null."""
     arguments = [*_arguments(tmp_path), "--re", "250", "--substeps", "600", "--lid-off-after", "300"]
