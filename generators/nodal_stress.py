@@ -335,15 +335,19 @@ class NodalStress:
             self.g2p(s, p)
             self.update(s, p)
 
-    @ti.kernel
-    def restart_extremes(self) -> Nothing:
+    def restart_extremes(self) -> None:
         """Start an advance: the extremes are those of the present state."""
+        self._restart_extremes(self.parameters.particles, self.width**2)
+
+    @ti.kernel
+    def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
+        # Counts are arguments: of some constants, such as 4,000, LLVM makes code for twenty seconds.
         ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
+        for s, p in ti.ndrange(self.scenarios, particles):
             now = self.carried[s, p]
             self.extremes[s, p] = ti.Vector([ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]])
         ti.loop_config(serialize=ti.static(not self.atomic))
-        for s, n in ti.ndrange(self.scenarios, self.width**2):
+        for s, n in ti.ndrange(self.scenarios, nodes):
             self.peak[s, n] = 0.0
 
     @ti.kernel

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,23 @@ from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.draws import fill, quantise
 from lagbench.generators.solver import Device, build
 from lagbench.generators.split import ClosedBoxParameters, InitialState
+from lagbench.work.machine import available_cores
 
 ALL_LIDS = (0.3, -0.2, 0.25, -0.35)
 
 
 def parameters(**changes: float | bool) -> ClosedBoxParameters:
-    """Return the cavity's constants on a box of 11 x 11 cells with 700 particles, or changes of them."""
-    values: dict[str, float | bool] = {"particles": 700, "grid": 16, "dt": 4e-3, "wall": 2, "no_slip": True}
+    """Return the cavity's constants on a box of 11 x 11 cells of nine particles, or changes of them."""
+    values: dict[str, float | bool] = {"particles": 1089, "grid": 16, "dt": 4e-3, "wall": 2, "no_slip": True}
     values |= {"density": 1e-4, "modulus": 5e-4, "velocity_relaxation": 0.01, "jacobian_relaxation": 0.1}
-    values |= {"density_coupling": 0.01, "shift": 0.01}
+    values |= {"density_coupling": 0.01, "shift": 0.01, "substeps_per_frame": 7}
     return ClosedBoxParameters(**(values | changes))
+
+
+# Constants are compiled into the kernels, which takes seconds: tests share these few where they can.
+NO_SLIP = parameters()
+FREE_SLIP = parameters(no_slip=False, wall=1, velocity_relaxation=0.002, density_coupling=0.002, shift=0.002)
+INERT = parameters(particles=20_000, grid=40, modulus=1e-30, shift=0.0, velocity_relaxation=0.2)
 
 
 def box(constants: ClosedBoxParameters) -> tuple[float, float]:
@@ -62,14 +69,20 @@ def scenario(
     )
 
 
-compiled = functools.cache(build)
+_compiled = functools.cache(build)
+
+
+def compiled(constants: Any, device: Device = Device.CPU, scenarios: int = 1, threads: Any = None) -> Any:
+    """Return the solver of these arguments, built once; to load states sets it back."""
+    threads = 1 if device is Device.CPU else threads or available_cores()
+    return _compiled(constants, device=device, scenarios=scenarios, threads=threads)
 
 
 def loaded(
     constants: ClosedBoxParameters, states: Sequence[InitialState], **options: Device | int
 ) -> ClosedBox:
     """Return a solver with fresh scenarios; the next call with its arguments takes it over."""
-    solver = cast("ClosedBox", compiled(constants, scenarios=len(states), **options))
+    solver: ClosedBox = compiled(constants, scenarios=len(states), **options)
     solver.load(states)
     return solver
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import atexit
 import functools
 import gc
 import os
 import pickle
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -37,6 +35,8 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
+from lagbench.scoring.score_file import StoredScores, read_statistics
+from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
 from lagbench.submission.format import Anatomy
@@ -48,13 +48,14 @@ from lagbench.work.pool import Pool
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("seeded")
 
-# Each child process would compile torch anew, in 7 s.
-if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and "PYTHONPYCACHEPREFIX" not in os.environ:
-    os.environ["PYTHONPYCACHEPREFIX"] = bytecode = tempfile.mkdtemp(prefix="lagbench-bytecode-")
-    atexit.register(shutil.rmtree, bytecode, ignore_errors=True)
+# Each process would compile torch anew, in 7 s, and every run all that the tests import, in 15 s.
+if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
+    sys.pycache_prefix = sys.pycache_prefix or str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    os.environ["PYTHONPYCACHEPREFIX"], sys.dont_write_bytecode = sys.pycache_prefix, False
 
 OUTCOMES, DRAW = scored._outcomes, cards._draw
 Names = tuple[str, ...]
+READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
 
 SPLIT, SIZE = "curl-noise", "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
@@ -66,27 +67,33 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+def pytest_sessionfinish() -> None:
+    """Have Taichi keep what it compiled, which it does only where no solver is left as the process ends."""
+    if (taichi := sys.modules.get("taichi")) is not None:
+        taichi.reset()
+
+
 @pytest.fixture(scope="session", autouse=True)
 def lasting_workers() -> Iterator[None]:
-    """Simulate in workers that outlive a generation, unless it fails: starting Taichi takes seconds.
+    """Simulate in one worker that outlives a generation, unless it is left at work: Taichi starts in seconds.
 
     Generations that are killed or counted are started by their tests as processes of their own.
     """
     held: dict[object, Pool] = {}
 
     @contextmanager
-    def lasting(size: int, environment: Mapping[str, str] | None = None) -> Iterator[Pool]:
-        # A simulation is told all that it reads, its folder and registry too.
-        own = ("PYTEST_", "LAGBENCH_", "AWS_")
-        inherited = sorted((k, v) for k, v in os.environ.items() if not k.startswith(own))
-        key = size, tuple((environment or {}).items()), tuple(sys.path), tuple(inherited)
+    def lasting(_: int, environment: Mapping[str, str] | None = None) -> Iterator[Pool]:
+        # A simulation is told all else that it reads, its folder and registry too.
+        inherited = sorted((k, v) for k, v in os.environ.items() if k.startswith(("PYTHON", "TI_")))
+        key = tuple(sys.path), tuple(inherited)
         if key not in held:
-            held[key] = stack.enter_context(Pool(size, environment or {}))
+            held[key] = stack.enter_context(Pool(1, environment or {}))
+        pool = held[key]
         try:
-            yield held[key]
-        except BaseException:
-            held.pop(key).close()
-            raise
+            yield pool
+        finally:
+            if pool._waiting or any(worker.attempt for worker in pool._workers):
+                held.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         for module in ("generate", "verify"):
@@ -150,13 +157,42 @@ def floors_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def stored_once() -> Iterator[None]:
+    """Read score files of equal bytes once: commands read all of a board's, several times."""
+    known: dict[Hashable, Stored] = {}
+
+    @functools.cache
+    def statistics(_: str, path: Path) -> StoredScores:
+        stored = read_statistics(path)
+        object.__setattr__(stored, "scores", functools.cache(stored.scores))  # no test of tables adds metrics
+        return stored
+
+    def read(path: Path, size: Size | None = None) -> Stored:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_SCORE_BYTES:
+            return read_stored(path, size)
+        key = file_sha256(path), size and repr(size)
+        if key not in known:
+            known[key] = read_stored(path, size)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        for module in READERS:
+            patch.setattr(f"lagbench.board.{module}.read_stored", read)
+        reader = "lagbench.baselines.reproduce.evidence.read_statistics"
+        patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
+        yield
+
+
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take what is above back for one test: workers of its own, the child, floors anew, pictures."""
+    """Take what is above back for one test: workers of its own, the child, floors, files, pictures."""
     for module in ("make.generate", "make.verify"):
         monkeypatch.setattr(f"lagbench.{module}.Pool", Pool)
     for module in ("scoring.score", "board.submit"):
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
+    for module in READERS:
+        monkeypatch.setattr(f"lagbench.board.{module}.read_stored", read_stored)
     monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
     monkeypatch.setattr(cards, "_draw", DRAW)
 

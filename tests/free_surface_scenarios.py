@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
+from box_scenarios import compiled
 from numpy.typing import NDArray
 
 from lagbench.generators.draws import quantise
 from lagbench.generators.free_surface import FreeSurface
 from lagbench.generators.shapes import Shape, body_at, seeds
-from lagbench.generators.solver import Device, build
+from lagbench.generators.solver import Device
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
 
@@ -54,14 +53,11 @@ def scenario(
     )
 
 
-compiled = functools.cache(build)
-
-
 def start(
     constants: FreeSurfaceParameters, states: Sequence[InitialState], **options: Device | int
 ) -> FreeSurface:
     """Return a solver that holds some scenarios; the next call with its arguments takes it over."""
-    solver = cast("FreeSurface", compiled(constants, scenarios=len(states), **options))
+    solver: FreeSurface = compiled(constants, scenarios=len(states), **options)
     solver.load(states)
     return solver
 

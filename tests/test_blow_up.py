@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from box_scenarios import compiled
 from conftest import SIZE, SPLIT
 
 from lagbench.data.manifest import read_manifest
@@ -20,12 +20,9 @@ from lagbench.generators.batch import Batch, SimulationJob
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.constants import split_module
 from lagbench.generators.simulate import simulate
-from lagbench.generators.solver import Device, build
+from lagbench.generators.solver import Device
 from lagbench.generators.split import InitialState
 from lagbench.make.generate import generate
-
-compiled = functools.cache(build)
-"""Solvers of this file, each compiled once: loading states sets them back."""
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from box_scenarios import ALL_LIDS, after, loaded, parameters, scenario, snapshot
+from box_scenarios import ALL_LIDS, FREE_SLIP, INERT, NO_SLIP, after, loaded, parameters, scenario, snapshot
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry
@@ -21,32 +21,29 @@ from lagbench.generators.solver import Device, build
 from lagbench.make.generate import GenerationResult
 from lagbench.make.verify import verify
 
-NO_SLIP = parameters()
-FREE_SLIP = parameters(no_slip=False, wall=1, velocity_relaxation=0.002, density_coupling=0.002, shift=0.002)
-
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_drivers_give_the_same_bits(threads: int) -> None:
     """Serial frames, and parallel phases with atomics over two scenarios, agree after 450 substeps."""
+    constants, sliding = (NO_SLIP, 1.0) if threads == 2 else (FREE_SLIP, 0.0)
+    left, right, bottom, top = (sliding * lid for lid in ALL_LIDS)
     states = [
-        scenario(NO_SLIP, seed=4, speed=0.4, walls=ALL_LIDS),
-        scenario(NO_SLIP, seed=5, speed=0.4, walls=(0.0, 0.0, 0.0, 0.3), viscosity=3e-3),
+        scenario(constants, seed=4, speed=0.4, walls=(left, right, bottom, top)),
+        scenario(constants, seed=5, speed=0.4, walls=(0.0, 0.0, 0.0, top), viscosity=3e-3),
     ]
-    together = after(NO_SLIP, states, 450, device=Device.PARALLEL, threads=threads)
+    together = after(constants, states, 450, device=Device.PARALLEL, threads=threads)
     for index, state in enumerate(states):
         own = {name: values[index : index + 1] for name, values in together.items()}
-        np.testing.assert_equal(own, after(NO_SLIP, [state], 450))
+        np.testing.assert_equal(own, after(constants, [state], 450))
 
 
-@pytest.mark.slow
 def test_threads_lose_no_contribution() -> None:
     """Two threads that add 20,000 particles to the same nine nodes, 100 times, lose none of them."""
-    constants = parameters(particles=20_000, modulus=1e-30)
-    state = scenario(constants)
+    state = scenario(INERT)
     everywhere = np.ones_like(state.position)
     crowd = [dataclasses.replace(state, position=0.5 * everywhere, velocity=0.25 * everywhere)]
-    threaded = after(constants, crowd, 100, device=Device.PARALLEL, threads=2)
-    np.testing.assert_equal(threaded, after(constants, crowd, 100))
+    threaded = after(INERT, crowd, 100, device=Device.PARALLEL, threads=2)
+    np.testing.assert_equal(threaded, after(INERT, crowd, 100))
 
 
 def test_frames_do_not_matter() -> None:
@@ -58,14 +55,17 @@ def test_frames_do_not_matter() -> None:
 @pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
 def test_the_order_of_particles_does_not_matter(device: Device) -> None:
     """Particles in another order move in the same way, bit by bit, over 450 substeps."""
-    state = scenario(FREE_SLIP, seed=7, speed=0.4, viscosity=0.0)
-    order = np.random.default_rng(8).permutation(FREE_SLIP.particles)
+    constants, copies = (FREE_SLIP, 1) if device is Device.CPU else (NO_SLIP, 2)
+    state = scenario(constants, seed=7, speed=0.4, viscosity=0.0)
+    order = np.random.default_rng(8).permutation(constants.particles)
     arrays = {name: getattr(state, name)[order] for name in ("position", "velocity", "affine")}
     shuffled = dataclasses.replace(state, **arrays)
-    straight, mixed = after(FREE_SLIP, [state], 450), after(FREE_SLIP, [shuffled], 450, device=device)
-    np.testing.assert_array_equal(straight.pop("grid_velocity"), mixed["grid_velocity"])
-    for name, values in straight.items():
-        np.testing.assert_array_equal(values[0][order], mixed[name][0], err_msg=name)
+    straight = after(constants, [state], 450)
+    mixed = after(constants, [shuffled] * copies, 450, device=device)
+    for copy in range(copies):
+        np.testing.assert_array_equal(straight["grid_velocity"][0], mixed["grid_velocity"][copy])
+        for name in ("position", "velocity", "jacobian"):
+            np.testing.assert_array_equal(straight[name][0][order], mixed[name][copy], err_msg=name)
 
 
 def test_what_the_runtime_cannot_do_is_refused() -> None:
@@ -104,20 +104,19 @@ def test_taichi_is_imported_late_and_quietly() -> None:
 @pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
 def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
     """Two programs, one shorter than the run, in calls that end within frames, act frame by frame."""
-    constants = parameters(substeps_per_frame=10)
-    lengths = {1: 9} if device is Device.CPU else {1: 9, 2: 5}
-    states = [scenario(constants, seed=k, walls=ALL_LIDS, frames=n) for k, n in lengths.items()]
-    solver = loaded(constants, states, device=device)
+    lengths = {1: 11} if device is Device.CPU else {1: 11, 2: 5}
+    states = [scenario(NO_SLIP, seed=k, walls=ALL_LIDS, frames=n) for k, n in lengths.items()]
+    solver = loaded(NO_SLIP, states, device=device)
     for substeps in (3, 17, 25, 20, 5):
         solver.advance(substeps)
     programmed = snapshot(solver)
     health = solver.health()
     resting = [dataclasses.replace(state, wall_velocity=np.zeros((4, 2))) for state in states]
-    by_hand = loaded(constants, resting, device=device)
-    for frame in range(1, 8):
+    by_hand = loaded(NO_SLIP, resting, device=device)
+    for frame in range(1, 11):
         rows = [state.wall_velocity[min(frame, len(state.wall_velocity) - 1)] for state in states]
         by_hand.move_walls(np.stack(rows).astype(np.float32))
-        by_hand.advance(10)
+        by_hand.advance(7)
     np.testing.assert_equal(snapshot(by_hand), programmed)
     assert np.abs(programmed["velocity"]).max() > 0.01
     assert health[0].max_speed > 0.0
@@ -125,16 +124,16 @@ def test_a_wall_program_is_a_wall_moved_by_hand(device: Device) -> None:
 
 def test_extremes_of_an_advance_span_its_frames() -> None:
     """A wall that is fast in the first of three frames only shows in the health of the whole advance."""
-    constants, program = parameters(substeps_per_frame=10), np.zeros((4, 4, 2))
+    program = np.zeros((4, 4, 2))
     program[1, 3, 0] = 0.5
-    state = dataclasses.replace(scenario(constants, seed=3, viscosity=1e-2), wall_velocity=program)
-    solver = loaded(constants, [state])
-    solver.advance(30)
+    state = dataclasses.replace(scenario(NO_SLIP, seed=3, viscosity=1e-2), wall_velocity=program)
+    solver = loaded(NO_SLIP, [state])
+    solver.advance(21)
     fastest = solver.health()[0].max_speed
     solver.load([state])
-    solver.advance(10)
+    solver.advance(7)
     first = solver.health()[0].max_speed
-    solver.advance(20)
+    solver.advance(14)
     assert solver.health()[0].max_speed < first == fastest
 
 

@@ -8,10 +8,11 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
+from box_scenarios import compiled
 from numpy.typing import NDArray
 from score_bench import ScoreBench, straight
 
@@ -19,7 +20,7 @@ from lagbench.data.layout import major_of
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.floors import FLOORS, Given, floors_of, given_in, shipped
+from lagbench.floors import FLOORS, Given, coarse_solver, floors_of, given_in, shipped
 from lagbench.floors.analog import DIRECTIONS, Start, assigned, distance, nearest, start_of
 from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
 from lagbench.floors.floor import linear_field, mirrored
@@ -27,14 +28,10 @@ from lagbench.floors.frozen_field import decay
 from lagbench.floors.shipped import FOLDER, shipped_path
 from lagbench.floors.table import COUNTING
 from lagbench.generators.constants import solver_constants
-from lagbench.generators.solver import build
 from lagbench.generators.split import InitialState
 from lagbench.metrics.table import ranking_metric
 from lagbench.scoring.card import SUBMISSION, best_floor
 from lagbench.scoring.floors import measurable
-
-if TYPE_CHECKING:
-    from lagbench.generators.closed_box import ClosedBox
 
 Floats = NDArray[np.float64]
 
@@ -186,6 +183,12 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
     np.testing.assert_allclose(field(beyond)[0], corner @ gradient)
 
 
+@pytest.fixture(autouse=True)
+def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the floor take the solver that is there."""
+    monkeypatch.setattr(coarse_solver, "_solver", compiled)
+
+
 def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:
     """Return what a scenario of a generated data set gives, and its future."""
     n = size.task.input_frames
@@ -267,7 +270,7 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     held = given("fluid", path, area=0.04)
     found = list(predict_with(held, size))
     fall = np.array([0.0, -0.5 * size.value("gravity") * size.frame_interval])
-    solver = build(solver_constants(size))
+    solver = compiled(solver_constants(size))
     velocity = (path[-1] - path[-2]) / size.frame_interval + fall
     rest = {"affine": np.zeros((count, 2, 2)), "material": np.zeros(count, np.int8), "area": 0.04}
     solver.load([InitialState(position=path[-1], velocity=velocity, **rest)])
@@ -288,7 +291,7 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
     held = given("cavity", np.stack([place] * n), area=(right - left) * (top - bottom))
     held = replace(held, walls=walls, parameters={"viscosity": 1e-3})
     found = list(predict_with(held, size))
-    solver = cast("ClosedBox", build(replace(solver_constants(size), particles=len(place))))
+    solver = compiled(replace(solver_constants(size), particles=len(place)))
     still = {"affine": np.zeros((len(place), 2, 2)), "material": held.material, "area": held.area}
     still |= {"velocity": np.zeros_like(place), "wall_velocity": np.zeros((4, 2)), "viscosity": 1e-3}
     solver.load([InitialState(position=place, **still)])

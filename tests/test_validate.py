@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from box_scenarios import compiled
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
@@ -180,6 +181,12 @@ def test_plan_refuses_what_cannot_work(case: Case, settings: dict[str, Any], wor
     with pytest.raises(UsageError, match=words) as caught:
         plan(case, **{"substeps": 10, **settings})
     assert "expected" in str(caught.value)
+
+
+@pytest.fixture(autouse=True)
+def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every experiment take the solver that is there."""
+    monkeypatch.setattr(experiment, "build", compiled)
 
 
 def _arguments(folder: Path, *more: str) -> list[str]:

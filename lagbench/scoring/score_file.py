@@ -163,7 +163,7 @@ class StoredScores:
 
     def skill(self) -> Skill | None:
         """Return how much better than the best floor; None where none that counts has a score."""
-        ours = self.scores().get(self.ranking)
+        ours = self._scored(self.ranking).get(self.ranking)
         if self.best_floor is None or ours is None:
             return None
         floor = replace(ours, values=self.best_floor_values)
@@ -171,8 +171,11 @@ class StoredScores:
 
     def scores(self) -> dict[str, Score]:
         """Return the scores of all installed metrics whose statistics are here, by name."""
-        names = set(next(iter(self.tallies.values())).names)
-        metrics = [metric for metric in available().values() if names.issuperset(metric.of)]
+        return self._scored(*available())
+
+    def _scored(self, *wanted: str) -> dict[str, Score]:
+        names, known = set(next(iter(self.tallies.values())).names), available()
+        metrics = [known[name] for name in wanted if name in known and names.issuperset(known[name].of)]
         return aggregate(metrics, self.tallies)
 
 
