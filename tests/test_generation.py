@@ -191,15 +191,19 @@ def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generat
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_force_simulates_what_is_there(copied: Callable[[], Path], unmeasured: Registry) -> None:
-    """With force a good scenario is written again, with the same bytes."""
-    root = copied()
+def test_force_simulates_what_is_there(
+    copied: Callable[[], Path], unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With force a good scenario is written again, with the same bytes; compiled kernels are kept."""
+    root, kernels = copied(), tmp_path / "kernels"
+    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(kernels))
     before, path = contents(root), folder_of(root) / "valid" / "0002.nc"
     stamp = path.stat().st_mtime_ns
     result = generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, force=True, registry=unmeasured)
     assert result.simulated == (2,)
     assert path.stat().st_mtime_ns > stamp
     assert contents(root) == before
+    assert any(entry.is_file() for entry in kernels.rglob("*"))
 
 
 def test_files_of_other_parameters_are_made_anew(

@@ -144,7 +144,7 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
 
 
 def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
-    """Taichi saves compiled kernels as its process exits, so a worker without work is not killed."""
+    """Compiled kernels are kept as a worker ends, so one without work is not killed."""
     with Pool(1) as pool:
         pool.submit(Task(name="a", function=pool_tasks.leave_a_note, arguments=(tmp_path / "note",)))
         list(pool.events())

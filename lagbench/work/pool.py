@@ -118,7 +118,7 @@ class Pool:
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Let idle workers end by themselves, then kill; after an error kill at once."""
-        if error is None:  # Taichi saves what it compiled as its process exits
+        if error is None:  # what Taichi compiled is then kept for the next time
             idle = [worker for worker in self._workers if worker.attempt is None]
             for worker in idle:
                 with contextlib.suppress(OSError):  # it died while idle
@@ -244,3 +244,5 @@ def serve(descriptor: int) -> None:
         except Exception as error:
             reply = ("error", crashed(error))
         channel.send(reply)
+    if (taichi := sys.modules.get("taichi")) is not None:  # it keeps what it compiled only if asked to end
+        taichi.reset()
