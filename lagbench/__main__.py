@@ -40,7 +40,8 @@ class _Commands(TyperGroup):
             with _plain_warnings(), _told(), _refused_output():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            more = "; the same command goes on where it stopped" if ctx.invoked_subcommand in RESUMED else ""
+            again = "; the same command" + (", without --force," if "--force" in sys.argv else "")
+            more = f"{again} goes on where it stopped" if ctx.invoked_subcommand in RESUMED else ""
             typer.echo(f"lagbench: interrupted{more}", err=True)
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):

@@ -8,8 +8,9 @@ import os
 import pickle
 import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Hashable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ from lagbench.submission import ValidationResult
 from lagbench.submission.format import Anatomy
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
+from lagbench.work.run import ONE_THREAD
 
 # The same code gives the same verdict: what Hypothesis finds by chance is to be found by whoever caused it.
 # Seeded examples are the same ones every time, and the later ones are variations of the first.
@@ -50,7 +52,7 @@ settings.load_profile("seeded")
 
 # Each process would compile torch anew, in 7 s, and every run all that the tests import, in 15 s.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-    sys.pycache_prefix = sys.pycache_prefix or str(Path(__file__).parents[1] / ".pytest_cache" / "bytecode")
+    sys.pycache_prefix = sys.pycache_prefix or str(Path(__file__).parents[1] / "build" / "bytecode")
     os.environ["PYTHONPYCACHEPREFIX"], sys.dont_write_bytecode = sys.pycache_prefix, False
 
 OUTCOMES, DRAW = scored._outcomes, cards._draw
@@ -70,7 +72,10 @@ def pytest_collection_finish() -> None:
 def pytest_sessionfinish() -> None:
     """Have Taichi keep what it compiled, which it does only where no solver is left as the process ends."""
     if (taichi := sys.modules.get("taichi")) is not None:
-        taichi.reset()
+        with suppress(Exception):  # a cache that cannot be written costs the next run a compilation
+            taichi.reset()
+    if sys.pycache_prefix is not None:  # of modules that lay in temporary folders, each time another
+        shutil.rmtree(sys.pycache_prefix + tempfile.gettempdir(), ignore_errors=True)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -82,12 +87,12 @@ def lasting_workers() -> Iterator[None]:
     held: dict[object, Pool] = {}
 
     @contextmanager
-    def lasting(_: int, environment: Mapping[str, str] | None = None) -> Iterator[Pool]:
+    def lasting(_: int, __: Mapping[str, str] | None = None) -> Iterator[Pool]:
         # A simulation is told all else that it reads, its folder and registry too.
         inherited = sorted((k, v) for k, v in os.environ.items() if k.startswith(("PYTHON", "TI_")))
         key = tuple(sys.path), tuple(inherited)
         if key not in held:
-            held[key] = stack.enter_context(Pool(1, environment or {}))
+            held[key] = stack.enter_context(Pool(1, ONE_THREAD))
         pool = held[key]
         try:
             yield pool
@@ -237,7 +242,7 @@ def tiny_split(home: Path) -> Callable[..., GenerationResult]:
 
 @pytest.fixture(scope="session")
 def generated(tiny_split: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
-    """The tiny curl-noise data, generated once by two workers and compared with no hash."""
+    """The tiny curl-noise data, generated once and compared with no hash."""
     return tiny_split(SPLIT, "generated", workers=2, registry=unmeasured)
 
 

@@ -186,7 +186,8 @@ def test_the_field_is_linear_and_has_no_holes() -> None:
 @pytest.fixture(autouse=True)
 def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the floor take the solver that is there."""
-    monkeypatch.setattr(coarse_solver, "_solver", compiled)
+    coarse_solver._solver.cache_clear()
+    monkeypatch.setattr("lagbench.generators.solver.build", compiled)
 
 
 def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.float32]]:

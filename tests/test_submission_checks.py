@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -223,8 +224,8 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(own: Bench, damage: st
     assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
     assert (result.valid, result.verdict) == (False, "not judged")
     assert str(path) in result.errors[0].where
-    names = "" if damage == "cut" else " --split cavity --size tiny --subset test"
-    assert f"lagbench generate{names}" in result.errors[0].fix
+    command = "lagbench generate --split cavity --size tiny --subset test --root"
+    assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].fix
     assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
 
 

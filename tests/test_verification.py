@@ -259,7 +259,7 @@ def test_no_or_a_damaged_manifest_is_a_warning(damage: str | None, copied: Copy,
 
 
 def test_simulating_anew_is_identical(generated: GenerationResult, measured: Registry) -> None:
-    """First and last scenario, simulated by two workers, have the hashes of their files."""
+    """First and last scenario, simulated anew, have the hashes of their files."""
     result = verify(SPLIT, SIZE, root=generated.root, regenerate=2, workers=2, registry=measured)
     assert result.regenerated == {0: "identical", 4: "identical"}
     result.check()

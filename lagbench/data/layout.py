@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,3 +144,21 @@ def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:
 def scenario_path(root: Path, key: ScenarioKey) -> Path:
     """Return the path of a scenario file."""
     return dataset_folder(root, key.split, key.size, key.major) / key.subset / f"{key.scenario:04d}.nc"
+
+
+def generation_of(path: Path) -> str | None:
+    """Return the command that makes a scenario file anew; None where its place says no data set.
+
+    >>> generation_of(Path("/my data/cavity/tiny/v2/test/0003.nc"))
+    "lagbench generate --split cavity --size tiny --subset test --root '/my data'"
+    """
+    subset, version, size, split, *_ = *reversed(path.parts[:-1]), *[""] * 4
+    if re.fullmatch(r"v\d+", version) is None:
+        return None
+    root = path.parents[4]
+    return f"lagbench generate --split {split} --size {size} --subset {subset} --root {spelled(root)}"
+
+
+def spelled(root: Path) -> str:
+    """Return a root as an option's value for a shell: its URL, or the absolute path without detours."""
+    return shlex.quote(url_of(root) or os.path.abspath(root))

@@ -24,7 +24,7 @@ from typing import NamedTuple
 from lagbench.atomic import write_atomically
 from lagbench.errors import UnreadableFileError, UsageError, check_regular, nearest
 
-from .layout import CACHE_VARIABLE, MARK, as_url, dataset_folder, expanded, place_of, url_of
+from .layout import CACHE_VARIABLE, MARK, as_url, dataset_folder, expanded, place_of, spelled, url_of
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"
@@ -326,6 +326,6 @@ def remedy(size: Size, *options: str, root: Path | None = None) -> str:
     if size.simulated:
         if root is not None and (url_of(root) or "").startswith(("http://", "https://")):
             return "nothing can be written over HTTP: tell whoever serves the address, or name another --root"
-        place = [] if root is None else [f"--root {url_of(root) or root}"]
+        place = [] if root is None else [f"--root {spelled(root)}"]
         return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options, *place))
     return "remove the folder and make the local split again: lagbench adopt, or lagbench import"

@@ -27,7 +27,7 @@ from lagbench.errors import DataError, LagbenchError
 
 from . import MATERIALS
 from .checksums import ContentHasher, plain
-from .layout import ScenarioKey
+from .layout import ScenarioKey, generation_of
 
 if TYPE_CHECKING:
     import h5py
@@ -93,8 +93,6 @@ _FACT = re.compile(r"[a-z][a-z0-9_]{0,63}")
 
 MOST_IN_ROW = 20_000_000
 """Values of a variable in one frame, which is read at once: two for each of ten million particles."""
-
-_REPAIR = "lagbench generate writes it anew; a local split is made again by lagbench adopt or import"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -180,7 +178,7 @@ class ScenarioFile:
                     where=f"{self.path}, variable {name!r}",
                     expected="those of docs/format.md",
                     got=", ".join(f"{key} = {found.get(key, 'missing')}" for key in unlike),
-                    fix=_REPAIR,
+                    fix=_repair(self.path),
                 )
 
     def computed_hasher(self) -> ContentHasher:
@@ -201,7 +199,7 @@ def read_scenario(path: Path) -> ScenarioFile:
     import h5py
 
     if not path.is_file():
-        raise DataError("a scenario file is missing", where=str(path), fix=_REPAIR)
+        raise DataError("a scenario file is missing", where=str(path), fix=_repair(path))
     with _damage(path), ExitStack() as stack:
         file = h5py.File(path, "r", rdcc_nbytes=CHUNK_CACHE)
         stack.callback(file.close)
@@ -226,17 +224,17 @@ def check_scenario(path: Path, expected: str | None = None) -> str:
     for name, digest in hasher.digests().items():
         if digests.get(name) != digest:
             where = f"{path}, variable {name!r}"
-            raise _mismatch("values differ from their hash", where, digests.get(name), digest)
+            raise _mismatch(path, "values differ from their hash", where, digests.get(name), digest)
     content, stored = hasher.hexdigest(), file.header.content_sha256
     if content != stored:
-        raise _mismatch("attributes differ from their hash", f"{path}, attributes", stored, content)
+        raise _mismatch(path, "attributes differ from their hash", f"{path}, attributes", stored, content)
     if expected is not None and not content.startswith(expected):
-        raise _mismatch("the file has another content hash", str(path), expected, content)
+        raise _mismatch(path, "the file has another content hash", str(path), expected, content)
     return content
 
 
-def _mismatch(what: str, where: str, expected: object, got: str) -> DataError:
-    return DataError(what, where=where, expected=expected or "a stored hash", got=got, fix=_REPAIR)
+def _mismatch(path: Path, what: str, where: str, expected: object, got: str) -> DataError:
+    return DataError(what, where=where, expected=expected or "a stored hash", got=got, fix=_repair(path))
 
 
 def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
@@ -255,7 +253,7 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
         if held > largest:
             what, where = "a variable is larger than its file can hold", f"{path}, variable {name!r}"
             expected, got = f"at most {largest} bytes", f"shape {variable.shape}"
-            raise DataError(what, where=where, expected=expected, got=got, fix=_REPAIR)
+            raise DataError(what, where=where, expected=expected, got=got, fix=_repair(path))
 
 
 def _header(file: h5py.File, variables: Mapping[str, h5py.Dataset]) -> ScenarioHeader:
@@ -298,10 +296,16 @@ def _damage(path: Path, variable: str | None = None) -> Iterator[None]:
         raise damaged(path, f"{type(error).__name__}: {error}", variable) from error
 
 
-def damaged(path: Path, got: str, variable: str | None = None, *, fix: str = _REPAIR) -> DataError:
+def damaged(path: Path, got: str, variable: str | None = None, *, fix: str | None = None) -> DataError:
     """Return the error that a file is damaged, or one of its variables."""
     where = str(path) if variable is None else f"{path}, variable {variable!r}"
-    return DataError("a scenario file is damaged or not one of lagbench", where=where, got=got, fix=fix)
+    what = "a scenario file is damaged or not one of lagbench"
+    return DataError(what, where=where, got=got, fix=fix or _repair(path))
+
+
+def _repair(path: Path) -> str:
+    command = generation_of(path) or "lagbench generate"
+    return f"{command} writes it anew; a local split is made again by lagbench adopt or import"
 
 
 # --- what netCDF sees in an HDF5 file -------------------------------------------------------

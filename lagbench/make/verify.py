@@ -79,7 +79,8 @@ class VerificationResult:
         """Raise unless everything that has to hold does."""
         where = str(self.folder)
         if self.problems:
-            what = "\n  ".join([f"{len(self.problems)} problems", *self.problems])
+            count = f"{len(self.problems)} problem{'s' if len(self.problems) > 1 else ''}"
+            what = "\n  ".join([count, *self.problems])
             raise DataError(what, where=where, fix=self.fix)
         if not any(report.present for report in self.subsets):
             raise DataError("nothing is generated", where=where, fix=self.fix)

@@ -171,7 +171,8 @@ class FrameStore:
             raise damaged(self._paths[scenario], got, fix=fix) from error
 
     def _remedy(self, scenario: int) -> str:
-        return remedy(self._size, f"--subset {self._size.subset_of(scenario)}")
+        root = self._paths[scenario].parents[4]
+        return remedy(self._size, f"--subset {self._size.subset_of(scenario)}", root=root)
 
 
 class Window(NamedTuple):

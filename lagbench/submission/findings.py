@@ -103,7 +103,7 @@ class ValidationResult:
 
     @property
     def verdict(self) -> str:
-        """The word for people: ``not judged`` where the data set here is not that of the file, or damaged."""
+        """The word for people: ``not judged`` where the data set is missing, damaged or not the file's."""
         if self.valid:
             return "valid"
         return "not judged" if {f.check for f in self.errors} == {"dataset"} else "not valid"

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from lagbench.data.layout import major_of
+from lagbench.data.layout import major_of, spelled
 from lagbench.data.local import remedy
 from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Registry, Size, spell_ids
@@ -53,9 +53,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
         out.skip("the file does not name its data set", "dataset")
         return
     out.made("dataset")
-    remake = "predict from the data set that is here"
-    if size.simulated:
-        remake = f"generate {size.split} {size.name} anew and predict from that"
+    remake = f"predict again, from {size.split} {size.name} {size.version}"
     if not _VERSION.fullmatch(version) or major_of(version) != size.major:
         out.error(
             "dataset",
@@ -63,7 +61,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_version'",
             expected=size.version,
             got=quoted(version),
-            fix=remake,
+            fix=f"{remake}; if theirs is later, install a later lagbench",
         )
     expected = dataset_hash_of(size, root)
     if expected is None and HASH.fullmatch(got):
@@ -82,7 +80,8 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_sha256'",
             expected=expected or "64 hex digits",
             got=quoted(got),
-            fix=f"run `lagbench verify --split {size.split} --size {size.name}`; {remake}",
+            fix=f"{remake}; whether it is what lies here, says lagbench verify --split {size.split}"
+            f" --size {size.name} --root {spelled(root)}",
         )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.layout import spelled
 from lagbench.data.local import remedy
 from lagbench.data.manifest import note, noted_hashes, read_or_empty
 from lagbench.data.registry import Size, spell_ids
@@ -47,7 +48,7 @@ class Truth:
         """Hash the values of every scenario, or find that this machine has done so."""
         known, new = noted_hashes(self.folder), {}
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        fix = f"{self._remedy()}; {verify} says what is wrong"
+        fix = f"{self._remedy()}; {verify} --root {spelled(self.root)} says what is wrong"
         recorded = None if self.size.measured else read_or_empty(self.size, self.root)
         for scenario in sorted(self.size.subsets[self.subset]):
             path, entry = self.path(scenario), recorded.entry(scenario) if recorded else None

@@ -245,4 +245,5 @@ def serve(descriptor: int) -> None:
             reply = ("error", crashed(error))
         channel.send(reply)
     if (taichi := sys.modules.get("taichi")) is not None:  # it keeps what it compiled only if asked to end
-        taichi.reset()
+        with contextlib.suppress(Exception):  # where it cannot, the next run compiles again
+            taichi.reset()
