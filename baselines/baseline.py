@@ -1,9 +1,9 @@
 """The contract of a baseline: loss terms of a batch, and a rollout step by step.
 
-A baseline is one file: a subclass of :class:`Baseline` with its options, named by an entry
-point of the group ``lagbench.baselines``. Training, checkpoints, rollouts, predictions and
-scores then work without another line. It may know a data set's public figures, of datasets.yaml,
-and never a test scenario.
+A baseline is one file: a subclass of :class:`Baseline` with its options, named by an
+entry point of the group ``lagbench.baselines``. Training, checkpoints, rollouts,
+predictions and scores then work without another line. It may know a data set's public
+figures, of datasets.yaml, and never a test scenario.
 """
 
 from __future__ import annotations
@@ -15,7 +15,13 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Self
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidatorFunctionWrapHandler, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 from torch import Tensor, nn
 
 from lagbench.errors import UsageError
@@ -34,7 +40,9 @@ __all__ = [
 
 
 class Settings(BaseModel):
-    """Base of what recipes and ``--set`` fill: frozen; unknown keys and yes for a number are errors."""
+    """Base of what recipes and ``--set`` fill: frozen; unknown keys and yes for a
+    number are errors.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -61,9 +69,9 @@ def _counted(given: object, found: object) -> bool:
 class Options(Settings):
     """Base of the options of a model.
 
-    Class attributes:
-        in_training: names of the options of the training; a trained model refuses changes of them.
-        of_weights: names of options that say what weights mean where their shapes do not tell; likewise.
+    Class attributes: in_training: names of the options of the training; a trained model
+        refuses changes of them. of_weights: names of options that say what weights mean
+        where their shapes do not tell; likewise.
     """
 
     in_training: ClassVar[frozenset[str]] = frozenset()
@@ -73,10 +81,9 @@ class Options(Settings):
 class Baseline(nn.Module):
     """A surrogate: the next positions from the last ones.
 
-    Class attributes:
-        Options: the model's options, a subclass of :class:`Options`; recipes fill it.
-        method: what the board calls it.
-        any_size: whether weights of one size can be run at another: other particles, other distances.
+    Class attributes: Options: the model's options, a subclass of :class:`Options`;
+        recipes fill it. method: what the board calls it. any_size: whether weights of
+        one size can be run at another: other particles, other distances.
 
     Args:
         options: the model's options.
@@ -100,10 +107,11 @@ class Baseline(nn.Module):
     def adapted(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return weights that a training starts from, and their options, as this model takes them on.
+        """Return weights that a training starts from, and their options, as this model
+        takes them on.
 
-        As they are by default. Weights are refused whose shapes are not this model's, or whose options, those
-        returned, differ in what says what weights mean.
+        As they are by default. Weights are refused whose shapes are not this model's,
+        or whose options, those returned, differ in what says what weights mean.
 
         Args:
             weights: parameters and buffers by name, of a model with those options.
@@ -114,11 +122,15 @@ class Baseline(nn.Module):
     @property
     @abstractmethod
     def history(self) -> int:
-        """Frames that a training window gives to the model, before those that it must predict."""
+        """Frames that a training window gives to the model, before those that it must
+        predict.
+        """
 
     @property
     def future(self) -> int:
-        """Frames of a training window after the given ones: 1, or more with rollout losses."""
+        """Frames of a training window after the given ones: 1, or more with rollout
+        losses.
+        """
         return 1
 
     @property
@@ -127,8 +139,11 @@ class Baseline(nn.Module):
         return False
 
     @abstractmethod
-    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return every term of the training loss, raw: weights are applied by the trainer.
+    def forward(
+        self, batch: Batch, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Return every term of the training loss, raw: weights are applied by the
+        trainer.
 
         All model mathematics of a training step happen here, so that DDP sees them.
 
@@ -139,7 +154,9 @@ class Baseline(nn.Module):
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """Weight of each loss term; terms that are missing have weight 1, weight 0 is only logged."""
+        """Weight of each loss term; terms that are missing have weight 1, weight 0 is
+        only logged.
+        """
         return {}
 
     def compile_layers(self) -> None:
@@ -162,18 +179,23 @@ class Baseline(nn.Module):
 
     @abstractmethod
     def advance(self, state: Any) -> tuple[Any, Tensor]:  # noqa: ANN401
-        """Advance by one frame: the next state and positions [length], shape [particle, 2]."""
+        """Advance by one frame: the next state and positions [length], shape [particle,
+        2].
+        """
 
 
 def last_velocities(position: Tensor, count: int) -> Tensor:
-    """Return the last velocities [length/frame], shape [particle, count, 2], oldest first, of given frames.
+    """Return the last velocities [length/frame], shape [particle, count, 2], oldest
+    first, of given frames.
 
     Where the frames are few, the first velocity repeats.
     """
     velocity = position[:, -count - 1 :].diff(dim=1)
     if not velocity.shape[1]:
         raise UsageError(
-            "too few frames to start from", expected=f"2 or more, {count + 1} for all", got=position.shape[1]
+            "too few frames to start from",
+            expected=f"2 or more, {count + 1} for all",
+            got=position.shape[1],
         )
     missing = count - velocity.shape[1]
     return torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
@@ -191,7 +213,8 @@ def check_moving_walls(asked: bool, facts: Facts) -> None:
         )
 
 
-# Checked where facts are read from a file, which may be a stranger's: names are no paths.
+# Checked where facts are read from a file, which may be a stranger's: names are no
+# paths.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -208,7 +231,9 @@ class Facts:
     version: str  # semantic version of the split
     dataset_sha256: str  # hash of the data set
     particles: Count  # particles in one scenario
-    bounds: tuple[Pair, Pair]  # box that holds the particles, (low, high) along x and y [length]
+    bounds: tuple[
+        Pair, Pair
+    ]  # box that holds the particles, (low, high) along x and y [length]
     radius: Positive  # connectivity radius [length]
     input_frames: Count  # frames given at the start of a test scenario
     horizon: Count  # frames to predict after them
@@ -216,16 +241,19 @@ class Facts:
     score_placement: str  # 'cell_centres' or 'nodes', where that grid's nodes lie
     frame_interval: Positive  # time between frames [s]
     moving_walls: bool  # whether scenario files hold wall_velocity
-    # over train: position_mean, position_std [length], velocity_mean, velocity_std [length/frame],
-    # acceleration_mean, acceleration_std [length/frame^2], one (x, y) pair each
+    # over train: position_mean, position_std [length], velocity_mean, velocity_std
+    # [length/frame], acceleration_mean, acceleration_std [length/frame^2], one (x, y)
+    # pair each
     statistics: Mapping[str, Pair]
 
 
 def rescaled(trained: Facts, here: Facts) -> Facts:
-    """Return the facts of a size for weights of another: what they multiply stays as it was trained.
+    """Return the facts of a size for weights of another: what they multiply stays as it
+    was trained.
 
-    Statistics [length, length/frame, length/frame^2] are those of the training. Bodies fill the same area
-    with more or fewer particles, so the radius [length] goes with the root of that.
+    Statistics [length, length/frame, length/frame^2] are those of the training. Bodies
+    fill the same area with more or fewer particles, so the radius [length] goes with
+    the root of that.
     """
     radius = trained.radius * math.sqrt(trained.particles / here.particles)
     return replace(here, radius=radius, statistics=trained.statistics)

@@ -16,7 +16,11 @@ from .baseline import Facts
 
 
 def facts_of(
-    split: str, size: str | None = None, *, root: str | Path | None = None, registry: Registry | None = None
+    split: str,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
 ) -> Facts:
     """Return the public figures of a generated data set."""
     tier, home, _ = locate(split, size, root=root, registry=registry)
@@ -30,7 +34,8 @@ def facts_of(
     if manifest is None:
         raise absent("the data set is not generated")
     # what is here; where some subset is missing, what was recorded
-    task, measured = tier.task, tier.measured
+    task = tier.task
+    measured = tier.measured
     known = manifest.dataset_sha256 or (measured.dataset_sha256 if measured else None)
     statistics = manifest.statistics or (measured.statistics if measured else {})
     if known is None:

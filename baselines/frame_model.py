@@ -1,12 +1,13 @@
-"""A model of whole frames: the next state from the last few, fed with its own predictions.
+"""A model of whole frames: the next state from the last few, fed with its own
+predictions.
 
-A model is a file with its layers and :meth:`FrameModel.next_state`, for training and rollouts. A state is
-positions and velocities of all particles, standardised.
+A model is a file with its layers and :meth:`FrameModel.next_state`, for training and
+rollouts. A state is positions and velocities of all particles, standardised.
 
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
-with the public statistics of the training scenarios, one figure per feature. The first frame of
-a window has no frame before it: it takes the velocity of the second.
+with the public statistics of the training scenarios, one figure per feature. The first
+frame of a window has no frame before it: it takes the velocity of the second.
 """
 
 from __future__ import annotations
@@ -40,13 +41,23 @@ class FrameState(nn.Module):
         known = facts.statistics
         mean = (*known["position_mean"], *known["velocity_mean"])
         std = (*known["position_std"], *known["velocity_std"])
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float64), persistent=False)
-        self.register_buffer("std", torch.tensor(std, dtype=torch.float64), persistent=False)
+        self.register_buffer(
+            "mean", torch.tensor(mean, dtype=torch.float64), persistent=False
+        )
+        self.register_buffer(
+            "std", torch.tensor(std, dtype=torch.float64), persistent=False
+        )
 
     def of(self, position: Tensor) -> Tensor:
-        """Return the states [1], shape [..., frame, particle, 4], of two consecutive frames or more."""
+        """Return the states [1], shape [..., frame, particle, 4], of two consecutive
+        frames or more.
+        """
         if position.shape[-3] < 2:
-            raise DataError("a velocity needs two frames", expected="2 or more", got=position.shape[-3])
+            raise DataError(
+                "a velocity needs two frames",
+                expected="2 or more",
+                got=position.shape[-3],
+            )
         later = position[..., 1:, :, :] - position[..., :-1, :, :]
         velocity = torch.cat([later[..., :1, :, :], later], dim=-3)
         state = torch.cat([position, velocity], dim=-1)
@@ -54,11 +65,15 @@ class FrameState(nn.Module):
 
     def position(self, state: Tensor) -> Tensor:
         """Return the positions of states [length], shape [..., 2] from [..., 4]."""
-        return state[..., :2] * self.std[:2].to(state.dtype) + self.mean[:2].to(state.dtype)
+        return state[..., :2] * self.std[:2].to(state.dtype) + self.mean[:2].to(
+            state.dtype
+        )
 
 
 def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
-    """Return positions [length], shape [window, frame, particle, 2], and materials, [window, particle]."""
+    """Return positions [length], shape [window, frame, particle, 2], and materials,
+    [window, particle].
+    """
     counts = set(torch.bincount(batch.sample, minlength=batch.windows).tolist())
     if counts != {particles}:
         raise DataError(
@@ -76,12 +91,16 @@ def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
 class FrameWindow:
     """The state of a rollout: what :meth:`FrameModel.next_state` is given."""
 
-    state: Tensor  # the last standardised states [1], shape [window, frame, particle, 4]
+    state: (
+        Tensor  # the last standardised states [1], shape [window, frame, particle, 4]
+    )
     material: Tensor  # material of each particle, shape [window, particle]
 
 
 def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
-    """Return the mean squared errors of positions and of velocities, the two halves of Eq. 4.16 [1]."""
+    """Return the mean squared errors of positions and of velocities, the two halves of
+    Eq. 4.16 [1].
+    """
     error = (predicted - truth).square()
     return {"position": error[..., :2].mean(), "velocity": error[..., 2:].mean()}
 
@@ -110,7 +129,9 @@ class FrameModel(Baseline):
 
     @property
     def history(self) -> int:
-        """One frame more than the states that are given: the first has a velocity, too."""
+        """One frame more than the states that are given: the first has a velocity,
+        too.
+        """
         return self.inputs + 1
 
     @property
@@ -118,11 +139,17 @@ class FrameModel(Baseline):
         """Numbers that describe a frame: 4 per particle."""
         return FEATURES * self.facts.particles
 
-    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the mean squared errors of position and velocity after one step [1]."""
+    def forward(
+        self, batch: Batch, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Return the mean squared errors of position and velocity after one step
+        [1].
+        """
         return squared_errors(*self.one_step(batch, generator))
 
-    def one_step(self, batch: Batch, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+    def one_step(
+        self, batch: Batch, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the true and the predicted state of the last frame."""
         window = self._states(batch)
         given = self.disturbed(window.state[:, -1 - self.inputs : -1], generator)
@@ -138,7 +165,9 @@ class FrameModel(Baseline):
         return state
 
     def start(self, given: Batch) -> FrameWindow:
-        """Return the last states of the given frames; where too few are given, the first repeats."""
+        """Return the last states of the given frames; where too few are given, the
+        first repeats.
+        """
         window = self._states(given)
         state = window.state[:, -self.inputs :]
         missing = self.inputs - state.shape[1]
@@ -146,9 +175,13 @@ class FrameModel(Baseline):
         return FrameWindow(torch.cat([first, state], dim=1), window.material)
 
     def advance(self, state: FrameWindow) -> tuple[FrameWindow, Tensor]:
-        """Advance by one frame: the next window and positions [length], shape [particle, 2]."""
+        """Advance by one frame: the next window and positions [length], shape
+        [particle, 2].
+        """
         new = self.next_state(state)
-        window = FrameWindow(torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material)
+        window = FrameWindow(
+            torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material
+        )
         return window, self.frame_state.position(new).flatten(0, 1).to(torch.float32)
 
 
@@ -162,9 +195,10 @@ class Target(enum.StrEnum):
 class FrameNetworkOptions(baseline.Options):
     """Options of a network of whole frames.
 
-    The thesis's networks predict the next state itself, without noise; ``target: change`` and
-    ``noise_std`` are ours. A state is made anew in every frame, so that even the first step is off by
-    the error of the whole state; a change keeps what it does not know.
+    The thesis's networks predict the next state itself, without noise;
+    ``target: change`` and ``noise_std`` are ours. A state is made anew in every frame,
+    so that even the first step is off by the error of the whole state; a change keeps
+    what it does not know.
     """
 
     in_training = frozenset({"noise_std"})
@@ -172,13 +206,17 @@ class FrameNetworkOptions(baseline.Options):
 
     # the next state, or its change in units of the change's deviation over train
     target: Target = Target.STATE
-    material: bool = False  # give the material as a fifth, constant feature of every particle
+    material: bool = (
+        False  # give the material as a fifth, constant feature of every particle
+    )
     # of the noise on the states that training gives to the network [standardised]
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
 
 class FrameNetwork(FrameModel):
-    """Base of the networks: their inputs are states, with the material where the recipe wants it."""
+    """Base of the networks: their inputs are states, with the material where the recipe
+    wants it.
+    """
 
     options: FrameNetworkOptions
     typical_change: Tensor
@@ -190,26 +228,40 @@ class FrameNetwork(FrameModel):
         known = facts.statistics
         moved = zip(known["velocity_std"], known["position_std"], strict=True)
         pushed = zip(known["acceleration_std"], known["velocity_std"], strict=True)
-        typical = torch.tensor([change / spread for change, spread in (*moved, *pushed)])
+        typical = torch.tensor(
+            [change / spread for change, spread in (*moved, *pushed)]
+        )
         self.register_buffer("typical_change", typical, persistent=False)
 
     def disturbed(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Return the states with independent normal noise; unchanged without a generator."""
+        """Return the states with independent normal noise; unchanged without a
+        generator.
+        """
         if generator is None or self.options.noise_std == 0.0:
             return state
-        noise = torch.randn(state.shape, generator=generator, device=state.device, dtype=state.dtype)
+        noise = torch.randn(
+            state.shape, generator=generator, device=state.device, dtype=state.dtype
+        )
         return state + self.options.noise_std * noise
 
     def given(self, window: FrameWindow) -> Tensor:
-        """Return the inputs of the network [1], shape [window, frame, particle, 4 or 5]."""
+        """Return the inputs of the network [1], shape [window, frame, particle, 4 or
+        5].
+        """
         if not self.options.material:
             return window.state
-        constant = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0  # 0 ... 3 to -1 ... 1
+        constant = (
+            window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
+        )  # 0 ... 3 to -1 ... 1
         constant = constant[:, None, :, None].expand(-1, window.state.shape[1], -1, -1)
         return torch.cat([window.state, constant], dim=-1)
 
     def meant(self, output: Tensor, window: FrameWindow) -> Tensor:
-        """Return the state that an output of shape [window, feature] means, shape [window, particle, 4]."""
+        """Return the state that an output of shape [window, feature] means, shape
+        [window, particle, 4].
+        """
         last = window.state[:, -1]
         output = output.view(last.shape).to(last.dtype)
-        return output if self.options.target is Target.STATE else last + self.typical_change * output
+        if self.options.target is Target.STATE:
+            return output
+        return last + self.typical_change * output

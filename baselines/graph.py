@@ -4,13 +4,15 @@ A pair is connected where, in float64 of the positions as they are stored,
 
     (x_i - x_j)^2 + (y_i - y_j)^2 <= radius^2.
 
-Particles are sorted by square cells a little wider than the radius. In the order (column, row)
-the cells above a particle's own, and the three beside it in the next column, are two runs of
-consecutive particles; their distances are all that has to be computed. NumPy does this on the
-CPU, torch elsewhere, with the same roundings: they agree to the last edge.
+Particles are sorted by square cells a little wider than the radius. In the order
+(column, row) the cells above a particle's own, and the three beside it in the next
+column, are two runs of consecutive particles; their distances are all that has to be
+computed. NumPy does this on the CPU, torch elsewhere, with the same roundings: they
+agree to the last edge.
 
-What a graph network sees: motion, walls and material of a particle, its neighbours' places; of positions
-only differences, so that away from walls the features do not change when all particles move by one vector.
+What a graph network sees: motion, walls and material of a particle, its neighbours'
+places; of positions only differences, so that away from walls the features do not
+change when all particles move by one vector.
 """
 
 from __future__ import annotations
@@ -29,8 +31,11 @@ from lagbench.errors import UsageError
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 
-MARGIN = 1e-6  # cells are wider than the radius by this share, more than rounding can move a particle
-FAR = 1 << 20  # cells that are told apart on either side of the origin; what lies beyond shares the last
+# cells are wider than the radius by this share, more than rounding can move a particle
+MARGIN = 1e-6
+FAR = (
+    1 << 20
+)  # cells that are told apart on either side of the origin; what lies beyond shares the last
 
 
 @torch.no_grad()
@@ -44,21 +49,35 @@ def radius_graph(
 ) -> Tensor:
     """Connect all pairs of particles within a radius, itself included.
 
-    Return senders and receivers, int64, shape [2, edge]: both directions of every pair, sorted by receiver,
-    then sender. Particles of different windows, which `sample` names in ascending order, are never
-    connected, and those whose position is no finite number have no edges.
+    Return senders and receivers, int64, shape [2, edge]: both directions of every pair,
+    sorted by receiver, then sender. Particles of different windows, which `sample`
+    names in ascending order, are never connected, and those whose position is no finite
+    number have no edges.
 
-    With ``most``, a receiver hears that many neighbours, the nearest; of equally far ones any. So not all
-    pairs have both directions (SuperGAT's link loss takes what is not heard as unlinked). Where matter has
-    collapsed to a heap, memory is then bounded, and so is time unless thousands lie at the very same place.
+    With ``most``, a receiver hears that many neighbours, the nearest; of equally far
+    ones any. So not all pairs have both directions (SuperGAT's link loss takes what is
+    not heard as unlinked). Where matter has collapsed to a heap, memory is then
+    bounded, and so is time unless thousands lie at the very same place.
     """
     where = "radius_graph"
     if position.ndim != 2 or position.shape[1] != 2:
         got = tuple(position.shape)
-        raise UsageError("positions have the wrong shape", where=where, expected="[particle, 2]", got=got)
+        raise UsageError(
+            "positions have the wrong shape",
+            where=where,
+            expected="[particle, 2]",
+            got=got,
+        )
     if not (math.isfinite(radius) and radius > 0.0):
-        raise UsageError("the radius is no length", where=where, expected="a positive number", got=radius)
-    fits = sample is None or (sample.shape == position.shape[:1] and bool((sample[1:] >= sample[:-1]).all()))
+        raise UsageError(
+            "the radius is no length",
+            where=where,
+            expected="a positive number",
+            got=radius,
+        )
+    fits = sample is None or (
+        sample.shape == position.shape[:1] and bool((sample[1:] >= sample[:-1]).all())
+    )
     if sample is not None and not fits:
         raise UsageError(
             "windows do not fit the particles",
@@ -67,61 +86,97 @@ def radius_graph(
             got=f"shape {tuple(sample.shape)}",
         )
     x = position.detach().double()
-    window = torch.zeros(len(x), dtype=torch.int64, device=x.device) if sample is None else sample
+    if sample is None:
+        window = torch.zeros(len(x), dtype=torch.int64, device=x.device)
+    else:
+        window = sample
     if most is not None:
-        near = nearest_edges(x.cpu().numpy(), window.cpu().numpy(), radius, self_edges, most)
+        near = nearest_edges(
+            x.cpu().numpy(), window.cpu().numpy(), radius, self_edges, most
+        )
         edges = torch.from_numpy(np.sort(near)).to(x.device)
     elif x.device.type == "cpu":
-        edges = torch.from_numpy(np.sort(edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges)))
+        edges = torch.from_numpy(
+            np.sort(edge_numbers(np, x.numpy(), window.numpy(), radius, self_edges))
+        )
     else:
         edges = edge_numbers(torch, x, window, radius, self_edges).sort().values
     return torch.stack([edges & 0xFFFFFFFF, edges >> 32])
 
 
 def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) -> Any:  # noqa: ANN401
-    """Return receiver * 2^32 + sender of every edge, by arrays of NumPy or of torch as ``xp``."""
+    """Return receiver * 2^32 + sender of every edge, by arrays of NumPy or of torch as
+    ``xp``.
+    """
     repeat = np.repeat if xp is np else torch.repeat_interleave
     kept = xp.where(xp.isfinite(x).all(1))[0]
-    x, key, stride = x[kept], window[kept], 0
+    x = x[kept]
+    key = window[kept]
+    stride = 0
     if len(x):
         cell = xp.floor(x * (1.0 / (radius * (1.0 + MARGIN))))
         cell = xp.asarray(xp.clip(cell, -FAR, FAR), dtype=xp.int64)
         cell = cell - xp.amin(cell, 0)
         columns, rows = xp.amax(cell, 0)
-        # An empty row after each column and an empty column after each window keep them apart.
+        # An empty row after each column and an empty column after each window keep them
+        # apart.
         stride = rows + 2
         key = (key * (columns + 2) + cell[:, 0]) * stride + cell[:, 1]
     order = xp.argsort(key, stable=True)
-    x, key, particle = x[order], key[order], kept[order]
+    x = x[order]
+    key = key[order]
+    particle = kept[order]
     own = xp.arange(len(x), device=x.device)
     above = xp.searchsorted(key, key + 2)
     beside = xp.searchsorted(key, key + (stride - 1))
     past = xp.searchsorted(key, key + (stride + 2))
     start = xp.concatenate([own + 1, beside])
     count = xp.concatenate([above - (own + 1), past - beside])
-    run = repeat(xp.arange(len(count), device=x.device), count)  # the one repeat: a GPU is waited for at each
-    i = run % len(own) if len(own) else run
-    j = xp.arange(len(run), device=x.device) + (start - (xp.cumsum(count, 0) - count))[run]
+    run = repeat(
+        xp.arange(len(count), device=x.device), count
+    )  # the one repeat: a GPU is waited for at each
+    if len(own):
+        i = run % len(own)
+    else:
+        i = run
+    j = (
+        xp.arange(len(run), device=x.device)
+        + (start - (xp.cumsum(count, 0) - count))[run]
+    )
     along_x, along_y = xp.stack([x[:, 0], x[:, 1]])
-    dx, dy = along_x[i] - along_x[j], along_y[i] - along_y[j]
+    dx = along_x[i] - along_x[j]
+    dy = along_y[i] - along_y[j]
     near = xp.where(dx * dx + dy * dy <= radius * radius)[0]
-    i, j = particle[i[near]], particle[j[near]]
-    loops = [(kept << 32) | kept] if self_edges else []
+    i = particle[i[near]]
+    j = particle[j[near]]
+    if self_edges:
+        loops = [(kept << 32) | kept]
+    else:
+        loops = []
     return xp.concatenate([(i << 32) | j, (j << 32) | i, *loops])
 
 
 def nearest_edges(
-    x: NDArray[np.float64], window: NDArray[np.int64], radius: float, self_edges: bool, most: int
+    x: NDArray[np.float64],
+    window: NDArray[np.int64],
+    radius: float,
+    self_edges: bool,
+    most: int,
 ) -> NDArray[np.int64]:
-    """Return receiver * 2^32 + sender of every edge to one of the nearest ``most`` within the radius.
+    """Return receiver * 2^32 + sender of every edge to one of the nearest ``most``
+    within the radius.
 
-    ``x`` are positions [length], shape [particle, 2], ``window`` the number of the window of each.
+    ``x`` are positions [length], shape [particle, 2], ``window`` the number of the
+    window of each.
     """
     kept = np.flatnonzero(np.isfinite(x).all(axis=1))
-    x, window = x[kept], window[kept]
+    x = x[kept]
+    window = window[kept]
     if not len(x):
         return np.empty(0, np.int64)
-    apart = np.column_stack([x, 4.0 * radius * window])  # no two windows within the radius of each other
+    apart = np.column_stack(
+        [x, 4.0 * radius * window]
+    )  # no two windows within the radius of each other
     # itself is one of those found, but where more than that lie at its very place
     beyond = radius * (1.0 + MARGIN)
     _, found = KDTree(apart).query(
@@ -132,7 +187,10 @@ def nearest_edges(
     dx, dy = np.moveaxis(x[own] - x[j], -1, 0)
     near = (found < len(x)) & (found != own) & (dx * dx + dy * dy <= radius * radius)
     i, rank = np.nonzero(near & (near.cumsum(axis=1) <= most))
-    loops = [(kept << 32) | kept] if self_edges else []
+    if self_edges:
+        loops = [(kept << 32) | kept]
+    else:
+        loops = []
     return np.concatenate([(kept[i] << 32) | kept[j[i, rank]], *loops])
 
 
@@ -148,11 +206,16 @@ class Scale(nn.Module):
     mean: Tensor  # mean over train, (x, y)
     std: Tensor  # standard deviation over train, (x, y)
 
-    def __init__(self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0) -> None:
+    def __init__(
+        self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0
+    ) -> None:
         super().__init__()
         widened = (torch.tensor(std, dtype=torch.float64) ** 2 + noise**2).sqrt()
-        # Facts and options travel with the weights and rebuild these, unrounded by half precision.
-        self.register_buffer("mean", torch.tensor(mean, dtype=torch.float32), persistent=False)
+        # Facts and options travel with the weights and rebuild these, unrounded by half
+        # precision.
+        self.register_buffer(
+            "mean", torch.tensor(mean, dtype=torch.float32), persistent=False
+        )
         self.register_buffer("std", widened.to(torch.float32), persistent=False)
 
     def forward(self, value: Tensor) -> Tensor:
@@ -165,9 +228,11 @@ class Scale(nn.Module):
 
 
 def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
-    """Return the distances to left, right, bottom and top wall over the reach [length], clipped to [-1, 1].
+    """Return the distances to left, right, bottom and top wall over the reach [length],
+    clipped to [-1, 1].
 
-    A wall farther away than the reach looks like one at it; outside the box they are negative.
+    A wall farther away than the reach looks like one at it; outside the box they are
+    negative.
     """
     (left, right), (bottom, top) = bounds
     x, y = position.unbind(dim=-1)
@@ -176,23 +241,31 @@ def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
 
 
 def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor:
-    """Return ``((x_s - x_r) / radius, (y_s - y_r) / radius, distance / radius)``, shape [edge, 3]."""
+    """Return ``((x_s - x_r) / radius, (y_s - y_r) / radius, distance / radius)``, shape
+    [edge, 3].
+    """
     sender, receiver = edge_index
-    displacement = (position.index_select(0, sender) - position.index_select(0, receiver)) / radius
-    # The gradient of a norm is NaN at 0, where two particles coincide; that of this root is 0.
+    displacement = (
+        position.index_select(0, sender) - position.index_select(0, receiver)
+    ) / radius
+    # The gradient of a norm is NaN at 0, where two particles coincide; that of this
+    # root is 0.
     square = (displacement**2).sum(dim=-1, keepdim=True)
     distance = torch.where(square > 0.0, square, 1.0).sqrt() * (square > 0.0)
     return torch.cat([displacement, distance], dim=-1)
 
 
 class NodeFeatures(nn.Module):
-    """Features of a particle: 2 of each velocity, 4 of walls, 16 of material, 8 of moving walls if asked.
+    """Features of a particle: 2 of each velocity, 4 of walls, 16 of material, 8 of
+    moving walls if asked.
 
-    The last velocities are shown as the last one and the changes that led to it, each over its own
-    deviation: in velocities alone the changes, of which the next is to be predicted, are hundredths.
+    The last velocities are shown as the last one and the changes that led to it, each
+    over its own deviation: in velocities alone the changes, of which the next is to be
+    predicted, are hundredths.
 
     Moving walls: the per-frame velocity of each wall over the velocity scale, times
-    ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall is near.
+    ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall is
+    near.
     """
 
     def __init__(
@@ -211,21 +284,30 @@ class NodeFeatures(nn.Module):
         self.acceleration = acceleration
         self.bounds = bounds  # of the box, (low, high) along x and y [length]
         self.reach = reach  # how far a wall is seen [length]
-        self.moving_walls = moving_walls  # whether the velocities of the walls are features too
+        self.moving_walls = (
+            moving_walls  # whether the velocities of the walls are features too
+        )
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
 
     @property
     def count(self) -> int:
-        """Features of one particle: with five velocities 30, or 38 with moving walls."""
+        """Features of one particle: with five velocities 30, or 38 with moving
+        walls.
+        """
         return 2 * self.velocities + _WALLS + EMBEDDING + 2 * _WALLS * self.moving_walls
 
     def forward(
-        self, position: Tensor, velocity: Tensor, material: Tensor, wall_velocity: Tensor | None = None
+        self,
+        position: Tensor,
+        velocity: Tensor,
+        material: Tensor,
+        wall_velocity: Tensor | None = None,
     ) -> Tensor:
         """Return the features of each particle, shape [particle, count].
 
-        Velocities, oldest first, have shape [particle, velocities, 2]; those of the walls as each particle
-        sees them shape [particle, 4, 2], and None counts as walls at rest.
+        Velocities, oldest first, have shape [particle, velocities, 2]; those of the
+        walls as each particle sees them shape [particle, 4, 2], and None counts as
+        walls at rest.
         """
         distance = wall_distance(position, self.bounds, self.reach)
         changes = self.acceleration(velocity.diff(dim=1)).flatten(1)

@@ -1,4 +1,5 @@
-"""A training: what was asked for, the folder it writes, the record of what it did and what it cost.
+"""A training: what was asked for, the folder it writes, the record of what it did and
+what it cost.
 
 The folder holds checkpoint.pt, weights.pt, training.json and tensorboard/.
 """
@@ -23,7 +24,13 @@ from torch import Tensor
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_regular
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    check_regular,
+)
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
@@ -33,9 +40,13 @@ from .checkpoint import Checkpoint, load
 from .machine import hardware
 from .recipe import ANY, LATER, Recipe, recipe_for, recipe_names
 
-STOPPED_EARLY = "stopped early"  # state of a training whose validations brought nothing new; it is over
+# state of a training whose validations brought nothing new; it is over
+STOPPED_EARLY = "stopped early"
 MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
-OVER = ("finished", STOPPED_EARLY)  # states of a training that is not to be gone on with
+OVER = (
+    "finished",
+    STOPPED_EARLY,
+)  # states of a training that is not to be gone on with
 
 
 @dataclass
@@ -60,15 +71,18 @@ class TrainingRecord:
 
     def __post_init__(self) -> None:
         """Start the clocks."""
-        self._cpu, self._wall = _processor_seconds(), time.monotonic()
+        self._cpu = _processor_seconds()
+        self._wall = time.monotonic()
 
     def read_clocks(self, processes: int = 1, *, device: str = "cpu") -> None:
         """Add the time since the last reading, of as many processes as train alike."""
-        cpu, wall = _processor_seconds(), time.monotonic()
+        cpu = _processor_seconds()
+        wall = time.monotonic()
         self.cpu_seconds += (cpu - self._cpu) * processes
         self.gpu_seconds += (wall - self._wall) * processes * (device != "cpu")
         self.wall_seconds += wall - self._wall
-        self._cpu, self._wall = cpu, wall
+        self._cpu = cpu
+        self._wall = wall
 
     @contextmanager
     def validating(self, processes: int = 1, *, device: str = "cpu") -> Iterator[None]:
@@ -80,12 +94,17 @@ class TrainingRecord:
         self.validation_cpu_seconds += self.cpu_seconds - before
 
     def validated(self, metric: str, value: float) -> bool:
-        """Enter a validation at the present step; return whether it is the best so far."""
+        """Enter a validation at the present step; return whether it is the best so
+        far.
+        """
         self.metric = metric
         self.validation.append({"step": self.step, metric: value})
-        if not math.isfinite(value) or (self.best_value is not None and not value < self.best_value):
+        if not math.isfinite(value) or (
+            self.best_value is not None and not value < self.best_value
+        ):
             return False
-        self.best_step, self.best_value = self.step, value
+        self.best_step = self.step
+        self.best_value = value
         return True
 
     def since_best(self) -> int:
@@ -104,7 +123,9 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoint = path / "checkpoint.pt"  # the last state, to go on from
-        self.weights = path / "weights.pt"  # the best weights in bfloat16, to predict from
+        self.weights = (
+            path / "weights.pt"
+        )  # the best weights in bfloat16, to predict from
         self.record = path / "training.json"  # what the training did and cost
         self.logs = path / "tensorboard"  # folder of TensorBoard's files
 
@@ -112,23 +133,34 @@ class RunFolder:
         self, recipe: Recipe, facts: Facts, *, processes: int, resume: bool, fresh: bool
     ) -> Checkpoint | None:
         """Return the checkpoint to go on from; None for a training from the start."""
-        left = [file for file in (self.checkpoint, self.weights, self.record) if file.exists()]
+        left = [
+            file
+            for file in (self.checkpoint, self.weights, self.record)
+            if file.exists()
+        ]
         if fresh or not left:
             return None
-        where, asked = str(self.path), recipe.as_json()
+        where = str(self.path)
+        asked = recipe.as_json()
         taken = UsageError(
             "the folder holds a training",
             where=where,
-            fix="go on with --resume, train anew with --fresh, or name another --output",
+            fix="go on with --resume, train anew with --fresh, or name another "
+            "--output",
         )
         if self.checkpoint not in left:
             if not resume:
                 raise taken
             if self.weights not in left:  # it failed before there was anything to keep
                 return None
-            said = self._recorded()  # no training can go on from these weights, and none may replace them
+            said = (
+                self._recorded()
+            )  # no training can go on from these weights, and none may replace them
             over = said.get("recipe") == asked and said.get("state") in OVER
-            instead = "predict from its weights" if over else "name another folder with --output"
+            if over:
+                instead = "predict from its weights"
+            else:
+                instead = "name another folder with --output"
             lacking = "the folder holds weights, and no checkpoint to go on from"
             raise UsageError(
                 "the training is finished" if over else lacking,
@@ -144,7 +176,8 @@ class RunFolder:
                 where=f"--start, {where}",
                 expected=start_words(started) or "random weights: no --start",
                 got=start_words(asked.get("start")) or "no --start",
-                fix="give the same --start, name another folder with --output, or train anew with --fresh",
+                fix="give the same --start, name another folder with --output, or "
+                "train anew with --fresh",
             )
         if found.training.get("recipe") != asked:
             raise UsageError(
@@ -169,30 +202,45 @@ class RunFolder:
                 where="--processes",
                 expected=found.training.get("processes"),
                 got=processes,
-                fix="the learning rate and the order of windows follow from it; or train anew with --fresh",
+                fix="the learning rate and the order of windows follow from it; or "
+                "train anew with --fresh",
             )
         return found
 
     def unfinished(self, trained: Mapping[str, Any]) -> tuple[int, int] | None:
-        """Return step and steps of a training that is not over, if its record has the weights' recipe."""
+        """Return step and steps of a training that is not over, if its record has the
+        weights' recipe.
+        """
         said = self._recorded()
-        step, steps = said.get("step"), said.get("steps")
+        step = said.get("step")
+        steps = said.get("steps")
         if said.get("state") in OVER or said.get("recipe") != trained.get("recipe"):
             return None
-        return (step, steps) if isinstance(step, int) and isinstance(steps, int) else None
+        if isinstance(step, int) and isinstance(steps, int):
+            return (step, steps)
+        return None
 
     def _recorded(self) -> dict[str, Any]:
-        """Return what training.json says; nothing where it is not there or no record."""
+        """Return what training.json says; nothing where it is not there or no
+        record.
+        """
         try:
             check_regular(self.record, longest=MOST_RECORD)
             said = json.loads(self.record.read_bytes())
         except (UnreadableFileError, OSError, ValueError, RecursionError):
             return {}
-        return said if isinstance(said, dict) else {}
+        if isinstance(said, dict):
+            return said
+        return {}
 
     def holds(self, file: Path) -> bool:
-        """Tell whether a file is one of those that a training here writes, behind a link perhaps."""
-        return any(one.exists() and one.samefile(file) for one in (self.weights, self.checkpoint))
+        """Tell whether a file is one of those that a training here writes, behind a
+        link perhaps.
+        """
+        return any(
+            one.exists() and one.samefile(file)
+            for one in (self.weights, self.checkpoint)
+        )
 
     def clear(self) -> None:
         """Remove what an earlier training left, and nothing else."""
@@ -210,9 +258,13 @@ class RunFolder:
 
 def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> str:
     """Return the first key whose value differs, with both values."""
-    theirs = found if isinstance(found, dict) else {}
+    if isinstance(found, dict):
+        theirs = found
+    else:
+        theirs = {}
     for key in sorted({*wanted, *theirs}):
-        mine, other = wanted.get(key), theirs.get(key)
+        mine = wanted.get(key)
+        other = theirs.get(key)
         if mine != other:
             if isinstance(mine, dict) and isinstance(other, dict):
                 return first_difference(mine, other, f"{path}{key}.")
@@ -220,17 +272,27 @@ def first_difference(wanted: dict[str, Any], found: object, path: str = "") -> s
     return "the same recipe"
 
 
-UNTOLD = ("seed", "compile", "log_every", "checkpoint_every")  # options that do not say what was learned
+UNTOLD = (
+    "seed",
+    "compile",
+    "log_every",
+    "checkpoint_every",
+)  # options that do not say what was learned
 LONGEST_VALUE = 200  # letters of a changed option that are told
 
 
 def settings_of(recipe: object) -> tuple[str, ...]:
-    """Return what a training changed of the shipped recipe that it names, as ``--set`` takes it.
+    """Return what a training changed of the shipped recipe that it names, as ``--set``
+    takes it.
 
-    ``recipe`` is what a record of a training or its weights hold, of a stranger perhaps: options that are
-    unknown here, and whatever names no shipped recipe, are passed over, long values are not told.
+    ``recipe`` is what a record of a training or its weights hold, of a stranger
+    perhaps: options that are unknown here, and whatever names no shipped recipe, are
+    passed over, long values are not told.
     """
-    held = recipe if isinstance(recipe, Mapping) else {}
+    if isinstance(recipe, Mapping):
+        held = recipe
+    else:
+        held = {}
     split, _, where = str(held.get("name")).partition("/")
     size, _, variant = where.partition("-")
     try:
@@ -240,25 +302,40 @@ def settings_of(recipe: object) -> tuple[str, ...]:
         shipped = recipe_for(entry, split, size, variant=variant or None)
     except LagbenchError:
         return ()
-    parts = {"model": shipped.model, "training": shipped.training.model_dump(mode="json")}
-    return tuple(sorted(f"{key}={_spelled(value)}" for key, value in _changes(parts, held, LATER)))
+    parts = {
+        "model": shipped.model,
+        "training": shipped.training.model_dump(mode="json"),
+    }
+    return tuple(
+        sorted(
+            f"{key}={_spelled(value)}" for key, value in _changes(parts, held, LATER)
+        )
+    )
 
 
 def changes_of(recipe: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a training changed of its recipe, and the weights that it started from, in words."""
+    """Return what a training changed of its recipe, and the weights that it started
+    from, in words.
+    """
     words = start_words(recipe.get("start"))
     return (*settings_of(recipe), *((f"started from {words}",) if words else ()))
 
 
 def start_words(start: Mapping[str, Any] | None) -> str:
-    """Return which weights a training starts from, in words; nothing for random ones."""
-    return f"{start['recipe']}, weights {start['sha256'][:12]}" if start else ""
+    """Return which weights a training starts from, in words; nothing for random
+    ones.
+    """
+    if start:
+        return f"{start['recipe']}, weights {start['sha256'][:12]}"
+    return ""
 
 
 def _changes(
     shipped: Mapping[str, Any], held: object, missing: Mapping[str, Any], path: str = ""
 ) -> Iterator[tuple[str, Any]]:
-    """Yield where a record differs from the shipped options, with paths as in model.loss.vorticity."""
+    """Yield where a record differs from the shipped options, with paths as in
+    model.loss.vorticity.
+    """
     if not isinstance(held, Mapping):
         return
     for key, value in shipped.items():
@@ -270,21 +347,38 @@ def _changes(
 
 
 def _spelled(value: object) -> str:
-    """Return a value in a line of YAML, quoted only where it would be read as something else."""
+    """Return a value in a line of YAML, quoted only where it would be read as something
+    else.
+    """
     plain = isinstance(value, str) and value.isascii() and value.isprintable()
-    text = str(value) if plain else json.dumps(value)
+    if plain:
+        text = str(value)
+    else:
+        text = json.dumps(value)
     if len(text) > LONGEST_VALUE:
         return "..."
     try:
         bare = not plain or yaml.safe_load(text) == value
-    except (yaml.YAMLError, ValueError):  # the latter of what looks like a date and is none
+    except (
+        yaml.YAMLError,
+        ValueError,
+    ):  # the latter of what looks like a date and is none
         bare = False
-    return text if bare else json.dumps(value)
+    if bare:
+        return text
+    return json.dumps(value)
 
 
 FORMAT = 1  # of training.json
 # whose versions decide the result
-LIBRARIES = ("lagbench", "torch", "torch-geometric", "pytorch-lightning", "numpy", "scipy")
+LIBRARIES = (
+    "lagbench",
+    "torch",
+    "torch-geometric",
+    "pytorch-lightning",
+    "numpy",
+    "scipy",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,30 +397,47 @@ class TrainingJob:
     meter: Meter = field(default_factory=Meter)  # counts steps
 
     def ledger(self) -> TrainingRecord:
-        """Return the ledger that goes on where an earlier run ended, in the state that it ended in."""
-        stored = self.earlier.training if self.earlier else {}
+        """Return the ledger that goes on where an earlier run ended, in the state that
+        it ended in.
+        """
+        if self.earlier:
+            stored = self.earlier.training
+        else:
+            stored = {}
         return TrainingRecord(
-            **{one.name: stored[one.name] for one in fields(TrainingRecord) if one.name in stored}
+            **{
+                one.name: stored[one.name]
+                for one in fields(TrainingRecord)
+                if one.name in stored
+            }
         )
 
     def budget(self, ledger: TrainingRecord) -> Budget:
         """Return what the training took so far, as predictions and entries say it.
 
-        Hours are with those of the weights that it started from; epochs, steps and validations are its own.
-        Of many validations every n-th is told, the last one among them.
+        Hours are with those of the weights that it started from; epochs, steps and
+        validations are its own. Of many validations every n-th is told, the last one
+        among them.
         """
         machine = hardware(self.device)
         device = str(machine["device" if self.device != "cpu" else "processor"])
-        known = [(int(one["step"]), one[str(ledger.metric)]) for one in ledger.validation]
+        known = [
+            (int(one["step"]), one[str(ledger.metric)]) for one in ledger.validation
+        ]
         told = [one for one in known if math.isfinite(one[1])]
         stride = -(-len(told) // MOST_VALIDATIONS) or 1
         # Processes that read windows ahead live on, so that nobody has their time.
-        seconds = None if self.workers else ledger.cpu_seconds - ledger.validation_cpu_seconds
+        if self.workers:
+            seconds = None
+        else:
+            seconds = ledger.cpu_seconds - ledger.validation_cpu_seconds
         earlier = (self.recipe.start or {}).get("took", {})
 
         def hours(own: float | None, name: str) -> float | None:
             spent = earlier.get(name, 0.0)
-            return None if own is None or spent is None else round_digits(own / 3600.0 + spent, 6)
+            if own is None or spent is None:
+                return None
+            return round_digits(own / 3600.0 + spent, 6)
 
         return Budget(
             windows=ledger.windows_seen or None,
@@ -357,13 +468,20 @@ class TrainingJob:
             options=self.recipe.model,
             facts=self.facts,
             weights=weights,
-            training={**fixed, **asdict(ledger), "budget": self.budget(ledger).model_dump(mode="json")},
+            training={
+                **fixed,
+                **asdict(ledger),
+                "budget": self.budget(ledger).model_dump(mode="json"),
+            },
             optimizer=optimizer,
         )
 
-    def record(self, model: Baseline, ledger: TrainingRecord, **more: int) -> dict[str, Any]:
+    def record(
+        self, model: Baseline, ledger: TrainingRecord, **more: int
+    ) -> dict[str, Any]:
         """Return what training.json says."""
-        facts, budget = self.facts, self.budget(ledger)
+        facts = self.facts
+        budget = self.budget(ledger)
         return {
             "format": FORMAT,
             "baseline": self.recipe.baseline,
@@ -376,7 +494,10 @@ class TrainingJob:
             "parameters": parameter_count(model),
             "processes": self.processes,
             "hardware": hardware(self.device),
-            "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
+            "versions": {
+                "python": platform.python_version(),
+                **{name: version(name) for name in LIBRARIES},
+            },
             "budget": budget.model_dump(mode="json"),
             "track": track_of(facts.size, budget),
             **more,
@@ -385,7 +506,13 @@ class TrainingJob:
 
 
 def parameter_count(model: Baseline) -> int:
-    """Return the trained numbers of a model: parameters, or the coefficients of a closed form."""
+    """Return the trained numbers of a model: parameters, or the coefficients of a
+    closed form.
+    """
     if getattr(model, "closed_form", False):
-        return sum(value.numel() for value in model.state_dict().values() if value.is_floating_point())
+        return sum(
+            value.numel()
+            for value in model.state_dict().values()
+            if value.is_floating_point()
+        )
     return sum(p.numel() for p in model.parameters() if p.requires_grad)

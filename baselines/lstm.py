@@ -1,4 +1,6 @@
-"""LSTM in a learned latent space, with and without an MLP between its layers (thesis section 4.7)."""
+"""LSTM in a learned latent space, with and without an MLP between its layers (thesis
+section 4.7).
+"""
 
 from __future__ import annotations
 
@@ -22,10 +24,10 @@ Share = Annotated[float, Field(ge=0, lt=1)]
 class LSTM(FrameNetwork):
     """Two frames in, the next one out (Table 4.6).
 
-    Each frame is encoded particle by particle and averaged over the particles; two LSTM layers
-    read the latent vectors, each followed by dropout; a decoder turns the last output into the
-    states of all particles. LSTM cells use tanh, as PyTorch's do; the table's ELU stands in
-    encoder, interleaved MLP and decoder.
+    Each frame is encoded particle by particle and averaged over the particles; two LSTM
+    layers read the latent vectors, each followed by dropout; a decoder turns the last
+    output into the states of all particles. LSTM cells use tanh, as PyTorch's do; the
+    table's ELU stands in encoder, interleaved MLP and decoder.
     """
 
     method = "lstm"
@@ -37,12 +39,21 @@ class LSTM(FrameNetwork):
 
         in_training = FrameNetworkOptions.in_training | {"dropout", "density_weight"}
 
-        latent: PositiveInt = 1250  # length of the latent vector of a frame and width of both LSTM layers
-        encoder: tuple[PositiveInt, ...] = ()  # widths of pointwise layers before the latent one
-        decoder: tuple[PositiveInt, ...] = (1250,)  # widths of hidden layers after the second LSTM layer
-        dropout: tuple[Share, Share] = (0.2, 0.1)  # after the first and after the second LSTM layer
-        # of the density term in the loss. The thesis states none; with 1 the gradient within a cell drowns
-        # that of the positions, which then are not learned.
+        latent: PositiveInt = (
+            1250  # length of the latent vector of a frame and width of both LSTM layers
+        )
+        encoder: tuple[
+            PositiveInt, ...
+        ] = ()  # widths of pointwise layers before the latent one
+        decoder: tuple[PositiveInt, ...] = (
+            1250,
+        )  # widths of hidden layers after the second LSTM layer
+        dropout: tuple[Share, Share] = (
+            0.2,
+            0.1,
+        )  # after the first and after the second LSTM layer
+        # of the density term in the loss. The thesis states none; with 1 the gradient
+        # within a cell drowns that of the positions, which then are not learned.
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
 
     options: Options
@@ -50,10 +61,16 @@ class LSTM(FrameNetwork):
     def __init__(self, options: Options, facts: Facts) -> None:
         super().__init__(options, facts)
         latent = options.latent
-        pointwise = dense((self.input_features, *options.encoder, latent), Activation.ELU)
+        pointwise = dense(
+            (self.input_features, *options.encoder, latent), Activation.ELU
+        )
         self.encoder = nn.Sequential(*pointwise, nn.ELU())
         self.first = nn.LSTM(latent, latent, batch_first=True)
-        self.between = nn.Sequential(nn.Linear(latent, latent), nn.ELU()) if self.interleaved else None
+        self.between = (
+            nn.Sequential(nn.Linear(latent, latent), nn.ELU())
+            if self.interleaved
+            else None
+        )
         self.second = nn.LSTM(latent, latent, batch_first=True)
         self.dropout = nn.ModuleList(nn.Dropout(share) for share in options.dropout)
         self.decoder = dense((latent, *options.decoder, self.features), Activation.ELU)
@@ -63,8 +80,12 @@ class LSTM(FrameNetwork):
         """Weight of the density term; the others have 1."""
         return {"density": self.options.density_weight}
 
-    def forward(self, batch: Batch, generator: torch.Generator | None = None) -> dict[str, Tensor]:
-        """Return the errors of position and velocity, and that of the density map [1]."""
+    def forward(
+        self, batch: Batch, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Return the errors of position and velocity, and that of the density map
+        [1].
+        """
         truth, predicted = self.one_step(batch, generator)
         grid = Grid(self.facts.score_cells, Placement(self.facts.score_placement))
         places = (self.frame_state.position(state) for state in (truth, predicted))

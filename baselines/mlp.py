@@ -26,7 +26,9 @@ LAYERS = dict(zip(Activation, (nn.ELU, nn.ReLU, nn.Tanh, nn.Sigmoid), strict=Tru
 
 
 def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:
-    """Return linear layers, each but the last with the activation, from the first width to the last."""
+    """Return linear layers, each but the last with the activation, from the first width
+    to the last.
+    """
     layers: list[nn.Module] = []
     for before, after in pairwise(widths):
         layers += [nn.Linear(before, after), LAYERS[activation]()]
@@ -34,7 +36,8 @@ def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:
 
 
 class MLP(FrameNetwork):
-    """``z(f+1) = W_n a(... a(W_1 z(f) + b_1) ...) + b_n`` over all particles of a frame at once.
+    """``z(f+1) = W_n a(... a(W_1 z(f) + b_1) ...) + b_n`` over all particles of a frame
+    at once.
 
     Particles are told apart by their place in the file.
     """
@@ -47,7 +50,12 @@ class MLP(FrameNetwork):
 
         of_weights = FrameNetworkOptions.of_weights | {"activation"}
 
-        widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)  # units of each hidden layer
+        widths: tuple[PositiveInt, ...] = (
+            2500,
+            1250,
+            1250,
+            2500,
+        )  # units of each hidden layer
         activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
 
     options: Options
@@ -55,7 +63,9 @@ class MLP(FrameNetwork):
     def __init__(self, options: Options, facts: Facts) -> None:
         super().__init__(options, facts)
         inputs = self.input_features * facts.particles
-        self.network = dense((inputs, *options.widths, self.features), options.activation)
+        self.network = dense(
+            (inputs, *options.widths, self.features), options.activation
+        )
 
     @property
     def weights(self) -> Mapping[str, float]:

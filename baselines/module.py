@@ -1,8 +1,9 @@
-"""A baseline as pytorch-lightning trains it: seeded steps, and what happens between them.
+"""A baseline as pytorch-lightning trains it: seeded steps, and what happens between
+them.
 
-Random numbers are a function of seed, step and process, and of nothing else, so that no state of
-any generator has to be stored: a training that was interrupted draws, at every step, what an
-uninterrupted one draws there, whatever happened in between.
+Random numbers are a function of seed, step and process, and of nothing else, so that no
+state of any generator has to be stored: a training that was interrupted draws, at every
+step, what an uninterrupted one draws there, whatever happened in between.
 """
 
 from __future__ import annotations
@@ -62,30 +63,40 @@ class TrainingModule(LightningModule):
         # raw loss terms of the last step, and their weighted sum as 'total'
         self.terms: dict[str, Tensor] = {}
         self._rate = options.learning_rate * processes
-        self._loader = loader  # returns the batches of a process, by its rank among so many
+        self._loader = (
+            loader  # returns the batches of a process, by its rank among so many
+        )
         self._resumed = optimizer
 
     @property
     def learning_rate(self) -> float:
         """Rate of the next step."""
         plan = self.recipe.schedule
-        return self._rate * plan.at(self.step, steps=self.steps, warmup=self.recipe.warmup_steps)
+        return self._rate * plan.at(
+            self.step, steps=self.steps, warmup=self.recipe.warmup_steps
+        )
 
     def train_dataloader(self) -> DataLoader[Window]:
         """Return the batches of this process, from the next step on."""
         return self._loader(self.global_rank, self.trainer.world_size)
 
     def configure_optimizers(self) -> Optimizer:
-        """Return AdamW, which is Adam where weights do not decay, as an earlier run left it."""
+        """Return AdamW, which is Adam where weights do not decay, as an earlier run
+        left it.
+        """
         if next(self.model.parameters(), None) is None:
             raise UsageError(
                 "a model without parameters",
                 where=type(self.model).__qualname__,
                 expected="one that learns",
-                fix="write its predictions without a training: lagbench.submission.write",
+                fix="write its predictions without a training: "
+                "lagbench.submission.write",
             )
         self._optimizer = AdamW(
-            self.model.parameters(), lr=self._rate, weight_decay=self.recipe.weight_decay, fused=True
+            self.model.parameters(),
+            lr=self._rate,
+            weight_decay=self.recipe.weight_decay,
+            fused=True,
         )
         if self._resumed is not None:
             self._optimizer.load_state_dict(dict(self._resumed))
@@ -98,10 +109,18 @@ class TrainingModule(LightningModule):
         seed = seed_of(self.recipe.seed, self.step, self.global_rank)
         reseed(seed)
         terms = self.model(batch, torch.Generator(device=self.device).manual_seed(seed))
-        named = terms if isinstance(terms, Mapping) else {"no dict": terms}
-        fit = named is terms and all(isinstance(one, Tensor) and one.numel() == 1 for one in named.values())
+        if isinstance(terms, Mapping):
+            named = terms
+        else:
+            named = {"no dict": terms}
+        fit = named is terms and all(
+            isinstance(one, Tensor) and one.numel() == 1 for one in named.values()
+        )
         if not named or not fit:
-            shapes = [f"{name}: {getattr(one, 'shape', type(one).__name__)}" for name, one in named.items()]
+            shapes = [
+                f"{name}: {getattr(one, 'shape', type(one).__name__)}"
+                for name, one in named.items()
+            ]
             raise UsageError(
                 "a model returned no loss",
                 where=where,
@@ -110,19 +129,28 @@ class TrainingModule(LightningModule):
                 fix="mend that class; docs/baselines.md has an example",
             )
         weights = {name: self.model.weights.get(name, 1.0) for name in terms}
-        parts = [terms[name].reshape(()) * weight for name, weight in weights.items() if weight != 0]
+        parts = [
+            terms[name].reshape(()) * weight
+            for name, weight in weights.items()
+            if weight != 0
+        ]
         if not parts:
-            raise WorkFailedError("every term of the loss has weight 0", got=", ".join(terms))
+            raise WorkFailedError(
+                "every term of the loss has weight 0", got=", ".join(terms)
+            )
         total = torch.stack(parts).sum()
         if not total.requires_grad:
             raise UsageError(
                 "nothing can be learned from the loss",
                 where=where,
-                expected="a term, of a weight above 0, that depends on the model's parameters",
+                expected="a term, of a weight above 0, that depends on the model's "
+                "parameters",
                 got=", ".join(terms),
                 fix="mend that class, or the weights",
             )
-        self.terms = {name: value.detach() for name, value in (*terms.items(), (TOTAL, total))}
+        self.terms = {
+            name: value.detach() for name, value in (*terms.items(), (TOTAL, total))
+        }
         return total
 
     def configure_gradient_clipping(
@@ -131,9 +159,11 @@ class TrainingModule(LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip the gradient; refuse one that is not finite before it reaches the weights.
+        """Clip the gradient; refuse one that is not finite before it reaches the
+        weights.
 
-        Over several processes the gradient is their mean by now, so that all of them stop.
+        Over several processes the gradient is their mean by now, so that all of them
+        stop.
         """
         del gradient_clip_val, gradient_clip_algorithm
         gradients = [p.grad for p in self.model.parameters() if p.grad is not None]
@@ -141,15 +171,17 @@ class TrainingModule(LightningModule):
         if not math.isfinite(float(norm)):
             raise self.not_finite()
         if self.recipe.clip is not None:
-            torch.nn.utils.clip_grads_with_norm_(self.model.parameters(), self.recipe.clip, norm)
+            torch.nn.utils.clip_grads_with_norm_(
+                self.model.parameters(), self.recipe.clip, norm
+            )
         for group in optimizer.param_groups:
             group["lr"] = self.learning_rate
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 (Lightning's)
         """Make a step, count it, and let the mean of the weights follow.
 
-        The mean is kept in the optimiser's state, which checkpoints hold. It follows faster at first:
-        where training starts is soon forgotten.
+        The mean is kept in the optimiser's state, which checkpoints hold. It follows
+        faster at first: where training starts is soon forgotten.
         """
         super().optimizer_step(*args, **kwargs)
         self.step += 1
@@ -163,12 +195,20 @@ class TrainingModule(LightningModule):
     def published(self) -> AbstractContextManager[None]:
         """Put the mean of the weights in their place for a while, where one is kept."""
         states = self._optimizer.state.items()
-        return replaced({parameter: state[MEAN] for parameter, state in states if MEAN in state})
+        return replaced(
+            {parameter: state[MEAN] for parameter, state in states if MEAN in state}
+        )
 
     def not_finite(self) -> WorkFailedError:
         """Return the error that names step and terms."""
-        broken = [name for name, value in self.terms.items() if not torch.isfinite(value).all()]
-        named = [name for name in broken if name != TOTAL] or ["none of the terms: the gradient"]
+        broken = [
+            name
+            for name, value in self.terms.items()
+            if not torch.isfinite(value).all()
+        ]
+        named = [name for name in broken if name != TOTAL] or [
+            "none of the terms: the gradient"
+        ]
         return WorkFailedError(
             "the loss is not finite",
             where=f"step {self.step + 1}",
@@ -179,9 +219,11 @@ class TrainingModule(LightningModule):
 
 
 class TrainingCallback(Callback):
-    """Logs, validates and stores a training, and stops it early or when a user interrupts.
+    """Logs, validates and stores a training, and stops it early or when a user
+    interrupts.
 
-    An interrupt lets the running step end and stores the state; a second one stops at once.
+    An interrupt lets the running step end and stores the state; a second one stops at
+    once.
     """
 
     def __init__(
@@ -200,53 +242,86 @@ class TrainingCallback(Callback):
         self._handlers: dict[int, Any] = {}
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
-        """Listen to interrupts; begin to count; validate weights that the training starts from."""
+        """Listen to interrupts; begin to count; validate weights that the training
+        starts from.
+        """
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._interrupt)
-        steps, step = _of(module).steps, _of(module).step
+        steps = _of(module).steps
+        step = _of(module).step
         self.job.meter.begin("training", total=steps, scenarios=steps, done=step)
-        if self.validation is not None and self.job.recipe.start and not self.ledger.validation:
+        if (
+            self.validation is not None
+            and self.job.recipe.start
+            and not self.ledger.validation
+        ):
             self._validate(trainer, _of(module), self.validation)
-            self._store(trainer, _of(module))  # weights without a checkpoint could not be gone on with
+            self._store(
+                trainer, _of(module)
+            )  # weights without a checkpoint could not be gone on with
 
     def on_train_batch_end(
-        self, trainer: Trainer, module: LightningModule, outputs: object, batch: object, batch_idx: int
+        self,
+        trainer: Trainer,
+        module: LightningModule,
+        outputs: object,
+        batch: object,
+        batch_idx: int,
     ) -> None:
         """Do what is due after a step."""
         trained = _of(module)
-        step, steps, recipe = trained.step, trained.steps, trained.recipe
+        step = trained.step
+        steps = trained.steps
+        recipe = trained.recipe
         seen = step * recipe.batch * trainer.world_size
-        self.ledger.step, self.ledger.windows_seen, self.ledger.epochs = step, seen, seen / self.windows
+        self.ledger.step = step
+        self.ledger.windows_seen = seen
+        self.ledger.epochs = seen / self.windows
         last = step >= steps
         if last or step % recipe.log_every == 0 or step == 1:
-            terms = self.ledger.loss = {name: float(value) for name, value in trained.terms.items()}
+            terms = self.ledger.loss = {
+                name: float(value) for name, value in trained.terms.items()
+            }
             if not math.isfinite(terms[TOTAL]) and trainer.world_size == 1:
                 raise trained.not_finite()
             self.job.meter.stage = f"loss {terms[TOTAL]:.3g}"
             if trainer.logger is not None:
                 values = {f"loss/{name}": value for name, value in terms.items()}
-                trainer.logger.log_metrics({**values, "learning_rate": trained.learning_rate}, step=step)
+                trainer.logger.log_metrics(
+                    {**values, "learning_rate": trained.learning_rate}, step=step
+                )
             return_memory()
         self.job.meter.count(1, scenarios=1)
         if self.validation is not None:
-            predicted = recipe.batch * trained.model.future, sum(self.validation.frames.values())
+            predicted = (
+                recipe.batch * trained.model.future,
+                sum(self.validation.frames.values()),
+            )
             count = recipe.validations(steps, trained=predicted[0], rolled=predicted[1])
             if recipe.is_validated(step, steps=steps, validations=count):
                 self._validate(trainer, trained, self.validation)
         stop = trainer.strategy.reduce_boolean_decision(self._interrupted, all=False)
         if stop or trainer.should_stop or last:
             over = last or self.ledger.state == STOPPED_EARLY
-            self.ledger.state = "interrupted" if stop and not over else self.ledger.state
+            if stop and not over:
+                self.ledger.state = "interrupted"
+            else:
+                self.ledger.state = self.ledger.state
             trainer.should_stop = True
-        if trainer.should_stop or step % (recipe.checkpoint_every or max(1, steps // 20)) == 0:
+        if (
+            trainer.should_stop
+            or step % (recipe.checkpoint_every or max(1, steps // 20)) == 0
+        ):
             self._store(trainer, trained)
 
     def on_train_end(self, trainer: Trainer, module: LightningModule) -> None:
         """Give the signals back."""
         self._release()
 
-    def on_exception(self, trainer: Trainer, module: LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: Trainer, module: LightningModule, exception: BaseException
+    ) -> None:
         """Give the signals back; enter the failure. The checkpoint stays as it is."""
         self._release()
         if trainer.is_global_zero and isinstance(exception, Exception):
@@ -264,7 +339,9 @@ class TrainingCallback(Callback):
             raise KeyboardInterrupt
         self._interrupted = True
 
-    def _validate(self, trainer: Trainer, module: TrainingModule, validation: Validation) -> None:
+    def _validate(
+        self, trainer: Trainer, module: TrainingModule, validation: Validation
+    ) -> None:
         """Validate in the first process; all act on what it finds."""
         value = 0.0
         with self.ledger.validating(trainer.world_size, device=self.job.device):
@@ -274,21 +351,32 @@ class TrainingCallback(Callback):
             value = float(trainer.strategy.broadcast(value))
         better = self.ledger.validated(validation.metric, value)
         if trainer.logger is not None:
-            trainer.logger.log_metrics({f"validation/{validation.metric}": value}, step=module.step)
+            trainer.logger.log_metrics(
+                {f"validation/{validation.metric}": value}, step=module.step
+            )
         if better and trainer.is_global_zero:
             self._publish(module)
         patience = module.recipe.patience
-        if patience is not None and self.ledger.since_best() >= patience and module.step < module.steps:
+        if (
+            patience is not None
+            and self.ledger.since_best() >= patience
+            and module.step < module.steps
+        ):
             self.ledger.state = STOPPED_EARLY
             trainer.should_stop = True
 
     def _publish(self, module: TrainingModule) -> None:
         """Write the weights to predict from."""
         with module.published():
-            save(self.job.folder.weights, self.job.checkpoint(self.ledger, rounded_weights(module.model)))
+            save(
+                self.job.folder.weights,
+                self.job.checkpoint(self.ledger, rounded_weights(module.model)),
+            )
 
     def _store(self, trainer: Trainer, module: TrainingModule) -> None:
-        """Write checkpoint and record; a model whose weights are not finite is not stored."""
+        """Write checkpoint and record; a model whose weights are not finite is not
+        stored.
+        """
         if self.ledger.state == "running" and module.step >= module.steps:
             self.ledger.state = "finished"
         if not trainer.is_global_zero:
@@ -305,11 +393,16 @@ class TrainingCallback(Callback):
         else:  # the weights stay those of the best step, their budget is that of the training
             best = load(folder.weights)
             budget = self.job.budget(self.ledger).model_dump(mode="json")
-            save(folder.weights, replace(best, training={**best.training, "budget": budget}))
+            save(
+                folder.weights,
+                replace(best, training={**best.training, "budget": budget}),
+            )
 
     def _write_record(self, trainer: Trainer, module: TrainingModule) -> None:
         self.ledger.read_clocks(trainer.world_size, device=self.job.device)
-        record = self.job.record(module.model, self.ledger, steps=module.steps, windows=self.windows)
+        record = self.job.record(
+            module.model, self.ledger, steps=module.steps, windows=self.windows
+        )
         self.job.folder.write_record(record)
 
 
@@ -321,11 +414,16 @@ def _of(module: LightningModule) -> TrainingModule:
 
 def seed_of(seed: int, *place: int) -> int:
     """Return a seed of 63 bits for a place in a training, such as (step, process)."""
-    return int(np.random.SeedSequence((seed, *place)).generate_state(1, np.uint64)[0] >> np.uint64(1))
+    return int(
+        np.random.SeedSequence((seed, *place)).generate_state(1, np.uint64)[0]
+        >> np.uint64(1)
+    )
 
 
 def reseed(seed: int) -> None:
-    """Set the global generators of Python, NumPy and torch, which layers of others draw from."""
+    """Set the global generators of Python, NumPy and torch, which layers of others draw
+    from.
+    """
     random.seed(seed)
     np.random.seed(seed % 2**32)  # noqa: NPY002 (what PyTorch Geometric may draw from)
     torch.manual_seed(seed)
@@ -334,7 +432,8 @@ def reseed(seed: int) -> None:
 @contextmanager
 def generators_kept() -> Iterator[None]:
     """Give the caller's global generators back as they were."""
-    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002 (the global one)
+    python = random.getstate()
+    numpy = np.random.get_state()  # noqa: NPY002 (the global one)
     with torch.random.fork_rng():
         try:
             yield
@@ -345,12 +444,21 @@ def generators_kept() -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep Lightning's advice from our users: none of it is about what they asked for."""
-    names = ("lightning.pytorch", "lightning.fabric", "pytorch_lightning", "lightning_fabric")
+    """Keep Lightning's advice from our users: none of it is about what they asked
+    for.
+    """
+    names = (
+        "lightning.pytorch",
+        "lightning.fabric",
+        "pytorch_lightning",
+        "lightning_fabric",
+    )
     loggers = [logging.getLogger(name) for name in names]
     levels = [logger.level for logger in loggers]
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", module=r"(pytorch_lightning|lightning_fabric|tensorboard)(\..*)?")
+        warnings.filterwarnings(
+            "ignore", module=r"(pytorch_lightning|lightning_fabric|tensorboard)(\..*)?"
+        )
         for logger in loggers:
             logger.setLevel(logging.ERROR)
         try:

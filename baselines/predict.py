@@ -1,7 +1,8 @@
 """Predict: roll a trained model out over the test scenarios into a predictions.nc.
 
-Of the test subset only the given frames are read. Time is taken of rollouts alone, after one
-step to warm up; that of the neighbour search is measured on frames of the same rollouts.
+Of the test subset only the given frames are read. Time is taken of rollouts alone,
+after one step to warm up; that of the neighbour search is measured on frames of the
+same rollouts.
 """
 
 from __future__ import annotations
@@ -29,7 +30,13 @@ from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
 from .job import MOST_RECORD, RunFolder, changes_of, parameter_count
-from .machine import bound_memory, chosen_device, hardware, memory_errors_told, threads_used
+from .machine import (
+    bound_memory,
+    chosen_device,
+    hardware,
+    memory_errors_told,
+    threads_used,
+)
 from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 from .start import warn_of_last_state
@@ -56,13 +63,17 @@ class PredictionResult:
     batch: int  # scenarios that were rolled out side by side
     seconds_per_frame: float  # time of one frame of one scenario [s]
     seconds_without_search: float  # the same without the neighbour search [s]
-    # 'processor' on one CPU thread, where other work on the machine then does not count; 'wall' on
-    # a GPU and on several threads
+    # 'processor' on one CPU thread, where other work on the machine then does not
+    # count; 'wall' on a GPU and on several threads
     clock: str
-    solver_seconds_per_frame: float | None  # of our solver on one core of this machine [s]
+    solver_seconds_per_frame: (
+        float | None
+    )  # of our solver on one core of this machine [s]
     device: str  # processor and threads, or GPU
     parameters: int  # trained numbers of the model
-    diverged: Mapping[int, int]  # scenario id to the absolute frame from which its rollout is frozen
+    diverged: Mapping[
+        int, int
+    ]  # scenario id to the absolute frame from which its rollout is frozen
 
 
 def predict(
@@ -80,63 +91,78 @@ def predict(
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> PredictionResult:
-    """Predict every test scenario of the data set that a model was trained on, or of another size of it.
+    """Predict every test scenario of the data set that a model was trained on, or of
+    another size of it.
 
-    At another size the connectivity radius keeps its ratio to the distance of particles, and statistics stay
-    those of the training.
+    At another size the connectivity radius keeps its ratio to the distance of
+    particles, and statistics stay those of the training.
 
-    Where a training.json beside the checkpoint says that its training is not over, there is an
-    :class:`UnfinishedWarning`; where it holds the last state beside the best weights, a
-    :class:`~lagbench.baselines.start.LastStateWarning`.
+    Where a training.json beside the checkpoint says that its training is not over,
+    there is an :class:`UnfinishedWarning`; where it holds the last state beside the
+    best weights, a :class:`~lagbench.baselines.start.LastStateWarning`.
 
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
         output: file to write; ``<name>.json`` beside it says what it cost.
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
+            folder.
         size: size of the split to predict; that of the training when None.
         settings: changes of options that have no weights, as in ``model.average=true``.
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
         method: what to call it; the model's own name by default.
-        solver: called with split and size after the rollouts: time of our solver for a frame on one core
-            of this machine [s], None where it cannot be told.
+        solver: called with split and size after the rollouts: time of our solver for a
+            frame on one core of this machine [s], None where it cannot be told.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
     Raises:
         UnreadableFileError: the checkpoint is damaged or unsafe.
-        DataError: the data set is missing, damaged, or of another version than that of the training.
-        UsageError: the baseline is not installed, no such device, weights of no use at the size or as set, or
-            the output would replace something else, as the weights themselves.
+        DataError: the data set is missing, damaged, or of another version than that of
+            the training.
+        UsageError: the baseline is not installed, no such device, weights of no use at
+            the size or as set, or the output would replace something else, as the
+            weights themselves.
         WorkFailedError: out of memory, or the disk is full.
     """
     check_replaceable(Path(output))
     found = load(checkpoint)
     warn_of_last_state(found, Path(checkpoint))
-    # Weights of the best validation say 'running' for good: what became of the training stands beside them.
+    # Weights of the best validation say 'running' for good: what became of the training
+    # stands beside them.
     path = Path(checkpoint)
     if (reached := RunFolder(path.parent).unfinished(found.training)) is not None:
         warnings.warn(
-            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; to go on with it"
+            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; "
+            f"to go on with it"
             f" give its `lagbench train` command again, with --output {path.parent}",
             UnfinishedWarning,
             stacklevel=2,
         )
     home = resolve_root(root)
     known = rooted(home, registry)
-    facts = check_data(found, root=home, registry=known, size=size, where=str(checkpoint))
+    facts = check_data(
+        found, root=home, registry=known, size=size, where=str(checkpoint)
+    )
     machine = chosen_device(device)
     bound_memory()
-    tests = scenario_paths(facts.split, subset="test", size=facts.size, root=home, registry=known)
+    tests = scenario_paths(
+        facts.split, subset="test", size=facts.size, root=home, registry=known
+    )
     paths = list(tests.values())
     side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
     with threads_used(threads), memory_errors_told("lower --batch"):
         model = _model(found, facts, settings, known, where=str(checkpoint)).to(machine)
         work = _Rollouts(model, facts, paths, side, machine)
-        label, count, here = method or model.method, parameter_count(model), hardware(machine)
+        label = method or model.method
+        count = parameter_count(model)
+        here = hardware(machine)
         on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
-        hardware_label = str(here["device"]) if machine == "cuda" else on_cpu
+        if machine == "cuda":
+            hardware_label = str(here["device"])
+        else:
+            hardware_label = on_cpu
         writer = PredictionsWriter(
             output,
             split=facts.split,
@@ -148,14 +174,22 @@ def predict(
             parameters=count,
             **_provenance(found, facts, settings),
         )
-        meter, timed = Meter(progress), None
+        meter = Meter(progress)
+        timed = None
         meter.begin("predicting", total=len(paths), scenarios=len(paths))
         with writer:
             for rollout in work:
-                writer.add(rollout.scenario, rollout.position.numpy(), diverged_at=rollout.diverged_at)
+                writer.add(
+                    rollout.scenario,
+                    rollout.position.numpy(),
+                    diverged_at=rollout.diverged_at,
+                )
                 meter.count(1, scenarios=1)
             writer.label(seconds_per_frame=work.seconds_per_frame)
-            if solver is not None and (timed := solver(facts.split, facts.size)) is not None:
+            if (
+                solver is not None
+                and (timed := solver(facts.split, facts.size)) is not None
+            ):
                 writer.label(solver_seconds_per_frame=timed)
     result = PredictionResult(
         path=Path(output),
@@ -175,22 +209,35 @@ def predict(
         parameters=count,
         diverged=work.diverged,
     )
-    plain = json.dumps({**asdict(result), "path": result.path.name}, indent=2, sort_keys=True)
-    write_atomically(result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output")
+    plain = json.dumps(
+        {**asdict(result), "path": result.path.name}, indent=2, sort_keys=True
+    )
+    write_atomically(
+        result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output"
+    )
     return result
 
 
 def check_replaceable(output: Path) -> None:
-    """Refuse to write predictions, and what they cost beside them, over files that are something else."""
-    cost = output if output.is_dir() else output.with_suffix(".json")  # a folder may have no name of its own
+    """Refuse to write predictions, and what they cost beside them, over files that are
+    something else.
+    """
+    cost = (
+        output if output.is_dir() else output.with_suffix(".json")
+    )  # a folder may have no name of its own
     if cost.is_dir():
         fix = f"name a file, as in -o {cost / 'predictions.nc'}"
-        raise UsageError("the output is a folder", where="--output", got=str(cost), fix=fix)
+        raise UsageError(
+            "the output is a folder", where="--output", got=str(cost), fix=fix
+        )
     if output == cost:
         fix = f"name it {output.with_suffix('.nc').name}: what the predictions cost goes to {cost.name}"
-        raise UsageError("predictions are no JSON", where="--output", got=str(output), fix=fix)
+        raise UsageError(
+            "predictions are no JSON", where="--output", got=str(output), fix=fix
+        )
     # scores have no format of data, scenarios no hash of the whole data set
-    of_predictions, of_cost = (b"lagbench_format", b"dataset_sha256"), (b"seconds_without_search",)
+    of_predictions = (b"lagbench_format", b"dataset_sha256")
+    of_cost = (b"seconds_without_search",)
     for path, ours in ((output, of_predictions), (cost, of_cost)):
         if not path.is_file():
             continue
@@ -208,21 +255,34 @@ def check_replaceable(output: Path) -> None:
 class _Rollouts:
     """Rolls scenarios out, some side by side, and takes the time."""
 
-    def __init__(self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str) -> None:
+    def __init__(
+        self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str
+    ) -> None:
         self.seconds = 0.0  # time of the rollouts [s]
         # the time that is taken, 'processor' or 'wall'
-        self.clock = "processor" if machine == "cpu" and torch.get_num_threads() == 1 else "wall"
-        self.frames = 0  # frames that the model was asked for, of all scenarios; frozen ones cost nothing
+        if machine == "cpu" and torch.get_num_threads() == 1:
+            self.clock = "processor"
+        else:
+            self.clock = "wall"
+        # frames that the model was asked for, of all scenarios; frozen ones cost
+        # nothing
+        self.frames = 0
         # scenario id to the absolute frame from which its rollout is frozen
         self.diverged: dict[int, int] = {}
-        self._model, self._facts, self._machine = model, facts, machine
-        self._groups = [paths[first : first + side] for first in range(0, len(paths), side)]
+        self._model = model
+        self._facts = facts
+        self._machine = machine
+        self._groups = [
+            paths[first : first + side] for first in range(0, len(paths), side)
+        ]
         self._searches: list[float] = []
 
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
         for number, group in enumerate(self._groups):
-            given = scenario_batch(group, slice(0, self._facts.input_frames)).to(self._machine)
+            given = scenario_batch(group, slice(0, self._facts.input_frames)).to(
+                self._machine
+            )
             if number == 0:
                 roll_out(self._model, given, 1)
             started = self._now()
@@ -235,12 +295,20 @@ class _Rollouts:
                     self.frames += one.diverged_at - self._facts.input_frames + 1
                     self.diverged[one.scenario] = one.diverged_at
             radius = getattr(self._model, "radius", None)
-            if radius is not None:  # search neighbours once more in some frames, and take the time
-                positions = torch.cat([one.position for one in found], dim=1).to(self._machine)
+            if (
+                radius is not None
+            ):  # search neighbours once more in some frames, and take the time
+                positions = torch.cat([one.position for one in found], dim=1).to(
+                    self._machine
+                )
                 most = getattr(self._model.options, "neighbours", None)
-                for frame in range(0, len(positions), max(1, len(positions) // SEARCHES)):
+                for frame in range(
+                    0, len(positions), max(1, len(positions) // SEARCHES)
+                ):
                     started = self._now()
-                    radius_graph(positions[frame], float(radius), given.sample, most=most)
+                    radius_graph(
+                        positions[frame], float(radius), given.sample, most=most
+                    )
                     self._searches.append((self._now() - started) / len(found))
             yield from found
 
@@ -252,18 +320,29 @@ class _Rollouts:
     @property
     def search_per_frame(self) -> float:
         """Time of the neighbour search in it [s]; 0 for a model without one."""
-        return sum(self._searches) / len(self._searches) if self._searches else 0.0
+        if self._searches:
+            return sum(self._searches) / len(self._searches)
+        return 0.0
 
     def _now(self) -> float:
         if self._machine == "cuda":
             torch.cuda.synchronize()
-        return time.process_time() if self.clock == "processor" else time.perf_counter()
+        if self.clock == "processor":
+            return time.process_time()
+        return time.perf_counter()
 
 
 def _model(
-    found: Checkpoint, facts: Facts, settings: Sequence[str], known: Registry, *, where: str
+    found: Checkpoint,
+    facts: Facts,
+    settings: Sequence[str],
+    known: Registry,
+    *,
+    where: str,
 ) -> Baseline:
-    """Return the model of a checkpoint for the size that facts tell of, with settings."""
+    """Return the model of a checkpoint for the size that facts tell of, with
+    settings.
+    """
     scaled = replace(found, facts=rescaled(found.facts, facts))
     model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
     if not settings:
@@ -281,13 +360,18 @@ def _model(
         ) from error
 
 
-# before a recipe's name and before the settings of a prediction, in the words for a training
-RECIPE, PREDICTED_WITH = ", recipe ", ", predicted with "
+# before a recipe's name and before the settings of a prediction, in the words for a
+# training
+RECIPE = ", recipe "
+PREDICTED_WITH = ", predicted with "
 
 
 def training_words(checkpoint: Checkpoint) -> str:
-    """Return what weights were trained on, by which recipe with which changes, and how long."""
-    facts, done = checkpoint.facts, checkpoint.training
+    """Return what weights were trained on, by which recipe with which changes, and how
+    long.
+    """
+    facts = checkpoint.facts
+    done = checkpoint.training
     recipe = done.get("recipe", {})
     subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
     words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
@@ -295,27 +379,40 @@ def training_words(checkpoint: Checkpoint) -> str:
 
 
 def told_by_us(training: str) -> bool:
-    """Tell whether what predictions say of their training was written by `training_words`."""
+    """Tell whether what predictions say of their training was written by
+    `training_words`.
+    """
     return RECIPE in training
 
 
 def fits(training: str, checkpoint: Checkpoint) -> bool:
-    """Tell whether what predictions say of their training is what weights say; words of others always fit."""
+    """Tell whether what predictions say of their training is what weights say; words of
+    others always fit.
+    """
     said, _, _ = training.partition(PREDICTED_WITH)
     return not told_by_us(said) or said == training_words(checkpoint)
 
 
-def _provenance(checkpoint: Checkpoint, here: Facts, settings: Sequence[str]) -> dict[str, Any]:
+def _provenance(
+    checkpoint: Checkpoint, here: Facts, settings: Sequence[str]
+) -> dict[str, Any]:
     """Return seed, training in words and its budget, for the file's attributes.
 
-    Validations at another size than the one predicted are left out: they compare with none there.
+    Validations at another size than the one predicted are left out: they compare with
+    none there.
     """
-    facts, done = checkpoint.facts, checkpoint.training
-    words = training_words(checkpoint) + (f"{PREDICTED_WITH}{', '.join(settings)}" if settings else "")
+    facts = checkpoint.facts
+    done = checkpoint.training
+    words = training_words(checkpoint) + (
+        f"{PREDICTED_WITH}{', '.join(settings)}" if settings else ""
+    )
     seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
     found: dict[str, Any] = {"training": words, "seed": int(seed)}
     if budget := checkpoint.budget:
         unknown = {"metric": None, "best": None, "best_step": None, "validations": ()}
-        budget = budget if here.size == facts.size else budget.model_copy(update=unknown)
+        if here.size == facts.size:
+            budget = budget
+        else:
+            budget = budget.model_copy(update=unknown)
         found["budget"] = budget.model_dump_json(exclude_defaults=True)
     return found

@@ -1,9 +1,11 @@
-"""Rollouts: a model fed with its own predictions, frozen where it ceases to be finite or leaves for far.
+"""Rollouts: a model fed with its own predictions, frozen where it ceases to be finite
+or leaves for far.
 
-One function serves the predictions that are scored and validation while a model is trained: rollouts
-of every scenario of ``valid`` by the metric that ranks. Files, metric and its rounding are the
-scorer's: were ``valid`` the test subset, the score card would have the same digits. ``test`` is
-never read. Scenarios come whole, as batches; training windows are `lagbench.torch`'s.
+One function serves the predictions that are scored and validation while a model is
+trained: rollouts of every scenario of ``valid`` by the metric that ranks. Files, metric
+and its rounding are the scorer's: were ``valid`` the test subset, the score card would
+have the same digits. ``test`` is never read. Scenarios come whole, as batches; training
+windows are `lagbench.torch`'s.
 """
 
 from __future__ import annotations
@@ -41,17 +43,21 @@ class Rollout:
     """Predicted positions of one window."""
 
     scenario: int  # scenario id
-    position: Tensor  # positions [length], float32, on the CPU, shape [frame, particle, 2]
-    diverged_at: int | None  # absolute frame from which the positions are frozen; None where none is
+    position: (
+        Tensor  # positions [length], float32, on the CPU, shape [frame, particle, 2]
+    )
+    diverged_at: (
+        int | None
+    )  # absolute frame from which the positions are frozen; None where none is
 
 
 @torch.no_grad()
 def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     """Predict frames after the given ones, for every window.
 
-    A window that ceases to be finite is frozen at its last finite frame (the last given one if
-    need be). Where that happens beside other windows, all are predicted again one by one, so
-    that no window can disturb another.
+    A window that ceases to be finite is frozen at its last finite frame (the last given
+    one if need be). Where that happens beside other windows, all are predicted again
+    one by one, so that no window can disturb another.
     """
     was_training = model.training
     model.eval()
@@ -59,16 +65,27 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
         predicted, finite = _advance(model, given, frames)
         if finite < frames and given.windows > 1:
             alone = (single(given, window) for window in range(given.windows))
-            return [rollout for window in alone for rollout in roll_out(model, window, frames)]
+            return [
+                rollout
+                for window in alone
+                for rollout in roll_out(model, window, frames)
+            ]
     finally:
         model.train(was_training)
     mark = None
     if finite < frames:
-        predicted[finite:] = predicted[finite - 1] if finite else given.position[:, -1].cpu().float()
+        if finite:
+            predicted[finite:] = predicted[finite - 1]
+        else:
+            predicted[finite:] = given.position[:, -1].cpu().float()
         mark = int(given.frame[0]) + given.frames + finite
     sample = given.sample.cpu()
     return [
-        Rollout(scenario=int(scenario), position=predicted[:, sample == window], diverged_at=mark)
+        Rollout(
+            scenario=int(scenario),
+            position=predicted[:, sample == window],
+            diverged_at=mark,
+        )
         for window, scenario in enumerate(given.scenario)
     ]
 
@@ -89,23 +106,36 @@ def single(batch: Batch, window: int) -> Batch:
 
 
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
-    """Return positions, shape [frame, particle, 2], and how many frames are finite and near the box."""
+    """Return positions, shape [frame, particle, 2], and how many frames are finite and
+    near the box.
+    """
     predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
         found: object = model.advance(state)
-        parts = found if isinstance(found, tuple | list) else (found,)
+        if isinstance(found, tuple | list):
+            parts = found
+        else:
+            parts = (found,)
         # What has another shape a frame could be broadcast from.
-        shape, position = predicted[frame].shape, parts[1] if len(parts) == 2 else None
+        shape = predicted[frame].shape
+        if len(parts) == 2:
+            position = parts[1]
+        else:
+            position = None
         if not isinstance(position, Tensor) or position.shape != shape:
             raise UsageError(
                 "a model returned no positions of the next frame",
                 where=f"{type(model).__qualname__}.advance",
-                expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
-                got=", ".join(str(getattr(part, "shape", type(part).__name__)) for part in parts),
+                expected=f"the next state and a tensor of shape {list(shape)}: "
+                f"[particle, 2]",
+                got=", ".join(
+                    str(getattr(part, "shape", type(part).__name__)) for part in parts
+                ),
                 fix="mend that class",
             )
-        state, predicted[frame] = parts[0], position
+        state = parts[0]
+        predicted[frame] = position
         # The scorer refuses what lies farther out; of NaN nothing is true.
         if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
             return predicted, frame
@@ -129,11 +159,18 @@ def replaced(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
 
 def as_published(model: nn.Module) -> AbstractContextManager[None]:
     """Round the parameters to bfloat16 for a while."""
-    return replaced({parameter: parameter.detach().to(torch.bfloat16) for parameter in model.parameters()})
+    return replaced(
+        {
+            parameter: parameter.detach().to(torch.bfloat16)
+            for parameter in model.parameters()
+        }
+    )
 
 
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
-    """Return the same frames of one or several whole scenarios, read without a cache."""
+    """Return the same frames of one or several whole scenarios, read without a
+    cache.
+    """
     windows: list[Window] = []
     for path in [paths] if isinstance(paths, Path) else paths:
         with read_scenario(path) as file:
@@ -148,11 +185,22 @@ def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) ->
             run = slice(numbers.start, numbers.stop)
             held = file.variables
             position = file.read("position", run)
-            material = file.read("material") if "material" in held else np.zeros(position.shape[1], np.int8)
-            # The forcing is given for all frames, so that a rollout from these knows what comes.
-            walls = file.read("wall_velocity", slice(run.start, None)) if "wall_velocity" in held else None
+            if "material" in held:
+                material = file.read("material")
+            else:
+                material = np.zeros(position.shape[1], np.int8)
+            # The forcing is given for all frames, so that a rollout from these knows
+            # what comes.
+            if "wall_velocity" in held:
+                walls = file.read("wall_velocity", slice(run.start, None))
+            else:
+                walls = None
             scenario = file.header.key.scenario
-            windows.append(tensors(window_of(list(position), material, walls, scenario, numbers.start)))
+            windows.append(
+                tensors(
+                    window_of(list(position), material, walls, scenario, numbers.start)
+                )
+            )
     return collate(windows)
 
 
@@ -174,7 +222,9 @@ class Validation:
     """The scenarios that a training is validated on; calling it validates."""
 
     task: ScoredTask  # the valid subset
-    frames: Mapping[int, int]  # frames to predict, by scenario id: later ones do not count
+    frames: Mapping[
+        int, int
+    ]  # frames to predict, by scenario id: later ones do not count
     compiled: bool = False  # whether the training compiles layers
 
     @property
@@ -185,30 +235,48 @@ class Validation:
     def __call__(self, model: Baseline) -> float:
         """Return the metric, the mean over scenarios; NaN where it is undefined.
 
-        The model is rolled out with its weights rounded to bfloat16, as predictions use them, on a CPU
-        one scenario after the other, as predictions are. A rollout that diverges counts with its frozen
-        frames.
+        The model is rolled out with its weights rounded to bfloat16, as predictions use
+        them, on a CPU one scenario after the other, as predictions are. A rollout that
+        diverges counts with its frozen frames.
         """
         device = next((p.device for p in model.parameters()), torch.device("cpu"))
         ids = list(self.frames)
-        groups = [[i] for i in ids] if device.type == "cpu" else [ids]
+        if device.type == "cpu":
+            groups = [[i] for i in ids]
+        else:
+            groups = [ids]
         tallies: dict[int, Tally] = {}
         # A rollout needs no gradients: its layers would be compiled anew.
-        stance = torch.compiler.set_stance("force_eager") if self.compiled else nullcontext()
+        if self.compiled:
+            stance = torch.compiler.set_stance("force_eager")
+        else:
+            stance = nullcontext()
         with as_published(model), stance:
             for group in groups:
                 paths = [self.task.truth.path(i) for i in group]
-                given = scenario_batch(paths, slice(0, self.task.setting.input_frames)).to(device)
-                for rollout in roll_out(model, given, max(self.frames[i] for i in group)):
+                given = scenario_batch(
+                    paths, slice(0, self.task.setting.input_frames)
+                ).to(device)
+                for rollout in roll_out(
+                    model, given, max(self.frames[i] for i in group)
+                ):
                     with self.task.opened(rollout.scenario) as truth:
-                        scenario, frames = truth.scenario, self.task.setting.predicted_frames
+                        scenario = truth.scenario
+                        frames = self.task.setting.predicted_frames
                         predicted = snapshots(scenario, rollout.position.numpy())
                         states = zip(frames, predicted, truth.snapshots(), strict=False)
-                        pairs = (FramePair(scenario, frame, true, guess) for frame, guess, true in states)
+                        pairs = (
+                            FramePair(scenario, frame, true, guess)
+                            for frame, guess, true in states
+                        )
                         measured = tally(pairs, select([self.metric]), frames)
-                        tallies[rollout.scenario] = as_stored(measured)  # rounded as score files hold them
+                        tallies[rollout.scenario] = as_stored(
+                            measured
+                        )  # rounded as score files hold them
         found = score(METRICS[self.metric], tallies)
-        return math.nan if found is None else found.mean
+        if found is None:
+            return math.nan
+        return found.mean
 
 
 def validation_of(
@@ -217,7 +285,9 @@ def validation_of(
     """Return the validation of a training; None where the recipe wants none."""
     if options.validate_every == 0:
         return None
-    task = load_scored_task(registry.size(facts.split, facts.size), root, subset="valid")
+    task = load_scored_task(
+        registry.size(facts.split, facts.size), root, subset="valid"
+    )
     horizon = min(options.validation_frames or facts.horizon, facts.horizon)
     task = replace(task, setting=replace(task.setting, horizon=horizon))
     frames = {}

@@ -1,8 +1,9 @@
 """Train a baseline: seeded, resumable, on one device or several.
 
-Most descend over windows, by pytorch-lightning; models with a closed form are fitted to whole
-scenarios instead. A step draws its windows and its noise from (seed, step, process) alone, so that
-a training that was interrupted and resumed ends, on one thread, with the same bits as one that was not.
+Most descend over windows, by pytorch-lightning; models with a closed form are fitted to
+whole scenarios instead. A step draws its windows and its noise from (seed, step,
+process) alone, so that a training that was interrupted and resumed ends, on one thread,
+with the same bits as one that was not.
 """
 
 from __future__ import annotations
@@ -34,7 +35,14 @@ from .baseline import Baseline
 from .catalogue import find
 from .checkpoint import load_weights, rounded_weights, save
 from .facts import facts_of
-from .job import STOPPED_EARLY, RunFolder, TrainingJob, TrainingRecord, parameter_count, start_words
+from .job import (
+    STOPPED_EARLY,
+    RunFolder,
+    TrainingJob,
+    TrainingRecord,
+    parameter_count,
+    start_words,
+)
 from .machine import (
     bound_memory,
     check_compiler,
@@ -44,7 +52,14 @@ from .machine import (
     multiplies_bfloat16,
     threads_used,
 )
-from .module import TrainingCallback, TrainingModule, generators_kept, quiet, reseed, seed_of
+from .module import (
+    TrainingCallback,
+    TrainingModule,
+    generators_kept,
+    quiet,
+    reseed,
+    seed_of,
+)
 from .recipe import TrainingOptions, recipe_for
 from .rollout import scenario_batch, scenario_paths, validation_of
 from .start import start_from
@@ -69,10 +84,14 @@ class TrainingResult:
     step: int  # optimiser steps made
     steps: int  # steps of the whole training
     parameters: int  # trainable parameters
-    loss: dict[str, float]  # raw loss terms of the last step, and their weighted sum 'total'
+    loss: dict[
+        str, float
+    ]  # raw loss terms of the last step, and their weighted sum 'total'
     windows_seen: int  # training windows of all steps
     epochs: float  # the same over the windows of the training subsets
-    metric: str | None  # what was validated by, lower is better; None without a validation
+    metric: (
+        str | None
+    )  # what was validated by, lower is better; None without a validation
     best_value: float | None  # its least value
     best_step: int | None
     device: str  # processor or GPU
@@ -113,22 +132,26 @@ def train(
         recipe: variant of the recipe, or a YAML file of recipes.
         settings: changes to the recipe, as in ``training.steps=100``.
         seed: seed in place of the recipe's.
-        start: weights.pt to start from, perhaps of another size; random weights when None.
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
-        output: folder of the run; ``runs/<split>/<size>/<baseline>[-further]-<seed>`` by default.
+        start: weights.pt to start from, perhaps of another size; random weights when
+            None.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
+            folder.
+        output: folder of the run; ``runs/<split>/<size>/<baseline>[-further]-<seed>``
+            by default.
         resume: go on with what an earlier run left there.
         fresh: train anew whatever is there.
         device: ``cpu``, ``cuda`` or ``auto``.
-        processes: processes, one device each (torchrun's own number where that started us).
+        processes: processes, one device each (torchrun's own number where that started
+            us).
         threads: threads of a process on the CPU; by default its share of the cores.
         workers: processes that read windows ahead; 0 reads them in between.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown baseline, split, size, recipe or key; images that gravity forbids; or
-            the folder holds another training, or weights without their checkpoint; weights to start
-            from that do not fit.
+        UsageError: unknown baseline, split, size, recipe or key; images that gravity
+            forbids; or the folder holds another training, or weights without their
+            checkpoint; weights to start from that do not fit.
         DataError: the data set is missing or damaged.
         UnreadableFileError: the checkpoint in the folder is damaged.
         WorkFailedError: the loss is not finite, memory or disk is full.
@@ -136,15 +159,36 @@ def train(
     """
     entry = find(baseline)
     tier, home, known = locate(split, size, root=root, registry=registry)
-    initial = None if start is None else start_from(start, entry, tier, root=home, registry=known)
-    learned = initial.options if initial else None
+    if start is None:
+        initial = None
+    else:
+        initial = start_from(start, entry, tier, root=home, registry=known)
+    if initial:
+        learned = initial.options
+    else:
+        learned = None
     plan = recipe_for(
-        entry, tier.split, tier.name, variant=recipe, settings=settings, seed=seed, learned=learned
+        entry,
+        tier.split,
+        tier.name,
+        variant=recipe,
+        settings=settings,
+        seed=seed,
+        learned=learned,
     )
     check_symmetry(plan.model.get("symmetry"), tier)
-    facts = initial.facts if initial else facts_of(tier.split, tier.name, root=home, registry=known)
-    plan = replace(plan, start=initial.record) if initial else plan
-    name = f"{plan.baseline}-further" if initial else plan.baseline
+    if initial:
+        facts = initial.facts
+    else:
+        facts = facts_of(tier.split, tier.name, root=home, registry=known)
+    if initial:
+        plan = replace(plan, start=initial.record)
+    else:
+        plan = plan
+    if initial:
+        name = f"{plan.baseline}-further"
+    else:
+        name = plan.baseline
     own = Path("runs") / plan.name / f"{name}-{plan.training.seed}"
     folder = RunFolder(Path(output) if output else own)
     check_writable(folder.path, option="--output")
@@ -171,7 +215,11 @@ def train(
     )
     bound_memory()
     here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
-    with generators_kept(), threads_used(threads, processes=here), memory_errors_told(SMALLER):
+    with (
+        generators_kept(),
+        threads_used(threads, processes=here),
+        memory_errors_told(SMALLER),
+    ):
         reseed(seed_of(plan.training.seed))
         model = entry.model.build(plan.model, facts)
         if earlier is not None:
@@ -180,8 +228,11 @@ def train(
             initial.fill(model)
         if earlier is None and not is_helper():
             folder.clear()
-        ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(job, model)
-        budget, done = job.budget(ledger), asdict(ledger)
+        ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(
+            job, model
+        )
+        budget = job.budget(ledger)
+        done = asdict(ledger)
         del done["validation"]
         return TrainingResult(
             baseline=plan.baseline,
@@ -205,10 +256,13 @@ def train(
 class StepBatches(Sampler[list[int]]):
     """Windows of each step of a training, from any step on.
 
-    Some of them, at random, are others: windows that begin in the first frames of a scenario, evenly drawn.
+    Some of them, at random, are others: windows that begin in the first frames of a
+    scenario, evenly drawn.
     """
 
-    def __init__(self, sampler: WindowSampler, options: TrainingOptions, *, first: int, last: int) -> None:
+    def __init__(
+        self, sampler: WindowSampler, options: TrainingOptions, *, first: int, last: int
+    ) -> None:
         self.sampler = sampler  # draws the windows of one process, epoch after epoch
         self.batch = options.batch  # windows of a step
         self.steps = range(first, last)
@@ -217,7 +271,9 @@ class StepBatches(Sampler[list[int]]):
             (start, min(start + options.opening_frames, stop))
             for start, stop in pairwise(sampler.data.starts)
         )
-        self.openings = np.concatenate([np.arange(*each) for each in ends])  # those others
+        self.openings = np.concatenate(
+            [np.arange(*each) for each in ends]
+        )  # those others
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -230,16 +286,21 @@ class StepBatches(Sampler[list[int]]):
         drawn = chain.from_iterable(self.sampler for _ in count())
         for step in self.steps:
             windows = np.array([*islice(drawn, self.batch)])
-            own = np.random.SeedSequence([self.sampler.seed, step, self.sampler.rank, self.sampler.ranks])
+            own = np.random.SeedSequence(
+                [self.sampler.seed, step, self.sampler.rank, self.sampler.ranks]
+            )
             # NumPy promises the same bits for `random` alone
-            chance, place = np.random.Generator(np.random.PCG64(own)).random((2, self.batch))
+            chance, place = np.random.Generator(np.random.PCG64(own)).random(
+                (2, self.batch)
+            )
             others = self.openings[(place * len(self.openings)).astype(np.intp)]
             yield np.where(chance < self.share, others, windows).tolist()
 
 
 def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     """Train a model; return the ledger and the steps of the whole training."""
-    facts, options = job.facts, job.recipe.training
+    facts = job.facts
+    options = job.recipe.training
     data = WindowDataset(
         facts.split,
         subset=options.windows,
@@ -253,7 +314,10 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
     steps = options.total_steps(len(data), processes=job.processes)
     ledger = job.ledger()
     if ledger.state != STOPPED_EARLY:
-        ledger.state = "finished" if ledger.step >= steps else "running"
+        if ledger.step >= steps:
+            ledger.state = "finished"
+        else:
+            ledger.state = "running"
     if ledger.state != "running":
         return ledger, steps
     if options.compile:
@@ -291,9 +355,13 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
             devices=int(os.environ.get("LOCAL_WORLD_SIZE", job.processes)),
             num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", "1")),
             strategy="ddp" if job.processes > 1 else "auto",
-            precision="bf16-mixed" if half or options.precision == "bf16" else "32-true",
+            precision="bf16-mixed"
+            if half or options.precision == "bf16"
+            else "32-true",
             max_epochs=1,
-            logger=TensorBoardLogger(job.folder.path, name="", version=job.folder.logs.name),
+            logger=TensorBoardLogger(
+                job.folder.path, name="", version=job.folder.logs.name
+            ),
             callbacks=[keeper],
             default_root_dir=job.folder.path,
             enable_checkpointing=False,
@@ -316,10 +384,12 @@ STEPS = 1  # a closed form counts as one step
 
 
 def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Fit a model to every scenario, validate and store it; return the ledger and its one step.
+    """Fit a model to every scenario, validate and store it; return the ledger and its
+    one step.
 
-    A baseline with ``closed_form = True`` has ``fit`` beside the contract: it sets the coefficients from
-    positions, shape [frame, particle, 2], of each scenario, and returns figures to log.
+    A baseline with ``closed_form = True`` has ``fit`` beside the contract: it sets the
+    coefficients from positions, shape [frame, particle, 2], of each scenario, and
+    returns figures to log.
     """
     ledger = job.ledger()
     if job.earlier is not None:
@@ -337,8 +407,13 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         )
 
     def scenarios() -> Iterator[NDArray[np.float32]]:
-        find_in = partial(scenario_paths, job.facts.split, size=job.facts.size, root=job.root)
-        parts = (find_in(subset=one, registry=job.registry) for one in job.recipe.training.windows)
+        find_in = partial(
+            scenario_paths, job.facts.split, size=job.facts.size, root=job.root
+        )
+        parts = (
+            find_in(subset=one, registry=job.registry)
+            for one in job.recipe.training.windows
+        )
         paths = [path for part in parts for path in part.values()]
         job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
         for path in paths:
@@ -346,9 +421,12 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
             job.meter.count(1, scenarios=1)
 
     figures = model.fit(scenarios())  # type: ignore[operator]
-    ledger.step, ledger.loss = STEPS, {name: float(value) for name, value in figures.items()}
+    ledger.step = STEPS
+    ledger.loss = {name: float(value) for name, value in figures.items()}
     ledger.epochs = 1.0
-    validation = validation_of(job.recipe.training, job.facts, root=job.root, registry=job.registry)
+    validation = validation_of(
+        job.recipe.training, job.facts, root=job.root, registry=job.registry
+    )
     if validation is not None:
         with ledger.validating(device=job.device):
             value = validation(model)

@@ -1,19 +1,21 @@
-"""Vector autoregression of whole frames (thesis section 4.8.3), by least squares in small memory.
+"""Vector autoregression of whole frames (thesis section 4.8.3), by least squares in
+small memory.
 
-Least squares by the Gram matrix, refined once, are nearly of full accuracy. For regressors X [row,
-regressor] and responses Y [row, response], with G = X'X + r I
+Least squares by the Gram matrix, refined once, are nearly of full accuracy. For
+regressors X [row, regressor] and responses Y [row, response], with G = X'X + r I
 
     B = G^-1 X'Y,   then   B <- B + G^-1 X'(Y - X B),
 
-the corrected semi-normal equations (Bjorck, Linear Algebra Appl. 88/89 (1987) 31): the residual is formed
-from X itself, so the loss of digits in squaring X is undone while cond(X)^2 is below 1e16. Rows
-pass through in blocks; four square matrices are all that is held. With fewer rows than regressors the
-solution of least norm comes from the Gram matrix of the rows, B = X' (X X')^-1 Y.
+the corrected semi-normal equations (Bjorck, Linear Algebra Appl. 88/89 (1987) 31): the
+residual is formed from X itself, so the loss of digits in squaring X is undone while
+cond(X)^2 is below 1e16. Rows pass through in blocks; four square matrices are all that
+is held. With fewer rows than regressors the solution of least norm comes from the Gram
+matrix of the rows, B = X' (X X')^-1 Y.
 
 Leading principal directions of many long rows come from randomised subspace iteration
-(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace somewhat larger than
-wanted is multiplied by X'X a few times, then rotated so that X'X is diagonal in it (Rayleigh and
-Ritz). Rows pass through in blocks; nothing as large as X'X is formed.
+(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace somewhat larger
+than wanted is multiplied by X'X a few times, then rotated so that X'X is diagonal in it
+(Rayleigh and Ritz). Rows pass through in blocks; nothing as large as X'X is formed.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ Sequences = Sequence[NDArray[np.float32]]
 
 
 class LaggedRows:
-    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several sequences, p the lags.
+    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several
+    sequences, p the lags.
 
     No row reaches from one sequence of states, shape [frame, feature], into the next.
     """
@@ -65,7 +68,9 @@ class LaggedRows:
                 regressors = np.ones((last - first, 1 + self.lags * features))
                 for lag in range(1, self.lags + 1):
                     column = 1 + (lag - 1) * features
-                    regressors[:, column : column + features] = states[first - lag : last - lag]
+                    regressors[:, column : column + features] = states[
+                        first - lag : last - lag
+                    ]
                 yield regressors, states[first:last].astype(np.float64)
 
 
@@ -80,7 +85,9 @@ class Fitted(FrameModel):
 
     @abstractmethod
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Set the coefficients from positions, [frame, particle, 2] per scenario; return what to log."""
+        """Set the coefficients from positions, [frame, particle, 2] per scenario;
+        return what to log.
+        """
 
     def states(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return standardised states [1], shape [frame - 1, feature].
@@ -94,10 +101,11 @@ class Fitted(FrameModel):
 class VAR(Fitted):
     """``z(f) = c + A_1 z(f-1) + ... + A_p z(f-p)``, by ordinary least squares.
 
-    The coefficients are those of statsmodels' ``VAR(states).fit(p)``, laid out as its ``params``
-    are: row 0 is the intercept, then the features of lag 1, lag 2, ... Several scenarios
-    are stacked without rows across their ends. With thousands of features its forecasts diverge, since
-    nothing holds the eigenvalues of A within the unit circle.
+    The coefficients are those of statsmodels' ``VAR(states).fit(p)``, laid out as its
+    ``params`` are: row 0 is the intercept, then the features of lag 1, lag 2, ...
+    Several scenarios are stacked without rows across their ends. With thousands of
+    features its forecasts diverge, since nothing holds the eigenvalues of A within the
+    unit circle.
     """
 
     method = "var"
@@ -122,8 +130,12 @@ class VAR(Fitted):
         return self.options.lags
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Fit the coefficients; return condition number, floor and rows of :class:`LeastSquares`."""
-        rows = LaggedRows([self.states(position) for position in scenarios], lags=self.options.lags)
+        """Fit the coefficients; return condition number, floor and rows of
+        :class:`LeastSquares`.
+        """
+        rows = LaggedRows(
+            [self.states(position) for position in scenarios], lags=self.options.lags
+        )
         found = solve(rows)
         self.coefficients = torch.from_numpy(found.coefficients)
         return {"condition": found.condition, "floor": found.floor, "rows": found.rows}
@@ -136,16 +148,19 @@ class VAR(Fitted):
 
 
 class StableVAR(Fitted):
-    """``z(f) = z(f-1) + b + A' V' (z(f-1) - m)``: ridge and truncation around persistence.
+    """``z(f) = z(f-1) + b + A' V' (z(f-1) - m)``: ridge and truncation around
+    persistence.
 
-    V are the leading principal directions of the states of training, m their mean, b the mean
-    change. With P = V'(Z - m) of all rows, D their changes less b, and n rows::
+    V are the leading principal directions of the states of training, m their mean, b
+    the mean change. With P = V'(Z - m) of all rows, D their changes less b, and n
+    rows::
 
         A = (P P' + ridge n I)^-1 P D'
 
-    so that directions whose variance is below the ridge, and all outside V, stay as they are. What
-    the plain VAR fits to noise in its thousands of small directions is what makes it diverge. Rank and ridge
-    of a recipe are chosen by rollouts of ``valid``.
+    so that directions whose variance is below the ridge, and all outside V, stay as
+    they are. What the plain VAR fits to noise in its thousands of small directions is
+    what makes it diverge. Rank and ridge of a recipe are chosen by rollouts of
+    ``valid``.
     """
 
     method = "var-stable"
@@ -156,7 +171,9 @@ class StableVAR(Fitted):
 
         in_training = frozenset({"ridge"})
 
-        rank: PositiveInt = 200  # principal directions kept; all there are if they are fewer
+        rank: PositiveInt = (
+            200  # principal directions kept; all there are if they are fewer
+        )
         # added to the variance of each direction [standardised^2]
         ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
 
@@ -176,11 +193,17 @@ class StableVAR(Fitted):
         self.register_buffer("response", torch.zeros(rank, self.features))
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Fit mean, drift, directions and response; return the share of variance they hold."""
+        """Fit mean, drift, directions and response; return the share of variance they
+        hold.
+        """
         rows = LaggedRows([self.states(position) for position in scenarios], lags=1)
         if not rows.rows:
-            raise WorkFailedError("nothing to fit", expected="scenarios of 3 frames or more", got="none")
-        mean, drift, squares = np.zeros(self.features), np.zeros(self.features), 0.0
+            raise WorkFailedError(
+                "nothing to fit", expected="scenarios of 3 frames or more", got="none"
+            )
+        mean = np.zeros(self.features)
+        drift = np.zeros(self.features)
+        squares = 0.0
         for x, y in rows:
             mean += x[:, 1:].sum(0) / rows.rows
             drift += (y - x[:, 1:]).sum(0) / rows.rows
@@ -193,8 +216,15 @@ class StableVAR(Fitted):
         response = np.zeros((kept, self.features))
         for x, y in rows:
             response += ((x[:, 1:] - mean) @ directions).T @ (y - x[:, 1:] - drift)
-        response /= (eigenvalues + max(self.options.ridge, EPSILON) * rows.rows)[:, None]
-        found = {"mean": mean, "drift": drift, "directions": directions, "response": response}
+        response /= (eigenvalues + max(self.options.ridge, EPSILON) * rows.rows)[
+            :, None
+        ]
+        found = {
+            "mean": mean,
+            "drift": drift,
+            "directions": directions,
+            "response": response,
+        }
         for name, value in found.items():
             getattr(self, name).copy_(torch.from_numpy(value))
         return {"variance": float(eigenvalues.sum() / spread), "rows": rows.rows}
@@ -202,7 +232,10 @@ class StableVAR(Fitted):
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
         state = window.state[:, -1]
-        change = self.drift + (state.flatten(1) - self.mean) @ self.directions @ self.response
+        change = (
+            self.drift
+            + (state.flatten(1) - self.mean) @ self.directions @ self.response
+        )
         return state + change.view(state.shape)
 
 
@@ -214,30 +247,45 @@ class LeastSquares:
     """The solution and how well it is determined."""
 
     coefficients: Matrix  # B, shape [regressor, response]
-    condition: float  # largest over smallest singular value of X; a lower bound where 'floor' > 0
-    # added to the Gram matrix since it was singular to rounding, as a share of its largest
-    # eigenvalue; 0 if it was not
+    # largest over smallest singular value of X; a lower bound where 'floor' > 0
+    condition: float
+    # added to the Gram matrix since it was singular to rounding, as a share of its
+    # largest eigenvalue; 0 if it was not
     floor: float
     rows: int  # rows that went in
 
 
 def solve(blocks: LaggedRows) -> LeastSquares:
-    """Return the least-squares solution of X B = Y, that of least norm if there are many."""
+    """Return the least-squares solution of X B = Y, that of least norm if there are
+    many.
+    """
     shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
     if shape is None:
-        raise WorkFailedError("nothing to fit", expected="scenarios longer than the lags", got="no rows")
+        raise WorkFailedError(
+            "nothing to fit", expected="scenarios longer than the lags", got="no rows"
+        )
     if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
-        divided, condition, floor = _factor(lambda: _gram((x for x, _ in blocks), shape[0]))
+        divided, condition, floor = _factor(
+            lambda: _gram((x for x, _ in blocks), shape[0])
+        )
         found = divided(_products(blocks, shape))
-        residual = partial(blas.dgemm, -1.0, found, trans_a=True, beta=1.0)  # (Y - X B)' of a block
-        found += divided(_products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape))
+        residual = partial(
+            blas.dgemm, -1.0, found, trans_a=True, beta=1.0
+        )  # (Y - X B)' of a block
+        found += divided(
+            _products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape)
+        )
     else:  # the Gram matrix of the rows, which all fit
         x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        divided, condition, floor = _factor(lambda: _gram([np.ascontiguousarray(x.T)], len(x)))
+        divided, condition, floor = _factor(
+            lambda: _gram([np.ascontiguousarray(x.T)], len(x))
+        )
         dual = divided(np.asfortranarray(y))
         dual += divided(np.asfortranarray(y - x @ (x.T @ dual)))
         found = x.T @ dual
-    return LeastSquares(coefficients=found, condition=condition, floor=floor, rows=blocks.rows)
+    return LeastSquares(
+        coefficients=found, condition=condition, floor=floor, rows=blocks.rows
+    )
 
 
 def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
@@ -248,16 +296,23 @@ def _gram(blocks: Iterable[Matrix], size: int) -> Matrix:
     return total
 
 
-def _products(blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]) -> Matrix:
+def _products(
+    blocks: Iterable[tuple[Matrix, Matrix]], shape: tuple[int, int]
+) -> Matrix:
     """Return X'Y from blocks of rows, Fortran-ordered."""
     total: Matrix = np.zeros(shape, order="F")
     for x, y in blocks:
-        total = blas.dgemm(1.0, x.T, y.T, trans_b=True, beta=1.0, c=total, overwrite_c=True)
+        total = blas.dgemm(
+            1.0, x.T, y.T, trans_b=True, beta=1.0, c=total, overwrite_c=True
+        )
     return total
 
 
-def _factor(gram: Callable[[], Matrix]) -> tuple[Callable[[Matrix], Matrix], float, float]:
-    """Return G^-1 times a matrix, in its place when that is Fortran-ordered, condition number and floor.
+def _factor(
+    gram: Callable[[], Matrix],
+) -> tuple[Callable[[Matrix], Matrix], float, float]:
+    """Return G^-1 times a matrix, in its place when that is Fortran-ordered, condition
+    number and floor.
 
     By Cholesky's factor of G, with the floor under it if it is singular to rounding.
     """
@@ -274,31 +329,46 @@ def _factor(gram: Callable[[], Matrix]) -> tuple[Callable[[Matrix], Matrix], flo
             upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
         except LinAlgError:
             continue
-        divided: Callable[..., Matrix] = partial(cho_solve, (upper, False), check_finite=False)
+        divided: Callable[..., Matrix] = partial(
+            cho_solve, (upper, False), check_finite=False
+        )
         condition = float(np.sqrt(largest * _largest_eigenvalue(divided, size)))
         return partial(divided, overwrite_b=True), condition, floor
     raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
 
 
 def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float:
-    """Return the largest eigenvalue of a symmetric matrix given by its product with a vector."""
+    """Return the largest eigenvalue of a symmetric matrix given by its product with a
+    vector.
+    """
     if size < 3:
-        return float(np.linalg.eigvalsh(np.column_stack([product(e) for e in np.eye(size)]))[-1])
+        return float(
+            np.linalg.eigvalsh(np.column_stack([product(e) for e in np.eye(size)]))[-1]
+        )
     operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=size)
-    return float(eigsh(operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False)[0])
+    return float(
+        eigsh(
+            operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False
+        )[0]
+    )
 
 
-OVERSAMPLING = 20  # directions beyond those wanted, which the last wanted ones need to converge
-ITERATIONS = 8  # multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
+OVERSAMPLING = (
+    20  # directions beyond those wanted, which the last wanted ones need to converge
+)
+# multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
+ITERATIONS = 8
 
 
 def principal_directions(
     blocks: Callable[[], Iterable[Matrix]], features: int, *, rank: int
 ) -> tuple[Matrix, Matrix]:
-    """Return orthonormal directions of largest X'X, shape [feature, rank], and their eigenvalues.
+    """Return orthonormal directions of largest X'X, shape [feature, rank], and their
+    eigenvalues.
 
-    The largest come first. ``blocks`` returns the rows of X in blocks, centred; it is called ten times.
+    The largest come first. ``blocks`` returns the rows of X in blocks, centred; it is
+    called ten times.
     """
     width = min(features, rank + OVERSAMPLING)
     basis = np.random.default_rng(0).normal(size=(features, width))

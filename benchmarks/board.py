@@ -1,12 +1,14 @@
-"""Build a leaderboard of made-up entries, 50 by default, and say how long it takes and how large the page is.
+"""Build a leaderboard of made-up entries, 50 by default, and say how long it takes and
+how large the page is.
 
     python benchmarks/board.py [--entries 50] [--output FOLDER]
 
-Entries stand on every split's `mini`: errors grow over the frames by a law of their own, films and maps are
-noise, so that nothing compresses away because two entries are alike. Every fifth has three seeds, some
-are superseded, withdrawn or flagged, and their texts hold markup. The same call gives the same bytes.
-Exit code 1 if `lagbench leaderboard check` finds anything, a page built again with other bytes included, or
-if the page has more than 2 MB.
+Entries stand on every split's `mini`: errors grow over the frames by a law of their
+own, films and maps are noise, so that nothing compresses away because two entries are
+alike. Every fifth has three seeds, some are superseded, withdrawn or flagged, and their
+texts hold markup. The same call gives the same bytes. Exit code 1 if
+`lagbench leaderboard check` finds anything, a page built again with other bytes
+included, or if the page has more than 2 MB.
 """
 
 from __future__ import annotations
@@ -45,7 +47,14 @@ from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.aggregate import as_stored
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
-from lagbench.scoring.card import FRAMES, PARTICLES, SUBMISSION, Preview, ScoreCard, skill
+from lagbench.scoring.card import (
+    FRAMES,
+    PARTICLES,
+    SUBMISSION,
+    Preview,
+    ScoreCard,
+    skill,
+)
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import read_stored, reported_frames
 from lagbench.submission import Header
@@ -54,14 +63,23 @@ from lagbench.submission.task_checks import frames_to_predict
 MOST_BYTES = 2_000_000
 SEEDS = 3
 SIZE = "mini"
-NAMES = ("Graph <b>network</b>", "Ünïcode & co.", "A model with a rather long name, as they have", "MLP")
+NAMES = (
+    "Graph <b>network</b>",
+    "Ünïcode & co.",
+    "A model with a rather long name, as they have",
+    "MLP",
+)
 
 
 def main() -> int:
     """Make the folder, build and check, print times and sizes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--entries", type=int, default=50)
-    parser.add_argument("--output", type=Path, help="folder to make; a temporary one by default")
+    parser.add_argument(
+        "--output", type=Path, help="folder to make; a temporary one by default"
+    )
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         return _measured(given.output or Path(scratch) / "board", given.entries)
@@ -71,19 +89,26 @@ def _measured(target: Path, entries: int) -> int:
     splits = [name for name, split in load().splits.items() if SIZE in split.sizes]
     for number in range(entries):
         make_entry(load().size(splits[number % len(splits)], SIZE), target, number)
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     result = build(target)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    wall = time.perf_counter() - wall
+    cpu = time.process_time() - cpu
     findings = check_board(target, page=True).findings
     for finding in findings:
         print(finding, file=sys.stderr)
     files = [path.stat().st_size for path in target.glob("scores/*/*/*.nc")]
     print(f"entries      {result.rows} on {result.tabs} tabs")
     print(f"score files  {len(files)}, at most {max(files)} bytes")
-    print(f"page         {spell_bytes(result.bytes)} ({result.bytes} bytes; limit {MOST_BYTES})")
+    print(
+        f"page         {spell_bytes(result.bytes)} ({result.bytes} bytes; limit "
+        f"{MOST_BYTES})"
+    )
     print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s")
     print(f"check        {len(findings)} findings")
-    return 0 if not findings and result.bytes <= MOST_BYTES else 1
+    if not findings and result.bytes <= MOST_BYTES:
+        return 0
+    return 1
 
 
 def make_entry(size: Size, target: Path, number: int) -> None:
@@ -92,20 +117,29 @@ def make_entry(size: Size, target: Path, number: int) -> None:
     place = (size.split, size.name, f"model-{number}")
     seeds: list[int | None] = [None] if number % 5 else list(range(SEEDS))
     cards = [
-        made_up(size, place[2], number * SEEDS + i, 10.0 ** rng.uniform(-1.5, 0.3)) for i in range(len(seeds))
+        made_up(size, place[2], number * SEEDS + i, 10.0 ** rng.uniform(-1.5, 0.3))
+        for i in range(len(seeds))
     ]
     paths = [target / path for path in score_paths(place, seeds)]
-    flags = (Flag(name="physics", reasons=("made up",)),) if number % 7 == 0 else ()
+    if number % 7 == 0:
+        flags = (Flag(name="physics", reasons=("made up",)),)
+    else:
+        flags = ()
     for card, path in zip(cards, paths, strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_statistics(card, path)
     write_floors(cards[0], Folder(target))
     files = tuple(
-        ScoredFile(sha256=file_sha256(path), predictions_sha256=card.predictions_sha256, flags=flags)
+        ScoredFile(
+            sha256=file_sha256(path),
+            predictions_sha256=card.predictions_sha256,
+            flags=flags,
+        )
         for card, path in zip(cards, paths, strict=True)
     )
     header = cards[0].header
-    superseded, withdrawn = number % 13 == 12, number % 11 == 10
+    superseded = number % 13 == 12
+    withdrawn = number % 11 == 10
     entry = Entry(
         format=2,
         split=size.split,
@@ -127,13 +161,20 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             device="a machine",
             solver_seconds_per_frame=0.05 if number % 3 else None,
         ),
-        status=Status.SUPERSEDED if superseded else Status.WITHDRAWN if withdrawn else Status.ACTIVE,
+        status=Status.SUPERSEDED
+        if superseded
+        else Status.WITHDRAWN
+        if withdrawn
+        else Status.ACTIVE,
         superseded_by=f"model-{number % 4}" if superseded else None,
         reason="made up" if superseded or withdrawn else "",
         dataset=DataSet(version=header.dataset_version, sha256=header.dataset_sha256),
         predictions=tuple(
             Prediction(
-                seed=seed, sha256=card.predictions_sha256, url="https://example.org/x.nc", bytes=1_000_000
+                seed=seed,
+                sha256=card.predictions_sha256,
+                url="https://example.org/x.nc",
+                bytes=1_000_000,
             )
             for seed, card in zip(seeds, cards, strict=True)
         ),
@@ -150,13 +191,22 @@ def make_entry(size: Size, target: Path, number: int) -> None:
 
 
 def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
-    """Return a score card of nobody's predictions: errors that grow, pictures of noise."""
-    rng, rows = np.random.Generator(np.random.PCG64(seed)), {SUBMISSION: quality}
+    """Return a score card of nobody's predictions: errors that grow, pictures of
+    noise.
+    """
+    rng = np.random.Generator(np.random.PCG64(seed))
+    rows = {SUBMISSION: quality}
     rows |= {name: 3.0 + i for i, name in enumerate(FLOORS)}
-    task, frames, ranking = size.task, tuple(frames_to_predict(size)), ranking_metric(size)
+    task = size.task
+    frames = tuple(frames_to_predict(size))
+    ranking = ranking_metric(size)
     tallies = {
         row: {
-            i: _tally(frames, value, np.random.Generator(np.random.PCG64([i, int(1e6 * value)])))
+            i: _tally(
+                frames,
+                value,
+                np.random.Generator(np.random.PCG64([i, int(1e6 * value)])),
+            )
             for i in size.subsets["test"]
         }
         for row, value in rows.items()
@@ -205,20 +255,35 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
 
 def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) -> Tally:
     """Return statistics that grow with the frames; correlations fall."""
-    metrics = [m for m in METRICS.values() if m.statistic is not None and m.extra is None]
+    metrics = [
+        m for m in METRICS.values() if m.statistic is not None and m.extra is None
+    ]
     share = np.linspace(0.01, 1.0, len(frames))
-    total = 1e-3 * quality * 10.0 ** rng.uniform(-0.1, 0.1, (len(metrics), len(frames))) * share
+    total = (
+        1e-3
+        * quality
+        * 10.0 ** rng.uniform(-0.1, 0.1, (len(metrics), len(frames)))
+        * share
+    )
     falling = np.array([metric.direction is Direction.HIGHER for metric in metrics])
     total[falling] = 1.0 / (1.0 + quality * share)
     ones = np.ones(total.shape, np.int64)
-    return as_stored(Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones))
+    return as_stored(
+        Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones)
+    )
 
 
 def _preview(size: Size, nodes: int, rng: np.random.Generator) -> Preview:
-    frames, maps = tuple(frames_to_predict(size)), reported_frames(size)
-    shown = [frames[i] for i in np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).astype(int)]
+    frames = tuple(frames_to_predict(size))
+    maps = reported_frames(size)
+    shown = [
+        frames[i]
+        for i in np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).astype(int)
+    ]
     truth = np.random.Generator(np.random.PCG64(size.particles))
-    vorticity = 0.1 * truth.normal(size=(1, len(maps), nodes, nodes)) * np.ones((2, 1, 1, 1))
+    vorticity = (
+        0.1 * truth.normal(size=(1, len(maps), nodes, nodes)) * np.ones((2, 1, 1, 1))
+    )
     vorticity[1] += 0.02 * rng.normal(size=vorticity[1].shape)
     film = truth.random((1, 1, PARTICLES, 2)) * np.ones((2, len(shown), 1, 1))
     film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0)

@@ -1,9 +1,11 @@
-"""Which materials meet where methods of the board err: the error by the materials of a test scenario.
+"""Which materials meet where methods of the board err: the error by the materials of a
+test scenario.
 
     python benchmarks/by_materials.py --size full --root DATA neuralmpm-projected neuralmpm-conserving
 
-prints, for the entries named (mean over their seeds) and the floors of a split, the metric that ranks in the
-mean over the test scenarios of each set of materials, and over all. Data are read for the materials alone.
+prints, for the entries named (mean over their seeds) and the floors of a split, the
+metric that ranks in the mean over the test scenarios of each set of materials, and over
+all. Data are read for the materials alone.
 """
 
 from __future__ import annotations
@@ -37,27 +39,50 @@ def main() -> int:
     parser.add_argument("--size", default="mini")
     parser.add_argument("--root", type=Path, help="where data sets are")
     asked = parser.parse_args()
-    size, root = load().size(asked.split, asked.size), resolve_root(asked.root)
-    metric, scenarios = ranking_metric(size), sorted(size.subsets["test"])
+    size = load().size(asked.split, asked.size)
+    root = resolve_root(asked.root)
+    metric = ranking_metric(size)
+    scenarios = sorted(size.subsets["test"])
     kinds = []
     for scenario in scenarios:
         with read_scenario(size.path(root, scenario)) as file:
-            kinds.append(" + ".join(MATERIALS[kind] for kind in np.unique(file.read("material"))))
-    rows = {name: floor.scores[metric].values for name, floor in (shipped(size) or {}).items()}
+            kinds.append(
+                " + ".join(MATERIALS[kind] for kind in np.unique(file.read("material")))
+            )
+    rows = {
+        name: floor.scores[metric].values
+        for name, floor in (shipped(size) or {}).items()
+    }
     folder = BOARD / "scores" / asked.split / asked.size
     for method in asked.methods:
-        files = [path for path in sorted(folder.glob("*.nc")) if method == path.stem.rpartition("_")[0]]
-        files = [folder / f"{method}.nc"] if (folder / f"{method}.nc").is_file() else files
+        files = [
+            path
+            for path in sorted(folder.glob("*.nc"))
+            if method == path.stem.rpartition("_")[0]
+        ]
+        if (folder / f"{method}.nc").is_file():
+            files = [folder / f"{method}.nc"]
+        else:
+            files = files
         if not files:
-            known = sorted({path.stem.partition("_")[0] for path in folder.glob("*.nc")})
-            parser.error(f"no entry {method!r} of {asked.split} {asked.size}: {nearest(method, known)}")
+            known = sorted(
+                {path.stem.partition("_")[0] for path in folder.glob("*.nc")}
+            )
+            parser.error(
+                f"no entry {method!r} of {asked.split} {asked.size}: "
+                f"{nearest(method, known)}"
+            )
         seeds = [published(path).scores["submission"][metric].values for path in files]
         rows[method] = np.mean(seeds, axis=0)
     sets = sorted(set(kinds))
     lines = []
     for name, values in rows.items():
-        means = [float(np.mean(np.asarray(values)[np.array(kinds) == one])) for one in sets]
-        lines.append([name, *(f"{mean:.4f}" for mean in [*means, float(np.mean(values))])])
+        means = [
+            float(np.mean(np.asarray(values)[np.array(kinds) == one])) for one in sets
+        ]
+        lines.append(
+            [name, *(f"{mean:.4f}" for mean in [*means, float(np.mean(values))])]
+        )
     head = [f"{one} ({kinds.count(one)})" for one in sets]
     print(markdown([metric, *head, f"all ({len(kinds)})"], lines))
     return 0

@@ -2,16 +2,16 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """The closed box as one would write it in Taichi by habit: the yardstick of the solver.
 
-Same equations as ``lagbench.generators.closed_box`` (design 4.3), but the conventional way, after
-Taichi's own mpm128 example: one kernel launch per substep, every phase a parallel loop, float32
-sums by atomics, Taichi's default fast math. Its sums depend on the order of threads, so no two
-runs agree to the bit.
+Same equations as ``lagbench.generators.closed_box`` (design 4.3), but the conventional
+way, after Taichi's own mpm128 example: one kernel launch per substep, every phase a
+parallel loop, float32 sums by atomics, Taichi's default fast math. Its sums depend on
+the order of threads, so no two runs agree to the bit.
 
     python benchmarks/conventional.py --grid 40 --threads 1 --substeps 2000
 
-prints one JSON object: particle-substeps per second of wall time and core, and per second of
-processor time (best of the repeats), and the mean kinetic energy per particle at the end, by
-which the two formulations are compared.
+prints one JSON object: particle-substeps per second of wall time and core, and per
+second of processor time (best of the repeats), and the mean kinetic energy per particle
+at the end, by which the two formulations are compared.
 """
 
 from __future__ import annotations
@@ -28,7 +28,12 @@ import numpy as np
 import taichi as ti
 
 from lagbench.data import WALLS
-from lagbench.generators.acceptance.experiment import Case, initial_state, plan, solver_parameters
+from lagbench.generators.acceptance.experiment import (
+    Case,
+    initial_state,
+    plan,
+    solver_parameters,
+)
 from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
@@ -44,19 +49,32 @@ class Conventional:
     def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
         """Take the memory and load the particles."""
         self.p = parameters
-        self.low, self.high = parameters.wall, parameters.grid - parameters.wall
+        self.low = parameters.wall
+        self.high = parameters.grid - parameters.wall
         self.dx = 1.0 / parameters.grid
         self.lid = float(state.wall_velocity[WALLS.index("top"), 0])
         self.mass = parameters.density * state.area / parameters.particles
-        self.pressure = 0.5 * parameters.grid * parameters.dt * parameters.modulus / parameters.density
+        self.pressure = (
+            0.5
+            * parameters.grid
+            * parameters.dt
+            * parameters.modulus
+            / parameters.density
+        )
         self.diffusion = state.viscosity * parameters.dt * parameters.grid**2
         self.inset = (self.low + 0.5 + 1e-3) * self.dx
-        n, nodes = parameters.particles, (parameters.grid + 1, parameters.grid + 1)
+        n = parameters.particles
+        nodes = (parameters.grid + 1, parameters.grid + 1)
         self.x, self.v = (ti.Vector.field(2, ti.f32, n) for _ in range(2))
-        self.c, self.j = ti.Matrix.field(2, 2, ti.f32, n), ti.field(ti.f32, n)
+        self.c = ti.Matrix.field(2, 2, ti.f32, n)
+        self.j = ti.field(ti.f32, n)
         self.m, self.q = (ti.field(ti.f32, nodes) for _ in range(2))
         self.gv, self.ga = (ti.Vector.field(2, ti.f32, nodes) for _ in range(2))
-        for target, values in ((self.x, state.position), (self.v, state.velocity), (self.c, state.affine)):
+        for target, values in (
+            (self.x, state.position),
+            (self.v, state.velocity),
+            (self.c, state.affine),
+        ):
             target.from_numpy(values.astype(np.float32))
         self.j.fill(1.0)
 
@@ -65,14 +83,20 @@ class Conventional:
         """Return base node, offset in cells and quadratic B-spline weights."""
         base = ti.cast(x * self.p.grid - 0.5, ti.i32)
         f = x * self.p.grid - ti.cast(base, ti.f32)
-        return base, f, [0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2]
+        return (
+            base,
+            f,
+            [0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2],
+        )
 
     @ti.func
     def fold(self, inner, ghost, flip, moved):
         """Add the mirror image of a ghost node to its interior node."""
         self.m[inner] += self.m[ghost]
         self.q[inner] += self.q[ghost]
-        self.gv[inner] += flip * self.gv[ghost] + ti.Vector([2.0 * moved * self.m[ghost], 0.0])
+        self.gv[inner] += flip * self.gv[ghost] + ti.Vector(
+            [2.0 * moved * self.m[ghost], 0.0]
+        )
 
     @ti.kernel
     def substep(self):
@@ -93,10 +117,14 @@ class Conventional:
         flip = ti.Vector([-1.0, -1.0])
         for k in range(self.low, self.high + 1):
             self.fold(ti.Vector([self.low + 1, k]), ti.Vector([self.low, k]), flip, 0.0)
-            self.fold(ti.Vector([self.high - 1, k]), ti.Vector([self.high, k]), flip, 0.0)
+            self.fold(
+                ti.Vector([self.high - 1, k]), ti.Vector([self.high, k]), flip, 0.0
+            )
         for i in range(self.low + 1, self.high):
             self.fold(ti.Vector([i, self.low + 1]), ti.Vector([i, self.low]), flip, 0.0)
-            self.fold(ti.Vector([i, self.high - 1]), ti.Vector([i, self.high]), flip, self.lid)
+            self.fold(
+                ti.Vector([i, self.high - 1]), ti.Vector([i, self.high]), flip, self.lid
+            )
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             mass = self.m[i, k]
             if mass > 0.0:
@@ -110,7 +138,9 @@ class Conventional:
             self.mirror(ti.Vector([self.high, k]), ti.Vector([self.high - 1, k]), 0.0)
         for i in range(self.low, self.high + 1):
             self.mirror(ti.Vector([i, self.low]), ti.Vector([i, self.low + 1]), 0.0)
-            self.mirror(ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i))
+            self.mirror(
+                ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i)
+            )
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             q = ti.static(self.q)
             across = q[i + 1, k] - q[i - 1, k]
@@ -118,25 +148,40 @@ class Conventional:
             rising = q[i + 1, k + 1] - q[i - 1, k - 1]
             falling = q[i + 1, k - 1] - q[i - 1, k + 1]
             gradient = ti.Vector(
-                [0.75 * across + 0.125 * (rising + falling), 0.75 * along + 0.125 * (rising - falling)]
+                [
+                    0.75 * across + 0.125 * (rising + falling),
+                    0.75 * along + 0.125 * (rising - falling),
+                ]
             )
             v = ti.static(self.gv)
-            laplacian = v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1] - 4.0 * v[i, k]
+            laplacian = (
+                v[i + 1, k] + v[i - 1, k] + v[i, k + 1] + v[i, k - 1] - 4.0 * v[i, k]
+            )
             self.ga[i, k] = self.pressure * gradient + self.diffusion * laplacian
         for i, k in ti.ndrange((self.low + 1, self.high), (self.low + 1, self.high)):
             self.gv[i, k] += self.ga[i, k]
         for k in range(self.low + 1, self.high):
-            self.mirror_velocity(ti.Vector([self.low, k]), ti.Vector([self.low + 1, k]), 0.0)
-            self.mirror_velocity(ti.Vector([self.high, k]), ti.Vector([self.high - 1, k]), 0.0)
+            self.mirror_velocity(
+                ti.Vector([self.low, k]), ti.Vector([self.low + 1, k]), 0.0
+            )
+            self.mirror_velocity(
+                ti.Vector([self.high, k]), ti.Vector([self.high - 1, k]), 0.0
+            )
         for i in range(self.low, self.high + 1):
-            self.mirror_velocity(ti.Vector([i, self.low]), ti.Vector([i, self.low + 1]), 0.0)
-            self.mirror_velocity(ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i))
+            self.mirror_velocity(
+                ti.Vector([i, self.low]), ti.Vector([i, self.low + 1]), 0.0
+            )
+            self.mirror_velocity(
+                ti.Vector([i, self.high]), ti.Vector([i, self.high - 1]), self.lid_at(i)
+            )
         for p in self.x:
             self.gather(p)
 
     @ti.func
     def lid_at(self, i):
-        """Return the lid speed that the ghost fill sees: halved in the last cells, 0 in the corners."""
+        """Return the lid speed that the ghost fill sees: halved in the last cells, 0 in
+        the corners.
+        """
         speed = self.lid
         if i == self.low + 1 or i == self.high - 1:
             speed = 0.5 * self.lid
@@ -161,9 +206,12 @@ class Conventional:
     def gather(self, p):
         """G2P of one particle and its motion."""
         base, f, w = self.weights(self.x[p])
-        v, a, thinner = ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0]), ti.Vector([0.0, 0.0])
+        v = ti.Vector([0.0, 0.0])
+        a = ti.Vector([0.0, 0.0])
+        thinner = ti.Vector([0.0, 0.0])
         c = ti.Matrix.zero(ti.f32, 2, 2)
-        density, smooth = 0.0, 0.0
+        density = 0.0
+        smooth = 0.0
         for i, k in ti.static(ti.ndrange(3, 3)):
             offset = ti.Vector([i, k])
             apart = offset - f
@@ -178,10 +226,14 @@ class Conventional:
         c *= 4.0 * self.p.grid
         density = ti.max(density, 0.5)
         limit = 0.1 * self.dx
-        shift = ti.math.clamp(-4.0 * self.p.shift * self.dx * thinner / density, -limit, limit)
+        shift = ti.math.clamp(
+            -4.0 * self.p.shift * self.dx * thinner / density, -limit, limit
+        )
         moved = self.v[p] + a
         self.v[p] = moved + self.p.velocity_relaxation * (v - moved) + c @ shift
-        self.x[p] = ti.math.clamp(self.x[p] + self.p.dt * v + shift, self.inset, 1.0 - self.inset)
+        self.x[p] = ti.math.clamp(
+            self.x[p] + self.p.dt * v + shift, self.inset, 1.0 - self.inset
+        )
         self.c[p] = c
         old = self.j[p]
         self.j[p] = (
@@ -201,12 +253,20 @@ def main() -> int:
     parser.add_argument("--substeps", type=int, default=2000)
     parser.add_argument("--repeats", type=int, default=3)
     given = parser.parse_args()
-    ti.init(arch=ti.cpu, cpu_max_num_threads=given.threads, offline_cache=True, log_level=ti.ERROR)
-    experiment = plan(Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps)
+    ti.init(
+        arch=ti.cpu,
+        cpu_max_num_threads=given.threads,
+        offline_cache=True,
+        log_level=ti.ERROR,
+    )
+    experiment = plan(
+        Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps
+    )
     box = Conventional(solver_parameters(experiment), initial_state(experiment))
     box.substep()
     ti.sync()
-    wall, processor = [], []
+    wall = []
+    processor = []
     for _ in range(given.repeats):
         start = time.perf_counter(), time.process_time()
         for _ in range(given.substeps):

@@ -2,8 +2,8 @@
 
     python benchmarks/data_sets.py --root FOLDER [--split NAME ...] [--size NAME ...] [--workers N]
 
-Prints one Markdown row per data set; what is there already is generated again, so the figures
-are those of a whole generation, cards and hash checks included.
+Prints one Markdown row per data set; what is there already is generated again, so the
+figures are those of a whole generation, cards and hash checks included.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from lagbench.data.registry import load
 from lagbench.make.generate import GenerationResult, generate
 
 HEADER = (
-    "| split | size | scenarios | frames | wall [s] | CPU [s] | largest worker [MB] | on disk [MB] |\n"
+    "| split | size | scenarios | frames | wall [s] | CPU [s] | largest worker [MB] | "
+    "on disk [MB] |\n"
     "|---|---|---:|---:|---:|---:|---:|---:|"
 )
 
 
 def main() -> int:
     """Generate what the arguments name and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--split", nargs="+", default=list(load().splits))
     parser.add_argument("--size", nargs="+", default=["tiny", "mini", "full"])
@@ -33,7 +36,9 @@ def main() -> int:
     for size in given.size:
         for split in given.split:
             before = _cpu_seconds()
-            result = generate(split, size, root=given.root, workers=given.workers, force=True)
+            result = generate(
+                split, size, root=given.root, workers=given.workers, force=True
+            )
             print(_row(result, _cpu_seconds() - before), flush=True)
     return 0
 
@@ -44,7 +49,8 @@ def _row(result: GenerationResult, cpu: float) -> str:
     files = sum(path.stat().st_size for path in result.folder.rglob("*.nc"))
     largest = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1000
     return (
-        f"| {result.split} | {result.size} | {len(size.scenarios)} | {frames} | {result.seconds:.0f} "
+        f"| {result.split} | {result.size} | {len(size.scenarios)} | {frames} | "
+        f"{result.seconds:.0f} "
         f"| {cpu:.0f} | {largest:.0f} | {files / 1e6:.1f} |"
     )
 
@@ -53,7 +59,9 @@ def _cpu_seconds() -> float:
     """Return the CPU time of this process and of its children that have ended."""
     return sum(
         usage.ru_utime + usage.ru_stime
-        for usage in map(resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        for usage in map(
+            resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        )
     )
 
 

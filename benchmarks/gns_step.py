@@ -3,11 +3,12 @@
     python benchmarks/gns_step.py --operator gns --precision bfloat16
     python benchmarks/gns_step.py --particles 2048 --windows 2 --latent 64 --layers 5
 
-prints one JSON object: processor seconds of the fastest step (network, mean square error,
-backward pass, Adam; without neighbour search, features and grid losses), its peak memory [byte],
-edges and parameters. ``--edge-layer plain`` multiplies the concatenation of an edge and its ends,
-as public codes do, ``--products torch`` uses torch's linear layer, ``--hidden kept`` never
-computes a hidden layer twice. ``--compiled`` compiles the processor layers (``training.compile``).
+prints one JSON object: processor seconds of the fastest step (network, mean square
+error, backward pass, Adam; without neighbour search, features and grid losses), its
+peak memory [byte], edges and parameters. ``--edge-layer plain`` multiplies the
+concatenation of an edge and its ends, as public codes do, ``--products torch`` uses
+torch's linear layer, ``--hidden kept`` never computes a hidden layer twice.
+``--compiled`` compiles the processor layers (``training.compile``).
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from lagbench.baselines import network as layers
 from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.network import EdgeMLP, EncodeProcessDecode
 
-NODE_FEATURES, EDGE_FEATURES = 30, 3
+NODE_FEATURES = 30
+EDGE_FEATURES = 3
 RADIUS = 1.72
 """Connectivity radius in cells of the lattice."""
 
@@ -51,11 +53,15 @@ def conventional(given: argparse.Namespace) -> None:
 
 
 def particles(count: int, windows: int) -> Tensor:
-    """Return a graph with about 8 neighbours: a box full of particles, one in each cell of a lattice."""
+    """Return a graph with about 8 neighbours: a box full of particles, one in each cell
+    of a lattice.
+    """
     side = math.ceil(math.sqrt(count))
     lattice = torch.cartesian_prod(torch.arange(side), torch.arange(side))[:count]
     source = torch.Generator().manual_seed(0)
-    position = lattice.repeat(windows, 1) + torch.rand(count * windows, 2, generator=source)
+    position = lattice.repeat(windows, 1) + torch.rand(
+        count * windows, 2, generator=source
+    )
     sample = torch.arange(windows).repeat_interleave(count)
     edge_index: Tensor = radius_graph(position, RADIUS, sample)
     return edge_index
@@ -75,24 +81,28 @@ def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, i
     if given.compiled:
         model.compile_layers()
     edge_index = particles(given.particles, given.windows)
-    rows, edges = given.particles * given.windows, edge_index.shape[1]
-    node, edge, target = (
-        torch.randn(rows, NODE_FEATURES),
-        torch.randn(edges, EDGE_FEATURES),
-        torch.randn(rows, 2),
-    )
+    rows = given.particles * given.windows
+    edges = edge_index.shape[1]
+    node = torch.randn(rows, NODE_FEATURES)
+    edge = torch.randn(edges, EDGE_FEATURES)
+    target = torch.randn(rows, 2)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     source = torch.Generator().manual_seed(0)
 
     def step() -> None:
-        with torch.autocast("cpu", torch.bfloat16, enabled=given.precision == "bfloat16"):
+        with torch.autocast(
+            "cpu", torch.bfloat16, enabled=given.precision == "bfloat16"
+        ):
             output, losses = model(node, edge_index, edge, source)
         loss = nn.functional.mse_loss(output, target) + sum(losses.values())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
-    return step, {"edges": edges, "parameters": sum(p.numel() for p in model.parameters())}
+    return step, {
+        "edges": edges,
+        "parameters": sum(p.numel() for p in model.parameters()),
+    }
 
 
 def main() -> int:
@@ -106,11 +116,15 @@ def main() -> int:
     parser.add_argument("--latent", type=int, default=128)
     parser.add_argument("--layers", type=int, default=10)
     parser.add_argument("--steps", type=int, default=3)
-    parser.add_argument("--precision", choices=("float32", "bfloat16"), default="float32")
+    parser.add_argument(
+        "--precision", choices=("float32", "bfloat16"), default="float32"
+    )
     parser.add_argument("--edge-layer", choices=("split", "plain"), default="split")
     parser.add_argument("--products", choices=("onednn", "torch"), default="onednn")
     parser.add_argument("--compiled", action="store_true")
-    parser.add_argument("--hidden", choices=("recomputed", "kept"), default="recomputed")
+    parser.add_argument(
+        "--hidden", choices=("recomputed", "kept"), default="recomputed"
+    )
     given = parser.parse_args()
     torch.set_num_threads(1)
     conventional(given)

@@ -1,11 +1,13 @@
-"""Do jelly and rope keep their shape, and does matter keep its density: in the truth, and in predictions?
+"""Do jelly and rope keep their shape, and does matter keep its density: in the truth,
+and in predictions?
 
     python benchmarks/held_in_shape.py --size mini --root DATA [PREDICTIONS ...]
 
-rolls nothing out: for the truth of the test scenarios of multimaterial and for each file of predictions it
-prints, by material, how far particles are from where shape matching has them (lagbench.baselines.projection),
-mean over particles [length], and the 95th percentile of the density over the greatest of the first frame;
-both as the mean over scenarios and frames, and the greatest of any scenario's frames.
+rolls nothing out: for the truth of the test scenarios of multimaterial and for each
+file of predictions it prints, by material, how far particles are from where shape
+matching has them (lagbench.baselines.projection), mean over particles [length], and the
+95th percentile of the density over the greatest of the first frame; both as the mean
+over scenarios and frames, and the greatest of any scenario's frames.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ def frame_of(file: Predictions, scenario: int, frame: int) -> NDArray[np.float32
     return np.asarray(file.frames(scenario, frame, 1)[0])
 
 
-def figures(size: Size, root: Path, read: Read | None, cells: tuple[int, int]) -> dict[int, Tensor]:
+def figures(
+    size: Size, root: Path, read: Read | None, cells: tuple[int, int]
+) -> dict[int, Tensor]:
     """Return (deviation, density) of each material, shape [scenario and frame, 2]."""
     clusters, nodes = (ParticleGrid(size.bounds, each) for each in cells)
     rows: dict[int, list[list[float]]] = {kind: [] for kind in range(len(NAMES))}
@@ -51,16 +55,24 @@ def figures(size: Size, root: Path, read: Read | None, cells: tuple[int, int]) -
             material = torch.from_numpy(file.read("material").astype(np.int64))
             first = torch.from_numpy(file.read("position", slice(0, 1))[0])
             frames = range(size.task.input_frames, file.header.frames, EVERY)
-            truth = {frame: file.read("position", slice(frame, frame + 1))[0] for frame in frames}
+            truth = {
+                frame: file.read("position", slice(frame, frame + 1))[0]
+                for frame in frames
+            }
         one = torch.zeros_like(material)
-        shape, density = Shape.of(clusters, first, material, len(NAMES)), Density.of(nodes, first, one, 1)
+        shape = Shape.of(clusters, first, material, len(NAMES))
+        density = Density.of(nodes, first, one, 1)
         for frame in frames:
-            now = torch.from_numpy(truth[frame] if read is None else read(scenario, frame))
+            now = torch.from_numpy(
+                truth[frame] if read is None else read(scenario, frame)
+            )
             off = (shape.matched(now) - now).norm(dim=1)
             dense, _ = density.relative(nodes.stencil(now, one))
             for kind in sorted(set(material.tolist())):
                 own = material == kind
-                rows[kind].append([float(off[own].mean()), float(dense[own].quantile(0.95))])
+                rows[kind].append(
+                    [float(off[own].mean()), float(dense[own].quantile(0.95))]
+                )
     return {kind: torch.tensor(values) for kind, values in rows.items()}
 
 
@@ -69,10 +81,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("predictions", nargs="*", type=Path, help="files to look at beside the truth")
+    parser.add_argument(
+        "predictions", nargs="*", type=Path, help="files to look at beside the truth"
+    )
     parser.add_argument("--size", default="mini")
     parser.add_argument("--root", type=Path, help="where data sets are")
-    parser.add_argument("--cells", default="15,30", help="cells across the box: of clusters, of densities")
+    parser.add_argument(
+        "--cells",
+        default="15,30",
+        help="cells across the box: of clusters, of densities",
+    )
     asked = parser.parse_args()
     clusters, nodes = (int(each) for each in asked.cells.split(","))
     size = load().size(SPLIT, asked.size)
@@ -85,10 +103,19 @@ def main() -> int:
             readers[str(path)] = partial(frame_of, file)
         for name, read in readers.items():
             for kind, values in figures(size, root, read, (clusters, nodes)).items():
-                mean, most = values.mean(dim=0).tolist(), values.amax(dim=0).tolist()
-                pairs = [f"{each:.2g}" for pair in zip(mean, most, strict=True) for each in pair]
+                mean = values.mean(dim=0).tolist()
+                most = values.amax(dim=0).tolist()
+                pairs = [
+                    f"{each:.2g}"
+                    for pair in zip(mean, most, strict=True)
+                    for each in pair
+                ]
                 lines.append([name, NAMES[kind], *pairs])
-    print(markdown(["of", "material", "off its shape", "at most", "density", "at most"], lines))
+    print(
+        markdown(
+            ["of", "material", "off its shape", "at most", "density", "at most"], lines
+        )
+    )
     return 0
 
 

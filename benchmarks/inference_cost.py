@@ -1,11 +1,13 @@
-"""Time of a predicted frame against the number of particles, one core: is it linear (thesis section 3.2.2)?
+"""Time of a predicted frame against the number of particles, one core: is it linear
+(thesis section 3.2.2)?
 
     python benchmarks/inference_cost.py --rows 1-4 --output docs/figures
 
-rolls untrained models out over boxes of 2,000 q^2 particles at one density: connectivity radius and grid
-spacing shrink with 1/q, and a network of whole frames has as many inputs as the box has numbers. Prints a
-table of milliseconds of processor time and the exponents of a least-squares line through their logarithms;
-with --output also into `inference_cost.md` there. The solver's exponents are in table_3_1.py's table.
+rolls untrained models out over boxes of 2,000 q^2 particles at one density:
+connectivity radius and grid spacing shrink with 1/q, and a network of whole frames has
+as many inputs as the box has numbers. Prints a table of milliseconds of processor time
+and the exponents of a least-squares line through their logarithms; with --output also
+into `inference_cost.md` there. The solver's exponents are in table_3_1.py's table.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from lagbench.baselines.rollout import roll_out
 from lagbench.data.registry import load
 from lagbench.draw.tables import markdown
 
-SPLIT, SIZE = "curl-noise", "mini"
+SPLIT = "curl-noise"
+SIZE = "mini"
 MODELS = ("gns", "mlp", "neuralmpm")
 PARTICLES = 2000
 FRAMES = 8
@@ -36,9 +39,14 @@ REPEATS = 3
 
 
 def facts() -> Facts:
-    """Return the public figures of the data set whose recipes are used; no file of it is read."""
+    """Return the public figures of the data set whose recipes are used; no file of it
+    is read.
+    """
     size = load().size(SPLIT, SIZE)
-    known = size.measured.statistics if size.measured else {}
+    if size.measured:
+        known = size.measured.statistics
+    else:
+        known = {}
     task = size.task
     return Facts(
         split=SPLIT,
@@ -59,16 +67,24 @@ def facts() -> Facts:
 
 
 def given(about: Facts) -> Batch:
-    """Return the given frames of a box full of particles, one in each cell of a lattice, that swirl."""
+    """Return the given frames of a box full of particles, one in each cell of a
+    lattice, that swirl.
+    """
     side = int(np.ceil(np.sqrt(about.particles)))
-    cells = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1).reshape(-1, 2)
+    cells = np.stack(
+        np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1
+    ).reshape(-1, 2)
     rng = np.random.default_rng(0)
     unit = (cells[: about.particles] + rng.random((about.particles, 2))) / side
     a, b = np.pi * unit.T
     speed = about.statistics["velocity_std"][0]
-    swirl = 2.0 * speed * np.stack([np.sin(a) * np.cos(b), -np.cos(a) * np.sin(b)], axis=-1)
+    swirl = (
+        2.0 * speed * np.stack([np.sin(a) * np.cos(b), -np.cos(a) * np.sin(b)], axis=-1)
+    )
     low, high = np.transpose(about.bounds)
-    frames = [low + (high - low) * unit + step * swirl for step in range(about.input_frames)]
+    frames = [
+        low + (high - low) * unit + step * swirl for step in range(about.input_frames)
+    ]
     count = about.particles
     return Batch(
         position=torch.tensor(np.stack(frames, axis=1), dtype=torch.float32),
@@ -89,7 +105,8 @@ def milliseconds(name: str, q: int) -> float:
     if "cells" in options:
         options["cells"] *= q
     torch.manual_seed(0)
-    model, start = entry.model.build(options, about), given(about)
+    model = entry.model.build(options, about)
+    start = given(about)
     roll_out(model, start, FRAMES)
     taken = []
     for _ in range(REPEATS):
@@ -117,7 +134,10 @@ def main() -> int:
         for i, (q, count) in enumerate(zip(rows, counts, strict=True))
     ]
     if len(rows) > 1:
-        slopes = [float(np.polyfit(np.log(counts), np.log(found[name]), 1)[0]) for name in MODELS]
+        slopes = [
+            float(np.polyfit(np.log(counts), np.log(found[name]), 1)[0])
+            for name in MODELS
+        ]
         lines.append(["", "exponent", *(f"{slope:.2f}" for slope in slopes)])
     said = f"Processor time of a frame [ms] on one core; untrained models, recipes of {SPLIT} {SIZE}."
     text = f"{said}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"

@@ -2,9 +2,10 @@
 
     python benchmarks/journeys.py
 
-Runs each command in this process on a made-up root and prints in how many files of ours a function
-ran, and how many functions: class bodies, imports and child processes are left out. Then what the
-source says: files, lines, comments, the longest chain of imports. Its table stands in CONTRIBUTING.md.
+Runs each command in this process on a made-up root and prints in how many files of ours
+a function ran, and how many functions: class bodies, imports and child processes are
+left out. Then what the source says: files, lines, comments, the longest chain of
+imports. Its table stands in CONTRIBUTING.md.
 """
 
 from __future__ import annotations
@@ -32,11 +33,15 @@ MOST = {"generate": 40, "score": 42, "verify": 26}
 
 
 def sources() -> dict[str, Path]:
-    """Return the dotted name and file of every module; rglob does not follow the links inside the package."""
+    """Return the dotted name and file of every module; rglob does not follow the links
+    inside the package.
+    """
     found = {}
     for folder, name in ROOTS.items():
         for path in folder.rglob("*.py"):
-            found[".".join((name, *path.relative_to(folder).with_suffix("").parts))] = path
+            found[".".join((name, *path.relative_to(folder).with_suffix("").parts))] = (
+                path
+            )
     return found
 
 
@@ -50,10 +55,15 @@ def journey(words: list[str]) -> tuple[int, int]:
 
     def watch(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
-        if event != "call" or code.co_name in {"<module>", "<lambda>"} or code.co_name.startswith("<"):
+        if (
+            event != "call"
+            or code.co_name in {"<module>", "<lambda>"}
+            or code.co_name.startswith("<")
+        ):
             return
         file = known.setdefault(code.co_filename, os.path.realpath(code.co_filename))
-        # Class bodies are code objects too; functions have local variables of their own.
+        # Class bodies are code objects too; functions have local variables of their
+        # own.
         if file in ours and code.co_flags & 0x02:
             ran.add((file, code.co_firstlineno))
 
@@ -71,12 +81,18 @@ def journey(words: list[str]) -> tuple[int, int]:
 
 def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
     """Return the modules of ours that a module imports, for type checkers too."""
-    package = name if path.name == "__init__.py" else name.rpartition(".")[0]
+    if path.name == "__init__.py":
+        package = name
+    else:
+        package = name.rpartition(".")[0]
     package = package.removesuffix(".__init__")
     found = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+            else:
+                above = []
             base = ".".join([*above, *([node.module] if node.module else [])])
             for alias in node.names:
                 for candidate in (f"{base}.{alias.name}", base, f"{base}.__init__"):
@@ -104,7 +120,9 @@ def main() -> int:
     """Print both tables."""
     with tempfile.TemporaryDirectory() as folder:
         root = str(Path(folder, "data"))
-        os.environ["LAGBENCH_CACHE"] = folder  # a generation notes there how fast it was
+        os.environ["LAGBENCH_CACHE"] = (
+            folder  # a generation notes there how fast it was
+        )
         predictions = str(Path(folder, "p.nc"))
         where = ["--split", "cavity", "--size", "tiny", "--root", root]
         commands = {
@@ -131,10 +149,14 @@ def main() -> int:
         for token in tokenize.generate_tokens(io.StringIO(part).readline)
     )
     print(
-        f"\n{len(text)} files, {lines} lines, {100 * comments / lines:.1f} comments per 100 lines;", end=" "
+        f"\n{len(text)} files, {lines} lines, {100 * comments / lines:.1f} comments "
+        f"per 100 lines;",
+        end=" ",
     )
     print(f"longest chain of imports {longest_chain(known)}")
-    return 1 if over else 0
+    if over:
+        return 1
+    return 0
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python benchmarks/open_files.py --root DATA --split multimaterial --size full
 
-Prints processor time of the first windows of an epoch with 32 files kept open and with as many as
-lagbench keeps, in turns in one process, and their ratio.
+Prints processor time of the first windows of an epoch with 32 files kept open and with
+as many as lagbench keeps, in turns in one process, and their ratio.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ def spent(root: Path | None, split: str, size: str, *, files: int, count: int) -
 
 def main() -> int:
     """Measure what the arguments name and print it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--root", type=Path)
     parser.add_argument("--split", default="multimaterial")
     parser.add_argument("--size", default="full")
@@ -44,12 +46,25 @@ def main() -> int:
     took: dict[int, list[float]] = {FEW: [], KEPT: []}
     scenarios = len(load().size(given.split, given.size).subsets["train"])
     if scenarios <= FEW:
-        parser.error(f"{given.split} {given.size} trains on {scenarios} scenarios: name a split with more")
+        parser.error(
+            f"{given.split} {given.size} trains on {scenarios} scenarios: name a "
+            f"split with more"
+        )
     for _ in range(given.rounds):
         for files, times in took.items():
-            times.append(spent(given.root, given.split, given.size, files=files, count=given.windows))
+            times.append(
+                spent(
+                    given.root,
+                    given.split,
+                    given.size,
+                    files=files,
+                    count=given.windows,
+                )
+            )
     few, kept = (min(took[files]) for files in (FEW, KEPT))
-    print(f"{given.windows} windows of {given.split} {given.size}, the first of an epoch")
+    print(
+        f"{given.windows} windows of {given.split} {given.size}, the first of an epoch"
+    )
     print(f"{FEW:4d} files open  {few:6.2f} s")
     print(f"{KEPT:4d} files open  {kept:6.2f} s")
     print(f"ratio {few / kept:.2f}")

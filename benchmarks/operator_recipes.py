@@ -1,10 +1,12 @@
-"""What the recipes of the graph networks rest on: loss terms at the start, and what a step costs.
+"""What the recipes of the graph networks rest on: loss terms at the start, and what a
+step costs.
 
     python benchmarks/operator_recipes.py --root DATA --size mini
 
-prints for every split and operator the terms of the loss that count, times their weights, of the
-untrained network on windows spread over train; the processor seconds of a training step on one
-thread (the median of a few, without reading windows); and the steps of the recipe in minutes.
+prints for every split and operator the terms of the loss that count, times their
+weights, of the untrained network on windows spread over train; the processor seconds of
+a training step on one thread (the median of a few, without reading windows); and the
+steps of the recipe in minutes.
 """
 
 from __future__ import annotations
@@ -27,7 +29,9 @@ from lagbench.torch import WindowDataset, collate
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
 WINDOWS = 120
-"""Windows whose terms are averaged; a few violent ones make most of the mean on the free surface."""
+"""Windows whose terms are averaged; a few violent ones make most of the mean on the
+free surface.
+"""
 
 STEPS = 12
 """Steps that are taken; the first two are not timed."""
@@ -40,14 +44,24 @@ def half(recipe: Recipe) -> bool:
 
 
 def terms(recipe: Recipe, model: Baseline, data: WindowDataset) -> dict[str, float]:
-    """Return the weighted terms at the start that count, means over windows spread over train."""
+    """Return the weighted terms at the start that count, means over windows spread over
+    train.
+    """
     generator = torch.Generator().manual_seed(0)
     totals: Counter[str] = Counter()
     places = range(0, len(data), max(1, len(data) // WINDOWS))
     for index in places:
-        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=half(recipe)):
+        with (
+            torch.no_grad(),
+            torch.autocast("cpu", torch.bfloat16, enabled=half(recipe)),
+        ):
             found = model(collate([data[index]]), generator)
-        totals.update({name: model.weights.get(name, 1.0) * float(value) for name, value in found.items()})
+        totals.update(
+            {
+                name: model.weights.get(name, 1.0) * float(value)
+                for name, value in found.items()
+            }
+        )
     return {name: value / len(places) for name, value in totals.items() if value}
 
 
@@ -59,12 +73,16 @@ def seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:
     generator = torch.Generator().manual_seed(0)
     found = []
     for step in range(STEPS):
-        windows = collate([data[(step + STEPS * place) * stride] for place in range(batch)])
+        windows = collate(
+            [data[(step + STEPS * place) * stride] for place in range(batch)]
+        )
         started = time.process_time()
         with torch.autocast("cpu", torch.bfloat16, enabled=half(recipe)):
             raw = model(windows, generator)
         optimizer.zero_grad()
-        torch.stack([model.weights.get(name, 1.0) * value for name, value in raw.items()]).sum().backward()
+        torch.stack(
+            [model.weights.get(name, 1.0) * value for name, value in raw.items()]
+        ).sum().backward()
         optimizer.step()
         found.append(time.process_time() - started)
     return statistics.median(found[2:])
@@ -83,7 +101,8 @@ def main() -> int:
     given = parser.parse_args()
     torch.set_num_threads(1)
     print(
-        "| split | operator | terms at the start | s per step | steps | minutes |\n|---|---|---|---|---|---|"
+        "| split | operator | terms at the start | s per step | steps | minutes "
+        "|\n|---|---|---|---|---|---|"
     )
     for split in given.split:
         facts = facts_of(split, given.size, root=given.root)
@@ -92,12 +111,21 @@ def main() -> int:
             torch.manual_seed(0)
             model = find(name).model.build(recipe.model, facts)
             data = WindowDataset(
-                split, size=given.size, root=given.root, history=model.history, future=model.future
+                split,
+                size=given.size,
+                root=given.root,
+                history=model.history,
+                future=model.future,
             )
-            said = ", ".join(f"{term} {value:.2g}" for term, value in terms(recipe, model, data).items())
-            cost, count = seconds(recipe, model, data), recipe.training.steps or 0
+            said = ", ".join(
+                f"{term} {value:.2g}"
+                for term, value in terms(recipe, model, data).items()
+            )
+            cost = seconds(recipe, model, data)
+            count = recipe.training.steps or 0
             print(
-                f"| {split} | {name} | {said} | {cost:.3f} | {count} | {count * cost / 60:.1f} |",
+                f"| {split} | {name} | {said} | {cost:.3f} | {count} | "
+                f"{count * cost / 60:.1f} |",
                 flush=True,
             )
     return 0

@@ -3,9 +3,10 @@
     python benchmarks/power.py                    # prints the tables
     python benchmarks/power.py --write            # and writes docs/power.md
 
-Seeds, scenarios and the rest scatter, relative to a method's mean: by three stated assumptions,
-and as the score files below leaderboard/scores say, for a data set with two near methods, one of
-them of several seeds. From that model, seeded draws of methods that are equal, or 5, 10 and 20 % apart.
+Seeds, scenarios and the rest scatter, relative to a method's mean: by three stated
+assumptions, and as the score files below leaderboard/scores say, for a data set with
+two near methods, one of them of several seeds. From that model, seeded draws of methods
+that are equal, or 5, 10 and 20 % apart.
 """
 
 from __future__ import annotations
@@ -53,16 +54,24 @@ ASSUMED = {
 
 
 def read_methods(split: str) -> dict[str, Floats]:
-    """Return the ranking metric's values of each method of the mini size, shape [seed, scenario]."""
-    metric, held = ranking_metric(load().size(split, "mini")), defaultdict(list)
+    """Return the ranking metric's values of each method of the mini size, shape [seed,
+    scenario].
+    """
+    metric = ranking_metric(load().size(split, "mini"))
+    held = defaultdict(list)
     for path in sorted((ROOT / "leaderboard" / "scores" / split / "mini").glob("*.nc")):
-        held[re.sub(r"_\d+$", "", path.stem)].append(read_statistics(path).scores()[metric].values)
+        held[re.sub(r"_\d+$", "", path.stem)].append(
+            read_statistics(path).scores()[metric].values
+        )
     return {name: np.array(seeds) for name, seeds in held.items()}
 
 
 def measured_scatter(methods: dict[str, Floats]) -> Scatter:
-    """Return the scatter of methods; NaN where no method has two seeds, or none a rival."""
-    seeds, rests = [], []
+    """Return the scatter of methods; NaN where no method has two seeds, or none a
+    rival.
+    """
+    seeds = []
+    rests = []
     relative = {name: values / values.mean() for name, values in methods.items()}
     for values in relative.values():
         if len(values) > 1:
@@ -71,28 +80,41 @@ def measured_scatter(methods: dict[str, Floats]) -> Scatter:
             within = off - off.mean(axis=1, keepdims=True)
             rest = float(np.sum(within**2)) / ((len(values) - 1) * (count - 1))
             rests.append(rest)
-            seeds.append(max(0.0, float(np.var(off.mean(axis=1), ddof=1)) - rest / count))
+            seeds.append(
+                max(0.0, float(np.var(off.mean(axis=1), ddof=1)) - rest / count)
+            )
     near = [
         (a, b)
         for a, b in itertools.permutations(methods, 2)
         if len(methods[a]) > 1 and 0.5 < methods[a].mean() / methods[b].mean() < 2.0
     ]
     pairs = {frozenset(pair) for pair in near}
-    noise = float(np.mean(rests)) if rests else np.nan
+    if rests:
+        noise = float(np.mean(rests))
+    else:
+        noise = np.nan
     gaps = []
     for a, b in sorted(map(sorted, pairs)):
-        apart = float(np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1))
+        apart = float(
+            np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1)
+        )
         of_seeds = noise * (1 / len(methods[a]) + 1 / len(methods[b]))
         gaps.append(max(0.0, apart - of_seeds) / 2)
 
     def root(variances: list[float]) -> float:
-        return float(np.sqrt(np.mean(variances))) if variances else np.nan
+        if variances:
+            return float(np.sqrt(np.mean(variances)))
+        return np.nan
 
     return Scatter(root(seeds), root(rests), root(gaps))
 
 
 def share_told_apart(
-    scatter: Scatter, scenarios: int, difference: float, seeds: int, others: int | None = None
+    scatter: Scatter,
+    scenarios: int,
+    difference: float,
+    seeds: int,
+    others: int | None = None,
 ) -> float:
     """Return the share of draws of two methods so far apart that the test tells apart.
 
@@ -105,13 +127,18 @@ def share_told_apart(
         for level, count in ((1.0, seeds), (1.0 - difference, others or seeds)):
             own = rng.normal(0.0, scatter.method if difference else 0.0, scenarios)
             seed = rng.normal(0.0, scatter.seed, (count, 1))
-            sides.append(level * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (count, scenarios))))
+            sides.append(
+                level
+                * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (count, scenarios)))
+            )
         told += differ(*sides) < SIGNIFICANCE
     return told / DRAWS
 
 
 def pairs_of_seeds() -> tuple[int, int]:
-    """Return how many pairs of seeds of one method there are, and how many differ as weights."""
+    """Return how many pairs of seeds of one method there are, and how many differ as
+    weights.
+    """
     p = [
         differ(a, b)
         for split in TEST
@@ -128,13 +155,18 @@ def tables() -> str:
         scatter = measured_scatter(read_methods(split))
         if np.isfinite(astuple(scatter)).all():
             cases.append((split, scenarios, scatter))
-    rows, wrong = [], []
+    rows = []
+    wrong = []
     for name, scenarios, scatter in cases:
         spread = " | ".join(f"{100 * value:.1f} %" for value in astuple(scatter))
-        power = " | ".join(f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES)
+        power = " | ".join(
+            f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES
+        )
         rows.append(f"| {name} | {scenarios} | {spread} | {power} |")
         sides = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
-        false = [100 * share_told_apart(scatter, scenarios, 0.0, *seeds) for seeds in sides]
+        false = [
+            100 * share_told_apart(scatter, scenarios, 0.0, *seeds) for seeds in sides
+        ]
         wrong.append(f"| {name} | {' | '.join(f'{share:.1f} %' for share in false)} |")
     pairs, differing = pairs_of_seeds()
     return f"""# Power: what the test can tell apart

@@ -2,8 +2,8 @@
 
     python benchmarks/ranking_figure.py
 
-One frame of a full box and one of a cloud, each with a good, a shifted, a smoothed and a
-permuted prediction, and the scores that our own metrics give them.
+One frame of a full box and one of a cloud, each with a good, a shifted, a smoothed and
+a permuted prediction, and the scores that our own metrics give them.
 """
 
 from __future__ import annotations
@@ -26,23 +26,35 @@ MODES = {(1, 2): 1.0, (3, 2): 0.8, (4, 5): 0.5, (7, 6): 0.35, (9, 11): 0.25}
 
 SPEED = 0.004
 SHOWN = {
-    Placement.CELL_CENTRES: ("vorticity_nrmse", "vorticity_pearson", "spectrum_error", "position_rmse"),
+    Placement.CELL_CENTRES: (
+        "vorticity_nrmse",
+        "vorticity_pearson",
+        "spectrum_error",
+        "position_rmse",
+    ),
     Placement.NODES: ("cloud_distance", "position_rmse"),
 }
 
 
 def flow(x: Floats, *, largest: int = 99, shift: float = 0.0) -> Floats:
-    """Return the velocity of the modes up to a wave number [length/frame], shape [particle, 2]."""
+    """Return the velocity of the modes up to a wave number [length/frame], shape
+    [particle, 2].
+    """
     u = np.zeros_like(x)
     for (m, n), amplitude in MODES.items():
         if max(m, n) <= largest:
-            a, b = np.pi * m * (x[:, 0] - shift), np.pi * n * x[:, 1]
+            a = np.pi * m * (x[:, 0] - shift)
+            b = np.pi * n * x[:, 1]
             scale = SPEED * amplitude / np.hypot(m, n)
-            u += scale * np.stack([n * np.sin(a) * np.cos(b), -m * np.cos(a) * np.sin(b)], axis=1)
+            u += scale * np.stack(
+                [n * np.sin(a) * np.cos(b), -m * np.cos(a) * np.sin(b)], axis=1
+            )
     return u
 
 
-def pair_of(x: Floats, u: Floats, y: Floats, v: Floats, placement: Placement) -> FramePair:
+def pair_of(
+    x: Floats, u: Floats, y: Floats, v: Floats, placement: Placement
+) -> FramePair:
     """Return the pair of a truth (positions, velocities) and a prediction."""
     setting = Setting(
         grid=Grid(40, placement),
@@ -59,7 +71,9 @@ def pair_of(x: Floats, u: Floats, y: Floats, v: Floats, placement: Placement) ->
         particle_mass=1.0 / len(x),
         area=1.0 if setting.full_box else 0.12,
     )
-    return FramePair(scenario, 2, scenario.snapshot(x, x - u), scenario.snapshot(y, y - v))
+    return FramePair(
+        scenario, 2, scenario.snapshot(x, x - u), scenario.snapshot(y, y - v)
+    )
 
 
 def scores(pair: FramePair) -> str:
@@ -67,7 +81,9 @@ def scores(pair: FramePair) -> str:
     names = SHOWN[Placement(pair.scenario.setting.grid.placement)]
     metrics = select(names)
     found = aggregate(metrics, {0: tally([pair], metrics, (2,))})
-    return "\n".join(f"{name.replace('_', ' ')} {round(found[name].mean, 12):.2g}" for name in names)
+    return "\n".join(
+        f"{name.replace('_', ' ')} {round(found[name].mean, 12):.2g}" for name in names
+    )
 
 
 def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
@@ -75,7 +91,8 @@ def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
     axis = (np.arange(90) + 0.5) / 90
     x = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     x = np.clip(x + rng.uniform(-0.004, 0.004, x.shape), 0.0, 1.0)
-    u, order = flow(x), rng.permutation(len(x))
+    u = flow(x)
+    order = rng.permutation(len(x))
     wrong: dict[str, Callable[[Floats], Floats]] = {
         "truth": flow,
         "good: 7 % too fast": lambda y: 1.07 * flow(y),
@@ -84,19 +101,29 @@ def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
     }
     sides = {}
     for name, predicted in wrong.items():
-        y = np.clip(x + 10.0 * (predicted(x) - u), 0.0, 1.0)  # where ten such frames would lead
+        y = np.clip(
+            x + 10.0 * (predicted(x) - u), 0.0, 1.0
+        )  # where ten such frames would lead
         sides[name] = y, predicted(y)
     sides["particles permuted"] = x[order], u[order]
-    return {name: pair_of(x, u, *side, Placement.CELL_CENTRES) for name, side in sides.items()}
+    return {
+        name: pair_of(x, u, *side, Placement.CELL_CENTRES)
+        for name, side in sides.items()
+    }
 
 
 def cloud(rng: np.random.Generator) -> dict[str, FramePair]:
     """Return predictions of a splash: a pool and a drop."""
     pool = rng.uniform((0.05, 0.05), (0.95, 0.17), (900, 2))
-    radius, angle = 0.08 * np.sqrt(rng.random(300)), rng.uniform(0, 2 * np.pi, 300)
-    drop = np.stack([0.35 + radius * np.cos(angle), 0.5 + radius * np.sin(angle)], axis=1)
-    x, u = np.concatenate([pool, drop]), np.zeros((1200, 2))
-    order, smear = rng.permutation(1200), rng.normal(0.0, 0.05, (1200, 2))
+    radius = 0.08 * np.sqrt(rng.random(300))
+    angle = rng.uniform(0, 2 * np.pi, 300)
+    drop = np.stack(
+        [0.35 + radius * np.cos(angle), 0.5 + radius * np.sin(angle)], axis=1
+    )
+    x = np.concatenate([pool, drop])
+    u = np.zeros((1200, 2))
+    order = rng.permutation(1200)
+    smear = rng.normal(0.0, 0.05, (1200, 2))
     falling = np.where(np.arange(1200)[:, None] < 900, 0.0, 1.0)
     sides: dict[str, Floats] = {
         "truth": x,
@@ -118,10 +145,16 @@ def main() -> int:
         for ax, (name, pair) in zip(line, row.items(), strict=True):
             if pair.scenario.setting.full_box:
                 ax.imshow(
-                    pair.predicted_fields.vorticity.T, origin="lower", cmap="RdBu_r", vmin=-limit, vmax=limit
+                    pair.predicted_fields.vorticity.T,
+                    origin="lower",
+                    cmap="RdBu_r",
+                    vmin=-limit,
+                    vmax=limit,
                 )
             else:
-                ax.scatter(*pair.prediction.position.T, s=1.2, c="#20639b", linewidths=0)
+                ax.scatter(
+                    *pair.prediction.position.T, s=1.2, c="#20639b", linewidths=0
+                )
                 ax.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
             ax.set(xticks=[], yticks=[])
             ax.set_title(name, fontsize=9)

@@ -1,12 +1,14 @@
-"""Plan data sets of large scenarios: measure rows of Table 3.1 and extrapolate to a million particles.
+"""Plan data sets of large scenarios: measure rows of Table 3.1 and extrapolate to a
+million particles.
 
     python benchmarks/scaling_plan.py --rows 2,4 --output docs/figures
 
-writes scaling_plan.md and prints it. Row q has the particles, grid and substeps of the thesis's Table 3.1;
-a body of liquid, four particles per cell, falls (split fluid, scenario 0). Costs are processor times, so
-that other processes do not count: of parts (solver, file, hash), and of whole generations with their
-checks, twin and cards, at two numbers of frames. Peak memory is that of the largest process; its growth
-between the two numbers of frames says what of it depends on the length of a scenario.
+writes scaling_plan.md and prints it. Row q has the particles, grid and substeps of the
+thesis's Table 3.1; a body of liquid, four particles per cell, falls (split fluid,
+scenario 0). Costs are processor times, so that other processes do not count: of parts
+(solver, file, hash), and of whole generations with their checks, twin and cards, at two
+numbers of frames. Peak memory is that of the largest process; its growth between the
+two numbers of frames says what of it depends on the length of a scenario.
 """
 
 from __future__ import annotations
@@ -35,13 +37,17 @@ from lagbench.make.generate import generate
 FRAMES = (4, 10)
 """Frames of the two generations."""
 
-SCENARIOS, PLANNED = 1000, 600
+SCENARIOS = 1000
+PLANNED = 600
 """Scenarios and frames of the data set that is planned for."""
 
-TESTS, HORIZON = 0.1, 298
+TESTS = 0.1
+HORIZON = 298
 """Share of test scenarios, and frames that their twins take."""
 
-_AREA, _COURANT, _MODULUS = 0.25, 0.4, 30.0
+_AREA = 0.25
+_COURANT = 0.4
+_MODULUS = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,9 +84,18 @@ def registry_of(row: Row, frames: int) -> Registry:
         "grid": row.grid,
         "substeps_per_frame": row.substeps,
     }
-    task = full.task.model_copy(update={"horizon": frames - 2, "frames_of_interest": (frames - 1,)})
+    task = full.task.model_copy(
+        update={"horizon": frames - 2, "frames_of_interest": (frames - 1,)}
+    )
     subsets = {"train": (0,), "valid": (1,), "test": (2,)}
-    size = full.model_copy(update={"parameters": changed, "subsets": subsets, "frames": frames, "task": task})
+    size = full.model_copy(
+        update={
+            "parameters": changed,
+            "subsets": subsets,
+            "frames": frames,
+            "task": task,
+        }
+    )
     values = {"area_min": _AREA, "area_max": _AREA, "frame_rate": 1.0 / interval}
     parameters = {
         name: parameter.model_copy(update={"value": values.get(name, parameter.value)})
@@ -104,10 +119,17 @@ def measure_parts(row: Row, frames: int, root: Path) -> Parts:
     drawing = min(timed(lambda: draw(size, 0)) for _ in range(3))
     batch = Batch(job, lambda _: None)
     batch.solver.advance(1)
-    solving = min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3)) / row.substeps
-    position, velocity = batch.solver.position()[0], batch.solver.velocity()[0]
+    solving = (
+        min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3))
+        / row.substeps
+    )
+    position = batch.solver.position()[0]
+    velocity = batch.solver.velocity()[0]
     with scenario_writer(job, 0, batch.states[0]) as writer:
-        writing = timed(lambda: [writer.append(position, velocity) for _ in range(frames)]) / frames
+        writing = (
+            timed(lambda: [writer.append(position, velocity) for _ in range(frames)])
+            / frames
+        )
     path = writer.path
     return Parts(
         draw=drawing / row.particles,
@@ -122,7 +144,14 @@ def measure_parts(row: Row, frames: int, root: Path) -> Parts:
 def measure_whole(row: Row, frames: int, root: Path) -> Whole:
     """Generate one scenario and one with a twin, one after the other, by one worker."""
     start = time.process_time()
-    generate("fluid", "q", scenarios="0,2", root=root, workers=1, registry=registry_of(row, frames))
+    generate(
+        "fluid",
+        "q",
+        scenarios="0,2",
+        root=root,
+        workers=1,
+        registry=registry_of(row, frames),
+    )
     workers = resource.getrusage(resource.RUSAGE_CHILDREN)
     return Whole(
         frames=frames,
@@ -135,7 +164,9 @@ def measure_whole(row: Row, frames: int, root: Path) -> Whole:
 def apart(row: Row, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
     """Measure in a process of its own, whose peak memory is nobody else's."""
     command = [sys.executable, __file__, "--one", f"{row.q},{frames},{what}"]
-    return json.loads(subprocess.run(command, capture_output=True, check=True, text=True).stdout)
+    return json.loads(
+        subprocess.run(command, capture_output=True, check=True, text=True).stdout
+    )
 
 
 def one(text: str) -> int:
@@ -143,7 +174,10 @@ def one(text: str) -> int:
     q, frames, what = text.split(",")
     row = next(row for row in THESIS if row.q == int(q))
     with tempfile.TemporaryDirectory() as folder:
-        measure = measure_parts if what == "parts" else measure_whole
+        if what == "parts":
+            measure = measure_parts
+        else:
+            measure = measure_whole
         print(json.dumps(asdict(measure(row, int(frames), Path(folder)))))
     return 0
 
@@ -151,12 +185,16 @@ def one(text: str) -> int:
 def parts_table(found: Sequence[tuple[Row, Parts]]) -> list[str]:
     """Return the costs per particle."""
     lines = [
-        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] | hash it again [ns] "
+        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] | hash it "
+        "again [ns] "
         "| statistics [ns] | bytes of a frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row, p in found:
-        times = " | ".join(f"{1e9 * t:.3g}" for t in (p.draw, p.substep, p.write, p.check, p.statistics))
+        times = " | ".join(
+            f"{1e9 * t:.3g}"
+            for t in (p.draw, p.substep, p.write, p.check, p.statistics)
+        )
         lines.append(f"| {row.q} | {row.particles:,} | {times} | {p.bytes:.3g} |")
     return lines
 
@@ -164,15 +202,18 @@ def parts_table(found: Sequence[tuple[Row, Parts]]) -> list[str]:
 def whole_table(found: Sequence[tuple[Row, Parts, Sequence[Whole]]]) -> list[str]:
     """Return what whole generations took, beside the sum of the parts."""
     lines = [
-        "| q | frames | core seconds | sum of the parts | one frame [MB] | parent, peak [MB] "
+        "| q | frames | core seconds | sum of the parts | one frame [MB] | parent, "
+        "peak [MB] "
         "| worker, peak [MB] |",
         "|--:|--:|--:|--:|--:|--:|--:|",
     ]
     for row, parts, runs in found:
         for run in runs:
             lines.append(
-                f"| {row.q} | {run.frames} | {run.seconds:.1f} | {expected(row, parts, run.frames):.1f} "
-                f"| {16 * row.particles / 1e6:.1f} | {run.parent / 1e6:.0f} | {run.worker / 1e6:.0f} |"
+                f"| {row.q} | {run.frames} | {run.seconds:.1f} | "
+                f"{expected(row, parts, run.frames):.1f} "
+                f"| {16 * row.particles / 1e6:.1f} | {run.parent / 1e6:.0f} | "
+                f"{run.worker / 1e6:.0f} |"
             )
     return lines
 
@@ -185,22 +226,27 @@ def expected(row: Row, p: Parts, frames: int) -> float:
 
 def plan_table(row: Row, p: Parts, memory: int) -> list[str]:
     """Return bytes, core hours and memory of the planned data set."""
-    n, frames = row.particles, PLANNED
-    hours, file = SCENARIOS * n / 3600.0, frames * n * p.bytes
+    n = row.particles
+    frames = PLANNED
+    hours = SCENARIOS * n / 3600.0
+    file = frames * n * p.bytes
     simulating = hours * (p.draw + (frames - 1) * row.substeps * p.substep)
     twins = TESTS * hours * (p.draw + HORIZON * row.substeps * p.substep)
     rows = {
         "bytes before compression": f"{SCENARIOS * frames * n * 16 / 1e12:.2f} TB",
-        "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} GB each)",
+        "bytes in files": f"{SCENARIOS * file / 1e12:.2f} TB ({file / 1e9:.1f} "
+        f"GB each)",
         "simulating": f"{simulating:,.0f} core hours",
         "compressing, hashing, writing": f"{hours * frames * p.write:,.0f} core hours",
         f"twins of {TESTS:.0%} test scenarios": f"{twins:,.0f} core hours",
-        "statistics of 80 % train scenarios": f"{0.8 * hours * frames * p.statistics:,.0f} core hours",
+        "statistics of 80 % train "
+        "scenarios": f"{0.8 * hours * frames * p.statistics:,.0f} core hours",
         "one `lagbench verify`": f"{hours * frames * p.check:,.0f} core hours",
         "memory of a worker": f"{memory / 1e6:.0f} MB",
     }
     return [
-        f"{SCENARIOS:,} scenarios of {n:,} particles, {frames} frames of {row.substeps} substeps, "
+        f"{SCENARIOS:,} scenarios of {n:,} particles, {frames} frames of "
+        f"{row.substeps} substeps, "
         f"{row.grid} x {row.grid} cells:",
         "",
         "| | |",
@@ -209,10 +255,15 @@ def plan_table(row: Row, p: Parts, memory: int) -> list[str]:
     ]
 
 
-def extrapolated(found: Sequence[tuple[Row, Parts, Sequence[Whole]]], particles: int) -> int:
-    """Return a worker's peak memory at a number of particles, by the line through two rows [bytes]."""
+def extrapolated(
+    found: Sequence[tuple[Row, Parts, Sequence[Whole]]], particles: int
+) -> int:
+    """Return a worker's peak memory at a number of particles, by the line through two
+    rows [bytes].
+    """
     (small, _, few), (large, _, many) = found[0], found[-1]
-    low, high = few[-1].worker, many[-1].worker
+    low = few[-1].worker
+    high = many[-1].worker
     if small is large:
         return round(high * particles / large.particles)
     slope = (high - low) / (large.particles - small.particles)

@@ -1,7 +1,8 @@
-"""A data set of the size of cavity full, and a submission to it, made without simulating.
+"""A data set of the size of cavity full, and a submission to it, made without
+simulating.
 
-Particles are carried by swirls that differ between scenarios, so that fields and errors are
-of realistic shape; nothing is learned from the values.
+Particles are carried by swirls that differ between scenarios, so that fields and errors
+are of realistic shape; nothing is learned from the values.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class ScoreData:
 def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
     """Write the test scenarios of 8192 particles and predictions with growing errors.
 
-    The registry claims the hash of the real data set, so that scoring finds the shipped floors,
-    as a user's does, and measures the submission alone.
+    The registry claims the hash of the real data set, so that scoring finds the shipped
+    floors, as a user's does, and measures the submission alone.
 
     Args:
         folder: an empty folder.
@@ -49,26 +50,43 @@ def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
     """
     size = load().size("cavity", "full")
     frames = size.task.input_frames + horizon
-    root, hashes = folder / "root", {}
+    root = folder / "root"
+    hashes = {}
     for scenario in size.subsets["test"]:
-        key = ScenarioKey(split="cavity", size="full", version=size.version, scenario=scenario, subset="test")
-        flow = ((position, position) for position in _flow(scenario, frames, size.particles))
+        key = ScenarioKey(
+            split="cavity",
+            size="full",
+            version=size.version,
+            scenario=scenario,
+            subset="test",
+        )
+        flow = (
+            (position, position) for position in _flow(scenario, frames, size.particles)
+        )
         mass = 1e-4 * BOX[1] ** 2 / size.particles
         hashes[scenario] = write_scenario(
             root, key, flow, particles=size.particles, frames=frames, particle_mass=mass
         )
     registry = load(_write_registry(folder / "datasets.yaml", horizon, frames, hashes))
     path = folder / "predictions.nc"
-    writer = PredictionsWriter(path, split="cavity", size="full", method="swirls", registry=registry)
+    writer = PredictionsWriter(
+        path, split="cavity", size="full", method="swirls", registry=registry
+    )
     with writer:
         for scenario in size.subsets["test"]:
-            guess = list(_flow(scenario, frames, size.particles, error=0.02))[size.task.input_frames :]
+            guess = list(_flow(scenario, frames, size.particles, error=0.02))[
+                size.task.input_frames :
+            ]
             writer.add(scenario, np.stack(guess))
     return ScoreData(root, registry, path)
 
 
-def _flow(scenario: int, frames: int, particles: int, *, error: float = 0.0) -> Iterator[NDArray[np.float32]]:
-    """Yield positions frame by frame; an error makes the swirls faster by that share."""
+def _flow(
+    scenario: int, frames: int, particles: int, *, error: float = 0.0
+) -> Iterator[NDArray[np.float32]]:
+    """Yield positions frame by frame; an error makes the swirls faster by that
+    share.
+    """
     rng = np.random.Generator(np.random.PCG64(scenario))
     low, side = BOX
     x = low + side * rng.random((particles, 2))
@@ -76,8 +94,13 @@ def _flow(scenario: int, frames: int, particles: int, *, error: float = 0.0) -> 
     for frame in range(frames):
         yield x.astype(np.float32)
         s = waves * np.pi * (x - low) / side
-        u = np.stack([np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1)
-        x = np.clip(x + SPEED * (1.0 + (error if frame >= 5 else 0.0)) * u, low, low + side)
+        u = np.stack(
+            [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])],
+            axis=1,
+        )
+        x = np.clip(
+            x + SPEED * (1.0 + (error if frame >= 5 else 0.0)) * u, low, low + side
+        )
 
 
 def write_scenario(
@@ -90,7 +113,9 @@ def write_scenario(
     particle_mass: float = 1e-8,
     wall_velocity: NDArray[np.float64] | None = None,
 ) -> str:
-    """Write a made-up scenario of positions and velocities, frame by frame; return its content hash."""
+    """Write a made-up scenario of positions and velocities, frame by frame; return its
+    content hash.
+    """
     writer = ScenarioWriter(
         scenario_path(root, key),
         key,
@@ -111,17 +136,23 @@ def write_scenario(
     return writer.content_sha256
 
 
-def _write_registry(path: Path, horizon: int, frames: int, hashes: dict[int, str]) -> Path:
+def _write_registry(
+    path: Path, horizon: int, frames: int, hashes: dict[int, str]
+) -> Path:
     held = read_yaml(default_path())
     size = held["splits"]["cavity"]["sizes"]["full"]
-    size["task"]["horizon"], size["frames"] = horizon, frames
+    size["task"]["horizon"] = horizon
+    size["frames"] = frames
     held["measured"] = {
         "cavity": {
             "full": {
                 "dataset_sha256": held["measured"]["cavity"]["full"]["dataset_sha256"],
                 "subset_sha256": {},
                 "scenario_sha256": {i: digest[:16] for i, digest in hashes.items()},
-                "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.0015, 0.0015]},
+                "statistics": {
+                    "position_std": [0.25, 0.25],
+                    "velocity_std": [0.0015, 0.0015],
+                },
                 "twin_floor": [1e-6] * horizon,
             }
         }

@@ -2,11 +2,12 @@
 
     python benchmarks/scoring_against.py --against 0e958a2
 
-checks the other commit out beside this one (0e958a2 is the last with version 1 of the data). Each
-tree makes a submission to cavity full of the same swirls by its own ``score_data.py`` and scores
-it in processes of its own, in turns; the first round, which may hash the truth, is not counted.
-Printed is the processor time per scenario of 90 frames, imports aside (best of the rounds), what
-the validation's child takes of it, the memory of the largest process, and the ratios.
+checks the other commit out beside this one (0e958a2 is the last with version 1 of the
+data). Each tree makes a submission to cavity full of the same swirls by its own
+``score_data.py`` and scores it in processes of its own, in turns; the first round,
+which may hash the truth, is not counted. Printed is the processor time per scenario of
+90 frames, imports aside (best of the rounds), what the validation's child takes of it,
+the memory of the largest process, and the ratios.
 """
 
 from __future__ import annotations
@@ -55,19 +56,28 @@ print(json.dumps({"cpu": (own + children) / count, "children": children / count,
 
 def score(tree: Path, data: Path) -> dict[str, float]:
     """Return what a tree's scorer takes for the data that it made."""
-    found: dict[str, float] = json.loads(on_one_core(tree, "-c", SCORE, str(data), OMP_NUM_THREADS="1"))
+    found: dict[str, float] = json.loads(
+        on_one_core(tree, "-c", SCORE, str(data), OMP_NUM_THREADS="1")
+    )
     return found
 
 
 def declare(tree: Path) -> None:
-    """Write the entry points that a tree declares, which an installation of another tree would hide."""
-    groups = tomllib.loads((tree / "pyproject.toml").read_text())["project"]["entry-points"]
+    """Write the entry points that a tree declares, which an installation of another
+    tree would hide.
+    """
+    groups = tomllib.loads((tree / "pyproject.toml").read_text())["project"][
+        "entry-points"
+    ]
     lines = [
-        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in named.items()) for group, named in groups.items()
+        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in named.items())
+        for group, named in groups.items()
     ]
     folder = tree / "lagbench.egg-info"
     folder.mkdir()
-    (folder / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: lagbench\nVersion: 0\n")
+    (folder / "PKG-INFO").write_text(
+        "Metadata-Version: 2.1\nName: lagbench\nVersion: 0\n"
+    )
     (folder / "entry_points.txt").write_text("\n".join(lines))
 
 
@@ -91,16 +101,26 @@ def main() -> int:
         for _ in range(given.rounds):
             for tree, data in made.items():
                 found = score(tree, data)
-                best[tree] = min(best.get(tree, found), found, key=lambda one: one["cpu"])
+                best[tree] = min(
+                    best.get(tree, found), found, key=lambda one: one["cpu"]
+                )
     print(f"{hardware()['processor']}, one core, cavity full, all metrics but Sinkhorn")
-    print(f"| per scenario of 90 frames | {given.against} | this tree | ratio |\n|---|---|---|---|")
+    print(
+        f"| per scenario of 90 frames | {given.against} | this tree | ratio "
+        f"|\n|---|---|---|---|"
+    )
     shown: tuple[tuple[str, str, Callable[[float], str]], ...] = (
         ("processor time", "cpu", lambda seconds: f"{seconds:.2f} s"),
         ("of it in children", "children", lambda seconds: f"{seconds:.2f} s"),
-        ("memory of the largest process", "memory", lambda size: f"{size / 1e6:.0f} MB"),
+        (
+            "memory of the largest process",
+            "memory",
+            lambda size: f"{size / 1e6:.0f} MB",
+        ),
     )
     for name, key, text in shown:
-        theirs, ours = best[other][key], best[HERE][key]
+        theirs = best[other][key]
+        ours = best[HERE][key]
         print(f"| {name} | {text(theirs)} | {text(ours)} | {ours / theirs:.2f} |")
     return 0
 

@@ -2,10 +2,11 @@
 
     python benchmarks/skill_interval.py [--draws 400]
 
-Scores of a method and of a floor are drawn lognormal, with a correlation over scenarios; each seed of the
-method has a factor of its own. Beside the shipped interval, on the logarithm of the ratio, stands that of the
-ratio itself. Prints the share of draws in which either 95 % interval holds the true skill, and the
-least and greatest end of any. docs/scoring.md quotes it.
+Scores of a method and of a floor are drawn lognormal, with a correlation over
+scenarios; each seed of the method has a factor of its own. Beside the shipped interval,
+on the logarithm of the ratio, stands that of the ratio itself. Prints the share of
+draws in which either 95 % interval holds the true skill, and the least and greatest end
+of any. docs/scoring.md quotes it.
 """
 
 from __future__ import annotations
@@ -19,13 +20,28 @@ from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.table import METRICS
 from lagbench.scoring.card import skill
 
-CASES = ((1.9, 0.6, 0.6, 0.3), (0.4, 0.4, 0.3, 0.5), (0.4, 0.8, 0.6, 0.0), (1.0, 0.3, 0.3, 0.8))
-"""Ratio of the means, deviations of the logarithms of method and floor over scenarios, their correlation."""
+CASES = (
+    (1.9, 0.6, 0.6, 0.3),
+    (0.4, 0.4, 0.3, 0.5),
+    (0.4, 0.8, 0.6, 0.0),
+    (1.0, 0.3, 0.3, 0.8),
+)
+"""Ratio of the means, deviations of the logarithms of method and floor over scenarios,
+their correlation.
+"""
 
 SEED = 0.15
 """Deviation of the logarithm of a seed's factor."""
 
-HEADS = ("seeds", "scenarios", "skill", "deviations", "shipped: holds", "least", "greatest")
+HEADS = (
+    "seeds",
+    "scenarios",
+    "skill",
+    "deviations",
+    "shipped: holds",
+    "least",
+    "greatest",
+)
 
 
 def score_of(values: NDArray[np.float64]) -> Score:
@@ -42,7 +58,9 @@ def score_of(values: NDArray[np.float64]) -> Score:
 
 def main() -> int:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--draws", type=int, default=400)
     draws = parser.parse_args().draws
     rng = np.random.Generator(np.random.PCG64(0))
@@ -51,22 +69,39 @@ def main() -> int:
     for seeds in (1, 2, 3):
         for count in (6, 16, 20):
             for ratio, spread, base_spread, correlation in CASES:
-                held, least, greatest = np.zeros(2), np.full(2, np.inf), np.full(2, -np.inf)
+                held = np.zeros(2)
+                least = np.full(2, np.inf)
+                greatest = np.full(2, -np.inf)
                 for _ in range(draws):
-                    z = rng.multivariate_normal([0, 0], [[1, correlation], [correlation, 1]], count)
+                    z = rng.multivariate_normal(
+                        [0, 0], [[1, correlation], [correlation, 1]], count
+                    )
                     deviations = np.array([spread, base_spread])
                     ours, base = np.exp(deviations * z - deviations**2 / 2).T
-                    factor = np.exp(rng.normal(0.0, SEED, seeds) - SEED**2 / 2) if seeds > 1 else np.ones(1)
+                    if seeds > 1:
+                        factor = np.exp(rng.normal(0.0, SEED, seeds) - SEED**2 / 2)
+                    else:
+                        factor = np.ones(1)
                     own = ratio * factor[:, None] * ours
-                    found = skill([score_of(row) for row in own], {"persistence": score_of(base)})
+                    found = skill(
+                        [score_of(row) for row in own], {"persistence": score_of(base)}
+                    )
                     if found is None:
                         raise ValueError("persistence does not count as a floor")
-                    low, high = bootstrap_interval((own - (1.0 - found.value) * base) / np.mean(base))
-                    ends = np.array([found.interval, (found.value - high, found.value - low)])
+                    low, high = bootstrap_interval(
+                        (own - (1.0 - found.value) * base) / np.mean(base)
+                    )
+                    ends = np.array(
+                        [found.interval, (found.value - high, found.value - low)]
+                    )
                     held += (ends[:, 0] <= 1.0 - ratio) & (1.0 - ratio <= ends[:, 1])
-                    least, greatest = np.minimum(least, ends[:, 0]), np.maximum(greatest, ends[:, 1])
+                    least = np.minimum(least, ends[:, 0])
+                    greatest = np.maximum(greatest, ends[:, 1])
                 shares = zip(held / draws, least, greatest, strict=True)
-                cells = [f"{share:.1%} | {low:.2f} | {high:.2f}" for share, low, high in shares]
+                cells = [
+                    f"{share:.1%} | {low:.2f} | {high:.2f}"
+                    for share, low, high in shares
+                ]
                 what = f"{seeds} | {count} | {1 - ratio:.1f} | {spread}, {base_spread}"
                 print(f"| {what} | {' | '.join(cells)} |", flush=True)
     return 0

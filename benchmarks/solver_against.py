@@ -2,10 +2,11 @@
 
     python benchmarks/solver_against.py --against main~20
 
-checks the other commit out beside this one, runs both alternately in processes of their own and
-prints, per split, the particle-substeps per second of processor time (best of the rounds) of both
-and their ratio. ``lagbench bench solver`` times frames as generation makes them, with the checks
-and the positions read out after each; the row ``kernels`` is ``whole_frame.py``, substeps alone.
+checks the other commit out beside this one, runs both alternately in processes of their
+own and prints, per split, the particle-substeps per second of processor time (best of
+the rounds) of both and their ratio. ``lagbench bench solver`` times frames as
+generation makes them, with the checks and the positions read out after each; the row
+``kernels`` is ``whole_frame.py``, substeps alone.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def checked_out(revision: str) -> Iterator[Path]:
     git = ["git", "-C", str(HERE), "worktree"]
     with tempfile.TemporaryDirectory() as folder:
         other = Path(folder) / "other"
-        subprocess.run([*git, "add", "--quiet", "--detach", str(other), revision], check=True)
+        subprocess.run(
+            [*git, "add", "--quiet", "--detach", str(other), revision], check=True
+        )
         try:
             yield other
         finally:
@@ -59,7 +62,17 @@ def rate(tree: Path, case: str, size: str) -> float:
     """Return the particle-substeps per second of processor time that a tree reaches."""
     command = ["benchmarks/whole_frame.py"]
     if case != "kernels":
-        command = ["-m", "lagbench", "bench", "solver", "--split", case, "--size", size, "--json"]
+        command = [
+            "-m",
+            "lagbench",
+            "bench",
+            "solver",
+            "--split",
+            case,
+            "--size",
+            size,
+            "--json",
+        ]
     printed = on_one_core(tree, *command)
     found: dict[str, Any] = json.loads(printed[printed.index("{") :])
     if case == "kernels":
@@ -76,7 +89,10 @@ def main() -> int:
     parser.add_argument("--size", default="mini")
     parser.add_argument("--rounds", type=int, default=3)
     given = parser.parse_args()
-    print(f"{hardware()['processor']}, size {given.size}; M particle-substeps/s of processor time")
+    print(
+        f"{hardware()['processor']}, size {given.size}; M particle-substeps/s of "
+        f"processor time"
+    )
     print(f"| case | {given.against} | this tree | ratio |\n|---|---|---|---|")
     with checked_out(given.against) as other:
         for case in ("kernels", *SPLITS):
@@ -84,8 +100,12 @@ def main() -> int:
             for _ in range(given.rounds):
                 for tree, so_far in best.items():
                     best[tree] = max(so_far, rate(tree, case, given.size))
-            theirs, ours = best[other] / 1e6, best[HERE] / 1e6
-            print(f"| {case} | {theirs:.1f} | {ours:.1f} | {ours / theirs:.2f} |", flush=True)
+            theirs = best[other] / 1e6
+            ours = best[HERE] / 1e6
+            print(
+                f"| {case} | {theirs:.1f} | {ours:.1f} | {ours / theirs:.2f} |",
+                flush=True,
+            )
     return 0
 
 

@@ -1,11 +1,13 @@
-"""Regenerate Table 3.1 and Fig. 3.1 of the thesis: solver time over the quality factor q.
+"""Regenerate Table 3.1 and Fig. 3.1 of the thesis: solver time over the quality factor
+q.
 
     python benchmarks/table_3_1.py --rows 1-4 --device cpu --output docs/figures
 
-writes table_3_1_DEVICE.md and table_3_1_DEVICE.png and prints the table. The rows take particles,
-grid and substeps per frame from the thesis; a block of liquid, four particles per cell, falls and
-spreads (free-surface solver). Times are the best of the repeats, in milliseconds: processor time on
-the CPU, so that other processes do not count, wall time on a GPU.
+writes table_3_1_DEVICE.md and table_3_1_DEVICE.png and prints the table. The rows take
+particles, grid and substeps per frame from the thesis; a block of liquid, four
+particles per cell, falls and spreads (free-surface solver). Times are the best of the
+repeats, in milliseconds: processor time on the CPU, so that other processes do not
+count, wall time on a GPU.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ FIXED = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row of Table 3.1 as the thesis prints it (times on its GPU, in milliseconds)."""
+    """One row of Table 3.1 as the thesis prints it (times on its GPU, in
+    milliseconds).
+    """
 
     q: int
     particles: int
@@ -43,7 +47,14 @@ class Row:
 
 
 THESIS = tuple(
-    Row(q=q, particles=n, grid=grid, substeps=substeps, substep_ms=substep, frame_ms=frame)
+    Row(
+        q=q,
+        particles=n,
+        grid=grid,
+        substeps=substeps,
+        substep_ms=substep,
+        frame_ms=frame,
+    )
     for q, n, grid, substeps, substep, frame in (
         (1, 16_384, 128, 20, 0.06, 1.17),
         (2, 65_536, 256, 20, 0.14, 5.33),
@@ -110,16 +121,23 @@ def block(row: Row) -> tuple[FreeSurfaceParameters, InitialState]:
 def start(row: Row, device: solver.Device) -> solver.Solver:
     """Build the solver of a row, load the block and compile."""
     parameters, state = block(row)
-    running = solver.build(parameters, device=device, threads=1 if device is solver.Device.CPU else None)
+    running = solver.build(
+        parameters, device=device, threads=1 if device is solver.Device.CPU else None
+    )
     running.load([state])
     running.advance(2)
     return running
 
 
 def best_ms(
-    running: solver.Solver, substeps: int, repeats: int, clock: Callable[[], float] = time.process_time
+    running: solver.Solver,
+    substeps: int,
+    repeats: int,
+    clock: Callable[[], float] = time.process_time,
 ) -> float:
-    """Return the shortest time of advancing by some substeps [ms], positions fetched."""
+    """Return the shortest time of advancing by some substeps [ms], positions
+    fetched.
+    """
     times = []
     for _ in range(repeats):
         begin = clock()
@@ -130,9 +148,14 @@ def best_ms(
 
 
 def measure(row: Row, *, device: solver.Device, repeats: int) -> Measurement:
-    """Time one row: substeps in runs of a fixed number, and frames of its own substeps."""
+    """Time one row: substeps in runs of a fixed number, and frames of its own
+    substeps.
+    """
     running = start(row, device)
-    clock = time.process_time if device is solver.Device.CPU else time.perf_counter
+    if device is solver.Device.CPU:
+        clock = time.process_time
+    else:
+        clock = time.perf_counter
     return Measurement(
         row=row,
         substep_ms=best_ms(running, FIXED, repeats, clock) / FIXED,
@@ -140,7 +163,9 @@ def measure(row: Row, *, device: solver.Device, repeats: int) -> Measurement:
     )
 
 
-def exponents(sizes: Sequence[Row], substep_ms: Sequence[float], frame_ms: Sequence[float]) -> Exponents:
+def exponents(
+    sizes: Sequence[Row], substep_ms: Sequence[float], frame_ms: Sequence[float]
+) -> Exponents:
     """Fit straight lines to the logarithms (Eq. 3.1)."""
     squares = [row.q**2 for row in sizes]
     particles = [row.particles for row in sizes]
@@ -152,21 +177,31 @@ def exponents(sizes: Sequence[Row], substep_ms: Sequence[float], frame_ms: Seque
 
 
 def _slope(x: Sequence[float], y: Sequence[float]) -> float:
-    return float(np.polyfit(np.log10(x), np.log10(y), 1)[0]) if len(x) > 1 else float("nan")
+    if len(x) > 1:
+        return float(np.polyfit(np.log10(x), np.log10(y), 1)[0])
+    return float("nan")
 
 
 def of_thesis(rows: Sequence[Row] = THESIS) -> Exponents:
     """Return the exponents of the thesis's own times."""
-    return exponents(rows, [row.substep_ms for row in rows], [row.frame_ms for row in rows])
+    return exponents(
+        rows, [row.substep_ms for row in rows], [row.frame_ms for row in rows]
+    )
 
 
 def of_measured(found: Sequence[Measurement]) -> Exponents:
     """Return the exponents of our times."""
-    return exponents([m.row for m in found], [m.substep_ms for m in found], [m.frame_ms for m in found])
+    return exponents(
+        [m.row for m in found],
+        [m.substep_ms for m in found],
+        [m.frame_ms for m in found],
+    )
 
 
 def markdown(found: Sequence[Measurement], device: str) -> str:
-    """Return Table 3.1 with our times beside the thesis's, and the exponents below it."""
+    """Return Table 3.1 with our times beside the thesis's, and the exponents below
+    it.
+    """
     lines = [
         f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
         "",
@@ -177,23 +212,33 @@ def markdown(found: Sequence[Measurement], device: str) -> str:
     for m in found:
         r = m.row
         lines.append(
-            f"| {r.q} | {r.q**2} | {r.particles:,} | {r.grid} x {r.grid} | {r.substeps} | {m.substep_ms:.3g} "
-            f"| {m.frame_ms:.4g} | {1e3 / m.frame_ms:.4g} | {r.substep_ms} | {r.frame_ms} "
+            f"| {r.q} | {r.q**2} | {r.particles:,} | {r.grid} x {r.grid} | "
+            f"{r.substeps} | {m.substep_ms:.3g} "
+            f"| {m.frame_ms:.4g} | {1e3 / m.frame_ms:.4g} | {r.substep_ms} | "
+            f"{r.frame_ms} "
             f"| {r.frame_ms / m.frame_ms:.3g} |"
         )
-    lines += ["", "| exponent of | ours | thesis, same rows | thesis, all rows |", "|---|--:|--:|--:|"]
+    lines += [
+        "",
+        "| exponent of | ours | thesis, same rows | thesis, all rows |",
+        "|---|--:|--:|--:|",
+    ]
     sets = (of_measured(found), of_thesis([m.row for m in found]), of_thesis())
     for name, words in (
         ("frame_q2", "t/frame against q^2"),
         ("frame_particles", "t/frame against particles"),
         ("substep_particles", "t/substep against particles"),
     ):
-        lines.append(f"| {words} | " + " | ".join(f"{getattr(e, name):.2f}" for e in sets) + " |")
+        lines.append(
+            f"| {words} | " + " | ".join(f"{getattr(e, name):.2f}" for e in sets) + " |"
+        )
     return "\n".join(lines) + "\n"
 
 
 def draw(found: Sequence[Measurement], device: str, path: Path) -> None:
-    """Draw Fig. 3.1: (a) log-log with fitted lines, (b) linear with second-degree fits."""
+    """Draw Fig. 3.1: (a) log-log with fitted lines, (b) linear with second-degree
+    fits.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
@@ -207,9 +252,16 @@ def draw(found: Sequence[Measurement], device: str, path: Path) -> None:
         slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
         line = np.linspace(x.min(), x.max(), 200)
         left.loglog(x, y, "o", color=colour)
-        left.loglog(line, 10**offset * line**slope, color=colour, label=f"{name}: slope {slope:.2f}")
+        left.loglog(
+            line,
+            10**offset * line**slope,
+            color=colour,
+            label=f"{name}: slope {slope:.2f}",
+        )
         right.plot(x, y, "o", color=colour)
-        right.plot(line, np.polyval(np.polyfit(x, y, 2), line), color=colour, label=name)
+        right.plot(
+            line, np.polyval(np.polyfit(x, y, 2), line), color=colour, label=name
+        )
     for axes, title in ((left, "(a) log-log"), (right, "(b) second-degree fit")):
         axes.set(xlabel="q^2", ylabel="t/frame [ms]", title=title)
         axes.grid(alpha=0.3)
@@ -224,7 +276,10 @@ def main() -> int:
     )
     parser.add_argument("--rows", default="1-4", help="first and last q, such as 1-4")
     parser.add_argument(
-        "--device", type=solver.Device, default=solver.Device.CPU, choices=list(solver.Device)
+        "--device",
+        type=solver.Device,
+        default=solver.Device.CPU,
+        choices=list(solver.Device),
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
@@ -234,8 +289,12 @@ def main() -> int:
     found = [measure(row, device=given.device, repeats=given.repeats) for row in rows]
     table = markdown(found, given.device.value)
     given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / f"table_3_1_{given.device.value}.md").write_text(table, encoding="utf-8")
-    draw(found, given.device.value, given.output / f"table_3_1_{given.device.value}.png")
+    (given.output / f"table_3_1_{given.device.value}.md").write_text(
+        table, encoding="utf-8"
+    )
+    draw(
+        found, given.device.value, given.output / f"table_3_1_{given.device.value}.png"
+    )
     print(table)
     return 0
 

@@ -1,4 +1,6 @@
-"""Two worker processes against one: the same scenarios, the same hashes, nearly half the time."""
+"""Two worker processes against one: the same scenarios, the same hashes, nearly half
+the time.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,16 @@ def generate(root: Path, workers: int) -> None:
 
 def hashes(root: Path) -> dict[str, str]:
     """Return the content hash of every scenario file below a root, recomputed."""
-    return {str(path.relative_to(root)): rehash(path) for path in sorted(root.rglob("*.nc"))}
+    return {
+        str(path.relative_to(root)): rehash(path) for path in sorted(root.rglob("*.nc"))
+    }
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_two_workers(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
-    """Two workers are at least 1.8 times as fast as one, started processes and compilation included."""
+    """Two workers are at least 1.8 times as fast as one, started processes and
+    compilation included.
+    """
     times: dict[int, float] = {}
 
     def both() -> None:
@@ -39,9 +45,15 @@ def test_two_workers(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
 
     best_seconds(benchmark, both, rounds=1)
     speed_up = times[1] / times[2]
-    benchmark.extra_info.update(one_worker=times[1], two_workers=times[2], speed_up=speed_up)
-    print(f"\none worker {times[1]:.1f} s, two {times[2]:.1f} s: {speed_up:.2f}x (target {TARGET})")
-    one, two = hashes(tmp_path / "1"), hashes(tmp_path / "2")
+    benchmark.extra_info.update(
+        one_worker=times[1], two_workers=times[2], speed_up=speed_up
+    )
+    print(
+        f"\none worker {times[1]:.1f} s, two {times[2]:.1f} s: {speed_up:.2f}x "
+        f"(target {TARGET})"
+    )
+    one = hashes(tmp_path / "1")
+    two = hashes(tmp_path / "2")
     assert one == two
     assert len(one) == 24
     assert speed_up >= TARGET

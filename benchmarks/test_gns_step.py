@@ -1,6 +1,7 @@
 """A training step of the graph network: ours against the conventional one, in one run.
 
-Every side runs in a process of its own, one thread; rounds alternate, the best of each counts.
+Every side runs in a process of its own, one thread; rounds alternate, the best of each
+counts.
 """
 
 from __future__ import annotations
@@ -36,18 +37,25 @@ Found = dict[str, Any]
 
 def measure(*options: str) -> Found:
     """Run the script in a process of its own and return what it prints."""
-    found: Found = measured_apart("-W", "ignore", str(Path(__file__).with_name("gns_step.py")), *options)
+    found: Found = measured_apart(
+        "-W", "ignore", str(Path(__file__).with_name("gns_step.py")), *options
+    )
     return found
 
 
-def best_of(benchmark: BenchmarkFixture, sides: Mapping[str, tuple[str, ...]]) -> dict[str, Found]:
+def best_of(
+    benchmark: BenchmarkFixture, sides: Mapping[str, tuple[str, ...]]
+) -> dict[str, Found]:
     """Run the sides in turns and keep each one's fastest step and smallest peak."""
     best: dict[str, Found] = {}
 
     def one_round() -> None:
         for name, options in sides.items():
             found = measure(*options)
-            best[name] = {key: min(value, best.get(name, found)[key]) for key, value in found.items()}
+            best[name] = {
+                key: min(value, best.get(name, found)[key])
+                for key, value in found.items()
+            }
 
     best_seconds(benchmark, one_round, rounds=ROUNDS)
     benchmark.extra_info.update(best)
@@ -55,25 +63,37 @@ def best_of(benchmark: BenchmarkFixture, sides: Mapping[str, tuple[str, ...]]) -
 
 
 def test_full_step(benchmark: BenchmarkFixture) -> None:
-    """8192 particles, latent 128, 10 layers: float32 in 4.2 s and 2.4 GB, bfloat16 in 1.5 s, of one core."""
+    """8192 particles, latent 128, 10 layers: float32 in 4.2 s and 2.4 GB, bfloat16 in
+    1.5 s, of one core.
+    """
     best = best_of(benchmark, SIDES)
     print(f"\nGNS, 8192 particles, {best['float32']['edges']} edges, one core")
     for name, found in best.items():
         base = best[name.partition(",")[0]]["processor_seconds"]
         print(
-            f"{name:32s} {found['processor_seconds']:6.2f} s {found['peak_bytes'] / 1e9:5.2f} GB"
+            f"{name:32s} {found['processor_seconds']:6.2f} s "
+            f"{found['peak_bytes'] / 1e9:5.2f} GB"
             f"  {found['processor_seconds'] / base:5.2f}x ours"
         )
     seconds = {precision: best[precision]["processor_seconds"] for precision in SECONDS}
-    print(f"bfloat16 is {seconds['float32'] / seconds['bfloat16']:.1f}x faster than float32")
+    print(
+        f"bfloat16 is {seconds['float32'] / seconds['bfloat16']:.1f}x faster "
+        f"than float32"
+    )
     assert best["float32"]["peak_bytes"] <= BYTES
     for precision, target in SECONDS.items():
         assert seconds[precision] <= target
 
 
 def test_operators_at_mini(benchmark: BenchmarkFixture) -> None:
-    """A training step of each operator as the mini recipes have it, plain, in bfloat16, and compiled."""
-    kinds = {"float32": (), "bfloat16": ("--precision", "bfloat16"), "compiled": ("--compiled",)}
+    """A training step of each operator as the mini recipes have it, plain, in bfloat16,
+    and compiled.
+    """
+    kinds = {
+        "float32": (),
+        "bfloat16": ("--precision", "bfloat16"),
+        "compiled": ("--compiled",),
+    }
     sides = {
         f"{operator} {kind}": ("--operator", operator, *options, *MINI)
         for operator in OPERATORS
@@ -81,10 +101,19 @@ def test_operators_at_mini(benchmark: BenchmarkFixture) -> None:
     }
     best = best_of(benchmark, sides)
     gains = []
-    print(f"\n{'operator':14s} " + " ".join(f"{kind:>9s}" for kind in kinds) + "  gain parameters")
+    print(
+        f"\n{'operator':14s} "
+        + " ".join(f"{kind:>9s}" for kind in kinds)
+        + "  gain parameters"
+    )
     for operator in OPERATORS:
-        seconds = {kind: best[f"{operator} {kind}"]["processor_seconds"] for kind in kinds}
+        seconds = {
+            kind: best[f"{operator} {kind}"]["processor_seconds"] for kind in kinds
+        }
         gains.append(seconds["float32"] / seconds["compiled"])
         times = " ".join(f"{value:9.3f}" for value in seconds.values())
-        print(f"{operator:14s} {times} {gains[-1]:5.2f} {best[f'{operator} float32']['parameters']:10d}")
+        print(
+            f"{operator:14s} {times} {gains[-1]:5.2f} "
+            f"{best[f'{operator} float32']['parameters']:10d}"
+        )
     assert math.prod(gains) ** (1 / len(gains)) >= GAIN

@@ -13,7 +13,8 @@ from timing import best_seconds
 from lagbench.data import checksums
 
 TARGET = 1e9
-FRAMES, PARTICLES = 600, 8192
+FRAMES = 600
+PARTICLES = 8192
 
 Frames = NDArray[np.float32]
 
@@ -27,7 +28,9 @@ def frames() -> Frames:
 def stream(frames: Frames) -> str:
     """Hash frame by frame, as the writer does."""
     hasher = checksums.ContentHasher({"split": "cavity"})
-    hasher.declare("position", frames.dtype, ("frame", "particle", "space"), frames.shape)
+    hasher.declare(
+        "position", frames.dtype, ("frame", "particle", "space"), frames.shape
+    )
     for frame in frames:
         hasher.update("position", frame)
     return hasher.hexdigest()
@@ -35,7 +38,9 @@ def stream(frames: Frames) -> str:
 
 def test_content_hash(benchmark: BenchmarkFixture, frames: Frames) -> None:
     """At least 1 GB/s, printed beside the bare SHA-256 of the same bytes."""
-    rate = frames.nbytes / best_seconds(benchmark, lambda: stream(frames), rounds=5, warmup_rounds=1)
+    rate = frames.nbytes / best_seconds(
+        benchmark, lambda: stream(frames), rounds=5, warmup_rounds=1
+    )
     benchmark.extra_info["bytes_per_second"] = rate
     print(f"\ncontent hash: {rate / 1e9:.2f} GB/s (target {TARGET / 1e9:.0f})")
     assert rate >= TARGET
@@ -43,5 +48,10 @@ def test_content_hash(benchmark: BenchmarkFixture, frames: Frames) -> None:
 
 def test_bare_sha256(benchmark: BenchmarkFixture, frames: Frames) -> None:
     """The floor: SHA-256 of the bytes without looking at a value."""
-    bare = best_seconds(benchmark, lambda: hashlib.sha256(frames.data).digest(), rounds=5, warmup_rounds=1)
+    bare = best_seconds(
+        benchmark,
+        lambda: hashlib.sha256(frames.data).digest(),
+        rounds=5,
+        warmup_rounds=1,
+    )
     print(f"\nbare SHA-256: {frames.nbytes / bare / 1e9:.2f} GB/s")

@@ -2,10 +2,10 @@
 
     OMP_NUM_THREADS=1 pytest benchmarks/test_radius_graph.py -s
 
-All search the same particles (a disordered lattice in the cavity, radius 0.015, about seven
-neighbours each) and must find as many edges. PyTorch computes all distances at once; SciPy's
-cKDTree and scikit-learn, where it is installed, get float64. ``LAGBENCH_BENCH_DEVICE=cuda`` times
-the search on an NVIDIA GPU too.
+All search the same particles (a disordered lattice in the cavity, radius 0.015, about
+seven neighbours each) and must find as many edges. PyTorch computes all distances at
+once; SciPy's cKDTree and scikit-learn, where it is installed, get float64.
+``LAGBENCH_BENCH_DEVICE=cuda`` times the search on an NVIDIA GPU too.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from lagbench.baselines.graph import radius_graph
 TARGET = 3e-3
 """Target on one core [s]."""
 
-PARTICLES, RADIUS = 8192, 0.015
+PARTICLES = 8192
+RADIUS = 0.015
 
 
 @pytest.fixture(scope="module")
@@ -34,20 +35,28 @@ def position() -> Tensor:
     """Particles of the cavity [length], shape [particle, 2]."""
     rng = np.random.Generator(np.random.PCG64(0))
     side = int(np.ceil(np.sqrt(PARTICLES)))
-    lattice = np.stack(np.meshgrid(*[np.arange(side) + 0.5] * 2), axis=-1).reshape(-1, 2)[:PARTICLES]
+    lattice = np.stack(np.meshgrid(*[np.arange(side) + 0.5] * 2), axis=-1).reshape(
+        -1, 2
+    )[:PARTICLES]
     x = 0.0625 + 0.875 * (lattice + rng.normal(0.0, 0.3, (PARTICLES, 2))) / side
     return torch.from_numpy(x.astype(np.float32))
 
 
 def brute_force(position: Tensor) -> Tensor:
     """Compute all distances in float64 in PyTorch."""
-    near = torch.cdist(position.double(), position.double(), compute_mode="donot_use_mm_for_euclid_dist")
+    near = torch.cdist(
+        position.double(),
+        position.double(),
+        compute_mode="donot_use_mm_for_euclid_dist",
+    )
     return (near <= RADIUS).fill_diagonal_(False).nonzero().T
 
 
 def tree(position: Tensor) -> Tensor:
     """Query SciPy's tree for pairs and write each in both directions, unsorted."""
-    found = cKDTree(position.numpy().astype(np.float64), compact_nodes=False, balanced_tree=False)
+    found = cKDTree(
+        position.numpy().astype(np.float64), compact_nodes=False, balanced_tree=False
+    )
     pairs = found.query_pairs(RADIUS, output_type="ndarray")
     return torch.from_numpy(np.concatenate([pairs, pairs[:, ::-1]]).T)
 
@@ -56,29 +65,44 @@ def scikit_learn(position: Tensor) -> Tensor:
     """Query scikit-learn's neighbours graph."""
     neighbours = pytest.importorskip("sklearn.neighbors")
     x = position.numpy().astype(np.float64)
-    graph = neighbours.radius_neighbors_graph(x, RADIUS, algorithm="kd_tree", include_self=False)
+    graph = neighbours.radius_neighbors_graph(
+        x, RADIUS, algorithm="kd_tree", include_self=False
+    )
     return torch.from_numpy(np.stack(graph.nonzero()))
 
 
 def test_radius_graph(benchmark: BenchmarkFixture, position: Tensor) -> None:
     """At most 3 ms for 8192 particles on one core."""
-    seconds = best_seconds(benchmark, lambda: radius_graph(position, RADIUS), rounds=50, warmup_rounds=3)
+    seconds = best_seconds(
+        benchmark, lambda: radius_graph(position, RADIUS), rounds=50, warmup_rounds=3
+    )
     edges = radius_graph(position, RADIUS).shape[1]
-    print(f"\nours: {seconds * 1e3:.2f} ms, {edges} edges (target {TARGET * 1e3:.0f} ms)")
+    print(
+        f"\nours: {seconds * 1e3:.2f} ms, {edges} edges (target {TARGET * 1e3:.0f} ms)"
+    )
     assert seconds <= TARGET
 
 
-@pytest.mark.parametrize(("search", "rounds"), [(tree, 20), (scikit_learn, 5), (brute_force, 3)])
+@pytest.mark.parametrize(
+    ("search", "rounds"), [(tree, 20), (scikit_learn, 5), (brute_force, 3)]
+)
 def test_others(
-    benchmark: BenchmarkFixture, position: Tensor, search: Callable[[Tensor], Tensor], rounds: int
+    benchmark: BenchmarkFixture,
+    position: Tensor,
+    search: Callable[[Tensor], Tensor],
+    rounds: int,
 ) -> None:
     """The others find as many edges."""
-    seconds = best_seconds(benchmark, lambda: search(position), rounds=rounds, warmup_rounds=1)
+    seconds = best_seconds(
+        benchmark, lambda: search(position), rounds=rounds, warmup_rounds=1
+    )
     print(f"\n{search.__name__}: {seconds * 1e3:.2f} ms")
     assert search(position).shape == radius_graph(position, RADIUS).shape
 
 
-@pytest.mark.skipif("LAGBENCH_BENCH_DEVICE" not in os.environ, reason="LAGBENCH_BENCH_DEVICE is not set")
+@pytest.mark.skipif(
+    "LAGBENCH_BENCH_DEVICE" not in os.environ, reason="LAGBENCH_BENCH_DEVICE is not set"
+)
 def test_on_device(benchmark: BenchmarkFixture, position: Tensor) -> None:
     """The search in torch finds the same edges on a GPU."""
     device = os.environ["LAGBENCH_BENCH_DEVICE"]

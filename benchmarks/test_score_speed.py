@@ -1,12 +1,13 @@
-"""How long and in what memory a full cavity submission is scored, beside a naive scorer.
+"""How long and in what memory a full cavity submission is scored, beside a naive
+scorer.
 
     OMP_NUM_THREADS=1 pytest benchmarks/test_score_speed.py -s
 
-Ours runs in a fresh process as ``lagbench score`` would: twenty scenarios, 90 or 594 frames, all
-metrics but Sinkhorn, one worker and two. The naive one scores two scenarios' first frames
-of the same files in the same run; its time is scaled to all frames. It is plain, as one would write
-it after the thesis: whole arrays, velocities by SciPy griddata, cubic, on the 40x40 grid, five metrics
-against our sixty.
+Ours runs in a fresh process as ``lagbench score`` would: twenty scenarios, 90 or 594
+frames, all metrics but Sinkhorn, one worker and two. The naive one scores two
+scenarios' first frames of the same files in the same run; its time is scaled to all
+frames. It is plain, as one would write it after the thesis: whole arrays, velocities by
+SciPy griddata, cubic, on the 40x40 grid, five metrics against our sixty.
 ``scoring_against.py`` is the comparison with an earlier scorer.
 """
 
@@ -62,7 +63,9 @@ def run_ours(folder: Path, workers: int) -> dict[str, float]:
     return dict(measured_apart("-c", CHILD, str(folder), str(workers)))
 
 
-def naive_scores(truth: Path, predictions: Path, row: int, first: int, frames: int) -> dict[str, float]:
+def naive_scores(
+    truth: Path, predictions: Path, row: int, first: int, frames: int
+) -> dict[str, float]:
     """Return five metrics of one scenario, means over frames.
 
     Args:
@@ -77,14 +80,21 @@ def naive_scores(truth: Path, predictions: Path, row: int, first: int, frames: i
     with h5py.File(predictions) as file:
         guess = np.asarray(file["position"][row, :frames], np.float64)
     guess = np.concatenate([true[:1], guess])
-    found = [_frame(true[f - 1], true[f], guess[f - 1], guess[f]) for f in range(1, frames + 1)]
+    found = [
+        _frame(true[f - 1], true[f], guess[f - 1], guess[f])
+        for f in range(1, frames + 1)
+    ]
     return {name: float(np.mean([one[name] for one in found])) for name in found[0]}
 
 
-def _frame(true_before: Floats, true: Floats, guess_before: Floats, guess: Floats) -> dict[str, float]:
-    t, p = _vorticity(true, true - true_before), _vorticity(guess, guess - guess_before)
+def _frame(
+    true_before: Floats, true: Floats, guess_before: Floats, guess: Floats
+) -> dict[str, float]:
+    t = _vorticity(true, true - true_before)
+    p = _vorticity(guess, guess - guess_before)
     known = np.isfinite(t) & np.isfinite(p)
-    t, p = t[known], p[known]
+    t = t[known]
+    p = p[known]
     return {
         "position_mse": float(np.mean((guess - true) ** 2)),
         "vorticity_mse": float(np.mean((p - t) ** 2)),
@@ -98,7 +108,9 @@ def _vorticity(x: Floats, u: Floats) -> Floats:
     axis = (np.arange(CELLS) + 0.5) / CELLS
     nodes = tuple(np.meshgrid(axis, axis, indexing="ij"))
     field = griddata(x, u, nodes, method="cubic")
-    return np.gradient(field[..., 1], 1 / CELLS, axis=0) - np.gradient(field[..., 0], 1 / CELLS, axis=1)
+    return np.gradient(field[..., 1], 1 / CELLS, axis=0) - np.gradient(
+        field[..., 0], 1 / CELLS, axis=1
+    )
 
 
 @pytest.fixture(scope="module")
@@ -110,25 +122,33 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> ScoreData:
 def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     """All metrics take a tenth of the time of five naive ones, or less."""
     folder = data.predictions.parent
-    one, two = run_ours(folder, 1), run_ours(folder, 2)
+    one = run_ours(folder, 1)
+    two = run_ours(folder, 2)
     task = load_scored_task(data.registry.size("cavity", "full"), data.root)
-    start, used = time.perf_counter(), time.process_time()
+    start = time.perf_counter()
+    used = time.process_time()
     for row, scenario in enumerate(task.scenarios[:2]):
         naive_scores(task.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)
     frames = len(task.scenarios) * 90
     scale = frames / (2 * NAIVE_FRAMES)
-    naive = {"wall": scale * (time.perf_counter() - start), "cpu": scale * (time.process_time() - used)}
+    naive = {
+        "wall": scale * (time.perf_counter() - start),
+        "cpu": scale * (time.process_time() - used),
+    }
     for name, found in (("one worker", one), ("two workers", two)):
         print(
-            f"\n{name}: {found['wall']:.2f} s, {found['cpu']:.2f} CPU-s, {found['memory'] / 1e6:.0f} MB,"
+            f"\n{name}: {found['wall']:.2f} s, {found['cpu']:.2f} CPU-s, "
+            f"{found['memory'] / 1e6:.0f} MB,"
             f" {found['metrics']} metrics, scores.nc {found['bytes'] / 1e3:.0f} kB"
             f" (targets {MEMORY / 1e6:.0f} MB, 1 MB)"
         )
-    # Idle BLAS threads count as processor time of the naive side, other processes as its wall time.
+    # Idle BLAS threads count as processor time of the naive side, other processes as
+    # its wall time.
     ratio = min(naive["cpu"], naive["wall"]) / one["cpu"]
     print(
         f"naive, 5 metrics: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s,"
-        f" extrapolated from {2 * NAIVE_FRAMES} of {frames} frames: {ratio:.0f} times ours"
+        f" extrapolated from {2 * NAIVE_FRAMES} of {frames} frames: {ratio:.0f} "
+        f"times ours"
     )
     assert ratio >= 10
     assert max(one["memory"], two["memory"]) <= MEMORY
@@ -141,6 +161,7 @@ def test_memory_does_not_grow_with_the_horizon(data: ScoreData, tmp_path: Path) 
     long = run_ours(make_score_data(tmp_path, horizon=594).predictions.parent, 1)
     print(
         f"\n90 frames: {short['memory'] / 1e6:.0f} MB, {short['cpu']:.1f} CPU-s;"
-        f" 594 frames: {long['memory'] / 1e6:.0f} MB, {long['cpu']:.1f} CPU-s, {long['wall']:.1f} s"
+        f" 594 frames: {long['memory'] / 1e6:.0f} MB, {long['cpu']:.1f} CPU-s, "
+        f"{long['wall']:.1f} s"
     )
     assert long["memory"] <= min(MEMORY, 1.15 * short["memory"])

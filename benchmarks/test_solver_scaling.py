@@ -1,6 +1,7 @@
 """Solver time over the quality factor q: fixed substeps, and the schedule of Table 3.1.
 
-q = 1 to 4 on one CPU core; ``LAGBENCH_BENCH_DEVICE=cuda`` runs q = 1 to 9 on an NVIDIA GPU.
+q = 1 to 4 on one CPU core; ``LAGBENCH_BENCH_DEVICE=cuda`` runs q = 1 to 9 on an NVIDIA
+GPU.
 """
 
 from __future__ import annotations
@@ -27,10 +28,16 @@ def found() -> list[table_3_1.Measurement]:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"q{row.q}")
-def test_row(benchmark: BenchmarkFixture, row: table_3_1.Row, found: list[table_3_1.Measurement]) -> None:
+def test_row(
+    benchmark: BenchmarkFixture, row: table_3_1.Row, found: list[table_3_1.Measurement]
+) -> None:
     """Time frames of the row's own substeps, and substeps in runs of 20."""
     rounds: list[table_3_1.Measurement] = []
-    best_seconds(benchmark, lambda: rounds.append(table_3_1.measure(row, device=DEVICE, repeats=3)), rounds=1)
+    best_seconds(
+        benchmark,
+        lambda: rounds.append(table_3_1.measure(row, device=DEVICE, repeats=3)),
+        rounds=1,
+    )
     measured = rounds[0]
     found.append(measured)
     benchmark.extra_info.update(
@@ -53,7 +60,9 @@ def test_exponents(found: list[table_3_1.Measurement], tmp_path: Path) -> None:
 
 
 def test_the_thesis_exponents_follow_from_its_table() -> None:
-    """Its text gives 1.41 for t/frame against q^2; against particles 1.35, per substep 0.83."""
+    """Its text gives 1.41 for t/frame against q^2; against particles 1.35, per substep
+    0.83.
+    """
     thesis = table_3_1.of_thesis()
     assert thesis.frame_q2 == pytest.approx(1.41, abs=0.01)
     assert thesis.frame_particles == pytest.approx(1.35, abs=0.01)

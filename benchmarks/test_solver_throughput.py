@@ -1,10 +1,11 @@
 """Our solver against the conventional Taichi formulation, per core, in one run.
 
-Taichi starts once per process, with fast math or without, so each side runs in a process of its
-own, pinned to its cores; rounds alternate, and the best of each side counts. The conventional code
-runs on one core and, as Taichi would by itself, on two; our solver uses cores by running scenarios
-side by side, so its rate per core is that of one. Rates depend on the machine, whose model is
-printed; asserted is only a ratio, of processor time on one core, which other work disturbs least.
+Taichi starts once per process, with fast math or without, so each side runs in a
+process of its own, pinned to its cores; rounds alternate, and the best of each side
+counts. The conventional code runs on one core and, as Taichi would by itself, on two;
+our solver uses cores by running scenarios side by side, so its rate per core is that of
+one. Rates depend on the machine, whose model is printed; asserted is only a ratio, of
+processor time on one core, which other work disturbs least.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ CORES = sorted(os.sched_getaffinity(0))
 
 
 def measure(script: str, cores: int) -> dict[str, Any]:
-    """Run a script on the first cores that this process may use and return what it prints."""
+    """Run a script on the first cores that this process may use and return what it
+    prints.
+    """
     options = ["--substeps", str(SUBSTEPS[script]), "--repeats", "2"]
     if script == "conventional.py":
         options += ["--threads", str(cores)]
@@ -38,32 +41,50 @@ def measure(script: str, cores: int) -> dict[str, Any]:
 def test_throughput_per_core(benchmark: BenchmarkFixture) -> None:
     """On one core, at least 4 times the conventional code by processor time."""
     sides = {"ours, 1 core": ("whole_frame.py", 1)}
-    sides |= {f"conventional, {n} core(s)": ("conventional.py", n) for n in (1, 2) if n <= len(CORES)}
+    sides |= {
+        f"conventional, {n} core(s)": ("conventional.py", n)
+        for n in (1, 2)
+        if n <= len(CORES)
+    }
     best = {name: {"per_core": 0.0, "per_processor_second": 0.0} for name in sides}
 
     def one_round() -> None:
         for name, (script, cores) in sides.items():
             found = measure(script, cores)
-            best[name] = {key: max(rate, found[key]) for key, rate in best[name].items()}
+            best[name] = {
+                key: max(rate, found[key]) for key, rate in best[name].items()
+            }
 
     best_seconds(benchmark, one_round, rounds=ROUNDS)
     ours = best["ours, 1 core"]
     print(f"\n{hardware()['processor']}; M particle-substeps/s")
     for name, rates in best.items():
-        core, second = rates["per_core"], rates["per_processor_second"]
+        core = rates["per_core"]
+        second = rates["per_processor_second"]
         print(
-            f"{name}: {core / 1e6:.2f} per core (ours {ours['per_core'] / core:.1f}x), by processor "
-            f"time {second / 1e6:.2f} (ours {ours['per_processor_second'] / second:.1f}x)"
+            f"{name}: {core / 1e6:.2f} per core (ours "
+            f"{ours['per_core'] / core:.1f}x), by processor "
+            f"time {second / 1e6:.2f} (ours "
+            f"{ours['per_processor_second'] / second:.1f}x)"
         )
-    ratio = ours["per_processor_second"] / best["conventional, 1 core(s)"]["per_processor_second"]
-    benchmark.extra_info.update(sides=best, ratio=ratio, machine=hardware()["processor"])
+    ratio = (
+        ours["per_processor_second"]
+        / best["conventional, 1 core(s)"]["per_processor_second"]
+    )
+    benchmark.extra_info.update(
+        sides=best, ratio=ratio, machine=hardware()["processor"]
+    )
     assert ratio >= TARGET_RATIO
 
 
 def test_both_formulations_simulate_the_same_flow() -> None:
-    """After 1001 substeps their kinetic energies agree to 1e-3: the yardstick does the same work."""
+    """After 1001 substeps their kinetic energies agree to 1e-3: the yardstick does the
+    same work.
+    """
     options = ["--substeps", "1000", "--repeats", "1"]
     energy = []
     for script in SUBSTEPS:
-        energy.append(measured_apart(str(Path(__file__).with_name(script)), *options)["energy"])
+        energy.append(
+            measured_apart(str(Path(__file__).with_name(script)), *options)["energy"]
+        )
     assert energy[0] == pytest.approx(energy[1], rel=1e-3)

@@ -1,9 +1,9 @@
 """VAR(1) against statsmodels at 1,000 dimensions, in one run; the coefficients agree.
 
 As many rows per dimension as in the thesis's own case: 70 % of 19,200 frames for 10,000
-dimensions. Both sides use as many threads as their linear algebra takes; rounds alternate and
-the best of each side counts. 10,000 dimensions on real data, with their memory, are measured by
-``python -m lagbench.baselines.reproduce.var_protocol``.
+dimensions. Both sides use as many threads as their linear algebra takes; rounds
+alternate and the best of each side counts. 10,000 dimensions on real data, with their
+memory, are measured by ``python -m lagbench.baselines.reproduce.var_protocol``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ TARGET_RATIO = 10.0
 LEAST_RATIO = 2.0
 """What must hold: both sides are dense LAPACK on the same rows."""
 
-DIMENSIONS, FRAMES = 1000, 1344
+DIMENSIONS = 1000
+FRAMES = 1344
 ROUNDS = 3
 
 
@@ -32,18 +33,25 @@ ROUNDS = 3
 def states() -> NDArray[np.float32]:
     """Return correlated noise, shape [frame, feature]."""
     rng = np.random.default_rng(0)
-    mixed = rng.normal(size=(FRAMES, DIMENSIONS)) @ rng.normal(size=(DIMENSIONS, DIMENSIONS))
+    mixed = rng.normal(size=(FRAMES, DIMENSIONS)) @ rng.normal(
+        size=(DIMENSIONS, DIMENSIONS)
+    )
     return np.asarray(mixed / np.sqrt(DIMENSIONS), np.float32)
 
 
-def test_var_of_a_thousand_dimensions(benchmark: BenchmarkFixture, states: NDArray[np.float32]) -> None:
-    """Faster than statsmodels, with its coefficients to 1e-6; printed beside the target."""
+def test_var_of_a_thousand_dimensions(
+    benchmark: BenchmarkFixture, states: NDArray[np.float32]
+) -> None:
+    """Faster than statsmodels, with its coefficients to 1e-6; printed beside the
+    target.
+    """
     double = states.astype(np.float64)
     sides: dict[str, Callable[[], NDArray[np.float64]]] = {
         "lagbench": lambda: solve(LaggedRows([states], lags=1)).coefficients,
         "statsmodels": lambda: StatsmodelsVAR(double).fit(1, trend="c").params,
     }
-    found, best = {}, dict.fromkeys(sides, np.inf)
+    found = {}
+    best = dict.fromkeys(sides, np.inf)
 
     def one_round() -> None:
         for name, fit in sides.items():
@@ -57,8 +65,10 @@ def test_var_of_a_thousand_dimensions(benchmark: BenchmarkFixture, states: NDArr
     ratio = best["statsmodels"] / best["lagbench"]
     benchmark.extra_info.update(best, ratio=ratio, relative_difference=float(relative))
     print(
-        f"\nVAR(1), {DIMENSIONS} dimensions, {FRAMES} frames: lagbench {best['lagbench']:.2f} s, "
-        f"statsmodels {best['statsmodels']:.2f} s, ratio {ratio:.1f} (target {TARGET_RATIO:.0f}); "
+        f"\nVAR(1), {DIMENSIONS} dimensions, {FRAMES} frames: lagbench "
+        f"{best['lagbench']:.2f} s, "
+        f"statsmodels {best['statsmodels']:.2f} s, ratio {ratio:.1f} (target "
+        f"{TARGET_RATIO:.0f}); "
         f"relative difference of the coefficients {relative:.1e}"
     )
     assert relative <= 1e-6

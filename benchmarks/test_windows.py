@@ -1,12 +1,14 @@
-"""Training windows per second from files of cavity full's size, beside two conventional readers.
+"""Training windows per second from files of cavity full's size, beside two conventional
+readers.
 
     OMP_NUM_THREADS=1 pytest benchmarks/test_windows.py -s
 
-The readers do what geoelements/gns (NPZ, everything in memory) and LagrangeBench (HDF5, one group
-per trajectory, windows read when asked for) do for a window of 6 + 1 frames; all draw windows at
-random. Files are made without simulating, in seconds: each scenario is a rotation at its own speed.
-Ours is timed over whole pools of its sampler, decompression included, in one process.
-Memory is that of a fresh process that has read from twice as many scenarios.
+The readers do what geoelements/gns (NPZ, everything in memory) and LagrangeBench (HDF5,
+one group per trajectory, windows read when asked for) do for a window of 6 + 1 frames;
+all draw windows at random. Files are made without simulating, in seconds: each scenario
+is a rotation at its own speed. Ours is timed over whole pools of its sampler,
+decompression included, in one process. Memory is that of a fresh process that has read
+from twice as many scenarios.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ OTHERS = 3
 HISTORY = 6
 SEED = 0
 
-FRAMES, PARTICLES = 600, 8192
+FRAMES = 600
+PARTICLES = 8192
 """Size of one scenario of cavity full."""
 
 RADIUS = 0.43
@@ -76,7 +79,9 @@ def trajectory(scenario: int) -> Frames:
 
 
 def _rotation(scenario: int) -> Iterator[Frames]:
-    """Yield frames of a solid-body rotation of random particles: files compress as real ones do."""
+    """Yield frames of a solid-body rotation of random particles: files compress as real
+    ones do.
+    """
     rng = np.random.Generator(np.random.PCG64(scenario))
     distance = RADIUS * np.sqrt(rng.random(PARTICLES))
     angle = 2.0 * np.pi * rng.random(PARTICLES)
@@ -90,16 +95,30 @@ def write_ours(root: Path, scenarios: int) -> None:
     """Write the train subset as lagbench does, and the registry that describes it."""
     held = read_yaml(default_path())
     size = held["splits"]["cavity"]["sizes"]["full"]
-    size["subsets"] = {"train": f"0-{scenarios - 1}", "valid": f"{scenarios}", "test": f"{scenarios + 1}"}
+    size["subsets"] = {
+        "train": f"0-{scenarios - 1}",
+        "valid": f"{scenarios}",
+        "test": f"{scenarios + 1}",
+    }
     held["measured"] = {}
     path = root / "datasets.yaml"
     path.write_text(yaml.safe_dump(held))
     registry = load(path)
-    version, still = registry.split("cavity").version, np.zeros((PARTICLES, 2), np.float32)
+    version = registry.split("cavity").version
+    still = np.zeros((PARTICLES, 2), np.float32)
     for i in range(scenarios):
-        key = ScenarioKey(split="cavity", size="full", version=version, scenario=i, subset="train")
+        key = ScenarioKey(
+            split="cavity", size="full", version=version, scenario=i, subset="train"
+        )
         flow = ((position, still) for position in _rotation(i))
-        write_scenario(root, key, flow, particles=PARTICLES, frames=FRAMES, wall_velocity=np.zeros((4, 2)))
+        write_scenario(
+            root,
+            key,
+            flow,
+            particles=PARTICLES,
+            frames=FRAMES,
+            wall_velocity=np.zeros((4, 2)),
+        )
 
 
 def write_gns_npz(path: Path, scenarios: int) -> None:
@@ -109,11 +128,17 @@ def write_gns_npz(path: Path, scenarios: int) -> None:
 
 
 def write_lagrangebench_h5(path: Path, scenarios: int) -> None:
-    """Write what LagrangeBench reads: a group per trajectory, gzip in the chunks that h5py guesses."""
+    """Write what LagrangeBench reads: a group per trajectory, gzip in the chunks that
+    h5py guesses.
+    """
     with h5py.File(path, "w") as file:
         for i in range(scenarios):
-            file.create_dataset(f"{i:05d}/particle_type", data=np.zeros(PARTICLES, np.int64))
-            file.create_dataset(f"{i:05d}/position", data=trajectory(i), compression="gzip")
+            file.create_dataset(
+                f"{i:05d}/particle_type", data=np.zeros(PARTICLES, np.int64)
+            )
+            file.create_dataset(
+                f"{i:05d}/position", data=trajectory(i), compression="gzip"
+            )
 
 
 @pytest.fixture(scope="module")
@@ -126,11 +151,19 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def dataset(root: Path) -> WindowDataset:
     """Open the train subset with an empty cache."""
-    return WindowDataset("cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml"))
+    return WindowDataset(
+        "cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml")
+    )
 
 
-def rate(read: Callable[[int], object], indices: Iterator[int] | NDArray[np.int64], count: int) -> float:
-    """Return windows per second of processor time, which hardly changes on a busy machine."""
+def rate(
+    read: Callable[[int], object],
+    indices: Iterator[int] | NDArray[np.int64],
+    count: int,
+) -> float:
+    """Return windows per second of processor time, which hardly changes on a busy
+    machine.
+    """
     drawn = iter(indices)
     start = time.process_time()
     for _ in range(count):
@@ -139,29 +172,48 @@ def rate(read: Callable[[int], object], indices: Iterator[int] | NDArray[np.int6
 
 
 def test_windows_per_second(benchmark: BenchmarkFixture, root: Path) -> None:
-    """At least 1000 windows a second, each epoch in one random order, decompression included."""
+    """At least 1000 windows a second, each epoch in one random order, decompression
+    included.
+    """
     data = dataset(root)
     rates: list[float] = []
 
     def epoch() -> None:
-        rates.append(rate(data.__getitem__, iter(WindowSampler(data, seed=SEED + len(rates))), len(data)))
+        rates.append(
+            rate(
+                data.__getitem__,
+                iter(WindowSampler(data, seed=SEED + len(rates))),
+                len(data),
+            )
+        )
 
     benchmark.pedantic(epoch, rounds=2)  # type: ignore[no-untyped-call]
     fresh = dataset(root)
-    loader = DataLoader(fresh, 2, sampler=WindowSampler(fresh, seed=SEED), collate_fn=collate)
+    loader = DataLoader(
+        fresh, 2, sampler=WindowSampler(fresh, seed=SEED), collate_fn=collate
+    )
     start = time.process_time()
     batches = sum(1 for _ in loader)
     loaded = 2 * batches / (time.process_time() - start)
-    plain = rate(dataset(root).__getitem__, np.random.default_rng(SEED).integers(len(data), size=500), 500)
+    plain = rate(
+        dataset(root).__getitem__,
+        np.random.default_rng(SEED).integers(len(data), size=500),
+        500,
+    )
     print(f"\nours, sampler's order: {min(rates):.0f} windows/s (target {TARGET:.0f})")
-    print(f"ours through DataLoader and collate, batch 2: {loaded:.0f}; any order, cold cache: {plain:.0f}")
+    print(
+        f"ours through DataLoader and collate, batch 2: {loaded:.0f}; any order, cold "
+        f"cache: {plain:.0f}"
+    )
     assert min(rates) >= TARGET
 
 
 def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The public arrays are read within 10 % of the rate of the trainer's tensors."""
     tensors = dataset(root)
-    arrays = lagbench.windows("cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml"))
+    arrays = lagbench.windows(
+        "cavity", root=root, history=HISTORY, registry=load(root / "datasets.yaml")
+    )
     order = list(WindowSampler(tensors, seed=SEED))
     spent: dict[str, float] = {"tensors": 0.0, "arrays": 0.0}
     # In turns over the same windows, so that a machine that slows down slows both.
@@ -176,13 +228,20 @@ def test_public_routes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     def read(index: int) -> NDArray[np.float32]:
         scenario, frame = tensors.place(index)
-        part = lazy.position.sel(scenario=scenario).isel(frame=slice(frame, frame + tensors.length))
+        part = lazy.position.sel(scenario=scenario).isel(
+            frame=slice(frame, frame + tensors.length)
+        )
         values: NDArray[np.float32] = part.values
         return values
 
     ratio = spent["tensors"] / spent["arrays"]
-    print(f"\nlagbench.torch.WindowDataset, the trainer's: {len(order) / spent['tensors']:.0f} windows/s")
-    print(f"lagbench.windows: {len(order) / spent['arrays']:.0f}, {ratio:.2f} times that")
+    print(
+        f"\nlagbench.torch.WindowDataset, the trainer's: "
+        f"{len(order) / spent['tensors']:.0f} windows/s"
+    )
+    print(
+        f"lagbench.windows: {len(order) / spent['arrays']:.0f}, {ratio:.2f} times that"
+    )
     print(f"open_split: {rate(read, iter(order), 60):.0f}")
     assert ratio > 0.9
 
@@ -196,12 +255,17 @@ def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
         float(measured_apart("-c", CHILD, str(folder), str(count)))
         for folder, count in ((few, 4100), (root, 7000))
     ]
-    print(f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: {peaks[1] / 1e6:.0f} MB")
+    print(
+        f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: "
+        f"{peaks[1] / 1e6:.0f} MB"
+    )
     assert peaks[1] <= 1.05 * peaks[0]
 
 
 def test_npz_in_memory(tmp_path: Path) -> None:
-    """How geoelements/gns reads: whole trajectories in memory, a window is a view of them."""
+    """How geoelements/gns reads: whole trajectories in memory, a window is a view of
+    them.
+    """
     write_gns_npz(tmp_path / "train.npz", OTHERS)
     start = time.process_time()
     with np.load(tmp_path / "train.npz") as held:
@@ -214,11 +278,20 @@ def test_npz_in_memory(tmp_path: Path) -> None:
         stop = index % per + HISTORY
         position = np.transpose(frames[stop - HISTORY : stop], (1, 0, 2))
         # Their collate stacks the windows: that copy is where the bytes are touched.
-        return np.ascontiguousarray(position), np.full(len(position), 5), frames[stop].copy()
+        return (
+            np.ascontiguousarray(position),
+            np.full(len(position), 5),
+            frames[stop].copy(),
+        )
 
-    found = rate(read, np.random.default_rng(SEED).integers(OTHERS * per, size=1000), 1000)
+    found = rate(
+        read, np.random.default_rng(SEED).integers(OTHERS * per, size=1000), 1000
+    )
     size = sum(frames.nbytes for frames in trajectories)
-    print(f"\nNPZ in memory: {found:.0f} windows/s, after {loading:.1f} s to load {size / 1e6:.0f} MB")
+    print(
+        f"\nNPZ in memory: {found:.0f} windows/s, after {loading:.1f} s to load "
+        f"{size / 1e6:.0f} MB"
+    )
 
 
 def test_hdf5_of_trajectories(tmp_path: Path) -> None:
@@ -228,9 +301,14 @@ def test_hdf5_of_trajectories(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "train.h5") as file:
 
         def read(index: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-            group, first = file[f"{index // per:05d}"], index % per
-            position = group["position"][first : first + HISTORY + 1].transpose((1, 0, 2))
+            group = file[f"{index // per:05d}"]
+            first = index % per
+            position = group["position"][first : first + HISTORY + 1].transpose(
+                (1, 0, 2)
+            )
             return position, group["particle_type"][:]
 
-        found = rate(read, np.random.default_rng(SEED).integers(OTHERS * per, size=200), 200)
+        found = rate(
+            read, np.random.default_rng(SEED).integers(OTHERS * per, size=200), 200
+        )
     print(f"\nHDF5 of trajectories: {found:.0f} windows/s")

@@ -15,17 +15,25 @@ __all__ = ["best_seconds", "measured_apart"]
 
 
 def best_seconds(
-    benchmark: BenchmarkFixture, call: Callable[[], object], *, rounds: int, warmup_rounds: int = 0
+    benchmark: BenchmarkFixture,
+    call: Callable[[], object],
+    *,
+    rounds: int,
+    warmup_rounds: int = 0,
 ) -> float:
     """Run a call some rounds under pytest-benchmark and return the shortest [s]."""
     # Calls of the pedantic mode are not annotated.
     benchmark.pedantic(call, rounds=rounds, warmup_rounds=warmup_rounds)  # type: ignore[no-untyped-call]
     # None only with --benchmark-disable, when there is nothing to report.
-    return float(benchmark.stats.stats.min) if benchmark.stats is not None else float("nan")
+    if benchmark.stats is not None:
+        return float(benchmark.stats.stats.min)
+    return float("nan")
 
 
 def measured_apart(*arguments: str, cores: Collection[int] = ()) -> Any:  # noqa: ANN401 (plain values)
-    """Run Python in a process of its own, on some cores where they are named; return the JSON at its end."""
+    """Run Python in a process of its own, on some cores where they are named; return
+    the JSON at its end.
+    """
     done = subprocess.run(
         [sys.executable, *arguments],
         preexec_fn=(lambda: os.sched_setaffinity(0, cores)) if cores else None,

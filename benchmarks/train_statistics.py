@@ -3,8 +3,9 @@
     python benchmarks/train_statistics.py [--size full]
 
 Per-frame velocity x(f) - x(f-1) and acceleration (second difference), mean and standard
-deviation over all train scenarios, from datasets.yaml. Table 5.3 is read as the cavity, Table
-5.1 as curl noise (design section 12); the thesis gives none for the free-surface splits.
+deviation over all train scenarios, from datasets.yaml. Table 5.3 is read as the cavity,
+Table 5.1 as curl noise (design section 12); the thesis gives none for the free-surface
+splits.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ from lagbench.data.registry import load
 
 def main() -> int:
     """Print one Markdown table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--size", default="full")
     name = parser.parse_args().size
     registry = load()
@@ -26,9 +29,14 @@ def main() -> int:
     for split in registry.splits:
         measured = registry.size(split, name).measured
         for statistic, values in measured.statistics.items() if measured else ():
-            thesis = STATISTICS.get(split, {}).get(statistic) if name == "full" else None
+            if name == "full":
+                thesis = STATISTICS.get(split, {}).get(statistic)
+            else:
+                thesis = None
             cells = [*values, *(thesis or ("", ""))]
-            words = (f"{cell:.4g}" if isinstance(cell, float) else cell for cell in cells)
+            words = (
+                f"{cell:.4g}" if isinstance(cell, float) else cell for cell in cells
+            )
             print(f"| {split} | {statistic.replace('_', ' ')} | {' | '.join(words)} |")
     return 0
 

@@ -1,9 +1,11 @@
-"""Our solver on the cavity that ``conventional.py`` runs: one core, strict, fixed-point sums.
+"""Our solver on the cavity that ``conventional.py`` runs: one core, strict, fixed-point
+sums.
 
     python benchmarks/whole_frame.py --grid 40 --substeps 2000
 
-prints one JSON object: particle-substeps per second of wall time and core, and per second of
-processor time (best of the repeats), and the mean kinetic energy per particle at the end.
+prints one JSON object: particle-substeps per second of wall time and core, and per
+second of processor time (best of the repeats), and the mean kinetic energy per particle
+at the end.
 """
 
 from __future__ import annotations
@@ -15,7 +17,12 @@ import time
 import numpy as np
 
 from lagbench.generators import solver
-from lagbench.generators.acceptance.experiment import Case, initial_state, plan, solver_parameters
+from lagbench.generators.acceptance.experiment import (
+    Case,
+    initial_state,
+    plan,
+    solver_parameters,
+)
 
 
 def main() -> int:
@@ -27,11 +34,16 @@ def main() -> int:
     parser.add_argument("--substeps", type=int, default=2000)
     parser.add_argument("--repeats", type=int, default=3)
     given = parser.parse_args()
-    experiment = plan(Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps)
-    running = solver.build(solver_parameters(experiment), device=solver.Device.CPU, threads=1)
+    experiment = plan(
+        Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps
+    )
+    running = solver.build(
+        solver_parameters(experiment), device=solver.Device.CPU, threads=1
+    )
     running.load([initial_state(experiment)])
     running.advance(1)
-    wall, processor = [], []
+    wall = []
+    processor = []
     for _ in range(given.repeats):
         start = time.perf_counter(), time.process_time()
         running.advance(given.substeps)

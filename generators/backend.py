@@ -1,7 +1,8 @@
 """Taichi's runtime: started once per process, with strict arithmetic.
 
 Strict means: no fused multiply-add, no reassociation (``fast_math=False``), float32 and
-int32 wherever a kernel does not say otherwise. Everything that makes fields starts here.
+int32 wherever a kernel does not say otherwise. Everything that makes fields starts
+here.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from lagbench.work.machine import available_cores
 
 from .solver import Device
 
-# Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the network.
+# Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the
+# network.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 ti = require("taichi", extra="generate")
@@ -33,13 +35,16 @@ HARMLESS = frozenset(
         "TI_VISIBLE_DEVICE",
     }
 )
-"""Variables of Taichi's that a user may set: they choose memory, places and cards, never arithmetic."""
+"""Variables of Taichi's that a user may set: they choose memory, places and cards,
+never arithmetic.
+"""
 
 _started: list[tuple[bool, int]] = []
 
 
 def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> int:
-    """Start Taichi for a device unless it runs, and return the threads for parallel loops.
+    """Start Taichi for a device unless it runs, and return the threads for parallel
+    loops.
 
     The first call in a process fixes the size of the thread pool; idle threads sleep.
     """
@@ -53,9 +58,14 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         )
     on_gpu = device is Device.CUDA
     if not _started:
-        size, greeting = max(2, available_cores(), threads or 0), io.StringIO()
+        size = max(2, available_cores(), threads or 0)
+        greeting = io.StringIO()
         # Others would change device, precision or optimisation behind our back.
-        names = [name for name in os.environ if name.startswith("TI_") and name not in HARMLESS]
+        names = [
+            name
+            for name in os.environ
+            if name.startswith("TI_") and name not in HARMLESS
+        ]
         hidden = {name: os.environ.pop(name) for name in names}
         try:
             with contextlib.redirect_stdout(greeting):
@@ -74,7 +84,9 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
                 "Taichi cannot use this device",
                 where="cuda" if on_gpu else "cpu",
                 got=error,
-                fix="use --device cpu: there is no NVIDIA GPU, or no driver of one" if on_gpu else None,
+                fix="use --device cpu: there is no NVIDIA GPU, or no driver of one"
+                if on_gpu
+                else None,
             ) from error
         finally:
             os.environ.update(hidden)
@@ -84,7 +96,8 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         raise UsageError(
             "Taichi runs already with another device or fewer threads",
             where=f"device {device.value}, threads {threads}",
-            expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most {pool} threads",
+            expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most "
+            f"{pool} threads",
             fix="use another process",
         )
     return threads or min(pool, available_cores())

@@ -1,7 +1,8 @@
 """Scenarios of one size that a solver advances together, from frame to frame.
 
-Every scenario starts recording after frames of its own, so a batch advances from one frame
-to the next, whichever scenario it belongs to. On ``Device.CPU`` a batch is one scenario.
+Every scenario starts recording after frames of its own, so a batch advances from one
+frame to the next, whichever scenario it belongs to. On ``Device.CPU`` a batch is one
+scenario.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from .draws import generator
 from .solver import Device, Health, Solver, build
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
-STRIDE = 4_000_000  # particle-substeps between two reports: about a tenth of a second on a core
+# particle-substeps between two reports: about a tenth of a second on a core
+STRIDE = 4_000_000
 
 Report = Callable[[int], None]
 """Called with the substeps done since the last call, summed over scenarios."""
@@ -42,22 +44,35 @@ class SimulationJob:
 
 
 def draw(size: Size, scenario: int) -> InitialState:
-    """Return a scenario before its first substep; what cannot be drawn is a WorkFailedError."""
-    rng, module = generator(size.split, size.name, size.major, scenario), split_module(size)
+    """Return a scenario before its first substep; what cannot be drawn is a
+    WorkFailedError.
+    """
+    rng = generator(size.split, size.name, size.major, scenario)
+    module = split_module(size)
     try:
         with blamed_on_parameters(size, f"drawing scenario {scenario}"):
             state: object = module.initial_state(size, scenario, rng)
     except WorkFailedError as error:
-        raise _placed(error, f"{size.split} {size.name}, scenario {scenario}") from error
+        raise _placed(
+            error, f"{size.split} {size.name}, scenario {scenario}"
+        ) from error
     if not isinstance(state, InitialState):
-        where, got = f"{size.generator}.initial_state", type(state).__name__
-        raise UsageError("a split drew no initial state", where=where, expected="an InitialState", got=got)
+        where = f"{size.generator}.initial_state"
+        got = type(state).__name__
+        raise UsageError(
+            "a split drew no initial state",
+            where=where,
+            expected="an InitialState",
+            got=got,
+        )
     return state
 
 
 def _placed(error: WorkFailedError, where: str) -> WorkFailedError:
     """Return an error that says where it happened."""
-    return WorkFailedError(error.what, where=where, expected=error.expected, got=error.got, fix=error.fix)
+    return WorkFailedError(
+        error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
+    )
 
 
 def substeps_of(size: Size, scenario: int) -> int:
@@ -69,29 +84,39 @@ def substeps_of(size: Size, scenario: int) -> int:
 class Batch:
     """Scenarios in a solver, and the frames at which they are due."""
 
-    def __init__(self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None) -> None:
+    def __init__(
+        self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None
+    ) -> None:
         self.job = job  # what to simulate
         # the scenarios before their first substep
         self.states = [draw(job.size, scenario) for scenario in job.scenarios]
         # what each has gone through so far
-        unseen = Health(finite=True, max_speed=0.0, jacobian_min=np.inf, jacobian_max=-np.inf)
+        unseen = Health(
+            finite=True, max_speed=0.0, jacobian_min=np.inf, jacobian_max=-np.inf
+        )
         self.extremes = [unseen] * len(self.states)
         # in the order of the job
         self.solver = _solver(solver_constants(job.size), job.device, len(self.states))
         with self._naming():
             self.solver.load(self.states)
         self._report = report
-        self._frames = frames or [job.size.frame_count(scenario) for scenario in job.scenarios]
+        self._frames = frames or [
+            job.size.frame_count(scenario) for scenario in job.scenarios
+        ]
         self._stride = max(1, STRIDE // (job.size.particles * len(self.states)))
         self._now = 0
         self._displaced: list[tuple[int, NDArray[np.float32]]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
-        """Yield (index in the batch, frame) whenever the solver stands at that frame."""
+        """Yield (index in the batch, frame) whenever the solver stands at that
+        frame.
+        """
         interval = self.job.size.substeps_per_frame
         schedule = sorted(
             ((state.start_frame + frame) * interval, index, frame)
-            for index, (state, count) in enumerate(zip(self.states, self._frames, strict=True))
+            for index, (state, count) in enumerate(
+                zip(self.states, self._frames, strict=True)
+            )
             for frame in range(count)
         )
         for substep, due in groupby(schedule, key=lambda entry: entry[0]):
@@ -102,7 +127,9 @@ class Batch:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return position [length] and velocity [length/s], shape [particle, 2], at the last recording."""
+        """Return position [length] and velocity [length/s], shape [particle, 2], at the
+        last recording.
+        """
         return self._position[index], self._velocity[index]
 
     def displace(self, offset: NDArray[np.float32]) -> None:
@@ -121,7 +148,8 @@ class Batch:
                     raise
             self._now += count
             # Extremes are those of the scenarios that still record, and so is the work.
-            interval, running = self.job.size.substeps_per_frame, 0
+            interval = self.job.size.substeps_per_frame
+            running = 0
             for index, health in enumerate(self.solver.health()):
                 last = self.states[index].start_frame + self._frames[index] - 1
                 if self._now <= last * interval:
@@ -136,7 +164,8 @@ class Batch:
             self._report(count * running)
 
     def _replay(self, count: int) -> None:
-        """Repeat everything up to here, then single substeps, to learn which one breaks first.
+        """Repeat everything up to here, then single substeps, to learn which one breaks
+        first.
 
         Returns when none of them breaks: then the failure was not the simulation's.
         """
@@ -155,19 +184,24 @@ class Batch:
     @contextmanager
     def _naming(self) -> Iterator[None]:
         """Put a scenario's id into errors of the solver, which knows its index only."""
-        ids, size = self.job.scenarios, self.job.size
+        ids = self.job.scenarios
+        size = self.job.size
         try:
             yield
         except WorkFailedError as error:
             place = re.sub(
-                r"scenario (\d+)", lambda found: f"scenario {ids[int(found[1])]}", error.where or ""
+                r"scenario (\d+)",
+                lambda found: f"scenario {ids[int(found[1])]}",
+                error.where or "",
             )
             raise _placed(error, f"{size.split} {size.name}, {place}") from error
 
 
 @functools.lru_cache(maxsize=1)
 def _solver(
-    parameters: ClosedBoxParameters | FreeSurfaceParameters, device: Device, scenarios: int
+    parameters: ClosedBoxParameters | FreeSurfaceParameters,
+    device: Device,
+    scenarios: int,
 ) -> Solver:
     """Build a solver, or take the last one again: building compiles."""
     threads = 1 if device is Device.CPU else None

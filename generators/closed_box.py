@@ -1,7 +1,8 @@
 """Weakly compressible flow in a full box: cavity and curl noise (design 4.3).
 
-Equations, walls and the bounds within which they hold stand in :mod:`.nodal_stress`. The settings
-of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and 400.
+Equations, walls and the bounds within which they hold stand in :mod:`.nodal_stress`.
+The settings of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and
+400.
 """
 
 from collections.abc import Sequence
@@ -20,15 +21,20 @@ from .split import ClosedBoxParameters, InitialState
 
 
 class ClosedBox(Driver[ClosedBoxParameters]):
-    """Solver for scenarios that share :class:`ClosedBoxParameters`; see :class:`.Solver`."""
+    """Solver for scenarios that share :class:`ClosedBoxParameters`; see
+    :class:`.Solver`.
+    """
 
     _kernels: NodalStress
 
     def _compile(self, atomic: bool, threads: int) -> NodalStress:
-        return NodalStress(self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads)
+        return NodalStress(
+            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
+        )
 
     def _start(self, states: Sequence[InitialState]) -> None:
-        p, k = self.parameters, self._kernels
+        p = self.parameters
+        k = self._kernels
         self._states = list(states)
         self._move_walls_towards(0)
         spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
@@ -39,11 +45,17 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         self._averaged = 0
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
-        """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its next frame."""
+        """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its
+        next frame.
+        """
         self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
 
     def _move_walls_towards(self, frame: int) -> None:
-        self.move_walls(np.stack([state.walls_towards(frame) for state in self._states]).astype(np.float32))
+        self.move_walls(
+            np.stack([state.walls_towards(frame) for state in self._states]).astype(
+                np.float32
+            )
+        )
 
     def _drive(self, end: int) -> int:
         if all(state.wall_velocity.ndim == 2 for state in self._states):
@@ -64,14 +76,17 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         return np.asarray(self._kernels.carried.to_numpy()[:, :, 3])
 
     def grid_velocity(self) -> NDArray[np.float32]:
-        """Nodal velocities of the last substep [length/s], shape [scenario, node_x, node_y, 2].
+        """Nodal velocities of the last substep [length/s], shape [scenario, node_x,
+        node_y, 2].
 
         Node (i, j) lies at (i, j) / grid; nodes beyond the ghost layer hold 0.
         """
         return self._on_grid(self._kernels.moved.to_numpy()[..., :2])
 
     def mean_grid_velocity(self) -> NDArray[np.float64]:
-        """Mean nodal velocity of the substeps advanced with ``average=True``; shape as above."""
+        """Mean nodal velocity of the substeps advanced with ``average=True``; shape as
+        above.
+        """
         return self._on_grid(self._kernels.total.to_numpy()) / max(self._averaged, 1)
 
     def _on_grid(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -93,15 +108,22 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         ]
 
     def close(self) -> None:
-        """Give the memory back, for good; kernels of other solvers in this process compile again."""
+        """Give the memory back, for good; kernels of other solvers in this process
+        compile again.
+        """
         self._kernels.release()
 
     def _broken(self, index: int, health: Health) -> dict[str, str]:
         bounds = {
             "J > 0": (health.jacobian_min <= 0.0, health.jacobian_min),
-            f"J <= {JACOBIAN_BOUND:g}": (health.jacobian_max > JACOBIAN_BOUND, health.jacobian_max),
+            f"J <= {JACOBIAN_BOUND:g}": (
+                health.jacobian_max > JACOBIAN_BOUND,
+                health.jacobian_max,
+            ),
         }
-        return {name: f"J = {value:.6g}" for name, (left, value) in bounds.items() if left}
+        return {
+            name: f"J = {value:.6g}" for name, (left, value) in bounds.items() if left
+        }
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
@@ -109,10 +131,17 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         normal = state.wall_velocity[..., (0, 1, 2, 3), (0, 0, 1, 1)]
         sliding = bool(np.any(state.wall_velocity != 0.0))
         steady = bool(np.all(np.abs(state.wall_velocity) <= fastest))
-        if np.any(normal != 0.0) or not steady or (sliding and not self.parameters.no_slip):
+        if (
+            np.any(normal != 0.0)
+            or not steady
+            or (sliding and not self.parameters.no_slip)
+        ):
             raise UsageError(
-                "walls can only slide along themselves, and only no-slip walls can move",
-                where=f"scenario {index}, wall_velocity in the order {', '.join(WALLS)}",
+                "walls can only slide along themselves, and only no-slip walls "
+                "can move",
+                where=f"scenario {index}, wall_velocity in the order "
+                f"{', '.join(WALLS)}",
                 expected=f"speeds up to dx/(2 dt) = {fastest:.6g}",
-                got=f"speeds up to {np.abs(state.wall_velocity).reshape(-1, 4, 2).max(axis=0).tolist()}",
+                got=f"speeds up to "
+                f"{np.abs(state.wall_velocity).reshape(-1, 4, 2).max(axis=0).tolist()}",
             )

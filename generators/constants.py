@@ -1,6 +1,8 @@
-"""From a size in datasets.yaml to its split's module, constants, walls and the ranges of what is drawn.
+"""From a size in datasets.yaml to its split's module, constants, walls and the ranges
+of what is drawn.
 
-What the constants of a solver may be: wrong names and values are told before work starts.
+What the constants of a solver may be: wrong names and values are told before work
+starts.
 """
 
 from __future__ import annotations
@@ -37,10 +39,24 @@ __all__ = [
 ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
 
 _POSITIVE = (
-    *("dt", "density", "modulus", "liquid_modulus", "jelly_modulus", "rope_modulus", "snow_modulus"),
+    *(
+        "dt",
+        "density",
+        "modulus",
+        "liquid_modulus",
+        "jelly_modulus",
+        "rope_modulus",
+        "snow_modulus",
+    ),
     *("snow_hardening_min", "snow_hardening_max", "snow_jp_min", "snow_jp_max"),
 )
-_NOT_NEGATIVE = ("shift", "liquid_viscosity", "elastic_damping", "snow_stretch", "snow_hardening")
+_NOT_NEGATIVE = (
+    "shift",
+    "liquid_viscosity",
+    "elastic_damping",
+    "snow_stretch",
+    "snow_hardening",
+)
 
 LIMITS = {
     "particles": Limit(low=1, whole=True),
@@ -49,7 +65,10 @@ LIMITS = {
     "substeps_per_frame": Limit(low=1, whole=True),
     **dict.fromkeys(_POSITIVE, Limit(low=0.0, open_low=True)),
     **dict.fromkeys(_NOT_NEGATIVE, Limit(low=0.0)),
-    **{f"{solid}_poisson": Limit(low=0.0, high=0.5, open_high=True) for solid in ("jelly", "rope", "snow")},
+    **{
+        f"{solid}_poisson": Limit(low=0.0, high=0.5, open_high=True)
+        for solid in ("jelly", "rope", "snow")
+    },
     "velocity_relaxation": Limit(low=0.0, high=1.0),
     "jacobian_relaxation": Limit(low=0.0, high=1.0),
     "density_coupling": Limit(low=0.0, high=1.0),
@@ -57,10 +76,14 @@ LIMITS = {
     "jacobian_max": Limit(low=1.0),
     "snow_compression": Limit(low=0.0, high=1.0, open_high=True),
 }
-"""Limits of constants that both the solvers and their stability rest on; others are finite numbers."""
+"""Limits of constants that both the solvers and their stability rest on; others are
+finite numbers.
+"""
 
 
-def check_constants(kind: ParametersType, given: Mapping[str, object], size: Size) -> None:
+def check_constants(
+    kind: ParametersType, given: Mapping[str, object], size: Size
+) -> None:
     """Refuse constants that a solver cannot use."""
     where = f"{size.file}, splits.{size.split}, size {size.name}"
     for field in fields(kind):
@@ -78,16 +101,20 @@ def check_constants(kind: ParametersType, given: Mapping[str, object], size: Siz
                     fix=f"did you mean {close[0]!r}?" if close else declare,
                 )
             continue
-        limit, value = LIMITS.get(field.name, Limit()), given[field.name]
+        limit = LIMITS.get(field.name, Limit())
+        value = given[field.name]
         if field.type == "bool":
-            good, expected = isinstance(value, bool), "true or false"
+            good = isinstance(value, bool)
+            expected = "true or false"
         else:
-            good, expected = limit.holds(value), str(limit)
+            good = limit.holds(value)
+            expected = str(limit)
         if field.name == "wall" and good:
             # The box between the walls is four cells wide at least.
             high = (int(str(given["grid"])) - 4) // 2
             limit = Limit(low=0, high=high, whole=True)
-            good, expected = limit.holds(value), str(limit)
+            good = limit.holds(value)
+            expected = str(limit)
         if not good:
             raise UnreadableFileError(
                 "a parameter has no possible value",
@@ -99,17 +126,29 @@ def check_constants(kind: ParametersType, given: Mapping[str, object], size: Siz
 
 @contextmanager
 def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
-    """Turn what a split's module raises over its parameters into an error that names their file."""
+    """Turn what a split's module raises over its parameters into an error that names
+    their file.
+    """
     where = f"{size.file}, splits.{size.split}, size {size.name}"
     try:
         yield
     except UsageError as error:
         raise UnreadableFileError(
-            error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
+            error.what,
+            where=where,
+            expected=error.expected,
+            got=error.got,
+            fix=error.fix,
         ) from error
     except (TypeError, ValueError, ArithmeticError, LookupError) as error:
-        texts = [f"{n} = {p.value!r}" for n, p in size.parameters.items() if isinstance(p.value, bool | str)]
-        listing = f"; parameters that are no numbers: {', '.join(texts)}" if texts else ""
+        texts = [
+            f"{n} = {p.value!r}"
+            for n, p in size.parameters.items()
+            if isinstance(p.value, bool | str)
+        ]
+        listing = (
+            f"; parameters that are no numbers: {', '.join(texts)}" if texts else ""
+        )
         raise UnreadableFileError(
             f"{work} failed with these parameters",
             where=where,
@@ -124,7 +163,9 @@ Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
     """Return the solver constants that a size names; others keep their defaults."""
-    given = {f.name: size.value(f.name) for f in fields(kind) if f.name in size.parameters}
+    given = {
+        f.name: size.value(f.name) for f in fields(kind) if f.name in size.parameters
+    }
     settled = {"dt": size.dt, **given, **fixed}
     check_constants(kind, settled, size)
     return kind(**settled)
@@ -158,16 +199,26 @@ def split_module(size: Size) -> Split:
         module = importlib.import_module(size.generator)
     except ImportError as error:
         raise UsageError(
-            f"the generator of split {size.split!r} cannot be imported", where=size.generator, got=error
+            f"the generator of split {size.split!r} cannot be imported",
+            where=size.generator,
+            got=error,
         ) from error
-    missing = [name for name in ("solver_parameters", "initial_state") if not hasattr(module, name)]
+    missing = [
+        name
+        for name in ("solver_parameters", "initial_state")
+        if not hasattr(module, name)
+    ]
     if missing:
-        raise UsageError(f"a generator lacks {' and '.join(missing)}", where=size.generator)
+        raise UsageError(
+            f"a generator lacks {' and '.join(missing)}", where=size.generator
+        )
     return cast("Split", module)
 
 
 def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
-    """Return the constants of the solver of a size; an impossible parameter is an UnreadableFileError."""
+    """Return the constants of the solver of a size; an impossible parameter is an
+    UnreadableFileError.
+    """
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):
         return module.solver_parameters(size)

@@ -1,15 +1,17 @@
 """Stress and plastic flow of liquid, jelly, rope and snow, as Taichi functions.
 
-Every stress is a Kirchhoff stress tau [mass/s^2], symmetric, shape [2, 2]. Only ``+ - * /``,
-``sqrt`` and comparisons are used, so that every processor returns the same bits.
+Every stress is a Kirchhoff stress tau [mass/s^2], symmetric, shape [2, 2]. Only
+``+ - * /``, ``sqrt`` and comparisons are used, so that every processor returns the same
+bits.
 
 A 2 x 2 deformation gradient is a scaled rotation plus a scaled reflection,
 
     F = [[e, -g], [g, e]] + [[h, k], [k, -h]],    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
 
-The rotation R of the polar decomposition F = R S has cosine e/q and sine g/q; the principal
-stretches are q + r and q - r (negative when F inverts); det F = q^2 - r^2. This is both
-decompositions in closed form, with one square root each and no eigenvector.
+The rotation R of the polar decomposition F = R S has cosine e/q and sine g/q; the
+principal stretches are q + r and q - r (negative when F inverts); det F = q^2 - r^2.
+This is both decompositions in closed form, with one square root each and no
+eigenvector.
 
 Sources: Hu et al. 2018 (MLS-MPM), Stomakhin et al. 2012 (fixed corotated), 2013 (snow).
 """
@@ -18,26 +20,34 @@ import taichi as ti
 
 from .transfer import Value, bounded
 
-EXPONENT_MAX = 4.0  # largest magnitude for which the error bound of :func:`exponential` holds
-STRETCH_MIN = 0.1  # smallest trial stretch that enters the plastic volume, an inverted particle's too
+EXPONENT_MAX = (
+    4.0  # largest magnitude for which the error bound of :func:`exponential` holds
+)
+# smallest trial stretch that enters the plastic volume, an inverted particle's too
+STRETCH_MIN = 0.1
 _STRETCH_EPSILON = 1e-6
 _SHEAR_EPSILON = 1e-12
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """Return Lame's constants of plane strain, mu = E / (2 (1 + nu)) and E nu / ((1 + nu) (1 - 2 nu)).
+    """Return Lame's constants of plane strain, mu = E / (2 (1 + nu)) and E nu / ((1 +
+    nu) (1 - 2 nu)).
 
     E is Young's modulus [mass/s^2], as are they; Poisson's ratio nu is below 1/2.
 
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
     """
-    return young / (2.0 * (1.0 + poisson)), young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    return young / (2.0 * (1.0 + poisson)), young * poisson / (
+        (1.0 + poisson) * (1.0 - 2.0 * poisson)
+    )
 
 
 @ti.func
 def larger(a: ti.f32, b: ti.f32) -> ti.f32:
-    """Return the larger of two numbers, b if a is not a number (one instruction, unlike max)."""
+    """Return the larger of two numbers, b if a is not a number (one instruction, unlike
+    max).
+    """
     return ti.select(a > b, a, b)
 
 
@@ -65,18 +75,24 @@ def rotation(f: ti.math.mat2) -> ti.math.vec3:
     e = 0.5 * (f[0, 0] + f[1, 1])
     g = 0.5 * (f[1, 0] - f[0, 1])
     q = ti.sqrt(e * e + g * g)
-    cosine, sine = 1.0, 0.0
+    cosine = 1.0
+    sine = 0.0
     if q > _STRETCH_EPSILON:
         inverse = 1.0 / q
-        cosine, sine = e * inverse, g * inverse
+        cosine = e * inverse
+        sine = g * inverse
     return ti.Vector([cosine, sine, q])
 
 
 @ti.func
 def viscous_stress(c: ti.math.mat2, viscosity: ti.f32) -> ti.math.mat2:
-    """Return mu (C + C^T), of a velocity gradient C [1/s] and the dynamic viscosity mu [mass/s]."""
+    """Return mu (C + C^T), of a velocity gradient C [1/s] and the dynamic viscosity mu
+    [mass/s].
+    """
     shear = viscosity * (c[0, 1] + c[1, 0])
-    return ti.Matrix([[2.0 * viscosity * c[0, 0], shear], [shear, 2.0 * viscosity * c[1, 1]]])
+    return ti.Matrix(
+        [[2.0 * viscosity * c[0, 0], shear], [shear, 2.0 * viscosity * c[1, 1]]]
+    )
 
 
 @ti.func
@@ -87,7 +103,8 @@ def liquid_stress(jacobian: ti.f32, modulus: ti.f32) -> ti.f32:
 
 @ti.func
 def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
-    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I, mu and lambda in [mass/s^2].
+    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I, mu and
+    lambda in [mass/s^2].
 
     With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
     (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W.
@@ -108,9 +125,11 @@ def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
 
 @ti.func
 def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> ti.f32:
-    """Return exp(xi (1 - Jp)) within [low, high], caps within exp(-+EXPONENT_MAX): snow's factor on moduli.
+    """Return exp(xi (1 - Jp)) within [low, high], caps within exp(-+EXPONENT_MAX):
+    snow's factor on moduli.
 
-    Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent`` is xi [1].
+    Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
+    is xi [1].
     """
     z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
     return bounded(exponential(z), low, high)
@@ -118,11 +137,13 @@ def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> t
 
 @ti.func
 def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
-    """Clamp the principal stretches of F to [low, high]; return (elastic F, volume ratio).
+    """Clamp the principal stretches of F to [low, high]; return (elastic F, volume
+    ratio).
 
-    F is the trial gradient; the limits are 1 - theta_c and 1 + theta_s. Clamping q + r and q - r gives new q
-    and r, by which rotation and reflection are scaled. The second value is
-    the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over clamped ones.
+    F is the trial gradient; the limits are 1 - theta_c and 1 + theta_s. Clamping q + r
+    and q - r gives new q and r, by which rotation and reflection are scaled. The second
+    value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
+    clamped ones.
     """
     turn = rotation(f)
     q = turn[2]
@@ -135,7 +156,9 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     if r > _SHEAR_EPSILON:
         shrink = 0.5 * (first - second) / r
     mean = 0.5 * (first + second)
-    e, g = mean * turn[0], mean * turn[1]
-    h, k = shrink * h, shrink * k
+    e = mean * turn[0]
+    g = mean * turn[1]
+    h = shrink * h
+    k = shrink * k
     trial = larger(q + r, STRETCH_MIN) * larger(q - r, STRETCH_MIN)
     return ti.Matrix([[e + h, k - g], [k + g, e - h]]), trial / (first * second)

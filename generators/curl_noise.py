@@ -5,11 +5,12 @@ The initial velocity is the rotated gradient of one stream function,
     u = dpsi/dy,  v = -dpsi/dx,  psi = s L Perlin(F X, F Y) w(X) w(1 - X) w(Y) w(1 - Y),
 
 with X, Y in [0, 1] across the box of width L, lattice frequency F = id % count + least
-(Eq. 5.55), and Bridson's ramp w over the first half cell from a wall. The scale is s = s0 (F0 / F)^k:
-with k = 0 a higher frequency has more energy (full), with k = 2 all have one vorticity (mini, whose
-slow flows would be frozen ones). psi is 0 on the walls, hence no flow crosses them; u_x + v_y = 0
-holds to the bit. The equations have no viscosity, the transfers have: larger vortices live longer,
-about three quarters of the energy is left after 600 frames at frequency 4 of full, a few per cent at 13.
+(Eq. 5.55), and Bridson's ramp w over the first half cell from a wall. The scale is s =
+s0 (F0 / F)^k: with k = 0 a higher frequency has more energy (full), with k = 2 all have
+one vorticity (mini, whose slow flows would be frozen ones). psi is 0 on the walls,
+hence no flow crosses them; u_x + v_y = 0 holds to the bit. The equations have no
+viscosity, the transfers have: larger vortices live longer, about three quarters of the
+energy is left after 600 frames at frequency 4 of full, a few per cent at 13.
 """
 
 from __future__ import annotations
@@ -38,17 +39,22 @@ def solver_parameters(size: Size) -> ClosedBoxParameters:
     return constants(ClosedBoxParameters, size, no_slip=False)
 
 
-def stream_function(position: Array, lattice: Array, *, low: float, high: float, scale: float) -> Jet:
-    """Return psi [length^2/s] and its derivatives at points between walls at low and high [length].
+def stream_function(
+    position: Array, lattice: Array, *, low: float, high: float, scale: float
+) -> Jet:
+    """Return psi [length^2/s] and its derivatives at points between walls at low and
+    high [length].
 
-    Points are of shape [point, 2], Perlin gradients of shape [F + 1, F + 1, 2], the scale is s [length/s];
-    u = psi.y and v = -psi.x.
+    Points are of shape [point, 2], Perlin gradients of shape [F + 1, F + 1, 2], the
+    scale is s [length/s]; u = psi.y and v = -psi.x.
     """
     cells = float(len(lattice) - 1)
     per_length = cells / (high - low)
     from_low = [axis.shift(-low).scale(per_length) for axis in coordinates(position)]
     # Measured from its own wall, the ramp is exactly 0 there.
-    from_high = [axis.scale(-1.0).shift(high).scale(per_length) for axis in coordinates(position)]
+    from_high = [
+        axis.scale(-1.0).shift(high).scale(per_length) for axis in coordinates(position)
+    ]
     psi = noise(from_low[0], from_low[1], lattice)
     for distance in (*from_low, *from_high):
         psi = psi * ramp(distance.scale(2.0))
@@ -56,7 +62,9 @@ def stream_function(position: Array, lattice: Array, *, low: float, high: float,
 
 
 def flow(psi: Jet) -> tuple[Array, Array]:
-    """Return velocity [point, 2] and its gradient C [point, 2, 2], multiples of 2^-20."""
+    """Return velocity [point, 2] and its gradient C [point, 2, 2], multiples of
+    2^-20.
+    """
     velocity = np.stack([psi.y, -psi.x], axis=-1)
     affine = np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1).reshape(-1, 2, 2)
     return quantise(velocity), quantise(affine)
@@ -68,15 +76,19 @@ def _root_mean_square(values: Array) -> float:
 
 
 def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]:
-    """Return RMS divergence (Eq. 5.54) and vorticity [1/s] as the solver's grid sees them.
+    """Return RMS divergence (Eq. 5.54) and vorticity [1/s] as the solver's grid sees
+    them.
 
-    Central differences between nodes inside the walls: what is not zero of the divergence is
-    the grid's share, not the field's.
+    Central differences between nodes inside the walls: what is not zero of the
+    divergence is the grid's share, not the field's.
     """
     low, high = closed_box_walls(size)
-    first, last = size.value("wall") + 1, size.grid - size.value("wall")
+    first = size.value("wall") + 1
+    last = size.grid - size.value("wall")
     node = np.arange(first, last) / size.grid
-    points = np.stack([side.ravel() for side in np.meshgrid(node, node, indexing="ij")], axis=-1)
+    points = np.stack(
+        [side.ravel() for side in np.meshgrid(node, node, indexing="ij")], axis=-1
+    )
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
     u, v = (part.reshape(len(node), len(node)) for part in (psi.y, -psi.x))
     slope = 0.5 * size.grid
@@ -88,7 +100,8 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a lattice of particles and the stream function that sets them moving."""
     low, high = closed_box_walls(size)
-    columns, rows = size.value("lattice_x"), size.value("lattice_y")
+    columns = size.value("lattice_x")
+    rows = size.value("lattice_y")
     if columns * rows != size.particles:
         raise UsageError(
             "the lattice does not hold the particles",
@@ -96,11 +109,15 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             expected=f"lattice_x * lattice_y = particles = {size.particles}",
             got=f"{columns} * {rows} = {columns * rows}",
         )
-    position = fill_grid(rng, columns, rows, low=low, high=high, jitter=size.value("jitter"))
+    position = fill_grid(
+        rng, columns, rows, low=low, high=high, jitter=size.value("jitter")
+    )
     frequency = scenario % size.value("frequency_count") + size.value("frequency_min")
     lattice = gradients(rng, frequency)
     scale = float(size.value("velocity_scale"))
-    for _ in range(size.value("scale_falloff")):  # no power: its bits differ from machine to machine
+    for _ in range(
+        size.value("scale_falloff")
+    ):  # no power: its bits differ from machine to machine
         scale = scale * size.value("frequency_min") / frequency
     psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)

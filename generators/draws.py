@@ -1,9 +1,10 @@
 """Seeded draws whose bits are the same on every machine.
 
-Two rules keep them so. Random bits come only from ``Generator.random``, the one distribution
-of NumPy that never changes for PCG64. What is done with them is + - * / sqrt, floor and
-comparison, which IEEE 754 rounds in one way only, or ``decimal``, whose ``exp`` and ``ln`` are
-correctly rounded by its specification; ``exp``, ``log`` and ``pow`` of a C library are not.
+Two rules keep them so. Random bits come only from ``Generator.random``, the one
+distribution of NumPy that never changes for PCG64. What is done with them is + - * /
+sqrt, floor and comparison, which IEEE 754 rounds in one way only, or ``decimal``, whose
+``exp`` and ``ln`` are correctly rounded by its specification; ``exp``, ``log`` and
+``pow`` of a C library are not.
 
 Jittered lattices fill a square box with particles (thesis Eq. 5.44).
 """
@@ -20,7 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import WorkFailedError
 
-QUANTUM = 2.0**-20  # grain of everything that enters the solver; multiples below 16 are exact in float32
+QUANTUM = (
+    2.0**-20
+)  # grain of everything that enters the solver; multiples below 16 are exact in float32
 _LARGEST = 16.0
 _PRECISE = Context(prec=50)
 
@@ -33,7 +36,8 @@ class RandomSource(Protocol):
 
 
 def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
-    """Return what seeds a scenario: the first eight bytes of SHA-256("split/size"), big-endian, and numbers.
+    """Return what seeds a scenario: the first eight bytes of SHA-256("split/size"),
+    big-endian, and numbers.
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
@@ -76,24 +80,32 @@ def _unit(rng: RandomSource) -> float:
 
 
 def uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw from the uniform distribution on [low, high), rounded to a multiple of 2^-20."""
+    """Draw from the uniform distribution on [low, high), rounded to a multiple of
+    2^-20.
+    """
     return float(quantise(low + (high - low) * _unit(rng)))
 
 
 def log_uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw x = low exp(u ln(high / low)), uniform in its logarithm: in 50 decimal digits, rounded once."""
+    """Draw x = low exp(u ln(high / low)), uniform in its logarithm: in 50 decimal
+    digits, rounded once.
+    """
     if not 0.0 < low <= high:
-        raise WorkFailedError("a log-uniform range is empty", expected="0 < low <= high", got=(low, high))
+        raise WorkFailedError(
+            "a log-uniform range is empty", expected="0 < low <= high", got=(low, high)
+        )
     span = _PRECISE.ln(_PRECISE.divide(Decimal(high), Decimal(low)))
     growth = _PRECISE.exp(_PRECISE.multiply(span, Decimal(_unit(rng))))
     return float(_PRECISE.multiply(Decimal(low), growth))
 
 
-def normal(rng: RandomSource, deviation: float, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def normal(
+    rng: RandomSource, deviation: float, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
     """Draw nearly normal variates of mean 0: twelve uniforms, minus six (Irwin-Hall).
 
-    Mean, variance and skewness are the normal ones, the excess kurtosis is -0.1, and nothing
-    lies beyond six deviations, which suits an initial velocity.
+    Mean, variance and skewness are the normal ones, the excess kurtosis is -0.1, and
+    nothing lies beyond six deviations, which suits an initial velocity.
     """
     total = np.full(shape, -6.0)
     for _ in range(12):
@@ -108,7 +120,9 @@ def choice(rng: RandomSource, count: int) -> int:
 
 def direction(rng: RandomSource) -> tuple[float, float]:
     """Draw a unit vector, uniform over the circle, without sine or cosine."""
-    while True:  # until a point of the square lies in the unit disc, and not at its very centre
+    while (
+        True
+    ):  # until a point of the square lies in the unit disc, and not at its very centre
         x, y = (float(2.0 * r - 1.0) for r in rng.random((2,)))
         square = x * x + y * y
         if 2.0**-20 <= square <= 1.0:
@@ -116,13 +130,16 @@ def direction(rng: RandomSource) -> tuple[float, float]:
             return x / length, y / length
 
 
-def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: float) -> NDArray[np.float64]:
+def fill(
+    rng: RandomSource, count: int, *, low: float, high: float, jitter: float
+) -> NDArray[np.float64]:
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
-    The columns number floor(sqrt(count)), their counts differ by one at the most, and each
-    spreads its own particles evenly over the height. ``low`` and ``high`` are coordinates of the
-    walls [length], ``jitter`` is the width of the uniform displacement, in spacings [1]. Positions
-    [length] are multiples of 2^-20, shape [particle, 2].
+    The columns number floor(sqrt(count)), their counts differ by one at the most, and
+    each spreads its own particles evenly over the height. ``low`` and ``high`` are
+    coordinates of the walls [length], ``jitter`` is the width of the uniform
+    displacement, in spacings [1]. Positions [length] are multiples of 2^-20, shape
+    [particle, 2].
     """
     columns = math.isqrt(count)
     ends = np.array([count * column // columns for column in range(columns + 1)])
@@ -130,7 +147,13 @@ def fill(rng: RandomSource, count: int, *, low: float, high: float, jitter: floa
 
 
 def fill_grid(
-    rng: RandomSource, columns: int, rows: int, *, low: float, high: float, jitter: float
+    rng: RandomSource,
+    columns: int,
+    rows: int,
+    *,
+    low: float,
+    high: float,
+    jitter: float,
 ) -> NDArray[np.float64]:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
     return _fill_columns(rng, rows * np.arange(columns + 1), low, high, jitter)
@@ -139,11 +162,15 @@ def fill_grid(
 def _fill_columns(
     rng: RandomSource, ends: NDArray[np.integer], low: float, high: float, jitter: float
 ) -> NDArray[np.float64]:
-    """Put particles near the middles of their cells, column by column: (r - 1/2) jitter spacings off."""
+    """Put particles near the middles of their cells, column by column: (r - 1/2) jitter
+    spacings off.
+    """
     sizes = np.diff(ends)
     column = np.repeat(np.arange(len(sizes)), sizes)
     row = np.arange(len(column)) - np.repeat(ends[:-1], sizes)
     cell = np.stack([column, row], axis=-1)
-    cells = np.stack([np.full(len(column), len(sizes)), np.repeat(sizes, sizes)], axis=-1)
+    cells = np.stack(
+        [np.full(len(column), len(sizes)), np.repeat(sizes, sizes)], axis=-1
+    )
     displacement = (rng.random(cell.shape) - 0.5) * jitter
     return quantise(low + (high - low) * (cell + 0.5 + displacement) / cells)

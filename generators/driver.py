@@ -1,7 +1,7 @@
 """What every solver does around its kernels: load, advance, check, read out.
 
-A solver is the kernels of one formulation (fields of a batch of scenarios, and one substep)
-inside a :class:`Driver`, which knows the bounds within which they are valid.
+A solver is the kernels of one formulation (fields of a batch of scenarios, and one
+substep) inside a :class:`Driver`, which knows the bounds within which they are valid.
 """
 
 from abc import ABC, abstractmethod
@@ -34,7 +34,9 @@ class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
     x: _Field  # particle positions [length], and two zeros
-    carried: _Field  # what particles spread: v_x, v_y and two numbers that are 1 at first
+    carried: (
+        _Field  # what particles spread: v_x, v_y and two numbers that are 1 at first
+    )
     slope_x: _Field  # d/dx of the velocity, first, at the particles
     slope_y: _Field  # d/dy of the same
     fill: _Field  # m / (rho dx^2), shape [scenario]
@@ -53,7 +55,9 @@ class Kernels(Protocol):
 
 
 class Driver(ABC, Generic[Parameters]):
-    """A solver around kernels; see :func:`.build` for its arguments and :class:`.Solver` for what it does."""
+    """A solver around kernels; see :func:`.build` for its arguments and
+    :class:`.Solver` for what it does.
+    """
 
     def __init__(
         self,
@@ -85,12 +89,18 @@ class Driver(ABC, Generic[Parameters]):
 
     @abstractmethod
     def _broken(self, index: int, health: Health) -> dict[str, str]:
-        """Return the bounds of this formulation that a scenario has left, and what it reached."""
+        """Return the bounds of this formulation that a scenario has left, and what it
+        reached.
+        """
 
     def load(self, states: Sequence[InitialState]) -> None:
-        """Start one scenario per state; one outside the solver's bounds is a WorkFailedError."""
+        """Start one scenario per state; one outside the solver's bounds is a
+        WorkFailedError.
+        """
         if len(states) != self.scenarios:
-            raise UsageError("wrong number of scenarios", expected=self.scenarios, got=len(states))
+            raise UsageError(
+                "wrong number of scenarios", expected=self.scenarios, got=len(states)
+            )
         for index, state in enumerate(states):
             self._check_state(index, state)
         self._place(stack(states, "position"))
@@ -101,14 +111,20 @@ class Driver(ABC, Generic[Parameters]):
             slope = np.zeros_like(carried)
             slope[..., :2] = stack(states, "affine")[..., axis]
             field.from_numpy(slope)
-        self._volume = np.array([state.area / self.parameters.particles for state in states])
-        self._kernels.fill.from_numpy((self._volume * self.parameters.grid**2).astype(np.float32))
+        self._volume = np.array(
+            [state.area / self.parameters.particles for state in states]
+        )
+        self._kernels.fill.from_numpy(
+            (self._volume * self.parameters.grid**2).astype(np.float32)
+        )
         self._start(states)
         self._substeps = 0
         self._kernels.restart_extremes()
 
     def advance(self, substeps: int) -> None:
-        """Advance every scenario; one that leaves the solver's bounds is a WorkFailedError."""
+        """Advance every scenario; one that leaves the solver's bounds is a
+        WorkFailedError.
+        """
         if substeps == 0:
             return
         self._kernels.restart_extremes()
@@ -126,22 +142,32 @@ class Driver(ABC, Generic[Parameters]):
             broken: dict[str, str] = {}
             if not health.finite:
                 broken["every number is finite"] = "NaN or an infinite number"
-            # NaN breaks no bound here: it is told above, and as a value it would say nothing.
+            # NaN breaks no bound here: it is told above, and as a value it would say
+            # nothing.
             if health.max_speed > fastest:
-                broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = f"abs(v) = {health.max_speed:.6g}"
+                broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = (
+                    f"abs(v) = {health.max_speed:.6g}"
+                )
             broken |= self._broken(index, health)
             if broken:
-                span = f"substep {end}" if substeps == 1 else f"substeps {end - substeps} to {end}"
+                span = (
+                    f"substep {end}"
+                    if substeps == 1
+                    else f"substeps {end - substeps} to {end}"
+                )
                 raise WorkFailedError(
                     "the simulation blew up",
                     where=f"scenario {index}, {span}",
                     expected="; ".join(broken),
                     got="; ".join(broken.values()),
-                    fix="a smaller dt (a larger substeps_per_frame), a softer material or smaller velocities",
+                    fix="a smaller dt (a larger substeps_per_frame), a softer "
+                    "material or smaller velocities",
                 )
 
     def _drive(self, end: int) -> int:
-        """Set what acts from outside now; return the substep up to which it does, ``end`` at most."""
+        """Set what acts from outside now; return the substep up to which it does,
+        ``end`` at most.
+        """
         return end
 
     def position(self) -> NDArray[np.float32]:
@@ -161,46 +187,62 @@ class Driver(ABC, Generic[Parameters]):
         return values
 
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept in the box."""
+        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept
+        in the box.
+        """
         self._place(self.position() + offset.astype(np.float32))
 
     def _place(self, position: NDArray[np.float32]) -> None:
-        kept = np.clip(position, np.float32(self._kernels.least), np.float32(self._kernels.most))
+        kept = np.clip(
+            position, np.float32(self._kernels.least), np.float32(self._kernels.most)
+        )
         self._kernels.x.from_numpy(np.concatenate((kept, np.zeros_like(kept)), axis=-1))
 
     def _check_state(self, index: int, state: InitialState) -> None:
         count = self.parameters.particles
-        shapes: dict[str, tuple[int, ...]] = {"position": (count, 2), "velocity": (count, 2)}
+        shapes: dict[str, tuple[int, ...]] = {
+            "position": (count, 2),
+            "velocity": (count, 2),
+        }
         shapes |= {"affine": (count, 2, 2), "material": (count,)}
         for name, shape in shapes.items():
             held = np.asarray(getattr(state, name))
-            if held.shape != shape or held.dtype.kind not in ("iu" if name == "material" else "f"):
+            if held.shape != shape or held.dtype.kind not in (
+                "iu" if name == "material" else "f"
+            ):
                 raise UsageError(
                     f"wrong shape of {name} in an initial state, or no such numbers",
                     where=f"scenario {index}",
                     expected=f"{shape}, {'whole' if name == 'material' else 'floating'}",
                     got=f"{held.shape}, {held.dtype}",
                 )
-        known, area = [int(one) for one in Material], np.float64(state.area)
+        known = [int(one) for one in Material]
+        area = np.float64(state.area)
         outside = np.count_nonzero((state.position < 0.0) | (state.position > 1.0))
         if outside or not np.isin(state.material, known).all() or not 0.0 < area <= 1.0:
             raise UsageError(
                 "no such initial state",
                 where=f"scenario {index}",
-                expected=f"positions in the unit box, materials of {known}, an area up to 1",
-                got=f"{outside} coordinates outside, materials {np.unique(state.material)}, area {area:g}",
+                expected=f"positions in the unit box, materials of {known}, an "
+                f"area up to 1",
+                got=f"{outside} coordinates outside, materials "
+                f"{np.unique(state.material)}, area {area:g}",
                 fix="mend the split's initial_state",
             )
         fastest = self._kernels.speed_bound
         speed = np.abs(state.velocity).max()
         stretch = np.abs(state.affine).max() * self.parameters.dt
-        if not (np.isfinite(state.position).all() and speed <= fastest and stretch <= 2.0):
+        if not (
+            np.isfinite(state.position).all() and speed <= fastest and stretch <= 2.0
+        ):
             raise WorkFailedError(
                 "the initial state is outside the solver's bounds",
                 where=f"scenario {index}",
-                expected=f"finite positions, abs(v) <= dx/dt = {fastest:.6g}, abs(C) dt <= 2",
+                expected=f"finite positions, abs(v) <= dx/dt = {fastest:.6g}, "
+                f"abs(C) dt <= 2",
                 got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
-                f"{np.count_nonzero(~np.isfinite(state.position))} coordinates that are not finite",
+                f"{np.count_nonzero(~np.isfinite(state.position))} coordinates that "
+                f"are not finite",
             )
 
 

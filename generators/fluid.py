@@ -1,8 +1,9 @@
 """A body of liquid that falls, is thrown or splashes (thesis §4.3, Fig. 4.3).
 
-Families by id % 4: 0 falling rectangle, 1 body thrown at the right wall, 2 falling circle,
-3 splash (four overlapping discs with velocities of their own, which tear the body apart
-before it falls). Expected behaviour: a jet along the walls after the impact, sloshing, rest.
+Families by id % 4: 0 falling rectangle, 1 body thrown at the right wall, 2 falling
+circle, 3 splash (four overlapping discs with velocities of their own, which tear the
+body apart before it falls). Expected behaviour: a jet along the walls after the impact,
+sloshing, rest.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ Array = NDArray[np.float64]
 FAMILIES = ("falling-rectangle", "thrown", "falling-circle", "splash")
 """Family of a scenario, by id % 4."""
 
-# Families whose bodies start in one region with one range of velocities share its parameters.
+# Families whose bodies start in one region with one range of velocities share its
+# parameters.
 _START = dict(zip(FAMILIES, ("falling", "thrown", "falling", "splash"), strict=True))
 
 
@@ -38,7 +40,10 @@ def _shape(rng: RandomSource, family: str, area: float, size: Size) -> Shape:
     if family == "splash":
         # All discs reach a common point, so that the body is one piece.
         reach = interval(size, "blob_offset")
-        offsets = [(uniform(rng, *reach), direction(rng)) for _ in range(size.value("blob_count"))]
+        offsets = [
+            (uniform(rng, *reach), direction(rng))
+            for _ in range(size.value("blob_count"))
+        ]
         arrangement = np.array([(r * x, r * y) for r, (x, y) in offsets])
         return Blobs.of_area(area, arrangement, cells=size.value("blob_cells"))
     if family == "falling-circle" or (family == "thrown" and choice(rng, 2) == 1):
@@ -56,11 +61,13 @@ def _splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array
         return np.zeros_like(position)
     own = normal(rng, size.value("blob_speed"), (size.value("blob_count"), 2))
     softening = size.value("blob_softening")
-    total, weights = np.zeros_like(position), np.zeros((len(position), 1))
+    total = np.zeros_like(position)
+    weights = np.zeros((len(position), 1))
     for centre, velocity in zip(body.shape.centres, own, strict=True):
         x, y = (position - body.centre - np.array(centre)).T
         weight = (1.0 / (x * x + y * y + softening * softening))[:, None]
-        total, weights = total + weight * velocity, weights + weight
+        total = total + weight * velocity
+        weights = weights + weight
     return total / weights + normal(rng, size.value("particle_speed"), position.shape)
 
 
@@ -72,10 +79,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     shape = _shape(rng, family, area, size)
     (left, right), (bottom, top) = ranges(size, start)
     low, high = free_surface_walls(size)
-    least, most = low + size.value("margin"), high - size.value("margin")
+    least = low + size.value("margin")
+    most = high - size.value("margin")
     region = (max(left, least), min(right, most)), (max(bottom, least), min(top, most))
     body = place(rng, shape, region)
-    drift = [uniform(rng, *component) for component in ranges(size, f"{start}_velocity")]
+    drift = [
+        uniform(rng, *component) for component in ranges(size, f"{start}_velocity")
+    ]
     position = seeds(rng, body, size.particles)
     return InitialState(
         position=position,

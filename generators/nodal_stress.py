@@ -1,8 +1,8 @@
 """One substep of weakly compressible flow whose stress acts at the nodes.
 
-The walls lie half-way between nodes; beyond each is one layer of ghost nodes, the mirror images
-of the outermost interior nodes. Per substep, for particles of equal mass m, positions x_p, grid
-spacing dx and weights w_ip:
+The walls lie half-way between nodes; beyond each is one layer of ghost nodes, the
+mirror images of the outermost interior nodes. Per substep, for particles of equal mass
+m, positions x_p, grid spacing dx and weights w_ip:
 
 1. P2G: n_i = sum w,  (n J)_i = sum w J_p,  (n v)_i = sum w (v_p + C_p (x_i - x_p)).
 2. Fold: ghosts give what they received to their mirror images, normal momentum reversed,
@@ -15,11 +15,13 @@ spacing dx and weights w_ip:
    x_p <- x_p + dt v* + s, kept in the box
    J_p <- J_p (1 + dt tr C) + kappa (Jbar - J_p) + theta (1/r - Jbar).
 
-The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no sum is
-tiny. Sums are integers (:mod:`.transfer`): no order of particles or threads changes a bit.
+The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no
+sum is tiny. Sums are integers (:mod:`.transfer`): no order of particles or threads
+changes a bit.
 
-Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J stays in
-(0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of the split ``cavity``.
+Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and while J
+stays in (0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of the split
+``cavity``.
 """
 
 import taichi as ti
@@ -46,8 +48,9 @@ _INSET = 1e-3  # distance that particles keep from a wall [cells]
 _REACH = 16.0
 """Bound of abs(v_p + C (x_i - x_p)) over the speed bound dx/dt [1].
 
-Walls move at half the bound or less, so ghosts at twice the bound or less; abs(C_ab) <= (4/dx^2)
-max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per axis: 1 + 2 x 4 x 1.5 = 13.
+Walls move at half the bound or less, so ghosts at twice the bound or less; abs(C_ab) <=
+(4/dx^2) max abs(v) sum w abs(x_i - x_p) <= 4/dt, and a node lies within 1.5 dx per
+axis: 1 + 2 x 4 x 1.5 = 13.
 """
 
 
@@ -56,7 +59,12 @@ class NodalStress:
     """Fields of a batch of scenarios and the kernels that advance them."""
 
     def __init__(
-        self, parameters: ClosedBoxParameters, *, scenarios: int, atomic: bool, threads: int
+        self,
+        parameters: ClosedBoxParameters,
+        *,
+        scenarios: int,
+        atomic: bool,
+        threads: int,
     ) -> None:
         """Round the constants and take the memory."""
         self.parameters = p = parameters  # constants that the scenarios share
@@ -66,31 +74,49 @@ class NodalStress:
         self.averaging = False  # whether the substeps to come count for the total
         self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
         dx = 1.0 / p.grid
-        self.inv_dx, self.width, self.dt = float(p.grid), p.grid + 1, p.dt
+        self.inv_dx = float(p.grid)
+        self.width = p.grid + 1
+        self.dt = p.dt
         self.least = (p.wall + 0.5 + _INSET) * dx  # smallest coordinate of a particle
-        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx  # largest coordinate of a particle
+        self.most = (
+            p.grid - p.wall - 0.5 - _INSET
+        ) * dx  # largest coordinate of a particle
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         self.velocity_scale = fixed_point_scale(p.particles, _REACH * self.speed_bound)
         self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
-        self.velocity_unit, self.count_unit = 1.0 / self.velocity_scale, 1.0 / self.count_scale
+        self.velocity_unit = 1.0 / self.velocity_scale
+        self.count_unit = 1.0 / self.count_scale
         self.cell_scale = self.velocity_scale * dx
         self.pressure = p.dt * p.modulus / (p.density * 2.0 * dx)
         self.gradient = 4.0 * self.inv_dx
-        self.shift, self.shift_bound = -p.shift * dx * dx, 0.1 * dx
-        self.x = ti.Vector.field(4, ti.f32)  # particle positions [length], and two zeros
+        self.shift = -p.shift * dx * dx
+        self.shift_bound = 0.1 * dx
+        self.x = ti.Vector.field(
+            4, ti.f32
+        )  # particle positions [length], and two zeros
         self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
-        self.slope_x = ti.Vector.field(4, ti.f32)  # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
+        self.slope_x = ti.Vector.field(
+            4, ti.f32
+        )  # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
         # largest abs(v_x), abs(v_y), J and -J of each particle since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
-        self.here = ti.Vector.field(4, ti.f32)  # nodal v_x, v_y, r, Jbar at the particles
-        self.push = ti.Vector.field(4, ti.f32)  # nodal dt a at the particles, and two zeros
+        self.here = ti.Vector.field(
+            4, ti.f32
+        )  # nodal v_x, v_y, r, Jbar at the particles
+        self.push = ti.Vector.field(
+            4, ti.f32
+        )  # nodal dt a at the particles, and two zeros
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
-        self.moved = ti.Vector.field(4, ti.f32)  # the same after the forces of the last substep
+        self.moved = ti.Vector.field(
+            4, ti.f32
+        )  # the same after the forces of the last substep
         self.gain = ti.Vector.field(2, ti.f32)  # dt a
-        self.peak = ti.field(ti.f32)  # largest absolute velocity component since the advance began
+        self.peak = ti.field(
+            ti.f32
+        )  # largest absolute velocity component since the advance began
         self.total = ti.Vector.field(2, ti.f64)  # sum over time of the nodal velocities
         self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
@@ -121,7 +147,9 @@ class NodalStress:
 
     @ti.func
     def locate(self, s: ti.i32, p: ti.i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and with what weights."""
+        """Keep for P2G and G2P which nodes a particle touches, and with what
+        weights.
+        """
         self.rows[0][s, p], self.rows[1][s, p], self.rows[2][s, p] = stencil(
             self.x[s, p], self.inv_dx, self.width
         )
@@ -130,10 +158,19 @@ class NodalStress:
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
         base, offset = base_node(self.rows, s, p)
-        scale = ti.Vector([self.velocity_scale, self.velocity_scale, self.count_scale, self.count_scale])
-        # n and J have no slope; a product with 0 is one, as nodes, and so slopes, are finite.
+        scale = ti.Vector(
+            [
+                self.velocity_scale,
+                self.velocity_scale,
+                self.count_scale,
+                self.count_scale,
+            ]
+        )
+        # n and J have no slope; a product with 0 is one, as nodes, and so slopes, are
+        # finite.
         only_v = ti.Vector([self.cell_scale, self.cell_scale, 0.0, 0.0])
-        c_x, c_y = only_v * self.slope_x[s, p], only_v * self.slope_y[s, p]
+        c_x = only_v * self.slope_x[s, p]
+        c_y = only_v * self.slope_y[s, p]
         middle = scale * self.carried[s, p] - offset[0] * c_x - offset[1] * c_y
         for i, j in ti.static(ti.ndrange(3, 3)):
             value = stepped(stepped(middle, c_x, i - 1), c_y, j - 1)
@@ -142,23 +179,37 @@ class NodalStress:
 
     @ti.func
     def received(self, s: ti.i32, i: ti.i32, j: ti.i32) -> Value:
-        """Return a node's sums and its mirror images' ones, and the momentum that moving walls add."""
+        """Return a node's sums and its mirror images' ones, and the momentum that
+        moving walls add.
+        """
         total = self.sums[s, self.at(i, j)]
         drag = ti.Vector([0.0, 0.0])
-        x_ghost, y_ghost = self.walls.beyond(i), self.walls.beyond(j)
+        x_ghost = self.walls.beyond(i)
+        y_ghost = self.walls.beyond(j)
         if x_ghost != i:
             image = self.sums[s, self.at(x_ghost, j)]
             total += ti.Vector([-1, self.walls.tangential, 1, 1]) * image
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(
+                image[2], self.count_unit
+            )
         if y_ghost != j:
             image = self.sums[s, self.at(i, y_ghost)]
             total += ti.Vector([self.walls.tangential, -1, 1, 1]) * image
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(
+                image[2], self.count_unit
+            )
         if x_ghost != i and y_ghost != j:
             image = self.sums[s, self.at(x_ghost, y_ghost)]
-            total += ti.Vector([-self.walls.tangential, -self.walls.tangential, 1, 1]) * image
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(image[2], self.count_unit)
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(image[2], self.count_unit)
+            total += (
+                ti.Vector([-self.walls.tangential, -self.walls.tangential, 1, 1])
+                * image
+            )
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(
+                image[2], self.count_unit
+            )
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(
+                image[2], self.count_unit
+            )
         return total, drag
 
     @ti.func
@@ -176,12 +227,20 @@ class NodalStress:
 
     @ti.func
     def mirror(self, state: Template, s: ti.i32, k: ti.i32) -> None:
-        """Fill the k-th ghost node of (v, r, Jbar): r and Jbar even, v odd about the wall's."""
+        """Fill the k-th ghost node of (v, r, Jbar): r and Jbar even, v odd about the
+        wall's.
+        """
         i, j = self.walls.ring(k)
         image = state[s, self.at(self.walls.source(i), self.walls.source(j))]
-        sign, add = self.walls.reflection(i, j), self.walls.drive(s, i, j)
+        sign = self.walls.reflection(i, j)
+        add = self.walls.drive(s, i, j)
         state[s, self.at(i, j)] = ti.Vector(
-            [sign[0] * image[0] + add[0], sign[1] * image[1] + add[1], image[2], image[3]]
+            [
+                sign[0] * image[0] + add[0],
+                sign[1] * image[1] + add[1],
+                image[2],
+                image[3],
+            ]
         )
 
     @ti.func
@@ -189,35 +248,52 @@ class NodalStress:
         """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
         i, j = self.walls.ring(k)
         self.gain[s, self.at(i, j)] = (
-            self.walls.reflection(i, j) * self.gain[s, self.at(self.walls.source(i), self.walls.source(j))]
+            self.walls.reflection(i, j)
+            * self.gain[s, self.at(self.walls.source(i), self.walls.source(j))]
         )
 
     @ti.func
     def force(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
-        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v; gradients weighted 1/8, 3/4, 1/8 across."""
-        east, west = self.node[s, self.at(i + 1, j)], self.node[s, self.at(i - 1, j)]
-        north, south = self.node[s, self.at(i, j + 1)], self.node[s, self.at(i, j - 1)]
-        rising = self.node[s, self.at(i + 1, j + 1)][3] - self.node[s, self.at(i - 1, j - 1)][3]
-        falling = self.node[s, self.at(i + 1, j - 1)][3] - self.node[s, self.at(i - 1, j + 1)][3]
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v; gradients weighted 1/8, 3/4,
+        1/8 across.
+        """
+        east = self.node[s, self.at(i + 1, j)]
+        west = self.node[s, self.at(i - 1, j)]
+        north = self.node[s, self.at(i, j + 1)]
+        south = self.node[s, self.at(i, j - 1)]
+        rising = (
+            self.node[s, self.at(i + 1, j + 1)][3]
+            - self.node[s, self.at(i - 1, j - 1)][3]
+        )
+        falling = (
+            self.node[s, self.at(i + 1, j - 1)][3]
+            - self.node[s, self.at(i - 1, j + 1)][3]
+        )
         grad_x = 0.75 * (east[3] - west[3]) + 0.125 * (rising + falling)
         grad_y = 0.75 * (north[3] - south[3]) + 0.125 * (rising - falling)
         here = self.node[s, self.at(i, j)]
         laplacian = ((east + west) + (north + south)) - 4.0 * here
         gain_x = self.pressure * grad_x + self.spread[s] * laplacian[0]
         gain_y = self.pressure * grad_y + self.spread[s] * laplacian[1]
-        v_x, v_y = here[0] + gain_x, here[1] + gain_y
+        v_x = here[0] + gain_x
+        v_y = here[1] + gain_y
         self.gain[s, self.at(i, j)] = ti.Vector([gain_x, gain_y])
         self.moved[s, self.at(i, j)] = ti.Vector([v_x, v_y, here[2], here[3]])
-        self.peak[s, self.at(i, j)] = largest(ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, self.at(i, j)]))
+        self.peak[s, self.at(i, j)] = largest(
+            ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, self.at(i, j)])
+        )
 
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
         """Interpolate (v, r, Jbar), their slopes and dt a."""
         base, offset = base_node(self.rows, s, p)
-        here, gain = ti.Vector([0.0, 0.0, 0.0, 0.0]), ti.Vector([0.0, 0.0])
-        slope_x, slope_y = here, here
+        here = ti.Vector([0.0, 0.0, 0.0, 0.0])
+        gain = ti.Vector([0.0, 0.0])
+        slope_x = here
+        slope_y = here
         for i, j in ti.static(ti.ndrange(3, 3)):
-            w, node = self.rows[i][s, p][j], base + i * self.width + j
+            w = self.rows[i][s, p][j]
+            node = base + i * self.width + j
             share = w * self.moved[s, node]
             gain += w * self.gain[s, node]
             here += share
@@ -231,7 +307,9 @@ class NodalStress:
     @ti.func
     def update(self, s: ti.i32, p: ti.i32) -> None:
         """Relax v_p and J_p towards the grid, move and shift x_p."""
-        here, slope_x, slope_y = self.here[s, p], self.slope_x[s, p], self.slope_y[s, p]
+        here = self.here[s, p]
+        slope_x = self.slope_x[s, p]
+        slope_y = self.slope_y[s, p]
         volume = 1.0 / largest(here[2], 0.5)
         push = self.shift * volume * ti.Vector([slope_x[2], slope_y[2]])
         push = bounded(push, -self.shift_bound, self.shift_bound)
@@ -240,7 +318,8 @@ class NodalStress:
         v = v + ti.Vector([self.push[s, p][0], self.push[s, p][1]])
         v = v + self.parameters.velocity_relaxation * (grid_v - v)
         v = v + (
-            push[0] * ti.Vector([slope_x[0], slope_x[1]]) + push[1] * ti.Vector([slope_y[0], slope_y[1]])
+            push[0] * ti.Vector([slope_x[0], slope_x[1]])
+            + push[1] * ti.Vector([slope_y[0], slope_y[1]])
         )
         x = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
         x = bounded(x + (self.dt * grid_v + push), self.least, self.most)
@@ -278,7 +357,8 @@ class NodalStress:
     def _serial_substeps(self, substeps: ti.i32, average: ti.i32) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            # Read first, so that the address of the fields stays out of the loops: else no vectors.
+            # Read first, so that the address of the fields stays out of the loops: else
+            # no vectors.
             fill = self.fill[0]
             for i in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
                 for j in range(self.walls.ghost[0], self.walls.ghost[1] + 1):
@@ -341,11 +421,14 @@ class NodalStress:
 
     @ti.kernel
     def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
-        # Counts are arguments: of some constants, such as 4,000, LLVM makes code for twenty seconds.
+        # Counts are arguments: of some constants, such as 4,000, LLVM makes code for
+        # twenty seconds.
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
             now = self.carried[s, p]
-            self.extremes[s, p] = ti.Vector([ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]])
+            self.extremes[s, p] = ti.Vector(
+                [ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]]
+            )
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
             self.peak[s, n] = 0.0

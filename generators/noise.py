@@ -3,8 +3,9 @@
 Both are polynomials within a lattice cell, so that a stream function made of them has
 continuous second derivatives, and every operation is + - * or floor.
 
-A :class:`Jet` carries a function with its first and second derivatives by the product rule, so a
-field written once in + - * has exact derivatives (to rounding) and no step width to choose:
+A :class:`Jet` carries a function with its first and second derivatives by the product
+rule, so a field written once in + - * has exact derivatives (to rounding) and no step
+width to choose:
 
     (f g)_x = f_x g + f g_x,    (f g)_xy = f_xy g + f_x g_y + f_y g_x + f g_xy.
 """
@@ -44,7 +45,8 @@ class Jet:
 
     def __mul__(self, other: Jet) -> Jet:
         """Multiply by the product rule."""
-        f, g = self, other
+        f = self
+        g = other
         return Jet(
             f.value * g.value,
             f.x * g.value + f.value * g.x,
@@ -75,7 +77,8 @@ class Jet:
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
-    zero, one = np.zeros(len(position)), np.ones(len(position))
+    zero = np.zeros(len(position))
+    one = np.ones(len(position))
     x, y = position.T
     return Jet(x, one, zero, zero, zero, zero), Jet(y, zero, one, zero, zero, zero)
 
@@ -87,12 +90,15 @@ def gradients(rng: RandomSource, frequency: int) -> NDArray[np.float64]:
 
 
 def fade(t: Jet) -> Jet:
-    """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3; slope and curvature vanish at 0 and 1."""
+    """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3; slope and curvature vanish at 0 and
+    1.
+    """
     return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
 
 
 def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
-    """Return gradient noise of a lattice [node, node, 2] at points given in its cells (Eqs. 5.40, 5.41).
+    """Return gradient noise of a lattice [node, node, 2] at points given in its cells
+    (Eqs. 5.40, 5.41).
 
     It is 0 at every node and its slope there is the node's gradient.
     """
@@ -100,20 +106,29 @@ def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
     i = np.minimum(np.floor(x.value).astype(np.int64), last)
     j = np.minimum(np.floor(y.value).astype(np.int64), last)
-    p, q = x.shift(-i.astype(np.float64)), y.shift(-j.astype(np.float64))
+    p = x.shift(-i.astype(np.float64))
+    q = y.shift(-j.astype(np.float64))
 
     def corner(k: int, m: int) -> Jet:
         slope = lattice[i + k, j + m]
-        return p.shift(-float(k)).scale(slope[:, 0]) + q.shift(-float(m)).scale(slope[:, 1])
+        return p.shift(-float(k)).scale(slope[:, 0]) + q.shift(-float(m)).scale(
+            slope[:, 1]
+        )
 
-    u, w = fade(p), fade(q)
+    u = fade(p)
+    w = fade(q)
     low = corner(0, 0) + u * (corner(1, 0) - corner(0, 0))
     high = corner(0, 1) + u * (corner(1, 1) - corner(0, 1))
     return low + w * (high - low)
 
 
 def ramp(t: Jet) -> Jet:
-    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two derivatives, then 1."""
+    """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two
+    derivatives, then 1.
+    """
     value, *derivatives = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)._terms()
     below = t.value < 1.0
-    return Jet(np.where(below, value, 1.0), *(np.where(below, term, 0.0) for term in derivatives))
+    return Jet(
+        np.where(below, value, 1.0),
+        *(np.where(below, term, 0.0) for term in derivatives),
+    )

@@ -1,23 +1,25 @@
-"""One substep of MLS-MPM with a free surface: liquid, jelly, snow and rope (design 4.4).
+"""One substep of MLS-MPM with a free surface: liquid, jelly, snow and rope (design
+4.4).
 
 For particles of equal mass m, positions x_p, grid spacing dx, weights w_ip and
 o = (x_i - x_p) / dx:
 
 1. P2G:  n_i = sum w,   (n v)_i = sum w (v_p + A_p o),   (n J)_i = sum w J_p,
    with A = dx C - (4 dt / (rho dx)) tau, and J = 1 in solids.
-2. Grid: v_i = (n v)_i / n_i + dt g; the walls take the outward normal velocity and, by Coulomb
-   friction, at most ``friction`` times as much tangential velocity. Jbar = (n J)/n. Relative
-   density r_i = n_i m / (rho dx^2), where n_i counts mirror images at the walls.
+2. Grid: v_i = (n v)_i / n_i + dt g; the walls take the outward normal velocity and, by
+   Coulomb friction, at most ``friction`` times as much tangential velocity. Jbar = (n
+   J)/n. Relative density r_i = n_i m / (rho dx^2), where n_i counts mirror images at
+   the walls.
 3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,   x_p <- x_p + dt v_p, kept in the box.
    Liquid: J <- J (1 + dt tr C) + kappa (Jbar - J), then J <- J + theta (1/max(r, 1) - J),
    within [J_min, J_max]. Solids: F <- (I + dt C) F; snow then yields.
 
-The mass of a particle cancels everywhere but in r, so nodes count particles. Sums are integers
-(:mod:`.transfer`): no order of particles or threads changes a bit. The stresses stand in
-:mod:`.constitutive`.
+The mass of a particle cancels everywhere but in r, so nodes count particles. Sums are
+integers (:mod:`.transfer`): no order of particles or threads changes a bit. The
+stresses stand in :mod:`.constitutive`.
 
-Source: Hu et al. 2018; Jiang et al. 2015 (APIC). The tie of J to the density is ours: without
-it a settled liquid loses a fifth of its depth.
+Source: Hu et al. 2018; Jiang et al. 2015 (APIC). The tie of J to the density is ours:
+without it a settled liquid loses a fifth of its depth.
 """
 
 import taichi as ti
@@ -47,9 +49,12 @@ from .transfer import (
 )
 
 _INSET = 1e-3  # distance that particles keep from a wall [cells]
-_REACH = 64.0  # bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2
+# bound of abs(v_p + A o) over dx/dt, the largest speed [1]; a violent impact reaches 2
+_REACH = 64.0
 _HUGE = 3e38  # stands for what is not a number where extremes are kept
-_LIQUID, _SNOW, _ROPE = int(Material.LIQUID), int(Material.SNOW), int(Material.ROPE)
+_LIQUID = int(Material.LIQUID)
+_SNOW = int(Material.SNOW)
+_ROPE = int(Material.ROPE)
 
 
 @ti.data_oriented
@@ -57,7 +62,12 @@ class ParticleStress:
     """Fields of a batch of scenarios and the kernels that advance them."""
 
     def __init__(
-        self, parameters: FreeSurfaceParameters, *, scenarios: int, atomic: bool, threads: int
+        self,
+        parameters: FreeSurfaceParameters,
+        *,
+        scenarios: int,
+        atomic: bool,
+        threads: int,
     ) -> None:
         """Round the constants and take the memory."""
         self.parameters = p = parameters  # constants that the scenarios share
@@ -65,16 +75,23 @@ class ParticleStress:
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
         self.solid = True  # whether some particles are no liquid
-        self.inv_dx, self.dx, self.dt = float(p.grid), 1.0 / p.grid, p.dt
+        self.inv_dx = float(p.grid)
+        self.dx = 1.0 / p.grid
+        self.dt = p.dt
         self.width = p.grid + 1
-        self.low, self.high = p.wall, p.grid - p.wall
+        self.low = p.wall
+        self.high = p.grid - p.wall
         # smallest and largest coordinate of a particle
-        self.least, self.most = (self.low + _INSET) * self.dx, (self.high - _INSET) * self.dx
+        self.least = (self.low + _INSET) * self.dx
+        self.most = (self.high - _INSET) * self.dx
         self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
-        self.reach_bound = _REACH * self.speed_bound  # of abs(v) + abs(A o), what sums have room for
+        self.reach_bound = (
+            _REACH * self.speed_bound
+        )  # of abs(v) + abs(A o), what sums have room for
         self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
         self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
-        self.velocity_unit, self.count_unit = 1.0 / self.velocity_scale, 1.0 / self.count_scale
+        self.velocity_unit = 1.0 / self.velocity_scale
+        self.count_unit = 1.0 / self.count_scale
         self.impulse = 4.0 * p.dt * p.grid / p.density
         self.fall = p.gravity * p.dt
         self.liquid_viscosity = p.density * p.liquid_viscosity
@@ -82,45 +99,75 @@ class ParticleStress:
         self.jelly = lame(p.jelly_modulus, p.jelly_poisson)
         self.rope = lame(p.rope_modulus, p.rope_poisson)
         self.snow = lame(p.snow_modulus, p.snow_poisson)
-        self.yield_low, self.yield_high = 1.0 - p.snow_compression, 1.0 + p.snow_stretch
-        self.x = ti.Vector.field(4, ti.f32)  # particle positions [length], and two zeros
-        self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
+        self.yield_low = 1.0 - p.snow_compression
+        self.yield_high = 1.0 + p.snow_stretch
+        self.x = ti.Vector.field(
+            4, ti.f32
+        )  # particle positions [length], and two zeros
+        self.carried = ti.Vector.field(
+            4, ti.f32
+        )  # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
         # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
-        self.f = ti.Matrix.field(2, 2, ti.f32)  # deformation gradients of the solids [1]
+        self.f = ti.Matrix.field(
+            2, 2, ti.f32
+        )  # deformation gradients of the solids [1]
         # Material, J of liquid or plastic Jp of snow (1 in other solids), and two zeros
         self.matter = ti.Vector.field(4, ti.f32)
-        # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the advance began
+        # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
+        # advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
-        self.a_x = ti.Vector.field(4, ti.f32)  # first column of A, scaled, and two zeros
+        self.a_x = ti.Vector.field(
+            4, ti.f32
+        )  # first column of A, scaled, and two zeros
         self.a_y = ti.Vector.field(4, ti.f32)  # second column
         self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
-        self.friction = ti.field(ti.f32)  # Coulomb friction of the walls, shape [scenario]
-        carried = (self.x, self.carried, self.slope_x, self.slope_y, self.f, self.matter, self.extremes)
+        self.friction = ti.field(
+            ti.f32
+        )  # Coulomb friction of the walls, shape [scenario]
+        carried = (
+            self.x,
+            self.carried,
+            self.slope_x,
+            self.slope_y,
+            self.f,
+            self.matter,
+            self.extremes,
+        )
         derived = (*self.rows, self.a_x, self.a_y, self.here)
         backend.place(
             *(((scenarios, p.particles), [field]) for field in carried + derived),
-            *(((scenarios, self.width**2), [field]) for field in (self.sums, self.node)),
+            *(
+                ((scenarios, self.width**2), [field])
+                for field in (self.sums, self.node)
+            ),
             ((scenarios,), [self.fill, self.friction]),
         )
 
-    # --- one substep: each function is one phase at one particle or node ---------------------
+    # --- one substep: each function is one phase at one particle or node --------------
 
     @ti.func
-    def stress(self, s: ti.i32, p: ti.i32, c: ti.math.mat2, solid: Template) -> ti.math.mat2:
+    def stress(
+        self, s: ti.i32, p: ti.i32, c: ti.math.mat2, solid: Template
+    ) -> ti.math.mat2:
         """Return the Kirchhoff stress tau of a particle."""
-        kind, ratio = self.matter[s, p][0], self.matter[s, p][1]
+        kind = self.matter[s, p][0]
+        ratio = self.matter[s, p][1]
         pull = liquid_stress(ratio, self.parameters.liquid_modulus)
-        tau, viscosity = ti.Matrix([[pull, 0.0], [0.0, pull]]), self.liquid_viscosity
+        tau = ti.Matrix([[pull, 0.0], [0.0, pull]])
+        viscosity = self.liquid_viscosity
         if ti.static(solid):
-            mu, la, damping = self.jelly[0], self.jelly[1], self.solid_viscosity
+            mu = self.jelly[0]
+            la = self.jelly[1]
+            damping = self.solid_viscosity
             if kind == _ROPE:
-                mu, la = self.rope[0], self.rope[1]
+                mu = self.rope[0]
+                la = self.rope[1]
             if kind == _SNOW:
                 factor = hardening(
                     ratio,
@@ -128,15 +175,20 @@ class ParticleStress:
                     self.parameters.snow_hardening_min,
                     self.parameters.snow_hardening_max,
                 )
-                mu, la, damping = self.snow[0] * factor, self.snow[1] * factor, 0.0
-            tau = ti.select(kind == _LIQUID, tau, corotated_stress(self.f[s, p], mu, la))
+                mu = self.snow[0] * factor
+                la = self.snow[1] * factor
+                damping = 0.0
+            tau = ti.select(
+                kind == _LIQUID, tau, corotated_stress(self.f[s, p], mu, la)
+            )
             viscosity = ti.select(kind == _LIQUID, viscosity, damping)
         return tau + viscous_stress(c, viscosity)
 
     @ti.func
     def gradient(self, s: ti.i32, p: ti.i32) -> ti.math.mat2:
         """Return C of a particle."""
-        slope_x, slope_y = self.slope_x[s, p], self.slope_y[s, p]
+        slope_x = self.slope_x[s, p]
+        slope_y = self.slope_y[s, p]
         return ti.Matrix([[slope_x[0], slope_y[0]], [slope_x[1], slope_y[1]]])
 
     @ti.func
@@ -147,7 +199,8 @@ class ParticleStress:
         )
         c = self.gradient(s, p)
         a = self.dx * c - self.impulse * self.stress(s, p, c, solid)
-        v, seen = self.carried[s, p], self.extremes[s, p]
+        v = self.carried[s, p]
+        seen = self.extremes[s, p]
         reach_x = ti.abs(v[0]) + 1.5 * (ti.abs(a[0, 0]) + ti.abs(a[0, 1]))
         reach_y = ti.abs(v[1]) + 1.5 * (ti.abs(a[1, 0]) + ti.abs(a[1, 1]))
         reach = larger(largest_of(reach_x, reach_y), seen[3])
@@ -160,8 +213,16 @@ class ParticleStress:
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
         """Spread n v, n and n J, from the middle node to its neighbours, dx away."""
         base, offset = base_node(self.rows, s, p)
-        scale = ti.Vector([self.velocity_scale, self.velocity_scale, self.count_scale, self.count_scale])
-        a_x, a_y = self.a_x[s, p], self.a_y[s, p]
+        scale = ti.Vector(
+            [
+                self.velocity_scale,
+                self.velocity_scale,
+                self.count_scale,
+                self.count_scale,
+            ]
+        )
+        a_x = self.a_x[s, p]
+        a_y = self.a_y[s, p]
         middle = scale * self.carried[s, p] - offset[0] * a_x - offset[1] * a_y
         for i, j in ti.static(ti.ndrange(3, 3)):
             value = stepped(stepped(middle, a_x, i - 1), a_y, j - 1)
@@ -179,10 +240,14 @@ class ParticleStress:
         self.sums[s, self.at(i, j)] = ti.Vector.zero(ti.i64, 4)
 
     @ti.func
-    def update(self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32, friction: ti.f32) -> None:
+    def update(
+        self, s: ti.i32, i: ti.i32, j: ti.i32, fill: ti.f32, friction: ti.f32
+    ) -> None:
         """Divide by n, add gravity, meet the walls; an empty node is at rest."""
         total = self.sums[s, self.at(i, j)]
-        u, v, jacobian = 0.0, 0.0, 1.0
+        u = 0.0
+        v = 0.0
+        jacobian = 1.0
         if total[2] > 0:
             n = from_fixed(total[2], self.count_unit)
             u = from_fixed(total[0], self.velocity_unit) / n
@@ -194,12 +259,20 @@ class ParticleStress:
         self.node[s, self.at(i, j)] = ti.Vector([u, v, density, jacobian])
 
     @ti.func
-    def contact(self, index: ti.i32, normal: ti.f32, tangential: ti.f32, friction: ti.f32) -> Value:
-        """Return the (normal, tangential) velocity that the two walls across an axis leave."""
-        kept, braked = normal, tangential
-        if (index <= self.low and normal < 0.0) or (index >= self.high and normal > 0.0):
+    def contact(
+        self, index: ti.i32, normal: ti.f32, tangential: ti.f32, friction: ti.f32
+    ) -> Value:
+        """Return the (normal, tangential) velocity that the two walls across an axis
+        leave.
+        """
+        kept = normal
+        braked = tangential
+        if (index <= self.low and normal < 0.0) or (
+            index >= self.high and normal > 0.0
+        ):
             loss = friction * ti.abs(normal) / larger(ti.abs(tangential), 1e-9)
-            kept, braked = 0.0, tangential * larger(1.0 - loss, 0.0)
+            kept = 0.0
+            braked = tangential * larger(1.0 - loss, 0.0)
         return kept, braked
 
     @ti.func
@@ -214,9 +287,12 @@ class ParticleStress:
 
     @ti.func
     def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.i64:
-        """Return n of a node with its images: a wall node holds half a cell, a corner a quarter."""
+        """Return n of a node with its images: a wall node holds half a cell, a corner a
+        quarter.
+        """
         count = self.sums[s, self.at(i, j)][2]
-        image_i, image_j = self.image(i), self.image(j)
+        image_i = self.image(i)
+        image_j = self.image(j)
         if image_i >= 0:
             count += self.sums[s, self.at(image_i, j)][2]
         if image_j >= 0:
@@ -230,7 +306,8 @@ class ParticleStress:
         """Gather (v, r, Jbar) and their slopes."""
         base, offset = base_node(self.rows, s, p)
         here = ti.Vector.zero(ti.f32, 4)
-        slope_x, slope_y = here, here
+        slope_x = here
+        slope_y = here
         for i, j in ti.static(ti.ndrange(3, 3)):
             part = self.rows[i][s, p][j] * self.node[s, base + i * self.width + j]
             here += part
@@ -243,8 +320,12 @@ class ParticleStress:
     @ti.func
     def flow(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Move a particle; update J of a liquid or F of a solid."""
-        here, kind, old = self.here[s, p], self.matter[s, p][0], self.matter[s, p][1]
-        moved = ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector([here[0], here[1]])
+        here = self.here[s, p]
+        kind = self.matter[s, p][0]
+        old = self.matter[s, p][1]
+        moved = ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector(
+            [here[0], here[1]]
+        )
         x = bounded(moved, self.least, self.most)
         self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
         c = self.gradient(s, p)
@@ -252,28 +333,40 @@ class ParticleStress:
         j += self.parameters.jacobian_relaxation * (here[3] - old)
         j += self.parameters.density_coupling * (1.0 / larger(here[2], 1.0) - j)
         j = bounded(j, self.parameters.jacobian_min, self.parameters.jacobian_max)
-        ratio, jacobian, spread = j, j, j
+        ratio = j
+        jacobian = j
+        spread = j
         if ti.static(solid):
             resting = self.f[s, p]
             f = resting + self.dt * (c @ resting)
             yielded, growth = plastic_return(f, self.yield_low, self.yield_high)
-            jp = bounded(old * growth, self.parameters.snow_jp_min, self.parameters.snow_jp_max)
+            jp = bounded(
+                old * growth, self.parameters.snow_jp_min, self.parameters.snow_jp_max
+            )
             # Chosen, not branched upon: else no vectors.
-            f = ti.select(kind == _LIQUID, resting, ti.select(kind == _SNOW, yielded, f))
+            f = ti.select(
+                kind == _LIQUID, resting, ti.select(kind == _SNOW, yielded, f)
+            )
             self.f[s, p] = f
             ratio = ti.select(kind == _LIQUID, j, ti.select(kind == _SNOW, jp, old))
-            jacobian = ti.select(kind == _LIQUID, j, f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0])
+            jacobian = ti.select(
+                kind == _LIQUID, j, f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+            )
             spread = ti.select(kind == _LIQUID, j, 1.0)
         self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
         self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
-        seen, speed = self.extremes[s, p], largest_of(ti.abs(here[0]), ti.abs(here[1]))
-        least, most = -larger(-jacobian, -seen[1]), larger(jacobian, seen[2])
+        seen = self.extremes[s, p]
+        speed = largest_of(ti.abs(here[0]), ti.abs(here[1]))
+        least = -larger(-jacobian, -seen[1])
+        most = larger(jacobian, seen[2])
         self.extremes[s, p] = ti.Vector([larger(speed, seen[0]), least, most, seen[3]])
 
-    # --- the drivers: the same phases in the same order --------------------------------------
+    # --- the drivers: the same phases in the same order -------------------------------
 
     def run_serially(self, substeps: int) -> None:
-        """Advance scenario 0 by many substeps in one thread, on the nodes that particles touch."""
+        """Advance scenario 0 by many substeps in one thread, on the nodes that
+        particles touch.
+        """
         self._serial_substeps(substeps, self.solid)
 
     def run_in_parallel(self) -> None:
@@ -284,13 +377,17 @@ class ParticleStress:
     def _serial_substeps(self, substeps: ti.i32, solid: Template) -> Nothing:
         ti.loop_config(serialize=True)
         for _ in range(substeps):
-            # Read first, so that the address of the fields stays out of the loops: else no vectors.
-            fill, friction = self.fill[0], self.friction[0]
-            first, last = ti.Vector([self.high, self.high]), ti.Vector([0, 0])
+            # Read first, so that the address of the fields stays out of the loops: else
+            # no vectors.
+            fill = self.fill[0]
+            friction = self.friction[0]
+            first = ti.Vector([self.high, self.high])
+            last = ti.Vector([0, 0])
             for p in range(self.parameters.particles):
                 x = ti.Vector([self.x[0, p][0], self.x[0, p][1]])
                 base = ti.cast(x * self.inv_dx - 0.5, ti.i32)
-                first, last = ti.min(first, base), ti.max(last, base + 3)
+                first = ti.min(first, base)
+                last = ti.max(last, base + 3)
             # A node next to a wall counts its image, which no particle need touch.
             for a in ti.static(range(2)):
                 if first[a] <= self.low + 1:
@@ -335,7 +432,8 @@ class ParticleStress:
         """Start an advance: the extremes are those of the present state."""
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, self.parameters.particles):
-            v, f = self.carried[s, p], self.f[s, p]
+            v = self.carried[s, p]
+            f = self.f[s, p]
             jacobian = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
             if self.matter[s, p][0] == _LIQUID:
                 jacobian = v[3]
@@ -345,5 +443,7 @@ class ParticleStress:
 
 @ti.func
 def largest_of(a: ti.f32, b: ti.f32) -> ti.f32:
-    """Return the larger of two positive values, :data:`_HUGE` if either is not a number."""
+    """Return the larger of two positive values, :data:`_HUGE` if either is not a
+    number.
+    """
     return larger(ti.select(a < _HUGE, a, _HUGE), ti.select(b < _HUGE, b, _HUGE))

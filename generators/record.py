@@ -1,13 +1,14 @@
 """Record what a generated data set measures: its hashes, statistics and twin floor.
 
 usage: python -m lagbench.generators.record --split cavity --size tiny [--root FOLDER]
-           [--registry datasets.yaml] [--released tests/data/released_hashes.json] [--allow-change]
+           [--registry datasets.yaml] [--released tests/data/released_hashes.json]
+           [--allow-change]
 
-Reads the manifest of a complete data set, checks its files against it, computes the statistics
-of train anew, and writes the block ``measured`` of datasets.yaml; what stands above that block
-is not touched. Also keeps the list of released hashes, by which a test notices bits that change
-without their version. A recorded hash of the same MAJOR version is only replaced with
---allow-change.
+Reads the manifest of a complete data set, checks its files against it, computes the
+statistics of train anew, and writes the block ``measured`` of datasets.yaml; what
+stands above that block is not touched. Also keeps the list of released hashes, by which
+a test notices bits that change without their version. A recorded hash of the same MAJOR
+version is only replaced with --allow-change.
 """
 
 from __future__ import annotations
@@ -28,9 +29,13 @@ from lagbench.data.statistics import file_statistics
 from lagbench.errors import DataError, LagbenchError
 
 MARKER = "\nmeasured:"  # where the generated part of datasets.yaml begins
-_NOTICE = "# Written by `python -m lagbench.generators.record`; do not edit below this line."
+_NOTICE = (
+    "# Written by `python -m lagbench.generators.record`; do not edit below this line."
+)
 _SHORT = 16
-_PER_LINE = (110 - 10) // len("-1.00000000e-05, ")  # numbers of a list in a line of at most 110 characters
+_PER_LINE = (110 - 10) // len(
+    "-1.00000000e-05, "
+)  # numbers of a list in a line of at most 110 characters
 
 
 def measured_values(manifest: Manifest) -> Measured:
@@ -46,7 +51,9 @@ def measured_values(manifest: Manifest) -> Measured:
     return Measured(
         dataset_sha256=manifest.dataset_sha256,
         subset_sha256=manifest.subset_sha256,
-        scenario_sha256={entry.scenario: entry.content_sha256[:_SHORT] for entry in manifest.files},
+        scenario_sha256={
+            entry.scenario: entry.content_sha256[:_SHORT] for entry in manifest.files
+        },
         statistics=manifest.statistics,
         twin_floor=manifest.mean_twin_floor(),
     )
@@ -58,17 +65,32 @@ def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
     for split, sizes in sorted(measured.items()):
         lines.append(f"  {split}:")
         for size, values in sorted(sizes.items()):
-            lines += [f"    {size}:", f'      dataset_sha256: "{values.dataset_sha256}"']
+            lines += [
+                f"    {size}:",
+                f'      dataset_sha256: "{values.dataset_sha256}"',
+            ]
             lines.append("      subset_sha256:")
-            lines += [f'        {subset}: "{digest}"' for subset, digest in values.subset_sha256.items()]
+            lines += [
+                f'        {subset}: "{digest}"'
+                for subset, digest in values.subset_sha256.items()
+            ]
             lines.append("      scenario_sha256:")
-            lines += [f'        {i}: "{digest}"' for i, digest in sorted(values.scenario_sha256.items())]
+            lines += [
+                f'        {i}: "{digest}"'
+                for i, digest in sorted(values.scenario_sha256.items())
+            ]
             lines.append("      statistics:")
             for name, row in values.statistics.items():
                 lines.append(f"        {name}: [{', '.join(map(_number, row))}]")
             numbers = [_number(value) for value in values.twin_floor]
-            rows = [", ".join(numbers[k : k + _PER_LINE]) for k in range(0, len(numbers), _PER_LINE)]
-            lines += ["      twin_floor:", "        [" + ",\n         ".join(rows) + "]"]
+            rows = [
+                ", ".join(numbers[k : k + _PER_LINE])
+                for k in range(0, len(numbers), _PER_LINE)
+            ]
+            lines += [
+                "      twin_floor:",
+                "        [" + ",\n         ".join(rows) + "]",
+            ]
     return "\n".join(lines) + "\n"
 
 
@@ -84,15 +106,32 @@ def replace_measured(text: str, measured: Mapping[str, Mapping[str, Measured]]) 
 
 
 def released_name(size: Size) -> str:
-    """Return what names a size in the list of released hashes: its bits, not its text."""
+    """Return what names a size in the list of released hashes: its bits, not its
+    text.
+    """
     return f"{size.split}/{size.name}/v{size.major}"
 
 
-def record(size: Size, manifest: Manifest, *, registry: Path, released: Path | None, allow: bool) -> Measured:
-    """Write what a manifest measures to datasets.yaml and to the list of released hashes."""
+def record(
+    size: Size,
+    manifest: Manifest,
+    *,
+    registry: Path,
+    released: Path | None,
+    allow: bool,
+) -> Measured:
+    """Write what a manifest measures to datasets.yaml and to the list of released
+    hashes.
+    """
     values = measured_values(manifest)
-    hashes = json.loads(released.read_text()) if released is not None and released.exists() else {}
-    before = hashes.get(released_name(size)) or (size.measured.dataset_sha256 if size.measured else None)
+    hashes = (
+        json.loads(released.read_text())
+        if released is not None and released.exists()
+        else {}
+    )
+    before = hashes.get(released_name(size)) or (
+        size.measured.dataset_sha256 if size.measured else None
+    )
     if before not in (None, values.dataset_sha256) and not allow:
         raise DataError(
             "the bits changed and MAJOR did not",
@@ -103,11 +142,15 @@ def record(size: Size, manifest: Manifest, *, registry: Path, released: Path | N
         )
     known = load(registry).measured
     sizes = {**known.get(size.split, {}), size.name: values}
-    text = replace_measured(registry.read_text(encoding="utf-8"), {**known, size.split: sizes})
+    text = replace_measured(
+        registry.read_text(encoding="utf-8"), {**known, size.split: sizes}
+    )
     write_atomically(registry, text.encode())
     if released is not None:
         hashes[released_name(size)] = values.dataset_sha256
-        write_atomically(released, (json.dumps(hashes, indent=1, sort_keys=True) + "\n").encode())
+        write_atomically(
+            released, (json.dumps(hashes, indent=1, sort_keys=True) + "\n").encode()
+        )
     return values
 
 
@@ -136,16 +179,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise DataError(
                     "a file is not the one that the manifest describes",
                     where=str(path),
-                    fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
+                    fix=f"lagbench generate --split {manifest.split} --size "
+                    f"{manifest.size}",
                 )
-        released, checkout = options.released, options.registry.parent / "tests"
+        released = options.released
+        checkout = options.registry.parent / "tests"
         if released is None and checkout.is_dir():
             released = checkout / "data" / "released_hashes.json"
         # what the manifest says of train is not taken on trust
-        train = [folder / entry.path for entry in manifest.files if entry.subset == "train"]
+        train = [
+            folder / entry.path for entry in manifest.files if entry.subset == "train"
+        ]
         manifest = manifest.model_copy(update={"statistics": file_statistics(train)})
         allow = options.allow_change
-        values = record(size, manifest, registry=options.registry, released=released, allow=allow)
+        values = record(
+            size, manifest, registry=options.registry, released=released, allow=allow
+        )
     except LagbenchError as error:
         sys.stderr.write(f"record: {error}\n")
         return error.exit_code

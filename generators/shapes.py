@@ -17,7 +17,17 @@ from lagbench.errors import WorkFailedError
 
 from .draws import RandomSource, quantise, uniform
 
-__all__ = ["Blobs", "Body", "Disc", "Rectangle", "Region", "Shape", "body_at", "place", "seeds"]
+__all__ = [
+    "Blobs",
+    "Body",
+    "Disc",
+    "Rectangle",
+    "Region",
+    "Shape",
+    "body_at",
+    "place",
+    "seeds",
+]
 
 Array = NDArray[np.float64]
 Region = tuple[tuple[float, float], tuple[float, float]]
@@ -52,7 +62,9 @@ class Rectangle:
 
     @classmethod
     def of_area(cls, area: float, aspect: float) -> Rectangle:
-        """Return the level rectangle of this area [length^2] and length over width [1]."""
+        """Return the level rectangle of this area [length^2] and length over width
+        [1].
+        """
         length = math.sqrt(area * aspect)
         return cls(length, area / length)
 
@@ -64,8 +76,11 @@ class Rectangle:
     @property
     def reach(self) -> tuple[float, float]:
         """Half the bounding box of the turned rectangle."""
-        c, s = abs(self.axis[0]), abs(self.axis[1])
-        return 0.5 * (c * self.length + s * self.width), 0.5 * (s * self.length + c * self.width)
+        c = abs(self.axis[0])
+        s = abs(self.axis[1])
+        return 0.5 * (c * self.length + s * self.width), 0.5 * (
+            s * self.length + c * self.width
+        )
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
@@ -73,7 +88,8 @@ class Rectangle:
         along = np.abs(c * x + s * y) - 0.5 * self.length
         across = np.abs(c * y - s * x) - 0.5 * self.width
         inside = np.minimum(np.maximum(along, across), 0.0)
-        along, across = np.maximum(along, 0.0), np.maximum(across, 0.0)
+        along = np.maximum(along, 0.0)
+        across = np.maximum(across, 0.0)
         return np.asarray(np.sqrt(along * along + across * across) + inside)
 
 
@@ -114,20 +130,29 @@ class Blobs:
 
     @classmethod
     def of_area(cls, area: float, offsets: Array, *, cells: int) -> Blobs:
-        """Scale an arrangement of unit discs, centres in radii [disc, 2], until their union covers an area.
+        """Scale an arrangement of unit discs, centres in radii [disc, 2], until their
+        union covers an area.
 
-        The union of unit discs is measured once, by counting cells of a grid, so many across the bounding
-        box; at 512 the error is about 1e-3. Any other area follows by its scale.
+        The union of unit discs is measured once, by counting cells of a grid, so many
+        across the bounding box; at 512 the error is about 1e-3. Any other area follows
+        by its scale.
         """
-        low, high = offsets.min(axis=0) - 1.0, offsets.max(axis=0) + 1.0
-        centres, extent = offsets - 0.5 * (low + high), high - low
+        low = offsets.min(axis=0) - 1.0
+        high = offsets.max(axis=0) + 1.0
+        centres = offsets - 0.5 * (low + high)
+        extent = high - low
         middle = (np.arange(cells) + 0.5) / cells - 0.5
-        x, y = (side.ravel() for side in np.meshgrid(middle * extent[0], middle * extent[1]))
+        x, y = (
+            side.ravel() for side in np.meshgrid(middle * extent[0], middle * extent[1])
+        )
         covered = np.zeros(cells * cells, dtype=np.bool_)
         for centre in centres:
-            dx, dy = x - centre[0], y - centre[1]
+            dx = x - centre[0]
+            dy = y - centre[1]
             covered |= dx * dx + dy * dy <= 1.0
-        counted = float(np.count_nonzero(covered) * (extent[0] * extent[1])) / (cells * cells)
+        counted = float(np.count_nonzero(covered) * (extent[0] * extent[1])) / (
+            cells * cells
+        )
         scale = math.sqrt(area / counted)
         placed = tuple((float(x) * scale, float(y) * scale) for x, y in centres)
         return cls(placed, scale, area)
@@ -140,7 +165,9 @@ class Blobs:
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance, exact outside and on the outline."""
-        discs = [Disc(self.radius).distance(position - np.array(c)) for c in self.centres]
+        discs = [
+            Disc(self.radius).distance(position - np.array(c)) for c in self.centres
+        ]
         return np.asarray(np.minimum.reduce(discs))
 
 
@@ -177,16 +204,21 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
 
 
 def seeds(rng: RandomSource, body: Body, count: int) -> Array:
-    """Spread particles evenly inside a body: multiples of 2^-20 [length], shape [count, 2].
+    """Spread particles evenly inside a body: multiples of 2^-20 [length], shape [count,
+    2].
 
-    The first ``count`` points inside it of Roberts' R2 low-discrepancy sequence, laid by a
-    random shift over the smallest square about the bounding box, so that spacings are alike
-    in both directions however slender the body is.
+    The first ``count`` points inside it of Roberts' R2 low-discrepancy sequence, laid
+    by a random shift over the smallest square about the bounding box, so that spacings
+    are alike in both directions however slender the body is.
     """
     shift = rng.random((2,))
     side = 2.0 * max(body.shape.reach)
-    block = min(4 * count, 1 << 16)  # at once: a million particles take no memory beside their own
-    found, missing, start = [np.empty((0, 2))], count, 1
+    block = min(
+        4 * count, 1 << 16
+    )  # at once: a million particles take no memory beside their own
+    found = [np.empty((0, 2))]
+    missing = count
+    start = 1
     while missing > 0:
         index = np.arange(start, start + block, dtype=np.float64)[:, None]
         turns = shift + index * _R2

@@ -4,9 +4,10 @@ Neither xarray nor pandas is imported, which keeps a worker below 400 MB.
 
 The twin floor: how far a scenario drifts from a copy of itself that was nudged.
 
-At the last frame that a model is given, every coordinate of every particle moves by +2^-20 or
--2^-20 (seeded signs), far below anything that a frame shows. The position RMSE between this
-twin and the truth at each predicted frame is what no model can be expected to undercut::
+At the last frame that a model is given, every coordinate of every particle moves by
++2^-20 or -2^-20 (seeded signs), far below anything that a frame shows. The position
+RMSE between this twin and the truth at each predicted frame is what no model can be
+expected to undercut::
 
     floor(f) = sqrt(mean over particles and axes of (x_twin(f) - x(f))^2)
 
@@ -37,10 +38,15 @@ from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
-"""Parameters of a file that follow from its simulation; all others are known before it."""
+"""Parameters of a file that follow from its simulation; all others are known before it.
+"""
 
-COMPILING = 2  # frames on the way to which kernels are compiled: one is read out, then one is advanced to
-_FILE_NAMES = {"reynolds": "reynolds_number"}  # drawn parameters that files call by their CF-like long name
+# frames on the way to which kernels are compiled: one is read out, then one is advanced
+# to
+COMPILING = 2
+_FILE_NAMES = {
+    "reynolds": "reynolds_number"
+}  # drawn parameters that files call by their CF-like long name
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +58,9 @@ class Facts:
     kinetic_energy_last: float  # the same at the last frame
     kinetic_energy_max: float  # the largest of any frame
     kinetic_energy_mean: float  # the mean over frames
-    energy_last_over_max: float  # last over largest; small where the motion has died down
+    energy_last_over_max: (
+        float  # last over largest; small where the motion has died down
+    )
     max_speed: float  # largest velocity component at any substep [length/s]
     cfl: float  # cells that this speed crosses per substep [1]
     jacobian_min: float  # smallest J of any particle at any substep [1]
@@ -82,19 +90,28 @@ def _particle_mass(size: Size, state: InitialState) -> float:
 
 
 def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
-    """Return what a scenario's file states and hashes: constants, then what was drawn."""
+    """Return what a scenario's file states and hashes: constants, then what was
+    drawn.
+    """
     constants = {name: parameter.value for name, parameter in size.parameters.items()}
-    drawn = {_FILE_NAMES.get(name, name): value for name, value in state.parameters.items()}
+    drawn = {
+        _FILE_NAMES.get(name, name): value for name, value in state.parameters.items()
+    }
     return {**constants, **drawn, "start_frame": state.start_frame}
 
 
-def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> ScenarioWriter:
+def scenario_writer(
+    job: SimulationJob, scenario: int, state: InitialState
+) -> ScenarioWriter:
     """Return the writer of a scenario's file, with all that is known before it runs."""
-    size, walls = job.size, None
+    size = job.size
+    walls = None
     key = size.key(scenario)
     if isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters):
         # of each wall towards each recorded frame [length/s], shape [frame, 4, 2]
-        frames = range(state.start_frame, state.start_frame + size.frame_count(scenario))
+        frames = range(
+            state.start_frame, state.start_frame + size.frame_count(scenario)
+        )
         walls = np.stack([state.walls_towards(frame) for frame in frames])
     return ScenarioWriter(
         scenario_path(job.root, key),
@@ -115,37 +132,52 @@ def scenario_writer(job: SimulationJob, scenario: int, state: InitialState) -> S
 def active_frames(energies: Sequence[float], task: Task) -> int:
     """Return how many frames of the horizon pass until a free surface lies still.
 
-    Counted up to and including the last at which the kinetic energy is at least 1 % of its greatest
-    value from frame 0 to the end of the horizon.
+    Counted up to and including the last at which the kinetic energy is at least 1 % of
+    its greatest value from frame 0 to the end of the horizon.
     """
     span = energies[: task.input_frames + task.horizon]
-    last = max(frame for frame, energy in enumerate(span) if energy >= STILL * max(span))
+    last = max(
+        frame for frame, energy in enumerate(span) if energy >= STILL * max(span)
+    )
     return max(0, last + 1 - task.input_frames)
 
 
 def simulate(
-    job: SimulationJob, report: Report, *, clock: Callable[[], float] = time.process_time
+    job: SimulationJob,
+    report: Report,
+    *,
+    clock: Callable[[], float] = time.process_time,
 ) -> list[Simulated]:
     """Simulate the scenarios of a job and write their files, all or none of them.
 
     Kernels compile on the way to the first two frames, so time is taken from there on.
     """
-    batch, size = Batch(job, report), job.size
+    batch = Batch(job, report)
+    size = job.size
     masses = [_particle_mass(size, state) for state in batch.states]
-    kinetic: list[list[float]] = [[] for _ in masses]  # energies by scenario, frame by frame
+    kinetic: list[list[float]] = [
+        [] for _ in masses
+    ]  # energies by scenario, frame by frame
     begun = clock()
     with ExitStack() as stack:
         pairs = zip(job.scenarios, batch.states, strict=True)
-        writers = [stack.enter_context(scenario_writer(job, scenario, state)) for scenario, state in pairs]
+        writers = [
+            stack.enter_context(scenario_writer(job, scenario, state))
+            for scenario, state in pairs
+        ]
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
             writers[index].append(position, velocity)
             speed = velocity.astype(np.float64).ravel()
             # An exact sum: which frames are active enters the content hash.
-            kinetic[index].append(0.5 * masses[index] * math.fsum((speed * speed).tolist()))
+            kinetic[index].append(
+                0.5 * masses[index] * math.fsum((speed * speed).tolist())
+            )
             if frame == COMPILING - 1:
                 begun = clock()
-        for writer, energies, state, seen in zip(writers, kinetic, batch.states, batch.extremes, strict=True):
+        for writer, energies, state, seen in zip(
+            writers, kinetic, batch.states, batch.extremes, strict=True
+        ):
             if isinstance(batch.solver.parameters, FreeSurfaceParameters):
                 writer.state(active_frames=active_frames(energies, size.task))
             largest = max(energies)
@@ -189,11 +221,16 @@ def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
 
 def twin_substeps(size: Size, scenario: int) -> int:
     """Return how many substeps a scenario's twin takes."""
-    return substeps_of(size, scenario) - size.frames_behind(scenario) * size.substeps_per_frame
+    return (
+        substeps_of(size, scenario)
+        - size.frames_behind(scenario) * size.substeps_per_frame
+    )
 
 
 def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ...]]:
-    """Simulate twins of scenarios beside their files; return the RMSE of each predicted frame [length]."""
+    """Simulate twins of scenarios beside their files; return the RMSE of each predicted
+    frame [length].
+    """
     size = job.size
     counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
     batch = Batch(job, report, frames=counts)
@@ -209,6 +246,13 @@ def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ..
                 batch.displace(offsets)
             elif frame >= size.task.input_frames:
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                error = batch.frame(index)[0].astype(np.float64) - truth.astype(np.float64)
-                floors[index].append(math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size))
-    return {scenario: tuple(floor) for scenario, floor in zip(job.scenarios, floors, strict=True)}
+                error = batch.frame(index)[0].astype(np.float64) - truth.astype(
+                    np.float64
+                )
+                floors[index].append(
+                    math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)
+                )
+    return {
+        scenario: tuple(floor)
+        for scenario, floor in zip(job.scenarios, floors, strict=True)
+    }

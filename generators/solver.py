@@ -20,8 +20,10 @@ from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 class Device(enum.StrEnum):
     """Where and how the substeps run; the bits do not depend on it."""
 
-    CPU = "cpu"  # one scenario, a whole frame of substeps in one serial kernel without atomics
-    PARALLEL = "parallel"  # the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads
+    # one scenario, a whole frame of substeps in one serial kernel without atomics
+    CPU = "cpu"
+    # the GPU's kernels (scenarios x particles, atomics) on Taichi's CPU threads
+    PARALLEL = "parallel"
     CUDA = "cuda"  # the same kernels on an NVIDIA GPU
 
 
@@ -30,7 +32,9 @@ class Health:
     """What one scenario went through during the last advance."""
 
     finite: bool  # whether every position, velocity and J is a finite number
-    max_speed: float  # largest absolute velocity component of any particle or node at any substep [length/s]
+    # largest absolute velocity component of any particle or node at any substep
+    # [length/s]
+    max_speed: float
     jacobian_min: float  # smallest J of any particle at any substep [1]
     jacobian_max: float  # largest J of any particle at any substep [1]
 
@@ -48,8 +52,9 @@ class Solver(Protocol):
     def advance(self, substeps: int) -> None:
         """Advance every scenario.
 
-        One that leaves the bounds within which the solver is valid is a WorkFailedError, which names its
-        index, the range of substeps (for a single one its number, from 1), the broken bounds and the values.
+        One that leaves the bounds within which the solver is valid is a
+        WorkFailedError, which names its index, the range of substeps (for a single one
+        its number, from 1), the broken bounds and the values.
         """
 
     def position(self) -> NDArray[np.float32]:
@@ -59,7 +64,9 @@ class Solver(Protocol):
         """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
 
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept in the box."""
+        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept
+        in the box.
+        """
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
@@ -78,13 +85,20 @@ def build(
     scenarios: int = 1,
     threads: int | None = None,
 ) -> Solver:
-    """Compile the solver that belongs to the parameters, whose type chooses the formulation.
+    """Compile the solver that belongs to the parameters, whose type chooses the
+    formulation.
 
-    ``scenarios`` advance together, one on ``Device.CPU``; ``threads`` are those of ``Device.PARALLEL``, by
-    default all that the process may use. A device or count that cannot be is a UsageError.
+    ``scenarios`` advance together, one on ``Device.CPU``; ``threads`` are those of
+    ``Device.PARALLEL``, by default all that the process may use. A device or count that
+    cannot be is a UsageError.
     """
     module, name = _IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
-    importlib.import_module(".backend", package)  # before Taichi itself, which it keeps quiet
+    importlib.import_module(
+        ".backend", package
+    )  # before Taichi itself, which it keeps quiet
     implementation = getattr(importlib.import_module(module, package), name)
-    return cast("Solver", implementation(parameters, device=device, scenarios=scenarios, threads=threads))
+    return cast(
+        "Solver",
+        implementation(parameters, device=device, scenarios=scenarios, threads=threads),
+    )

@@ -16,11 +16,19 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["ClosedBoxParameters", "FreeSurfaceParameters", "InitialState", "Material", "Split"]
+__all__ = [
+    "ClosedBoxParameters",
+    "FreeSurfaceParameters",
+    "InitialState",
+    "Material",
+    "Split",
+]
 
 
 class Material(enum.IntEnum):
-    """Constitutive model of a particle; the values are the CF ``flag_values`` of the files."""
+    """Constitutive model of a particle; the values are the CF ``flag_values`` of the
+    files.
+    """
 
     LIQUID = 0
     JELLY = 1
@@ -32,19 +40,28 @@ class Material(enum.IntEnum):
 class ClosedBoxParameters:
     """Constants of the weakly compressible, nodal-stress solver (design 4.3).
 
-    The walls lie half-way between nodes, at ``(wall + 1/2) / grid`` and its mirror image.
+    The walls lie half-way between nodes, at ``(wall + 1/2) / grid`` and its mirror
+    image.
     """
 
     particles: int  # particles in one scenario
     grid: int  # cells across the unit box; the grid has grid + 1 nodes a side
     dt: float  # substep [s]
     wall: int  # index of the ghost node layer outside the low walls
-    no_slip: bool  # whether the walls hold the fluid (cavity) or let it slide (curl noise)
+    no_slip: (
+        bool  # whether the walls hold the fluid (cavity) or let it slide (curl noise)
+    )
     density: float  # rest density rho [mass/length^2]
     modulus: float  # bulk modulus E [mass/s^2]; the speed of sound is sqrt(E/rho)
-    velocity_relaxation: float  # lambda, share of the grid velocity mixed into v_p per substep [1]
-    jacobian_relaxation: float  # kappa, share of the nodal J mixed into J_p per substep [1]
-    density_coupling: float  # theta, pull of J_p towards the grid density per substep [1]
+    velocity_relaxation: (
+        float  # lambda, share of the grid velocity mixed into v_p per substep [1]
+    )
+    jacobian_relaxation: (
+        float  # kappa, share of the nodal J mixed into J_p per substep [1]
+    )
+    density_coupling: (
+        float  # theta, pull of J_p towards the grid density per substep [1]
+    )
     shift: float  # beta, strength of the particle shift [1]
     substeps_per_frame: int = 1  # substeps for which one row of a wall program acts
 
@@ -64,18 +81,26 @@ class FreeSurfaceParameters:
     density: float  # rest density rho of every material [mass/length^2]
     liquid_modulus: float  # bulk modulus K of the liquid [mass/s^2]
     liquid_viscosity: float  # kinematic viscosity nu of the liquid [length^2/s]
-    jacobian_relaxation: float  # kappa, share of the nodal J mixed into J_p per substep [1]
-    density_coupling: float  # theta, pull of J_p towards the grid density per substep [1]
+    jacobian_relaxation: (
+        float  # kappa, share of the nodal J mixed into J_p per substep [1]
+    )
+    density_coupling: (
+        float  # theta, pull of J_p towards the grid density per substep [1]
+    )
     jacobian_min: float  # lower bound of the liquid's J [1]
     jacobian_max: float  # upper bound of the liquid's J [1]
     jelly_modulus: float = 30.0  # Young's modulus of jelly [mass/s^2]
     jelly_poisson: float = 0.3  # Poisson's ratio of jelly [1]
     rope_modulus: float = 100.0  # Young's modulus of rope [mass/s^2]
     rope_poisson: float = 0.3  # Poisson's ratio of rope [1]
-    elastic_damping: float = 0.002  # kinematic damping eta of jelly and rope [length^2/s]
+    elastic_damping: float = (
+        0.002  # kinematic damping eta of jelly and rope [length^2/s]
+    )
     snow_modulus: float = 40.0  # Young's modulus of snow [mass/s^2]
     snow_poisson: float = 0.2  # Poisson's ratio of snow [1]
-    snow_compression: float = 2.5e-2  # critical compression theta_c (Stomakhin 2013) [1]
+    snow_compression: float = (
+        2.5e-2  # critical compression theta_c (Stomakhin 2013) [1]
+    )
     snow_stretch: float = 4.5e-3  # critical stretch theta_s (Stomakhin 2013) [1]
     snow_hardening: float = 10.0  # hardening exponent xi in exp(xi (1 - Jp)) [1]
     snow_hardening_min: float = 0.05  # lower cap of the hardening factor [1]
@@ -95,11 +120,13 @@ class InitialState:
     velocity: NDArray[np.float64]  # particle velocities [length/s], shape [particle, 2]
     affine: NDArray[np.float64]  # APIC matrix C = grad v [1/s], shape [particle, 2, 2]
     material: NDArray[np.int8]  # Material of each particle, shape [particle], int8
-    area: float  # area that the material covers [length^2]; particle volume is area / particles
-    viscosity: float = 0.0  # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
+    # area that the material covers [length^2]; particle volume is area / particles
+    area: float
+    # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
+    viscosity: float = 0.0
     # velocity of each wall in the order of WALLS [length/s], shape [4, 2], or a program
-    # of shape [frame, 4, 2]: row f acts from frame f-1 to f after the first substep, row
-    # 0 never, the last one for good
+    # of shape [frame, 4, 2]: row f acts from frame f-1 to f after the first substep,
+    # row 0 never, the last one for good
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
     friction: float = 0.0  # Coulomb friction of the walls (free surface only) [1]
     start_frame: int = 0  # frames simulated before frame 0 is recorded
@@ -107,7 +134,9 @@ class InitialState:
     parameters: Mapping[str, int | float | str] = field(default_factory=dict)
 
     def walls_towards(self, frame: int) -> NDArray[np.float64]:
-        """Return the velocity of each wall from the frame before up to this one [length/s], shape [4, 2]."""
+        """Return the velocity of each wall from the frame before up to this one
+        [length/s], shape [4, 2].
+        """
         program = self.wall_velocity
         return program if program.ndim == 2 else program[min(frame, len(program) - 1)]
 
@@ -118,8 +147,12 @@ class Split(Protocol):
     A module with these two functions is one.
     """
 
-    def solver_parameters(self, size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
+    def solver_parameters(
+        self, size: Size
+    ) -> ClosedBoxParameters | FreeSurfaceParameters:
         """Return the constants of the solver at this size."""
 
-    def initial_state(self, size: Size, scenario: int, rng: np.random.Generator) -> InitialState:
+    def initial_state(
+        self, size: Size, scenario: int, rng: np.random.Generator
+    ) -> InitialState:
         """Draw one scenario; only ``rng.random`` may be used."""

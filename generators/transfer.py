@@ -1,20 +1,21 @@
 """Particle-grid transfer: quadratic B-splines and exact fixed-point sums.
 
-Shared by both formulations. A particle at x touches the 3 x 3 nodes base + (i, j) with the
-weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
+Shared by both formulations. A particle at x touches the 3 x 3 nodes base + (i, j) with
+the weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
 
     w_0 = (3/2 - f)^2 / 2,    w_1 = 3/4 - (f - 1)^2,    w_2 = (f - 1/2)^2 / 2.
 
-Nodes sum 64-bit integers, q = round(scale x value): integer addition commutes, so neither the
-order of particles nor threads nor devices can change a bit of the sum.
+Nodes sum 64-bit integers, q = round(scale x value): integer addition commutes, so
+neither the order of particles nor threads nor devices can change a bit of the sum.
 
-What is stored of a particle is vectors of four, each in an array of its own. Loops that only look
-at one particle (stencil, stress, motion) then have one stride, and LLVM takes eight particles at a
-time; P2G and G2P, whose nodes lie anywhere, take the four numbers of a node at a time.
+What is stored of a particle is vectors of four, each in an array of its own. Loops that
+only look at one particle (stencil, stress, motion) then have one stride, and LLVM takes
+eight particles at a time; P2G and G2P, whose nodes lie anywhere, take the four numbers
+of a node at a time.
 
-In the signatures of Taichi functions ``Template`` is a field or a compile-time constant and
-``Value`` a scalar or vector of any type, for which Taichi wants no annotation; nor does it for a
-kernel that returns ``Nothing``.
+In the signatures of Taichi functions ``Template`` is a field or a compile-time constant
+and ``Value`` a scalar or vector of any type, for which Taichi wants no annotation; nor
+does it for a kernel that returns ``Nothing``.
 """
 
 import inspect
@@ -32,16 +33,18 @@ else:
     Value = inspect.Parameter.empty
     Nothing = tuple[()]
 
-# 1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low bits.
+# 1.5 x 2^52: added to a float64 below 2^51, it leaves the rounded integer in the low
+# bits.
 _ROUNDING_SHIFT = 6755399441055744.0
 _SHIFT_BITS = 0x4338000000000000  # of that float64
 
 
 def fixed_point_scale(particles: int, bound: float) -> float:
-    """Return the largest power of two for which no nodal sum of contributions can overflow.
+    """Return the largest power of two for which no nodal sum of contributions can
+    overflow.
 
-    A contribution of at most ``bound`` scales to at most 2^50 (:func:`to_fixed` is exact below
-    2^51), and ``particles`` of them sum to less than 2^62.
+    A contribution of at most ``bound`` scales to at most 2^50 (:func:`to_fixed` is
+    exact below 2^51), and ``particles`` of them sum to less than 2^62.
 
     >>> fixed_point_scale(8192, 8.0) == 2.0**46
     True
@@ -53,15 +56,21 @@ def fixed_point_scale(particles: int, bound: float) -> float:
 
 @ti.func
 def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
-    """Return three rows of weights w_i w_j, and in their fourth places what else a transfer needs.
+    """Return three rows of weights w_i w_j, and in their fourth places what else a
+    transfer needs.
 
-    These are the bits of the base node's index i width + j, and the offset f - 1 along x and y.
+    These are the bits of the base node's index i width + j, and the offset f - 1 along
+    x and y.
     """
     scaled = ti.Vector([x[0], x[1]]) * inv_dx
     base = ti.cast(scaled - 0.5, ti.i32)
     f = scaled - ti.cast(base, ti.f32)
-    to_low, to_mid, to_high = 1.5 - f, f - 1.0, f - 0.5
-    low, mid, high = 0.5 * (to_low * to_low), 0.75 - to_mid * to_mid, 0.5 * (to_high * to_high)
+    to_low = 1.5 - f
+    to_mid = f - 1.0
+    to_high = f - 0.5
+    low = 0.5 * (to_low * to_low)
+    mid = 0.75 - to_mid * to_mid
+    high = 0.5 * (to_high * to_high)
     node = ti.bit_cast(base[0] * width + base[1], ti.f32)
     return (
         ti.Vector([low[0] * low[1], low[0] * mid[1], low[0] * high[1], node]),
@@ -72,15 +81,20 @@ def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
 
 @ti.func
 def base_node(rows: Template, s: ti.i32, p: ti.i32) -> Value:
-    """Return a particle's base node, and its offset from the middle one in cells, from its stencil."""
-    return ti.bit_cast(rows[0][s, p][3], ti.i32), ti.Vector([rows[1][s, p][3], rows[2][s, p][3]])
+    """Return a particle's base node, and its offset from the middle one in cells, from
+    its stencil.
+    """
+    return ti.bit_cast(rows[0][s, p][3], ti.i32), ti.Vector(
+        [rows[1][s, p][3], rows[2][s, p][3]]
+    )
 
 
 @ti.func
 def to_fixed(scaled: Value) -> Value:
     """Round a float32 below 2^51 to the nearest 64-bit integer, ties to even.
 
-    NaN and larger values give some integer, never a trap: the float's bits are only read.
+    NaN and larger values give some integer, never a trap: the float's bits are only
+    read.
     """
     return shifted(scaled) - ti.i64(_SHIFT_BITS)
 
@@ -88,7 +102,9 @@ def to_fixed(scaled: Value) -> Value:
 @ti.func
 def shifted(scaled: Value) -> Value:
     """Return :func:`to_fixed` plus the bits of the shift."""
-    return ti.bit_cast(ti.cast(scaled, ti.f64) + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64)
+    return ti.bit_cast(
+        ti.cast(scaled, ti.f64) + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64
+    )
 
 
 @ti.func
@@ -98,13 +114,18 @@ def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
 
 
 @ti.func
-def accumulate(sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template) -> None:
-    """Add contributions, times their scales, to one node's sums; atomic where other threads may as well."""
+def accumulate(
+    sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template
+) -> None:
+    """Add contributions, times their scales, to one node's sums; atomic where other
+    threads may as well.
+    """
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):
         ti.atomic_add(sums[node], to_fixed(scaled))
     else:
-        # The shift comes off the sum: off the contribution, LLVM finds vectors for two lanes only.
+        # The shift comes off the sum: off the contribution, LLVM finds vectors for two
+        # lanes only.
         sums[node] = (sums[node] - ti.i64(_SHIFT_BITS)) + shifted(scaled)
 
 

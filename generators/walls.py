@@ -1,9 +1,9 @@
 """Ghost nodes of a closed box: which node mirrors which, and with what sign.
 
-A wall lies half-way between an outermost interior node (``edge``) and the ghost node beyond it
-(``ghost``). A vector's normal component is odd about the wall; its tangential component is odd
-about the wall's own velocity where the wall holds the fluid, even where it lets it slide. A ghost
-in a corner mirrors across both walls.
+A wall lies half-way between an outermost interior node (``edge``) and the ghost node
+beyond it (``ghost``). A vector's normal component is odd about the wall; its tangential
+component is odd about the wall's own velocity where the wall holds the fluid, even
+where it lets it slide. A ghost in a corner mirrors across both walls.
 """
 
 import taichi as ti
@@ -18,16 +18,23 @@ class Walls:
     def __init__(self, *, grid: int, wall: int, no_slip: bool) -> None:
         """Set the indices; the field ``speed`` is the caller's to place."""
         self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
-        self.edge = (wall + 1, grid - wall - 1)  # low and high index of the interior nodes
+        self.edge = (
+            wall + 1,
+            grid - wall - 1,
+        )  # low and high index of the interior nodes
         self.span = grid - 2 * wall
         self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
-        self.tangential = -1 if no_slip else 1  # sign with which a wall mirrors a tangential component
+        self.tangential = (
+            -1 if no_slip else 1
+        )  # sign with which a wall mirrors a tangential component
         # tangential velocity of each wall [length/s], order of WALLS; shape [scenario]
         self.speed = ti.Vector.field(4, ti.f32)
 
     @ti.func
     def beyond(self, i: ti.i32) -> ti.i32:
-        """Return the ghost index next to an outermost interior index, others as they are."""
+        """Return the ghost index next to an outermost interior index, others as they
+        are.
+        """
         ghost = i
         if i == self.edge[0]:
             ghost = self.ghost[0]
@@ -37,7 +44,9 @@ class Walls:
 
     @ti.func
     def doubled_speed(self, s: ti.i32, first: Template, ghost: ti.i32) -> ti.f32:
-        """Return 2 u_wall of the wall before a ghost node; ``first`` is the low wall of the pair."""
+        """Return 2 u_wall of the wall before a ghost node; ``first`` is the low wall of
+        the pair.
+        """
         speed = self.speed[s][first]
         if ghost == self.ghost[1]:
             speed = self.speed[s][first + 1]
@@ -45,21 +54,29 @@ class Walls:
 
     @ti.func
     def source(self, i: ti.i32) -> ti.i32:
-        """Return the interior index that a ghost index mirrors, an interior index itself."""
+        """Return the interior index that a ghost index mirrors, an interior index
+        itself.
+        """
         return ti.min(ti.max(i, self.edge[0]), self.edge[1])
 
     @ti.func
     def ring(self, k: ti.i32) -> Value:
         """Return the k-th ghost node: once around, from the low left corner."""
-        side, along = k // self.span, k % self.span
-        low, high = self.ghost[0], self.ghost[1]
-        i, j = low, low + along
+        side = k // self.span
+        along = k % self.span
+        low = self.ghost[0]
+        high = self.ghost[1]
+        i = low
+        j = low + along
         if side == 1:
-            i, j = low + along, high
+            i = low + along
+            j = high
         if side == 2:
-            i, j = high, high - along
+            i = high
+            j = high - along
         if side == 3:
-            i, j = high - along, low
+            i = high - along
+            j = low
         return i, j
 
     @ti.func
@@ -74,9 +91,12 @@ class Walls:
 
     @ti.func
     def drive(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.math.vec2:
-        """Return what moving walls add to a ghost's velocity: half in the last cells, 0 in corners."""
+        """Return what moving walls add to a ghost's velocity: half in the last cells, 0
+        in corners.
+        """
         add = ti.Vector([0.0, 0.0])
-        across_x, across_y = i != self.source(i), j != self.source(j)
+        across_x = i != self.source(i)
+        across_y = j != self.source(j)
         if across_x and not across_y:
             add[1] = self.doubled_speed(s, 0, i)
             if j == self.edge[0] or j == self.edge[1]:

@@ -1,4 +1,6 @@
-"""The program `lagbench`: its commands in the order in which a user meets them, and their errors."""
+"""The program `lagbench`: its commands in the order in which a user meets them, and
+their errors.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,12 @@ from .errors import LagbenchError, WorkFailedError, package_at_fault, printable
 
 INTERRUPTED = 130
 FAILED = 5
-RESUMED = {"demo", "generate", "download", "train"}  # commands that go on where they stopped
+RESUMED = {
+    "demo",
+    "generate",
+    "download",
+    "train",
+}  # commands that go on where they stopped
 UNREAD = 141  # what shells say of a command whose reader left, 128 + SIGPIPE
 FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -30,7 +37,9 @@ class _Commands(TyperGroup):
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
         for stream in (sys.stdout, sys.stderr):
-            if isinstance(stream, io.TextIOWrapper):  # a letter that a stream lacks shall not end the work
+            if isinstance(
+                stream, io.TextIOWrapper
+            ):  # a letter that a stream lacks shall not end the work
                 stream.reconfigure(errors="backslashreplace")
         with _told(), _refused_output():  # --help and --version print here
             return super().make_context(*args, **extra)
@@ -40,15 +49,22 @@ class _Commands(TyperGroup):
             with _plain_warnings(), _told(), _refused_output():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            again = "; the same command" + (", without --force," if "--force" in sys.argv else "")
-            more = f"{again} goes on where it stopped" if ctx.invoked_subcommand in RESUMED else ""
+            again = "; the same command" + (
+                ", without --force," if "--force" in sys.argv else ""
+            )
+            if ctx.invoked_subcommand in RESUMED:
+                more = f"{again} goes on where it stopped"
+            else:
+                more = ""
             typer.echo(f"lagbench: interrupted{more}", err=True)
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             # click's usage errors, or typer's own copy of them, are typer's to show
-            usage = any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
+            usage = any(
+                kind.__name__ == "ClickException" for kind in type(error).__mro__
+            )
             if usage or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
             again = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
@@ -56,7 +72,10 @@ class _Commands(TyperGroup):
             if (place := package_at_fault(error)) is not None:
                 fix = f"mend or uninstall the package of {place};\n       {again} has the whole trace"
             said = printable(", ".join([str(error), *getattr(error, "__notes__", ())]))
-            typer.echo(f"lagbench: unexpected {type(error).__name__}: {said}\n  fix: {fix}", err=True)
+            typer.echo(
+                f"lagbench: unexpected {type(error).__name__}: {said}\n  fix: {fix}",
+                err=True,
+            )
             raise typer.Exit(FAILED) from error
 
 
@@ -72,14 +91,20 @@ def _told() -> Iterator[None]:
 
 @contextmanager
 def _refused_output() -> Iterator[None]:
-    """End in silence where the reader of a pipe has left; say that there is no space to write to."""
+    """End in silence where the reader of a pipe has left; say that there is no space to
+    write to.
+    """
     try:
         yield
     except (BrokenPipeError, SystemExit) as left:
         # rich makes one of the other
-        if isinstance(left, SystemExit) and not isinstance(left.__context__, BrokenPipeError):
+        if isinstance(left, SystemExit) and not isinstance(
+            left.__context__, BrokenPipeError
+        ):
             raise
-        with suppress(AttributeError, OSError):  # what is still buffered would fail again at the end
+        with suppress(
+            AttributeError, OSError
+        ):  # what is still buffered would fail again at the end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(UNREAD) from None
     except OSError as error:
@@ -101,11 +126,18 @@ def _refused_output() -> Iterator[None]:
 
 @contextmanager
 def _plain_warnings() -> Iterator[None]:
-    """Tell our users' warnings in one line; those for developers keep their place in the code."""
+    """Tell our users' warnings in one line; those for developers keep their place in
+    the code.
+    """
     with warnings.catch_warnings():
         show = warnings.showwarning
 
-        def tell(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:  # noqa: ANN401
+        def tell(
+            message: Warning | str,
+            category: type[Warning],
+            *place: Any,  # noqa: ANN401
+            **more: Any,  # noqa: ANN401
+        ) -> None:
             if category.__module__.startswith("lagbench."):
                 typer.echo(f"warning: {message}", err=True)
             else:
@@ -136,10 +168,15 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _lagbench(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool,
+        typer.Option(
+            "--version", callback=_version, is_eager=True, help="Print the version."
+        ),
     ] = False,
 ) -> None:
-    """Bit-reproducible particle data sets for neural surrogates of continuum simulators."""
+    """Bit-reproducible particle data sets for neural surrogates of continuum
+    simulators.
+    """
 
 
 COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
@@ -170,7 +207,9 @@ COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
 
 for function, example in COMMANDS:
     app.command(example.split()[0], epilog=f"Example: lagbench {example}")(function)
-app.add_typer(board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show")
+app.add_typer(
+    board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show"
+)
 
 if __name__ == "__main__":
     app()

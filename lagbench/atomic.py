@@ -1,4 +1,6 @@
-"""Files that appear whole or not at all (temporary name, fsync, rename), and that are files at all."""
+"""Files that appear whole or not at all (temporary name, fsync, rename), and that are
+files at all.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,9 @@ ROOT_OPTION = "--root or LAGBENCH_ROOT"
 def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     """Yield a temporary name beside the target; rename it there on a clean exit.
 
-    The parent folder is created. Before the rename the file is flushed to disk, after it
-    the folder is, so that a crash at any time leaves the old file or the new one. When the
-    body raises, the temporary file is removed and the target stays as it was.
+    The parent folder is created. Before the rename the file is flushed to disk, after
+    it the folder is, so that a crash at any time leaves the old file or the new one.
+    When the body raises, the temporary file is removed and the target stays as it was.
     """
     temporary = temporary_name(target)
     try:
@@ -51,7 +53,8 @@ def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) ->
 def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
     """Rename files to places on the same disk, in their order.
 
-    What may fail comes first: files are flushed and folders made before the first one is moved.
+    What may fail comes first: files are flushed and folders made before the first one
+    is moved.
     """
     for source, target in moves:
         _flush(source)
@@ -64,14 +67,17 @@ def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
 
 
 def refuse_folders(paths: Iterable[Path]) -> None:
-    """Raise IsADirectoryError for a folder where a file is to be replaced or removed."""
+    """Raise IsADirectoryError for a folder where a file is to be replaced or
+    removed.
+    """
     for path in paths:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
-    """Make a folder and see that files can be written there, before work whose result goes there.
+    """Make a folder and see that files can be written there, before work whose result
+    goes there.
 
     Args:
         folder: the folder.
@@ -102,7 +108,9 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
 
 def temporary_name(target: Path) -> Path:
-    """Return this process's own temporary name beside a target, of which nothing may be left."""
+    """Return this process's own temporary name beside a target, of which nothing may be
+    left.
+    """
     return target.with_name(f".{target.name}.{os.getpid()}-{_mark()}{SUFFIX}")
 
 
@@ -129,7 +137,9 @@ def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
 def _discard(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
-    except OSError:  # the folder is missing or read-only: then there is nothing to remove
+    except (
+        OSError
+    ):  # the folder is missing or read-only: then there is nothing to remove
         return
 
 

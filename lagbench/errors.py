@@ -1,11 +1,12 @@
 """Errors that say what, where, expected, got and how to fix it.
 
 Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is what the
-command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is unreadable,
-4 data set missing, damaged or of another hash, 5 the work itself failed.
+command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is
+unreadable, 4 data set missing, damaged or of another hash, 5 the work itself failed.
 
-Files that a user names: refused unless they are regular and of bounded length. Optional dependencies:
-import one, or say which extra installs it. Packages that add something: import them.
+Files that a user names: refused unless they are regular and of bounded length. Optional
+dependencies: import one, or say which extra installs it. Packages that add something:
+import them.
 """
 
 from __future__ import annotations
@@ -47,29 +48,51 @@ class LagbenchError(Exception):
 
     def _compose(self) -> str:
         parts = [self.what]
-        labelled = {"where": self.where, "expected": self.expected, "got": self.got, "fix": self.fix}
-        parts += [f"{label}: {text}" for label, text in labelled.items() if text is not None]
+        labelled = {
+            "where": self.where,
+            "expected": self.expected,
+            "got": self.got,
+            "fix": self.fix,
+        }
+        parts += [
+            f"{label}: {text}" for label, text in labelled.items() if text is not None
+        ]
         return printable("\n  ".join(parts))
 
     def add_note(self, note: str, /) -> None:
-        """Say more of where it is, in place of Python's notes, which no message of ours shows."""
-        self.where = note if self.where is None else f"{self.where}, {note}"
+        """Say more of where it is, in place of Python's notes, which no message of ours
+        shows.
+        """
+        if self.where is None:
+            self.where = note
+        else:
+            self.where = f"{self.where}, {note}"
         self.args = (self._compose(),)
 
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild with keyword arguments, so that errors cross process borders."""
-        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.fix)
+        return _rebuild, (
+            type(self),
+            self.what,
+            self.where,
+            self.expected,
+            self.got,
+            self.fix,
+        )
 
 
 def printable(text: str) -> str:
-    r"""Spell out what is no printable character: in a stranger's words it would command the terminal.
+    r"""Spell out what is no printable character: in a stranger's words it would command
+    the terminal.
 
     >>> print(printable("a\x1b[2J\nb"))
     a\x1b[2J
     b
     """
     return "".join(
-        letter if letter.isprintable() or letter == "\n" else letter.encode("unicode_escape").decode("ascii")
+        letter
+        if letter.isprintable() or letter == "\n"
+        else letter.encode("unicode_escape").decode("ascii")
         for letter in text
     )
 
@@ -106,7 +129,9 @@ class Mistakes:
     def __enter__(self) -> None:
         """Begin what may be a mistake."""
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+    def __exit__(
+        self, kind: object, error: BaseException | None, trace: object
+    ) -> bool:
         """Keep a usage error and go on after the block; anything else is raised."""
         if not isinstance(error, UsageError):
             return False
@@ -145,10 +170,13 @@ class WorkFailedError(LagbenchError):
     exit_code = 5
 
 
-def check_regular(path: Path, *, longest: int | None = None, fix: str | None = None) -> int:
+def check_regular(
+    path: Path, *, longest: int | None = None, fix: str | None = None
+) -> int:
     """Refuse what is no regular file, or a long one; return its length [bytes].
 
-    Devices never end and a FIFO waits for ever, so this comes before anything is opened.
+    Devices never end and a FIFO waits for ever, so this comes before anything is
+    opened.
     """
     try:
         status = path.stat()
@@ -161,8 +189,13 @@ def check_regular(path: Path, *, longest: int | None = None, fix: str | None = N
             fix="check the path and that you may read the file",
         ) from error
     if not stat.S_ISREG(status.st_mode):
-        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, socket or pipe"
-        raise UnreadableFileError("not a file", where=str(path), expected="a file", got=kind, fix=fix)
+        if stat.S_ISDIR(status.st_mode):
+            kind = "a folder"
+        else:
+            kind = "a device, socket or pipe"
+        raise UnreadableFileError(
+            "not a file", where=str(path), expected="a file", got=kind, fix=fix
+        )
     if longest is not None and status.st_size > longest:
         raise UnreadableFileError(
             "the file is too long",
@@ -183,16 +216,24 @@ def nearest(name: str, known: Iterable[str]) -> str:
     words = sorted(known)
     close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     listing = f"known: {', '.join(words) or 'none'}"
-    return f"did you mean {close[0]!r}? {listing}" if close else listing
+    if close:
+        return f"did you mean {close[0]!r}? {listing}"
+    return listing
 
 
 def package_at_fault(error: BaseException) -> str | None:
-    """Return the innermost place of a trace in what another package adds; None where there is none."""
-    from importlib.metadata import entry_points  # half of what importing lagbench would take
+    """Return the innermost place of a trace in what another package adds; None where
+    there is none.
+    """
+    from importlib.metadata import (
+        entry_points,
+    )  # half of what importing lagbench would take
 
     groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
     points = [point for group in groups for point in entry_points(group=group)]
-    added = {point.value.partition(":")[0].split(".")[0].strip() for point in points} - {"lagbench"}
+    added = {
+        point.value.partition(":")[0].split(".")[0].strip() for point in points
+    } - {"lagbench"}
     place = None
     for frame, line in traceback.walk_tb(error.__traceback__):
         if str(frame.f_globals.get("__name__")).split(".")[0] in added:

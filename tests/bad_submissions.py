@@ -3,8 +3,9 @@
     python tests/bad_submissions.py [FOLDER]
 
 writes a small data set and one file per fault into FOLDER (a temporary one by default),
-validates each in a child process with limits, and prints check, exit code, computing time and the
-child's peak memory. Exit code 1 if any file is not recognised, crashes or breaks a limit.
+validates each in a child process with limits, and prints check, exit code, computing
+time and the child's peak memory. Exit code 1 if any file is not recognised, crashes or
+breaks a limit.
 """
 
 from __future__ import annotations
@@ -37,16 +38,24 @@ def main() -> int:
         seconds = cpu_seconds() - started
         checks = sorted({finding.check for finding in result.errors})
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-        good = entry.check in checks and result.exit_code == entry.exit_code and seconds < 10 and peak < 1000
+        good = (
+            entry.check in checks
+            and result.exit_code == entry.exit_code
+            and seconds < 10
+            and peak < 1000
+        )
         failures += not good
         text = f"{name:28} {','.join(checks):24} exit {result.exit_code} {seconds:5.1f} s {peak:5.0f} MiB"
         print(f"{text} {'ok' if good else 'NOT RECOGNISED'}")  # noqa: T201
-    print(f"{len(FAULTS)} faulty files, {failures} not recognised; they lie in {target}")  # noqa: T201
+    summary = f"{len(FAULTS)} faulty files, {failures} not recognised"
+    print(f"{summary}; they lie in {target}")  # noqa: T201
     return 1 if failures else 0
 
 
 def cpu_seconds() -> float:
-    """Computing time of this process and its children: unlike wall time, no matter of the load [s]."""
+    """Computing time of this process and its children: unlike wall time, no matter of
+    the load [s].
+    """
     used = os.times()
     return used.user + used.system + used.children_user + used.children_system
 

@@ -1,4 +1,6 @@
-"""Headless Chromium by its DevTools protocol over a pipe: no port, no driver, no package."""
+"""Headless Chromium by its DevTools protocol over a pipe: no port, no driver, no
+package.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,26 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
 """The browser; None where there is none (Debian: apt-get install chromium)."""
 
 FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    *(
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-quic",
+        "--no-first-run",
+    ),
+    *(
+        "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
+    ),
     *("--disable-dev-shm-usage", "--hide-scrollbars", "--remote-debugging-pipe"),
 )
 
@@ -38,8 +54,10 @@ KEYS = {
     "/": (191, "/"),
 }
 
-CLEAR, MARKED = 60, 20
-"""A pixel changes clearly by so many of 255 levels of grey; so many of them are a mark."""
+CLEAR = 60
+MARKED = 20
+"""A pixel changes clearly by so many of 255 levels of grey; so many of them are a mark.
+"""
 
 
 @dataclass
@@ -73,14 +91,16 @@ class Page:
         self.call("Input.dispatchKeyEvent", type="keyUp", **about)
 
     def focus_shows(self, selector: str) -> bool:
-        """Return whether focus is to be seen around an element: 20 pixels change clearly.
+        """Return whether focus is to be seen around an element: 20 pixels change
+        clearly.
 
         The page must know a reader who uses the keyboard: press a key first.
         """
         self.value("document.activeElement.blur(), 0")
         box = self.value(
             f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
-            " return {x: b.x + scrollX - 6, y: b.y + scrollY - 6, width: b.width + 12, height: b.height + 12}"
+            " return {x: b.x + scrollX - 6, y: b.y + scrollY - 6, width: b.width + "
+            "12, height: b.height + 12}"
             f" }})(document.querySelector({json.dumps(selector)}))"
         )
         pictures = []
@@ -88,7 +108,9 @@ class Page:
             data = self.call("Page.captureScreenshot", clip={**box, "scale": 1})["data"]
             picture = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
             pictures.append(np.asarray(picture, np.int16))
-            self.value(f"document.querySelector({json.dumps(selector)}).focus({{preventScroll: true}}), 0")
+            self.value(
+                f"document.querySelector({json.dumps(selector)}).focus({{preventScroll: true}}), 0"
+            )
         return bool((abs(pictures[1] - pictures[0]) > CLEAR).sum() >= MARKED)
 
     def pdf(self) -> bytes:
@@ -103,10 +125,17 @@ class Page:
 
     def _notice(self) -> None:
         for event in self.browser.events:
-            method, said = event["method"], event["params"]
-            if method in ("Log.entryAdded", "Runtime.consoleAPICalled", "Runtime.exceptionThrown"):
+            method = event["method"]
+            said = event["params"]
+            if method in (
+                "Log.entryAdded",
+                "Runtime.consoleAPICalled",
+                "Runtime.exceptionThrown",
+            ):
                 self.messages.append(json.dumps(said))
-            if method == "Network.requestWillBeSent" and not said["request"]["url"].startswith("data:"):
+            if method == "Network.requestWillBeSent" and not said["request"][
+                "url"
+            ].startswith("data:"):
                 self.requests.append(said["request"]["url"])
         self.browser.events.clear()
 
@@ -115,12 +144,15 @@ class Browser:
     """A running browser."""
 
     def __init__(self, write: int, read: int) -> None:
-        self._out, self._in = os.fdopen(write, "wb", 0), os.fdopen(read, "rb")
+        self._out = os.fdopen(write, "wb", 0)
+        self._in = os.fdopen(read, "rb")
         self._number = 0
         self._rest = b""
         self.events: list[dict[str, Any]] = []
 
-    def call(self, method: str, session: str | None = None, **parameters: Any) -> dict[str, Any]:
+    def call(
+        self, method: str, session: str | None = None, **parameters: Any
+    ) -> dict[str, Any]:
         """Call a method and return its answer; events on the way are kept."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
@@ -143,14 +175,23 @@ class Browser:
             if "method" in said:
                 self.events.append(said)
 
-    def open(self, path: Path, *, width: int, height: int = 900, dark: bool = False) -> Page:
+    def open(
+        self, path: Path, *, width: int, height: int = 900, dark: bool = False
+    ) -> Page:
         """Open a file in a new tab and wait until it is loaded."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)[
+            "sessionId"
+        ]
         page = Page(self, session)
         for domain in ("Page", "Network", "Log", "Runtime"):
             page.call(f"{domain}.enable")
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 600}
+        size = {
+            "width": width,
+            "height": height,
+            "deviceScaleFactor": 1,
+            "mobile": width < 600,
+        }
         page.call("Emulation.setDeviceMetricsOverride", **size)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         page.call("Emulation.setEmulatedMedia", features=[scheme])
@@ -181,9 +222,20 @@ def browser() -> Iterator[Browser]:
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         # the protocol wants descriptors 3 and 4
         shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out}'
-        command = ["bash", "-c", shell, "bash", str(CHROMIUM), *FLAGS, f"--user-data-dir={profile}"]
+        command = [
+            "bash",
+            "-c",
+            shell,
+            "bash",
+            str(CHROMIUM),
+            *FLAGS,
+            f"--user-data-dir={profile}",
+        ]
         process = subprocess.Popen(
-            command, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         os.close(theirs_in)
         os.close(theirs_out)
@@ -206,13 +258,20 @@ def close(page: Page) -> None:
 
 def still(page: Page, motion: str = "reduce") -> None:
     """Ask for reduced motion."""
-    page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-reduced-motion", "value": motion}])
+    page.call(
+        "Emulation.setEmulatedMedia",
+        features=[{"name": "prefers-reduced-motion", "value": motion}],
+    )
 
 
 def run(page: Page, statement: str) -> None:
     """Run a statement and whatever it sets going."""
     page.value(f"{statement}, 0")
-    page.call("Runtime.evaluate", expression="new Promise(done => setTimeout(done, 30))", awaitPromise=True)
+    page.call(
+        "Runtime.evaluate",
+        expression="new Promise(done => setTimeout(done, 30))",
+        awaitPromise=True,
+    )
 
 
 def press(page: Page, key: str, modifiers: int = 0) -> None:
@@ -244,7 +303,8 @@ def seen(page: Page) -> list[list[str]]:
     found: list[list[str]] = page.value(
         f"[...document.querySelectorAll('{rows}')].map(tr =>"
         " [tr.cells[0], tr.querySelector('.name'),"
-        " ...[...tr.querySelectorAll('td:not(.rank, [hidden])')].map(td => td.firstChild)]"
+        " ...[...tr.querySelectorAll('td:not(.rank, [hidden])')].map(td => "
+        "td.firstChild)]"
         ".map(e => e.textContent))"
     )
     return found
@@ -253,7 +313,8 @@ def seen(page: Page) -> list[list[str]]:
 def names(page: Page) -> list[str]:
     """Return the names of the entries in view, in order."""
     found: list[str] = page.value(
-        "[...document.querySelectorAll('section.tab:not([hidden]) tr[data-entry]:not([hidden]) .name')]"
+        "[...document.querySelectorAll('section.tab:not([hidden]) "
+        "tr[data-entry]:not([hidden]) .name')]"
         ".map(e => e.textContent)"
     )
     return found

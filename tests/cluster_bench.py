@@ -29,12 +29,19 @@ with LocalCluster(**options, protocol="tcp://") as cluster:
 
 @contextmanager
 def local_cluster(threads: int = 1) -> Iterator[Any]:
-    """Run a scheduler here and two worker processes that can import the test modules."""
+    """Run a scheduler here and two worker processes that can import the test
+    modules.
+    """
     import distributed
 
     before = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = str(TESTS)
-    options = {"n_workers": 2, "threads_per_worker": threads, "processes": True, "dashboard_address": ":0"}
+    options = {
+        "n_workers": 2,
+        "threads_per_worker": threads,
+        "processes": True,
+        "dashboard_address": ":0",
+    }
     try:
         with distributed.LocalCluster(**options, silence_logs=50) as running:
             yield running
@@ -47,24 +54,40 @@ def local_cluster(threads: int = 1) -> Iterator[Any]:
 
 @contextmanager
 def scheduler_process() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Run a scheduler with its worker in a process that a test may kill; yield its address and it."""
+    """Run a scheduler with its worker in a process that a test may kill; yield its
+    address and it.
+    """
     there = {**os.environ, "PYTHONPATH": str(TESTS)}
     pipe = subprocess.PIPE
     command = [sys.executable, "-c", ALONE]
-    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=there) as process:
+    with subprocess.Popen(
+        command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=there
+    ) as process:
         assert process.stdout is not None
         yield process.stdout.readline().decode().strip(), process
         process.kill()
 
 
 def everything(folder: Path) -> dict[str, bytes]:
-    """Return path and bytes of every file of a data set but its lock and notes of this machine."""
-    found = {str(path.relative_to(folder)): path for path in folder.rglob("*") if path.is_file()}
-    return {name: path.read_bytes() for name, path in found.items() if name not in (".lock", NOTES_NAME)}
+    """Return path and bytes of every file of a data set but its lock and notes of this
+    machine.
+    """
+    found = {
+        str(path.relative_to(folder)): path
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+    return {
+        name: path.read_bytes()
+        for name, path in found.items()
+        if name not in (".lock", NOTES_NAME)
+    }
 
 
 def writers(root: Path) -> dict[int, Path]:
-    """Return the unfinished scenario files below a folder by the process that writes them."""
+    """Return the unfinished scenario files below a folder by the process that writes
+    them.
+    """
     files = root.rglob(".*.nc.*.partial")
     return {int(path.name.split(".nc.")[1].split("-")[0]): path for path in files}
 
@@ -83,7 +106,8 @@ class Sabotage(threading.Thread):
 
     def __init__(self, root: Path, witness: Callable[[], None] = lambda: None) -> None:
         super().__init__(daemon=True)
-        self.root, self.witness = root, witness
+        self.root = root
+        self.witness = witness
         self.killed: tuple[int, Path] | None = None
         self.slowed: set[int] = set()
         self._over = threading.Event()
@@ -118,8 +142,13 @@ class Sabotage(threading.Thread):
 
 
 def gone(process: int) -> bool:
-    """Return whether a process has ended, be it that nobody has asked for its last words."""
+    """Return whether a process has ended, be it that nobody has asked for its last
+    words.
+    """
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return (
+            Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+            == "Z"
+        )
     except OSError:
         return True

@@ -45,51 +45,70 @@ from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 from lagbench.work.run import ONE_THREAD
 
-# The same code gives the same verdict: what Hypothesis finds by chance is to be found by whoever caused it.
-# Seeded examples are the same ones every time, and the later ones are variations of the first.
+# The same code gives the same verdict: what Hypothesis finds by chance is to be found
+# by whoever caused it. Seeded examples are the same ones every time, and the later ones
+# are variations of the first.
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("seeded")
 
-# Each process would compile torch anew, in 7 s, and every run all that the tests import, in 15 s.
+# Each process would compile torch anew, in 7 s, and every run all that the tests
+# import, in 15 s.
 if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
-    sys.pycache_prefix = sys.pycache_prefix or str(Path(__file__).parents[1] / "build" / "bytecode")
-    os.environ["PYTHONPYCACHEPREFIX"], sys.dont_write_bytecode = sys.pycache_prefix, False
+    sys.pycache_prefix = sys.pycache_prefix or str(
+        Path(__file__).parents[1] / "build" / "bytecode"
+    )
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    sys.dont_write_bytecode = False
 
-OUTCOMES, DRAW = scored._outcomes, cards._draw
+OUTCOMES = scored._outcomes
+DRAW = cards._draw
 Names = tuple[str, ...]
 READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
 
-SPLIT, SIZE = "curl-noise", "tiny"
+SPLIT = "curl-noise"
+SIZE = "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
 
 
 def pytest_collection_finish() -> None:
-    """Leave what the imports made out of every search for garbage: some 700,000 objects."""
+    """Leave what the imports made out of every search for garbage: some 700,000
+    objects.
+    """
     gc.collect()
     gc.freeze()
 
 
 def pytest_sessionfinish() -> None:
-    """Have Taichi keep what it compiled, which it does only where no solver is left as the process ends."""
+    """Have Taichi keep what it compiled, which it does only where no solver is left as
+    the process ends.
+    """
     if (taichi := sys.modules.get("taichi")) is not None:
-        with suppress(Exception):  # a cache that cannot be written costs the next run a compilation
+        with suppress(
+            Exception
+        ):  # a cache that cannot be written costs the next run a compilation
             taichi.reset()
-    if sys.pycache_prefix is not None:  # of modules that lay in temporary folders, each time another
+    if (
+        sys.pycache_prefix is not None
+    ):  # of modules that lay in temporary folders, each time another
         shutil.rmtree(sys.pycache_prefix + tempfile.gettempdir(), ignore_errors=True)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def lasting_workers() -> Iterator[None]:
-    """Simulate in one worker that outlives a generation, unless it is left at work: Taichi starts in seconds.
+    """Simulate in one worker that outlives a generation, unless it is left at work:
+    Taichi starts in seconds.
 
-    Generations that are killed or counted are started by their tests as processes of their own.
+    Generations that are killed or counted are started by their tests as processes of
+    their own.
     """
     held: dict[object, Pool] = {}
 
     @contextmanager
     def lasting(_: int, __: Mapping[str, str] | None = None) -> Iterator[Pool]:
         # A simulation is told all else that it reads, its folder and registry too.
-        inherited = sorted((k, v) for k, v in os.environ.items() if k.startswith(("PYTHON", "TI_")))
+        inherited = sorted(
+            (k, v) for k, v in os.environ.items() if k.startswith(("PYTHON", "TI_"))
+        )
         key = tuple(sys.path), tuple(inherited)
         if key not in held:
             held[key] = stack.enter_context(Pool(1, ONE_THREAD))
@@ -115,15 +134,21 @@ def running() -> Iterator[Browser]:
 
 @pytest.fixture(scope="session", autouse=True)
 def quick(home: Path) -> Iterator[None]:
-    """Keep out of the user's cache, and do without what takes long and has tests of its own."""
+    """Keep out of the user's cache, and do without what takes long and has tests of its
+    own.
+    """
 
-    def validated(path: str | Path, *, isolated: bool = True, **options: Any) -> ValidationResult:
+    def validated(
+        path: str | Path, *, isolated: bool = True, **options: Any
+    ) -> ValidationResult:
         """Validate without the child that looks at predictions first."""
         assert isolated
         return validate(path, isolated=False, **options)
 
     def draw(root: Path, size: Size, *_: object) -> None:
-        """Leave the pictures of cards blank: to draw them takes longer than to generate tiny data."""
+        """Leave the pictures of cards blank: to draw them takes longer than to generate
+        tiny data.
+        """
         for name in cards.PICTURES:
             path = dataset_folder(root, size.split, size.name, size.major) / name
             path.parent.mkdir(exist_ok=True)
@@ -134,28 +159,44 @@ def quick(home: Path) -> Iterator[None]:
         for module in ("scoring.score", "board.submit"):
             patch.setattr(f"lagbench.{module}.validate", validated)
         patch.setattr(cards, "_draw", draw)
-        # Commands are built from their signatures once, not at every call, which may take less.
+        # Commands are built from their signatures once, not at every call, which may
+        # take less.
         patch.setattr("typer.testing._get_command", functools.cache(get_command))
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def floors_once() -> Iterator[None]:
-    """Measure the floors of a data set once, unless by workers: they are most of what a score costs."""
+    """Measure the floors of a data set once, unless by workers: they are most of what a
+    score costs.
+    """
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
     def outcomes(
-        task: ScoredTask, path: Path, anatomy: Anatomy, metrics: Names, floors: Names, *others: Any
+        task: ScoredTask,
+        path: Path,
+        anatomy: Anatomy,
+        metrics: Names,
+        floors: Names,
+        *others: Any,
     ) -> list[ScenarioScores]:
         workers, scheduler, _ = others
         if not floors or scheduler is not None or (workers or 1) > 1:
             return OUTCOMES(task, path, anatomy, metrics, floors, *others)
         files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
         key = metrics, floors, repr((task.size, task.setting)), *map(file_sha256, files)
-        found = OUTCOMES(task, path, anatomy, metrics, () if key in known else floors, *others)
+        found = OUTCOMES(
+            task, path, anatomy, metrics, () if key in known else floors, *others
+        )
         if key not in known:
-            known[key] = {one.scenario: {name: one.tallies[name] for name in floors} for one in found}
-        return [replace(one, tallies={**one.tallies, **known[key][one.scenario]}) for one in found]
+            known[key] = {
+                one.scenario: {name: one.tallies[name] for name in floors}
+                for one in found
+            }
+        return [
+            replace(one, tallies={**one.tallies, **known[key][one.scenario]})
+            for one in found
+        ]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lagbench.scoring.score._outcomes", outcomes)
@@ -164,17 +205,25 @@ def floors_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def stored_once() -> Iterator[None]:
-    """Read score files of equal bytes once: commands read all of a board's, several times."""
+    """Read score files of equal bytes once: commands read all of a board's, several
+    times.
+    """
     known: dict[Hashable, Stored] = {}
 
     @functools.cache
     def statistics(_: str, path: Path) -> StoredScores:
         stored = read_statistics(path)
-        object.__setattr__(stored, "scores", functools.cache(stored.scores))  # no test of tables adds metrics
+        object.__setattr__(
+            stored, "scores", functools.cache(stored.scores)
+        )  # no test of tables adds metrics
         return stored
 
     def read(path: Path, size: Size | None = None) -> Stored:
-        if path.is_symlink() or not path.is_file() or path.stat().st_size > MAX_SCORE_BYTES:
+        if (
+            path.is_symlink()
+            or not path.is_file()
+            or path.stat().st_size > MAX_SCORE_BYTES
+        ):
             return read_stored(path, size)
         key = file_sha256(path), size and repr(size)
         if key not in known:
@@ -191,7 +240,9 @@ def stored_once() -> Iterator[None]:
 
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take what is above back for one test: workers of its own, the child, floors, files, pictures."""
+    """Take what is above back for one test: workers of its own, the child, floors,
+    files, pictures.
+    """
     for module in ("make.generate", "make.verify"):
         monkeypatch.setattr(f"lagbench.{module}.Pool", Pool)
     for module in ("scoring.score", "board.submit"):
@@ -204,7 +255,9 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def unmeasured_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of datasets.yaml without its measured block, so that tests hold before and after a record."""
+    """A copy of datasets.yaml without its measured block, so that tests hold before and
+    after a record.
+    """
     path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
     path.write_text(default_path().read_text().split("\nmeasured:")[0] + "\n")
     return path
@@ -218,7 +271,9 @@ def unmeasured(unmeasured_path: Path) -> Registry:
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that all processes of a test run share; take a FileLock for what is made there once."""
+    """The folder that all processes of a test run share; take a FileLock for what is
+    made there once.
+    """
     own = tmp_path_factory.getbasetemp()
     # Under pytest-xdist each process has a folder of its own in one that all share.
     return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
@@ -226,14 +281,18 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def tiny_split(home: Path) -> Callable[..., GenerationResult]:
-    """A function that generates the tiny data of a split once for all tests; do not change the files."""
+    """A function that generates the tiny data of a split once for all tests; do not
+    change the files.
+    """
 
     def made(split: str, name: str = "tiny", **options: Any) -> GenerationResult:
         root = home / f"{name}-{split}"
         told = root.with_suffix(".pickle")
         with FileLock(root.with_suffix(".lock")):
             if not told.exists():
-                told.write_bytes(pickle.dumps(generate(split, SIZE, root=root, **options)))
+                told.write_bytes(
+                    pickle.dumps(generate(split, SIZE, root=root, **options))
+                )
         found: GenerationResult = pickle.loads(told.read_bytes())
         return found
 
@@ -241,7 +300,9 @@ def tiny_split(home: Path) -> Callable[..., GenerationResult]:
 
 
 @pytest.fixture(scope="session")
-def generated(tiny_split: Callable[..., GenerationResult], unmeasured: Registry) -> GenerationResult:
+def generated(
+    tiny_split: Callable[..., GenerationResult], unmeasured: Registry
+) -> GenerationResult:
     """The tiny curl-noise data, generated once and compared with no hash."""
     return tiny_split(SPLIT, "generated", workers=2, registry=unmeasured)
 
@@ -253,7 +314,9 @@ def bench(generated: GenerationResult, unmeasured: Registry) -> ScoreBench:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Callable[..., Result]:
+def run(
+    monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path
+) -> Callable[..., Result]:
     """A function that runs lagbench with our splits and no recorded hashes."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
@@ -261,18 +324,28 @@ def run(monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Callable[...,
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Path]]:
-    """A function that installs a package of another author: group of its entry point, the object, its source.
+def package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Path]]:
+    """A function that installs a package of another author: group of its entry point,
+    the object, its source.
 
     It returns the module's file, which is there only where a source is given.
     """
     modules: list[str] = []
 
-    def call(group: str, value: str, source: str | None = None, *, name: str = "mine") -> Path:
-        module, about = value.partition(":")[0], tmp_path / f"{name}-1.dist-info"
+    def call(
+        group: str, value: str, source: str | None = None, *, name: str = "mine"
+    ) -> Path:
+        module = value.partition(":")[0]
+        about = tmp_path / f"{name}-1.dist-info"
         about.mkdir()
-        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n")
-        (about / "entry_points.txt").write_text(f"[lagbench.{group}]\n{name} = {value}\n")
+        (about / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n"
+        )
+        (about / "entry_points.txt").write_text(
+            f"[lagbench.{group}]\n{name} = {value}\n"
+        )
         if source is not None:
             (tmp_path / f"{module}.py").write_text(source)
             modules.append(module)
@@ -287,7 +360,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callabl
 
 @pytest.fixture
 def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
-    """A function that copies the generated data set to a root folder that a test may damage."""
+    """A function that copies the generated data set to a root folder that a test may
+    damage.
+    """
     return lambda: shutil.copytree(generated.root, tmp_path / "root")
 
 
@@ -305,7 +380,12 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     """A data set of four files of about 40 kB."""
     folder = tmp_path_factory.mktemp("original")
     np.save(folder / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400)))
-    return adopt(folder / "runs.npy", output=folder / "root" / "own", radius=0.1, frame_interval=0.1)
+    return adopt(
+        folder / "runs.npy",
+        output=folder / "root" / "own",
+        radius=0.1,
+        frame_interval=0.1,
+    )
 
 
 @pytest.fixture

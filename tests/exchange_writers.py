@@ -22,11 +22,14 @@ METADATA: dict[str, Any] = {
 
 
 def write_gns(folder: Path, runs: list[Any], kinds: Any = 5, **changes: Any) -> Path:
-    """Write runs as the GNS programs' own scripts do, with numpy.savez; one for each subset."""
+    """Write runs as the GNS programs' own scripts do, with numpy.savez; one for each
+    subset.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for subset, run in zip(SUBSETS, runs, strict=True):
         pair = np.empty(2, dtype=object)
-        pair[0], pair[1] = run, kinds
+        pair[0] = run
+        pair[1] = kinds
         np.savez(folder / f"{subset}.npz", simulation_trajectory_0=pair)
     (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
     return folder
@@ -38,6 +41,8 @@ def write_h5(folder: Path, runs: list[Any], kinds: Any = None, **changes: Any) -
     for subset, run in zip(SUBSETS, runs, strict=True):
         with h5py.File(folder / f"{subset}.h5", "w") as file:
             file.create_dataset("00000/position", data=run, compression="gzip")
-            file["00000/particle_type"] = np.zeros(run.shape[1], int) if kinds is None else kinds
+            file["00000/particle_type"] = (
+                np.zeros(run.shape[1], int) if kinds is None else kinds
+            )
     (folder / "metadata.json").write_text(json.dumps({**METADATA, **changes}))
     return folder

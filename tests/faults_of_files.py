@@ -117,8 +117,11 @@ def chunk_damaged(bench: Bench) -> Path:
 
 def _stream(gibibytes: int) -> bytes:
     """Return a zlib stream that unpacks to so much nothing."""
-    packer, zeros = zlib.compressobj(9), bytes(1 << 24)
-    blocks = [packer.compress(zeros) + packer.flush(zlib.Z_FULL_FLUSH) for _ in range(2)]
+    packer = zlib.compressobj(9)
+    zeros = bytes(1 << 24)
+    blocks = [
+        packer.compress(zeros) + packer.flush(zlib.Z_FULL_FLUSH) for _ in range(2)
+    ]
     return blocks[0] + (64 * gibibytes - 1) * blocks[1]
 
 
@@ -135,7 +138,12 @@ def small_chunk_bomb(bench: Bench) -> Path:
 def large_chunk_bomb(bench: Bench) -> Path:
     """A chunk of 8 MiB, allowed as such, whose stream of 2 MiB unpacks to 2 GiB."""
     path = bench.copy("large_chunk_bomb.nc")
-    options = {"maxshape": (None,) * 4, "chunks": (1, 8, 1 << 17, 2), "dtype": "f4", "compression": 1}
+    options = {
+        "maxshape": (None,) * 4,
+        "chunks": (1, 8, 1 << 17, 2),
+        "dtype": "f4",
+        "compression": 1,
+    }
     with h5py.File(path, "r+") as file:
         dataset = replace(file, "position", DIMS, shape=SHAPE, **options)
         dataset.id.write_direct_chunk((1, 0, 0, 0), _stream(2))
@@ -144,7 +152,9 @@ def large_chunk_bomb(bench: Bench) -> Path:
 
 @fault("readable", 3, hostile=True)
 def heap_loops(bench: Bench) -> Path:
-    """A global heap that leads HDF5 to an object of length 0, which it passes for ever."""
+    """A global heap that leads HDF5 to an object of length 0, which it passes for
+    ever.
+    """
     path = bench.copy("heap_loops.nc")
     data = bytearray(path.read_bytes())
     start = data.index(b"GCOL")

@@ -16,7 +16,12 @@ attribute("no_method", "method", None, says="missing")
 attribute("blank_method", "method", "  ")
 attribute("method_with_escape_codes", "method", "best\x1b[2Jmethod", says="\\x1b")
 attribute("method_is_a_number", "method", 5)
-attribute("method_is_a_list", "method", np.array(["a", "b"], dtype=h5py.string_dtype()), says="single")
+attribute(
+    "method_is_a_list",
+    "method",
+    np.array(["a", "b"], dtype=h5py.string_dtype()),
+    says="single",
+)
 attribute("long_method", "method", "x" * 10_000)
 attribute("method_as_bad_utf8", "method", np.bytes_(b"\xff\xfe"))
 attribute("method_is_empty", "method", h5py.Empty("S1"), says="single")
@@ -25,7 +30,9 @@ attribute("seconds_nan", "seconds_per_frame", np.nan)
 attribute("parameters_negative", "parameters", -5)
 attribute("seed_as_text", "seed", "seven")
 attribute("no_split", "split", None, says="missing")
-attribute("attribute_is_compound", "training", np.zeros(1, [("a", "i4")]), says="neither")
+attribute(
+    "attribute_is_compound", "training", np.zeros(1, [("a", "i4")]), says="neither"
+)
 
 
 @fault("format", says="single")
@@ -99,23 +106,53 @@ simple("format", "external_link", _external_link, says="external link")
 simple("format", "stray_external_link", _stray_link, says="external link")
 simple("format", "too_many_groups", _crowd, says="too many")
 simple("format", "position_without_values", _null)
-simple("format", "lzf_filter", lambda f: store(f, positions(f), compression="lzf"), says="lzf")
-simple("format", "scale_offset_filter", lambda f: store(f, positions(f), scaleoffset=6), says="filter")
+simple(
+    "format",
+    "lzf_filter",
+    lambda f: store(f, positions(f), compression="lzf"),
+    says="lzf",
+)
+simple(
+    "format",
+    "scale_offset_filter",
+    lambda f: store(f, positions(f), scaleoffset=6),
+    says="filter",
+)
 simple("format", "no_scenario_ids", lambda f: f.pop("scenario"), says="scenario")
-simple("format", "ids_as_text", lambda f: replace(f, "scenario", (), np.array([b"3", b"4", b"5"])))
-simple("format", "ids_as_floats", lambda f: replace(f, "scenario", (), np.array([3.0, 4.0, 5.0])))
-simple("format", "ids_in_two_dimensions", lambda f: replace(f, "scenario", (), np.array([[3, 4, 5]])))
+simple(
+    "format",
+    "ids_as_text",
+    lambda f: replace(f, "scenario", (), np.array([b"3", b"4", b"5"])),
+)
+simple(
+    "format",
+    "ids_as_floats",
+    lambda f: replace(f, "scenario", (), np.array([3.0, 4.0, 5.0])),
+)
+simple(
+    "format",
+    "ids_in_two_dimensions",
+    lambda f: replace(f, "scenario", (), np.array([[3, 4, 5]])),
+)
 simple(
     "format",
     "tiny_chunks",
-    lambda f: replace(f, "position", DIMS, shape=(3, 8, 5000, 2), chunks=(1, 1, 1, 1), dtype="f4"),
+    lambda f: replace(
+        f, "position", DIMS, shape=(3, 8, 5000, 2), chunks=(1, 1, 1, 1), dtype="f4"
+    ),
     says="too many chunks",
 )
 simple(
     "format",
     "huge_chunk",
     lambda f: replace(
-        f, "position", DIMS, shape=SHAPE, maxshape=(None,) * 4, chunks=(3, 8, 1 << 20, 8), dtype="f4"
+        f,
+        "position",
+        DIMS,
+        shape=SHAPE,
+        maxshape=(None,) * 4,
+        chunks=(3, 8, 1 << 20, 8),
+        dtype="f4",
     ),
     says="unpack",
 )
@@ -123,7 +160,14 @@ simple(
     "format",
     "huge_chunk_of_ids",
     lambda f: replace(
-        f, "scenario", (), shape=(3,), maxshape=(None,), chunks=(1 << 28,), dtype="i4", compression=1
+        f,
+        "scenario",
+        (),
+        shape=(3,),
+        maxshape=(None,),
+        chunks=(1 << 28,),
+        dtype="i4",
+        compression=1,
     ),
 )
 
@@ -168,17 +212,29 @@ def _filtered(name: str, codes: tuple[int, ...], variable: str) -> None:
     """Register a fault whose variable passes through filters in this order."""
 
     def change(file: h5py.File) -> None:
-        shape, kind = (SHAPE, h5py.h5t.IEEE_F32LE) if variable == "position" else ((3,), h5py.h5t.STD_I32LE)
+        shape, kind = (
+            (SHAPE, h5py.h5t.IEEE_F32LE)
+            if variable == "position"
+            else ((3,), h5py.h5t.STD_I32LE)
+        )
         plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         plist.set_chunk((1, 1, PARTICLES, 2) if variable == "position" else shape)
         for code in codes:
-            plist.set_filter(code, h5py.h5z.FLAG_OPTIONAL, (9,) if code == h5py.h5z.FILTER_DEFLATE else ())
+            plist.set_filter(
+                code,
+                h5py.h5z.FLAG_OPTIONAL,
+                (9,) if code == h5py.h5z.FILTER_DEFLATE else (),
+            )
         del file[variable]
-        h5py.h5d.create(file.id, variable.encode(), kind, h5py.h5s.create_simple(shape), plist)
+        h5py.h5d.create(
+            file.id, variable.encode(), kind, h5py.h5s.create_simple(shape), plist
+        )
 
     simple("format", name, change, says="more than once")
 
 
 _filtered("deflated_thirty_one_times", (h5py.h5z.FILTER_DEFLATE,) * 31, "position")
-_filtered("shuffled_twice", (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE) * 2, "position")
+_filtered(
+    "shuffled_twice", (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_DEFLATE) * 2, "position"
+)
 _filtered("ids_deflated_twice", (h5py.h5z.FILTER_DEFLATE,) * 2, "scenario")

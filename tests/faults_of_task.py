@@ -7,7 +7,18 @@ from typing import Any
 
 import h5py
 import numpy as np
-from faulty import DIMS, FAULTS, Fault, attribute, fault, positions, replace, rows, simple, store
+from faulty import (
+    DIMS,
+    FAULTS,
+    Fault,
+    attribute,
+    fault,
+    positions,
+    replace,
+    rows,
+    simple,
+    store,
+)
 from numpy.typing import NDArray
 from submission_data import FRAMES, GIVEN, PARTICLES, Bench
 
@@ -15,12 +26,18 @@ attribute("unknown_split", "split", "cavty", check="split", says="cavity")
 attribute("unknown_size", "size", "huge", check="split", says="full")
 attribute("path_as_split", "split", "../../etc", check="split")
 attribute("wrong_split", "split", "curl-noise", check="particles", says="506")
-attribute("stale_hash", "dataset_sha256", "ab" * 32, check="dataset", says="another data set")
+attribute(
+    "stale_hash", "dataset_sha256", "ab" * 32, check="dataset", says="another data set"
+)
 attribute("shortened_hash", "dataset_sha256", "abcdef", check="dataset")
-attribute("another_major_version", "dataset_version", "3.0.0", check="dataset", says="version")
-attribute("version_in_words", "dataset_version", "latest", check="dataset", says="version")
+attribute(
+    "another_major_version", "dataset_version", "3.0.0", check="dataset", says="version"
+)
+attribute(
+    "version_in_words", "dataset_version", "latest", check="dataset", says="version"
+)
 
-# --- dimensions ----------------------------------------------------------------------------
+# --- dimensions -----------------------------------------------------------------------
 
 
 def _transposed(name: str, order: tuple[int, ...], says: str) -> None:
@@ -35,15 +52,29 @@ def _transposed(name: str, order: tuple[int, ...], says: str) -> None:
 _transposed("space_before_particle", (0, 1, 3, 2), "transpose")
 _transposed("frame_before_scenario", (1, 0, 2, 3), "transpose")
 simple(
-    "dims", "axes_swapped_names_kept", lambda f: _unchecked(f, positions(f).swapaxes(2, 3)), says="swapped"
+    "dims",
+    "axes_swapped_names_kept",
+    lambda f: _unchecked(f, positions(f).swapaxes(2, 3)),
+    says="swapped",
 )
 simple(
-    "dims", "one_scenario_only", lambda f: replace(f, "position", DIMS[1:], positions(f)[0]), says="leading"
+    "dims",
+    "one_scenario_only",
+    lambda f: replace(f, "position", DIMS[1:], positions(f)[0]),
+    says="leading",
 )
-simple("dims", "dimensions_without_names", lambda f: _bare(f, positions(f)), says="scales")
+simple(
+    "dims", "dimensions_without_names", lambda f: _bare(f, positions(f)), says="scales"
+)
 simple("dims", "flattened", lambda f: _bare(f, positions(f).reshape(3, -1)))
-simple("dims", "three_components", lambda f: _unchecked(f, np.zeros((3, 8, PARTICLES, 3), "f4")))
-simple("dims", "fewer_frames_than_numbers", lambda f: _unchecked(f, positions(f)[:, :5]))
+simple(
+    "dims",
+    "three_components",
+    lambda f: _unchecked(f, np.zeros((3, 8, PARTICLES, 3), "f4")),
+)
+simple(
+    "dims", "fewer_frames_than_numbers", lambda f: _unchecked(f, positions(f)[:, :5])
+)
 simple("format", "scalar_position", lambda f: replace(f, "position", (), np.float32(1)))
 
 
@@ -73,8 +104,17 @@ def two_billion_particles(bench: Bench) -> Path:
     """2^31 particles that take no room in the file: 412 GB of zeros."""
     path = bench.copy("two_billion_particles.nc")
     with h5py.File(path, "r+") as file:
-        shape, chunks = (3, 8, 1 << 31, 2), (1, 1, 1 << 22, 2)
-        replace(file, "position", DIMS, shape=shape, chunks=chunks, dtype="f4", compression=1)
+        shape = (3, 8, 1 << 31, 2)
+        chunks = (1, 1, 1 << 22, 2)
+        replace(
+            file,
+            "position",
+            DIMS,
+            shape=shape,
+            chunks=chunks,
+            dtype="f4",
+            compression=1,
+        )
     return path
 
 
@@ -84,10 +124,27 @@ def two_billion_frames(bench: Bench) -> Path:
     path = bench.copy("two_billion_frames.nc")
     count = 1 << 31
     with h5py.File(path, "r+") as file:
-        replace(file, "frame", (), shape=(count,), chunks=(1 << 16,), dtype="i4", compression=1)
+        replace(
+            file,
+            "frame",
+            (),
+            shape=(count,),
+            chunks=(1 << 16,),
+            dtype="i4",
+            compression=1,
+        )
         file["frame"].make_scale("frame")
-        shape, chunks = (3, count, PARTICLES, 2), (1, 1 << 16, PARTICLES, 2)
-        replace(file, "position", DIMS, shape=shape, chunks=chunks, dtype="f4", compression=1)
+        shape = (3, count, PARTICLES, 2)
+        chunks = (1, 1 << 16, PARTICLES, 2)
+        replace(
+            file,
+            "position",
+            DIMS,
+            shape=shape,
+            chunks=chunks,
+            dtype="f4",
+            compression=1,
+        )
     return path
 
 
@@ -97,32 +154,62 @@ def twenty_thousand_frames(bench: Bench) -> Path:
     path = bench.copy("twenty_thousand_frames.nc")
     with h5py.File(path, "r+") as file:
         replace(file, "frame", (), np.arange(GIVEN, 20_000)).make_scale("frame")
-        shape, chunks = (3, 20_000 - GIVEN, PARTICLES, 2), (1, 100, PARTICLES, 2)
-        replace(file, "position", DIMS, shape=shape, chunks=chunks, dtype="f4", compression=1)
+        shape = (3, 20_000 - GIVEN, PARTICLES, 2)
+        chunks = (1, 100, PARTICLES, 2)
+        replace(
+            file,
+            "position",
+            DIMS,
+            shape=shape,
+            chunks=chunks,
+            dtype="f4",
+            compression=1,
+        )
     return path
 
 
-# --- scenarios and frames ------------------------------------------------------------------
+# --- scenarios and frames -------------------------------------------------------------
 
 ALL = list(range(GIVEN, FRAMES))
 
 
 def _rows(
-    name: str, check: str, scenarios: list[int], frames: list[int], pick: Any = slice(None), *, says: str
+    name: str,
+    check: str,
+    scenarios: list[int],
+    frames: list[int],
+    pick: Any = slice(None),
+    *,
+    says: str,
 ) -> None:
-    FAULTS[name] = Fault(lambda bench: rows(bench, name, scenarios, frames, pick), check, 1, says=says)
+    FAULTS[name] = Fault(
+        lambda bench: rows(bench, name, scenarios, frames, pick), check, 1, says=says
+    )
 
 
 _rows("scenario_missing", "scenarios", [3, 5], ALL, [0, 2], says="missing: 4")
-_rows("scenario_unknown", "scenarios", [3, 4, 5, 77], ALL, [0, 1, 2, 0], says="unknown: 77")
-_rows("scenario_twice", "scenarios", [3, 4, 5, 4], ALL, [0, 1, 2, 1], says="duplicate: 4")
+_rows(
+    "scenario_unknown",
+    "scenarios",
+    [3, 4, 5, 77],
+    ALL,
+    [0, 1, 2, 0],
+    says="unknown: 77",
+)
+_rows(
+    "scenario_twice", "scenarios", [3, 4, 5, 4], ALL, [0, 1, 2, 1], says="duplicate: 4"
+)
 _rows("scenarios_counted", "scenarios", [0, 1, 2], ALL, says="count")
 _rows("scenarios_of_train", "scenarios", [0, 1], ALL, [0, 1], says="train")
 _rows("scenario_negative", "scenarios", [-3, 4, 5], ALL, says="-3")
 _rows("scenario_enormous", "scenarios", [3, 4, 1 << 62], ALL, says="unknown")
 _rows("no_scenarios", "scenarios", [], ALL, slice(0), says="missing")
-_rows("every_second_frame", "frames", [3, 4, 5], ALL[::2], np.s_[:, ::2], says="every 2nd")
-_rows("every_third_frame", "frames", [3, 4, 5], ALL[::3], np.s_[:, ::3], says="every 3rd")
+_rows(
+    "every_second_frame", "frames", [3, 4, 5], ALL[::2], np.s_[:, ::2], says="every 2nd"
+)
+_rows(
+    "every_third_frame", "frames", [3, 4, 5], ALL[::3], np.s_[:, ::3], says="every 3rd"
+)
 _rows(
     "input_frames_included",
     "frames",
@@ -131,13 +218,31 @@ _rows(
     np.s_[:, [0] * 3 + [*range(8)]],
     says="input",
 )
-_rows("frames_counted_from_0", "frames", [3, 4, 5], list(range(8)), says="absolute number is 3")
+_rows(
+    "frames_counted_from_0",
+    "frames",
+    [3, 4, 5],
+    list(range(8)),
+    says="absolute number is 3",
+)
 _rows("frames_shifted", "frames", [3, 4, 5], [n + 2 for n in ALL], says="shifted by 2")
 _rows("frames_stop_early", "frames", [3, 4, 5], ALL[:5], np.s_[:, :5], says="too early")
 _rows("frames_reversed", "frames", [3, 4, 5], ALL[::-1], np.s_[:, ::-1], says="order")
 _rows(
-    "frame_twice", "frames", [3, 4, 5], [3, 4, 5, 5, 6, 7, 8, 9, 10], np.s_[:, [*range(8), 0]], says="twice"
+    "frame_twice",
+    "frames",
+    [3, 4, 5],
+    [3, 4, 5, 5, 6, 7, 8, 9, 10],
+    np.s_[:, [*range(8), 0]],
+    says="twice",
 )
-_rows("frame_left_out", "frames", [3, 4, 5], [3, 4, 6, 7, 8, 9, 10], np.s_[:, :7], says="lacks the frames 5")
+_rows(
+    "frame_left_out",
+    "frames",
+    [3, 4, 5],
+    [3, 4, 6, 7, 8, 9, 10],
+    np.s_[:, :7],
+    says="lacks the frames 5",
+)
 _rows("no_frames", "frames", [3, 4, 5], [], np.s_[:, :0], says="no frames")
 _rows("frames_enormous", "frames", [3, 4, 5], [3, 1 << 61], np.s_[:, :2], says="every")

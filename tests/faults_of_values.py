@@ -30,28 +30,70 @@ def particles_doubled(bench: Bench) -> Path:
 
 
 def _typed(name: str, dtype: str) -> None:
-    simple("dtype", f"positions_{name}", lambda f: store(f, positions(f).astype(dtype)), says=name)
+    simple(
+        "dtype",
+        f"positions_{name}",
+        lambda f: store(f, positions(f).astype(dtype)),
+        says=name,
+    )
 
 
-for _name, _type in {"float64": "f8", "float16": "f2", "int32": "i4", "uint8": "u1"}.items():
+for _name, _type in {
+    "float64": "f8",
+    "float16": "f2",
+    "int32": "i4",
+    "uint8": "u1",
+}.items():
     _typed(_name, _type)
-simple("dtype", "positions_complex", lambda f: store(f, positions(f).astype("c8")), says="compound")
+simple(
+    "dtype",
+    "positions_complex",
+    lambda f: store(f, positions(f).astype("c8")),
+    says="compound",
+)
 simple("dtype", "positions_bool", lambda f: store(f, positions(f) > 0.5), says="enum")
-simple("dtype", "positions_opaque", lambda f: store(f, np.zeros(SHAPE, "V4")), says="opaque")
-simple("dtype", "positions_text", lambda f: store(f, positions(f).astype("S8")), says="string")
-_TEXT, _RAGGED = h5py.string_dtype(), h5py.vlen_dtype(np.float32)
+simple(
+    "dtype",
+    "positions_opaque",
+    lambda f: store(f, np.zeros(SHAPE, "V4")),
+    says="opaque",
+)
+simple(
+    "dtype",
+    "positions_text",
+    lambda f: store(f, positions(f).astype("S8")),
+    says="string",
+)
+_TEXT = h5py.string_dtype()
+_RAGGED = h5py.vlen_dtype(np.float32)
 simple(
     "dtype",
     "positions_vlen",
     lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_RAGGED),
     says="length",
 )
-simple("dtype", "positions_vlen_text", lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_TEXT))
 simple(
-    "dtype", "positions_references", lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=h5py.ref_dtype)
+    "dtype",
+    "positions_vlen_text",
+    lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=_TEXT),
 )
-simple("dtype", "scale_factor", lambda f: f["position"].attrs.update(scale_factor=0.5), says="scale_factor")
-simple("dtype", "add_offset", lambda f: f["position"].attrs.update(add_offset=1.0), says="add_offset")
+simple(
+    "dtype",
+    "positions_references",
+    lambda f: replace(f, "position", DIMS, shape=SHAPE, dtype=h5py.ref_dtype),
+)
+simple(
+    "dtype",
+    "scale_factor",
+    lambda f: f["position"].attrs.update(scale_factor=0.5),
+    says="scale_factor",
+)
+simple(
+    "dtype",
+    "add_offset",
+    lambda f: f["position"].attrs.update(add_offset=1.0),
+    says="add_offset",
+)
 
 
 @fault("dtype", says="not IEEE")
@@ -68,11 +110,18 @@ def float_of_another_kind(bench: Bench) -> Path:
     return path
 
 
-# --- values --------------------------------------------------------------------------------
+# --- values ---------------------------------------------------------------------------
 
 
-def _value(check: str, name: str, edit: Callable[[NDArray[np.float32]], ArrayLike], says: str) -> None:
-    simple(check, name, lambda f: store(f, np.asarray(edit(positions(f)), np.float32)), says=says)
+def _value(
+    check: str, name: str, edit: Callable[[NDArray[np.float32]], ArrayLike], says: str
+) -> None:
+    simple(
+        check,
+        name,
+        lambda f: store(f, np.asarray(edit(positions(f)), np.float32)),
+        says=says,
+    )
 
 
 def _put(place: Any, value: float) -> Callable[[NDArray[np.float32]], ArrayLike]:
@@ -88,7 +137,9 @@ def _permuted(values: NDArray[np.float32]) -> ArrayLike:
 
 
 def _last_given() -> NDArray[np.float32]:
-    """Return the last given frame of every scenario, shape [scenario, 1, particle, 2]."""
+    """Return the last given frame of every scenario, shape [scenario, 1, particle,
+    2].
+    """
     return np.stack([frames_of(i, FRAMES, PARTICLES)[GIVEN - 1 : GIVEN] for i in TESTS])
 
 
@@ -96,9 +147,21 @@ def _displacements(values: NDArray[np.float32]) -> ArrayLike:
     return np.diff(values, axis=1, prepend=values[:, :1])
 
 
-_value("finite", "one_nan", _put((1, 2, 3, 1), np.nan), "scenario 4, frame 5, particle 3, y")
-_value("finite", "one_infinity", _put((2, 7, 0, 0), np.inf), "scenario 5, frame 10, particle 0, x")
-_value("finite", "last_frames_nan", _put((slice(None), slice(5, None)), np.nan), "finite")
+_value(
+    "finite",
+    "one_nan",
+    _put((1, 2, 3, 1), np.nan),
+    "scenario 4, frame 5, particle 3, y",
+)
+_value(
+    "finite",
+    "one_infinity",
+    _put((2, 7, 0, 0), np.inf),
+    "scenario 5, frame 10, particle 0, x",
+)
+_value(
+    "finite", "last_frames_nan", _put((slice(None), slice(5, None)), np.nan), "finite"
+)
 _value("finite", "all_nan", _put(..., np.nan), "finite")
 _value("finite", "all_infinite", _put(..., -np.inf), "finite")
 _value("start", "particles_permuted", _permuted, "another order")
@@ -112,9 +175,19 @@ _value(
 _value("start", "displacements", _displacements, "displacements")
 _value("start", "all_zero", np.zeros_like, "displacements")
 _value("start", "scenarios_mixed_up", lambda v: v[[1, 2, 0]], "of scenario")
-_value("start", "frames_early", lambda v: np.concatenate([_last_given(), v[:, :-1]], axis=1), "shifted")
+_value(
+    "start",
+    "frames_early",
+    lambda v: np.concatenate([_last_given(), v[:, :-1]], axis=1),
+    "shifted",
+)
 _value("in_domain", "huge_values", lambda v: v + np.float32(1e30), "far beyond")
-_value("in_domain", "one_huge_value", _put((1, 2, 3, 1), 3e38), "scenario 4, frame 5, particle 3")
+_value(
+    "in_domain",
+    "one_huge_value",
+    _put((1, 2, 3, 1), 3e38),
+    "scenario 4, frame 5, particle 3",
+)
 _value("in_domain", "eleven_boxes_away", _put((1, 2, 3, 0), -11.0), "far beyond")
 
 
@@ -127,12 +200,24 @@ def _marks(*marks: int, dim: str = "scenario") -> Callable[[h5py.File], object]:
     return change
 
 
-simple("diverged_at", "marks_on_their_own_dimension", _marks(-1, -1, -1, dim="mark"), says="per scenario")
+simple(
+    "diverged_at",
+    "marks_on_their_own_dimension",
+    _marks(-1, -1, -1, dim="mark"),
+    says="per scenario",
+)
 simple("diverged_at", "marks_too_few", _marks(-1, -1, dim="mark"), says="per scenario")
 simple("diverged_at", "mark_beyond_the_horizon", _marks(-1, 100_000, -1), says="100000")
-simple("diverged_at", "mark_at_a_given_frame", _marks(2, -1, -1), says="no predicted frame")
+simple(
+    "diverged_at", "mark_at_a_given_frame", _marks(2, -1, -1), says="no predicted frame"
+)
 simple("diverged_at", "mark_below_never", _marks(-1, -1, -5), says="-5")
-simple("diverged_at", "moves_after_its_mark", _marks(-1, 7, -1), says="scenario 4, frame 10")
+simple(
+    "diverged_at",
+    "moves_after_its_mark",
+    _marks(-1, 7, -1),
+    says="scenario 4, frame 10",
+)
 
 
 @fault("finite", says="never written")

@@ -1,4 +1,6 @@
-"""How faulty prediction files are made: the registry of faults and changes to a valid file."""
+"""How faulty prediction files are made: the registry of faults and changes to a valid
+file.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def fault(
     return register
 
 
-def simple(check: str, name: str, change: Callable[[h5py.File], object], *, says: str = "") -> None:
+def simple(
+    check: str, name: str, change: Callable[[h5py.File], object], *, says: str = ""
+) -> None:
     """Register a fault that changes an open copy of the valid file."""
 
     def make(bench: Bench) -> Path:
@@ -59,8 +63,14 @@ def simple(check: str, name: str, change: Callable[[h5py.File], object], *, says
 def replace(
     file: h5py.File, name: str, dims: tuple[str, ...], data: Any = None, **options: Any
 ) -> h5py.Dataset:
-    """Replace a variable by another of the same name, with dimension scales attached."""
-    attributes = {} if name not in file else {k: v for k, v in file[name].attrs.items() if k == "units"}
+    """Replace a variable by another of the same name, with dimension scales
+    attached.
+    """
+    attributes = (
+        {}
+        if name not in file
+        else {k: v for k, v in file[name].attrs.items() if k == "units"}
+    )
     if name in file:
         del file[name]
     dataset = file.create_dataset(name, data=data, **options)
@@ -93,10 +103,18 @@ def built(
     dims: tuple[str, ...] = DIMS,
     unlimited: bool = False,
 ) -> Iterator[tuple[Path, netCDF4.Dataset]]:
-    """Yield a new file with other coordinates; unwritten frames stand still in the middle."""
+    """Yield a new file with other coordinates; unwritten frames stand still in the
+    middle.
+    """
     path = bench.folder / f"{name}.nc"
-    numbers = {"scenario": np.array(scenarios, np.int64), "frame": np.array(frames, np.int64)}
-    lengths = {d: len(n) for d, n in numbers.items()} | {"particle": particles, "space": 2}
+    numbers = {
+        "scenario": np.array(scenarios, np.int64),
+        "frame": np.array(frames, np.int64),
+    }
+    lengths = {d: len(n) for d, n in numbers.items()} | {
+        "particle": particles,
+        "space": 2,
+    }
     with netCDF4.Dataset(bench.valid) as valid, netCDF4.Dataset(path, "w") as file:
         for dim, length in lengths.items():
             file.createDimension(dim, None if unlimited and dim == "frame" else length)
@@ -108,7 +126,9 @@ def built(
         yield path, file
 
 
-def rows(bench: Bench, name: str, scenarios: list[int], frames: list[int], pick: Any) -> Path:
+def rows(
+    bench: Bench, name: str, scenarios: list[int], frames: list[int], pick: Any
+) -> Path:
     """Write a selection of the valid positions under other coordinates."""
     with h5py.File(bench.valid) as valid:
         values = positions(valid)[pick]
@@ -117,8 +137,12 @@ def rows(bench: Bench, name: str, scenarios: list[int], frames: list[int], pick:
     return path
 
 
-def attribute(name: str, attribute: str, value: Any, *, check: str = "format", says: str = "") -> None:
-    """Register a fault that sets a global attribute, or removes it where the value is None."""
+def attribute(
+    name: str, attribute: str, value: Any, *, check: str = "format", says: str = ""
+) -> None:
+    """Register a fault that sets a global attribute, or removes it where the value is
+    None.
+    """
 
     def change(file: h5py.File) -> None:
         if value is None:

@@ -13,7 +13,9 @@ from independent_hash import content_hash, variable_hash
 
 
 def forge(path: Path) -> str:
-    """Change one velocity of a scenario file and mend every hash in it; return the content hash."""
+    """Change one velocity of a scenario file and mend every hash in it; return the
+    content hash.
+    """
     with h5py.File(path, "r+") as file:
         file["velocity"][7, 11, 0] += np.float32(1e-6)
         digest = variable_hash("velocity", file["velocity"])
@@ -30,5 +32,9 @@ def mend_manifest(path: Path, scenario: int, file: Path, content: str) -> None:
     told = json.loads(path.read_text())
     entry = next(entry for entry in told["files"] if entry["scenario"] == scenario)
     data = file.read_bytes()
-    entry |= {"content_sha256": content, "bytes": len(data), "file_sha256": hashlib.sha256(data).hexdigest()}
+    entry |= {
+        "content_sha256": content,
+        "bytes": len(data),
+        "file_sha256": hashlib.sha256(data).hexdigest(),
+    }
     path.write_text(json.dumps(told))

@@ -32,7 +32,9 @@ class Reading:
 
     def of_class(self, kind: str) -> list[Element]:
         """Return the elements of a class."""
-        return [e for e in self.elements if kind in e.attributes.get("class", "").split()]
+        return [
+            e for e in self.elements if kind in e.attributes.get("class", "").split()
+        ]
 
     @property
     def ids(self) -> list[str]:
@@ -58,7 +60,9 @@ class _Reader(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         if not self.open or self.open[-1].name != tag:
-            self.reading.faults.append(f"</{tag}> closes {self.open[-1].name if self.open else 'nothing'}")
+            self.reading.faults.append(
+                f"</{tag}> closes {self.open[-1].name if self.open else 'nothing'}"
+            )
         else:
             self.open.pop()
 
@@ -80,7 +84,11 @@ def read_html(text: str) -> Reading:
     reader = _Reader()
     reader.feed(text)
     reader.close()
-    reader.reading.faults += [f"<{element.name}> is never closed" for element in reader.open]
+    reader.reading.faults += [
+        f"<{element.name}> is never closed" for element in reader.open
+    ]
     ids = reader.reading.ids
-    reader.reading.faults += [f"id {name} twice" for name in sorted(set(ids)) if ids.count(name) > 1]
+    reader.reading.faults += [
+        f"id {name} twice" for name in sorted(set(ids)) if ids.count(name) > 1
+    ]
     return reader.reading

@@ -1,4 +1,6 @@
-"""An HTTP server over a folder that answers as told: rightly, or with a fault of its own."""
+"""An HTTP server over a folder that answers as told: rightly, or with a fault of its
+own.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,10 @@ class Mirror:
 
     def fault_of(self, path: str) -> str:
         """Return the fault of a path, "" for none."""
-        return next((fault for ending, fault in self.faults.items() if path.endswith(ending)), "")
+        return next(
+            (fault for ending, fault in self.faults.items() if path.endswith(ending)),
+            "",
+        )
 
     def count(self, ending: str) -> int:
         """Return how often paths with an ending were asked for."""
@@ -45,7 +50,8 @@ class _Handler(BaseHTTPRequestHandler):
     mirror: Mirror
 
     def do_GET(self) -> None:
-        wanted, fault = self.headers.get("Range"), self.mirror.fault_of(self.path)
+        wanted = self.headers.get("Range")
+        fault = self.mirror.fault_of(self.path)
         self.mirror.asked.append((self.path, wanted))
         path = self.mirror.folder / self.path.lstrip("/")
         if fault == "page":
@@ -71,18 +77,25 @@ class _Handler(BaseHTTPRequestHandler):
             data = data[:-500] + bytes([data[-500] ^ 1]) + data[-499:]
         if fault == "chopped":  # and the length is that of what is sent
             data = data[: len(data) // 2]
-        start, whole = 0, len(data)
+        start = 0
+        whole = len(data)
         if wanted and fault not in ("no ranges", "drops and starts over"):
             start = int(wanted.removeprefix("bytes=").split("-")[0])
             if start >= whole:
                 return self._send(416, b"", {"Content-Range": f"bytes */{whole}"})
         status = 206 if start else 200
-        headers = {"Content-Range": f"bytes {start}-{whole - 1}/{whole}"} if start else {}
+        headers = (
+            {"Content-Range": f"bytes {start}-{whole - 1}/{whole}"} if start else {}
+        )
         body = data[start:]
         match fault:
-            case "drops" | "no ranges":  # after a third of the file, at the first two requests for it
+            case (
+                "drops" | "no ranges"
+            ):  # after a third of the file, at the first two requests for it
                 late = self.mirror.count(self.path) > 2
-                return self._send(status, body, headers, only=None if late else whole // 3)
+                return self._send(
+                    status, body, headers, only=None if late else whole // 3
+                )
             case "drops and starts over":
                 return self._send(status, body, headers, only=whole // 3)
             case "drops always":
@@ -96,7 +109,9 @@ class _Handler(BaseHTTPRequestHandler):
             case "wrong range" if start:
                 headers["Content-Range"] = f"bytes {start + 7}-{whole - 1}/{whole}"
             case "announces a number without end":
-                return self._send(status, body, {**headers, "Content-Length": "9" * 5000}, length=-1)
+                return self._send(
+                    status, body, {**headers, "Content-Length": "9" * 5000}, length=-1
+                )
             case "endless":
                 return self._endless()
             case "slow":
@@ -134,11 +149,18 @@ class _Handler(BaseHTTPRequestHandler):
         length: int | None = None,
         only: int | None = None,
     ) -> None:
-        """Answer; ``length`` is what is announced (-1: nothing), ``only`` how much is sent."""
+        """Answer; ``length`` is what is announced (-1: nothing), ``only`` how much is
+        sent.
+        """
         self.send_response(status)
         if length != -1:
-            self.send_header("Content-Length", str(len(body) if length is None else length))
-        for name, value in {"Content-Type": "application/x-netcdf", **(headers or {})}.items():
+            self.send_header(
+                "Content-Length", str(len(body) if length is None else length)
+            )
+        for name, value in {
+            "Content-Type": "application/x-netcdf",
+            **(headers or {}),
+        }.items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body[:only])
@@ -156,7 +178,9 @@ def serving(folder: Path) -> Iterator[Mirror]:
     server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
     server.daemon_threads = True
     mirror.url = f"http://127.0.0.1:{server.server_port}"
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+    thread = threading.Thread(
+        target=server.serve_forever, kwargs={"poll_interval": 0.02}
+    )
     thread.start()
     try:
         yield mirror

@@ -1,4 +1,6 @@
-"""Small made-up flows of every split, methods that predict them, their reports and a leaderboard of them."""
+"""Small made-up flows of every split, methods that predict them, their reports and a
+leaderboard of them.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +34,21 @@ from lagbench.submission import write
 
 Floats = NDArray[np.float64]
 Method = Callable[[Floats, int, int], Floats]
-"""From all true positions [frame, particle, 2], given frames n and horizon h to predictions."""
+"""From all true positions [frame, particle, 2], given frames n and horizon h to
+predictions.
+"""
 
 DAY = datetime.date(2026, 1, 31)
-PLACE, SCORES = "submissions/cavity/tiny", "scores/cavity/tiny"
+PLACE = "submissions/cavity/tiny"
+SCORES = "scores/cavity/tiny"
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 
 
 @dataclass(frozen=True)
 class ReportBench:
-    """Test scenarios of one split in its tiny size, and the registry that describes them."""
+    """Test scenarios of one split in its tiny size, and the registry that describes
+    them.
+    """
 
     root: Path
     registry: Registry
@@ -54,49 +61,71 @@ class ReportBench:
 
     def submit(self, path: Path, method: Method, name: str, **labels: Any) -> Path:
         """Write the submission of a method."""
-        n, h = self.size.task.input_frames, self.size.task.horizon
-        guesses = {i: method(motion(self.size, i), n, h) for i in self.size.subsets["test"]}
-        where = {"split": self.size.split, "size": self.size.name, "registry": self.registry}
+        n = self.size.task.input_frames
+        h = self.size.task.horizon
+        guesses = {
+            i: method(motion(self.size, i), n, h) for i in self.size.subsets["test"]
+        }
+        where = {
+            "split": self.size.split,
+            "size": self.size.name,
+            "registry": self.registry,
+        }
         return write(path, guesses, method=name, **where, **labels)
 
     def card(self, path: Path) -> ScoreCard:
         """Return the score card of a submission."""
-        return score(path, root=self.root, registry=self.registry, workers=1, write=False)
+        return score(
+            path, root=self.root, registry=self.registry, workers=1, write=False
+        )
 
     def report(self, folder: Path, files: Mapping[str, Method]) -> Path:
         """Submit, score and report methods by name."""
         folder.mkdir(parents=True, exist_ok=True)
         paths = [
-            self.submit(folder / f"{i}.nc", method, name) for i, (name, method) in enumerate(files.items())
+            self.submit(folder / f"{i}.nc", method, name)
+            for i, (name, method) in enumerate(files.items())
         ]
         cards = [self.card(path) for path in paths]
-        return write_report(folder / "report", cards, paths, root=self.root, registry=self.registry)
+        return write_report(
+            folder / "report", cards, paths, root=self.root, registry=self.registry
+        )
 
 
 def make_report_bench(home: Path, split: str) -> ReportBench:
-    """Write the test scenarios of a split and its registry, once for all processes that share a folder."""
+    """Write the test scenarios of a split and its registry, once for all processes that
+    share a folder.
+    """
     folder = home / f"report-{split}"
     path = folder / "datasets.yaml"
     with FileLock(home / f"report-{split}.lock"):
         if not path.exists():
             plain = load().size(split, "tiny")
-            hashes = {i: _write(folder / "root", plain, i) for i in plain.subsets["test"]}
+            hashes = {
+                i: _write(folder / "root", plain, i) for i in plain.subsets["test"]
+            }
             path.write_text(_registry(plain, hashes))
     registry = load(path)
     return ReportBench(folder / "root", registry, registry.size(split, "tiny"))
 
 
 def page_of(home: Path, split: str) -> Path:
-    """Return the report on two methods of a split, one of a hostile name, made once likewise."""
+    """Return the report on two methods of a split, one of a hostile name, made once
+    likewise.
+    """
     page = home / f"page-{split}" / "report" / "index.html"
     with FileLock(home / f"page-{split}.lock"):
         if not page.exists():
-            assert make_report_bench(home, split).report(page.parents[1], METHODS) == page
+            assert (
+                make_report_bench(home, split).report(page.parents[1], METHODS) == page
+            )
     return page
 
 
 def motion(size: Size, scenario: int) -> Floats:
-    """Return true positions: four eddies in a full box, else two bodies that fall turning."""
+    """Return true positions: four eddies in a full box, else two bodies that fall
+    turning.
+    """
     frames = size.task.input_frames + size.task.horizon
     full = size.split in ("cavity", "curl-noise")
     return _eddies(size, scenario, frames) if full else _falling(size, scenario, frames)
@@ -121,7 +150,9 @@ def _falling(size: Size, scenario: int, frames: int) -> Floats:
     angle = 0.03 * np.arange(frames)[:, None]
     (x, y), cos, sin = body.T, np.cos(angle), np.sin(angle)
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    middle = np.where(np.arange(size.particles)[:, None] < half, [0.3, 0.7], [0.7, 0.75])
+    middle = np.where(
+        np.arange(size.particles)[:, None] < half, [0.3, 0.7], [0.7, 0.75]
+    )
     turned[..., 1] -= 0.0004 * np.arange(frames)[:, None] ** 2
     return np.asarray(turned + middle)
 
@@ -186,18 +217,25 @@ def still(truth: Floats, n: int, h: int) -> Floats:
 
 def damped(truth: Floats, n: int, h: int) -> Floats:
     """Predict the true steps, each smaller than the one before."""
-    steps = np.diff(truth[n - 1 : n + h], axis=0) * (0.95 ** np.arange(1, h + 1))[:, None, None]
+    steps = (
+        np.diff(truth[n - 1 : n + h], axis=0)
+        * (0.95 ** np.arange(1, h + 1))[:, None, None]
+    )
     return truth[n - 1] + np.cumsum(steps, axis=0)
 
 
 def noisy(truth: Floats, n: int, h: int) -> Floats:
     """Predict the truth with an error that wanders off."""
     rng = np.random.Generator(np.random.PCG64(7))
-    return truth[n : n + h] + np.cumsum(1e-4 * (rng.random(truth[n : n + h].shape) - 0.5), axis=0)
+    return truth[n : n + h] + np.cumsum(
+        1e-4 * (rng.random(truth[n : n + h].shape) - 0.5), axis=0
+    )
 
 
 def runaway(truth: Floats, n: int, h: int) -> Floats:
-    """Predict particles that leave the box ever faster, up to 9 lengths away, the most that is scored."""
+    """Predict particles that leave the box ever faster, up to 9 lengths away, the most
+    that is scored.
+    """
     guess = np.array(noisy(truth, n, h))
     guess[1:, :5] += 9.0 * 10.0 ** np.linspace(-8.0, 0.0, h - 1)[:, None, None]
     return guess
@@ -211,7 +249,8 @@ METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
 
 @dataclass(frozen=True)
 class BoardBench:
-    """A leaderboard's folder, and the data and registry that its entries were scored with.
+    """A leaderboard's folder, and the data and registry that its entries were scored
+    with.
 
     It has the floors, ``damped`` with two seeds, ``noisy`` and the wild ``flipping``.
     """
@@ -227,17 +266,30 @@ class BoardBench:
     def predict(self, method: Method, name: str, **labels: Any) -> Path:
         """Write predictions outside the folder."""
         seed = f"_{labels['seed']}" if "seed" in labels else ""
-        return self.data.submit(self.folder.parent / f"{name}{seed}.nc", method, name, **labels)
+        return self.data.submit(
+            self.folder.parent / f"{name}{seed}.nc", method, name, **labels
+        )
 
-    def submit(self, *paths: Path, replace: bool = False, add: bool = False, **keys: Any) -> SubmitResult:
+    def submit(
+        self, *paths: Path, replace: bool = False, add: bool = False, **keys: Any
+    ) -> SubmitResult:
         """Submit predictions."""
-        meta = Meta(**{"authors": ("A. Author",), "command": "make", "date": DAY, **keys})
-        return submit(paths, meta, replace=replace, add=add, new_board=True, **self.where)
+        meta = Meta(
+            **{"authors": ("A. Author",), "command": "make", "date": DAY, **keys}
+        )
+        return submit(
+            paths, meta, replace=replace, add=add, new_board=True, **self.where
+        )
 
     @property
     def where(self) -> dict[str, Any]:
         """Folders and registry as arguments."""
-        return {"board": self.folder, "root": self.data.root, "registry": self.registry, "workers": 1}
+        return {
+            "board": self.folder,
+            "root": self.data.root,
+            "registry": self.registry,
+            "workers": 1,
+        }
 
     def entry(self, method: str) -> Path:
         """Return the YAML file of an entry."""
@@ -247,14 +299,21 @@ class BoardBench:
         """Change the YAML file of an entry by hand."""
         held = yaml.load(self.entry(method).read_text(), Loader=yaml.CSafeLoader)
         change(held)
-        self.entry(method).write_text(yaml.dump(held, Dumper=yaml.CSafeDumper, sort_keys=False))
+        self.entry(method).write_text(
+            yaml.dump(held, Dumper=yaml.CSafeDumper, sort_keys=False)
+        )
 
     def forge(self, method: str) -> None:
-        """Make hashes and aggregates of an entry follow from its score files, as one does who knows how."""
+        """Make hashes and aggregates of an entry follow from its score files, as one
+        does who knows how.
+        """
         self.rehash(method)
         entry = read_entry(self.entry(method))
         stored = [read_stored(self.folder / path).scores for path in entry.score_paths]
-        plain = {name: summary.model_dump() for name, summary in summarise(combine(stored)).items()}
+        plain = {
+            name: summary.model_dump()
+            for name, summary in summarise(combine(stored)).items()
+        }
         self.edit(method, lambda held: held["score"].update(metrics=plain))
 
     def rehash(self, method: str) -> None:
@@ -270,19 +329,32 @@ class BoardBench:
     def state(self) -> dict[str, str]:
         """Return path to hash of every file in the folder."""
         files = sorted(path for path in self.folder.rglob("*") if path.is_file())
-        return {path.relative_to(self.folder).as_posix(): file_sha256(path) for path in files}
+        return {
+            path.relative_to(self.folder).as_posix(): file_sha256(path)
+            for path in files
+        }
 
 
 def master(home: Path) -> BoardBench:
     """Return the bench that all tests and processes share; do not change its files."""
-    bench = BoardBench(home / "board-bench" / "leaderboard", make_report_bench(home, "cavity"))
+    bench = BoardBench(
+        home / "board-bench" / "leaderboard", make_report_bench(home, "cavity")
+    )
     finished = home / "board-bench" / "finished"
     with FileLock(home / "board-bench.lock"):
         if not finished.exists():
             shutil.rmtree(finished.parent, ignore_errors=True)
             finished.parent.mkdir()
-            seeds = [bench.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)]
-            seeds.append(bench.predict(_worse, "damped", seed=3, device="cpu", seconds_per_frame=0.75))
+            seeds = [
+                bench.predict(
+                    damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25
+                )
+            ]
+            seeds.append(
+                bench.predict(
+                    _worse, "damped", seed=3, device="cpu", seconds_per_frame=0.75
+                )
+            )
             bench.submit(*seeds, solver_seconds_per_frame=2.0)
             bench.submit(bench.predict(noisy, "noisy", parameters=5))
             bench.submit(bench.predict(flipping, "flipping"))
@@ -291,7 +363,9 @@ def master(home: Path) -> BoardBench:
 
 
 def flipping(truth: Any, n: int, h: int) -> Any:
-    """Predict a box that is mirrored every other frame from the third on: a vorticity out of all bounds."""
+    """Predict a box that is mirrored every other frame from the third on: a vorticity
+    out of all bounds.
+    """
     guess = np.array(truth[n : n + h])
     guess[3::2, :, 0] = 1.0 - guess[3::2, :, 0]
     return guess
@@ -307,10 +381,14 @@ def nearer(truth: Any, n: int, h: int) -> Any:
 
 
 def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBench:
-    """Return the bench with a copy of the leaderboard that a test may damage, without some entries."""
+    """Return the bench with a copy of the leaderboard that a test may damage, without
+    some entries.
+    """
     shared = master(home)
     left_out = [f"{name}{end}" for name in without for end in (".yaml", ".nc", "_*.nc")]
-    shutil.copytree(shared.folder, folder / "leaderboard", ignore=shutil.ignore_patterns(*left_out))
+    shutil.copytree(
+        shared.folder, folder / "leaderboard", ignore=shutil.ignore_patterns(*left_out)
+    )
     return BoardBench(folder / "leaderboard", shared.data)
 
 
@@ -319,8 +397,12 @@ def set_mean(held: dict[str, Any], factor: float = 0.9) -> None:
     held["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
 
 
-def reform(bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True) -> None:
-    """Change the values of a score file and make its hash, and the aggregates, follow."""
+def reform(
+    bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True
+) -> None:
+    """Change the values of a score file and make its hash, and the aggregates,
+    follow.
+    """
     with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
         file.set_auto_maskandscale(False)
         change(file)

@@ -33,20 +33,34 @@ def lattice(side: int = 20) -> Floats:
 def swirl(position: Floats) -> Floats:
     """Return the Taylor-Green velocity that closes at the walls of the unit box."""
     s = np.pi * position
-    return np.stack([np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1)
+    return np.stack(
+        [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1
+    )
 
 
 def rollout(frames: int = 8, side: int = 20, speed: float = 0.01) -> Floats:
-    """Return positions carried by the swirl, whose speed wavers, shape [frame, particle, 2]."""
+    """Return positions carried by the swirl, whose speed wavers, shape [frame,
+    particle, 2].
+    """
     positions = [lattice(side)]
     for frame in range(frames - 1):
-        positions.append(positions[-1] + speed * (1 + 0.3 * np.sin(frame)) * swirl(positions[-1]))
+        positions.append(
+            positions[-1] + speed * (1 + 0.3 * np.sin(frame)) * swirl(positions[-1])
+        )
     return np.array(positions)
 
 
-def scenario_of(positions: Floats, *, material: ArrayLike | None = None, **changes: Any) -> Scenario:
-    """Return the scenario whose given frames are the first two; ``changes`` go to the setting."""
-    kinds = np.zeros(positions.shape[1], np.int8) if material is None else np.asarray(material, np.int8)
+def scenario_of(
+    positions: Floats, *, material: ArrayLike | None = None, **changes: Any
+) -> Scenario:
+    """Return the scenario whose given frames are the first two; ``changes`` go to the
+    setting.
+    """
+    kinds = (
+        np.zeros(positions.shape[1], np.int8)
+        if material is None
+        else np.asarray(material, np.int8)
+    )
     setting = replace(SETTING, **changes)
     return Scenario(
         setting=setting,
@@ -58,9 +72,13 @@ def scenario_of(positions: Floats, *, material: ArrayLike | None = None, **chang
 
 
 def pairs_of(scenario: Scenario, truth: Floats, prediction: Floats) -> list[FramePair]:
-    """Return the frame pairs of whole trajectories; the prediction's given frames are not read."""
+    """Return the frame pairs of whole trajectories; the prediction's given frames are
+    not read.
+    """
     first = scenario.setting.input_frames
-    sides = (snapshots(scenario, positions[first:]) for positions in (truth, prediction))
+    sides = (
+        snapshots(scenario, positions[first:]) for positions in (truth, prediction)
+    )
     numbered = zip(scenario.setting.predicted_frames, *sides, strict=True)
     return [FramePair(scenario, frame, t, p) for frame, t, p in numbered]
 
@@ -78,7 +96,8 @@ def pair_of(
 
     The mass of each particle is 1 / particles.
     """
-    x, u = np.asarray(position, np.float64), np.asarray(velocity, np.float64)
+    x = np.asarray(position, np.float64)
+    u = np.asarray(velocity, np.float64)
     y = x if predicted_position is None else np.asarray(predicted_position, np.float64)
     scenario = scenario_of(np.stack([x - 2 * u, x - u]), material=material, **changes)
     predicted = scenario.snapshot(y, y - np.asarray(predicted_velocity, np.float64))

@@ -1,4 +1,6 @@
-"""Stores for tests: S3 and HTTP servers in this process, folders by URL, machines of their own."""
+"""Stores for tests: S3 and HTTP servers in this process, folders by URL, machines of
+their own.
+"""
 
 from __future__ import annotations
 
@@ -35,9 +37,14 @@ def s3_server() -> Iterator[str]:
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
-    bucket = f"data-{uuid.uuid4().hex[:8]}"  # all servers of a process share what they hold
+    bucket = (
+        f"data-{uuid.uuid4().hex[:8]}"  # all servers of a process share what they hold
+    )
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**CREDENTIALS, "AWS_ENDPOINT_URL": f"http://{host}:{port}"}.items():
+        for name, value in {
+            **CREDENTIALS,
+            "AWS_ENDPOINT_URL": f"http://{host}:{port}",
+        }.items():
             patch.setenv(name, value)
         fsspec.filesystem("s3", skip_instance_cache=True).mkdir(bucket)
         try:
@@ -53,8 +60,12 @@ def machine(patch: pytest.MonkeyPatch, folder: Path) -> Path:
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """Return the file system of a URL, which remembers nothing of what it holds, and the path in it."""
-    options = {"endpoint_url": os.environ["AWS_ENDPOINT_URL"]} if url.startswith("s3") else {}
+    """Return the file system of a URL, which remembers nothing of what it holds, and
+    the path in it.
+    """
+    options = (
+        {"endpoint_url": os.environ["AWS_ENDPOINT_URL"]} if url.startswith("s3") else {}
+    )
     system, path = fsspec.core.url_to_fs(url, use_listings_cache=False, **options)
     return system, path
 
@@ -63,12 +74,20 @@ def objects(url: str) -> dict[str, bytes]:
     """Return name and content of all objects below a URL."""
     system, path = _opened(url)
     prefix = path.rstrip("/") + "/"
-    return {name.removeprefix(prefix): system.cat_file(name) for name in system.find(path)}
+    return {
+        name.removeprefix(prefix): system.cat_file(name) for name in system.find(path)
+    }
 
 
 def files(root: Path) -> dict[str, bytes]:
-    """Return name and content of all files below a folder but locks, notes and the mark."""
-    found = {path.relative_to(root).as_posix(): path for path in root.rglob("*") if path.is_file()}
+    """Return name and content of all files below a folder but locks, notes and the
+    mark.
+    """
+    found = {
+        path.relative_to(root).as_posix(): path
+        for path in root.rglob("*")
+        if path.is_file()
+    }
     return {
         name: path.read_bytes()
         for name, path in found.items()
@@ -118,7 +137,9 @@ def fill(url: str, root: Path) -> None:
 
 @contextmanager
 def holding(place: str, folder: Path, root: Path) -> Iterator[Store]:
-    """Hold a root folder's files in a store: "http" or "file", below a new folder, or at a URL."""
+    """Hold a root folder's files in a store: "http" or "file", below a new folder, or
+    at a URL.
+    """
     if "://" in place:
         url = f"{place}/{uuid.uuid4().hex}"
         fill(url, root)

@@ -1,6 +1,8 @@
-"""The closed-box solver a second time, in NumPy: written from the equations, whole arrays at once.
+"""The closed-box solver a second time, in NumPy: written from the equations, whole
+arrays at once.
 
-Strict float32 throughout; sums are int64. Walls are mirrored by slices rather than index by index.
+Strict float32 throughout; sums are int64. Walls are mirrored by slices rather than
+index by index.
 """
 
 from __future__ import annotations
@@ -22,20 +24,29 @@ class ReferenceClosedBox:
     def __init__(self, parameters: ClosedBoxParameters, state: InitialState) -> None:
         p = self.p = parameters
         dx = 1.0 / p.grid
-        self.inv_dx, self.dt = f(p.grid), f(p.dt)
-        self.low, self.high = p.wall, p.grid - p.wall
-        self.bounds = f((p.wall + 0.5 + 1e-3) * dx), f((p.grid - p.wall - 0.5 - 1e-3) * dx)
+        self.inv_dx = f(p.grid)
+        self.dt = f(p.dt)
+        self.low = p.wall
+        self.high = p.grid - p.wall
+        self.bounds = (
+            f((p.wall + 0.5 + 1e-3) * dx),
+            f((p.grid - p.wall - 0.5 - 1e-3) * dx),
+        )
         room = 62 - int(np.ceil(np.log2(p.particles)))
         fastest = int(np.ceil(np.log2(16.0 * dx / p.dt)))
-        self.mv_bits, self.m_bits = min(room, 50) - fastest, min(room, 50) - 3
+        self.mv_bits = min(room, 50) - fastest
+        self.m_bits = min(room, 50) - 3
         self.cell_scale = f(2.0**self.mv_bits * dx)
         self.stiffness = f(p.dt * p.modulus / (p.density * 2.0 * dx))
         self.diffusion = f(state.viscosity * p.dt * p.grid**2)
         self.fill = f(state.area / p.particles * p.grid**2)
-        self.gradient, self.shift, self.shift_bound = f(4.0 * p.grid), f(-p.shift * dx * dx), f(0.1 * dx)
+        self.gradient = f(4.0 * p.grid)
+        self.shift = f(-p.shift * dx * dx)
+        self.shift_bound = f(0.1 * dx)
         self.sign = -1 if p.no_slip else 1
         self.program = state.wall_velocity.reshape(-1, 4, 2).astype(f)
-        self.wall, self.done = self.program[0], 0
+        self.wall = self.program[0]
+        self.done = 0
         self.x = np.clip(state.position.astype(f), *self.bounds)
         self.v = state.velocity.astype(f)
         self.c = state.affine.astype(f)
@@ -49,8 +60,12 @@ class ReferenceClosedBox:
             self.done += 1
             sums = self.to_grid()
             v, r, jbar = self.fold(sums)
-            low, high = self.low, self.high
-            for q in (r, jbar):  # scalars are even: columns first, then whole rows with the corners
+            low = self.low
+            high = self.high
+            for q in (
+                r,
+                jbar,
+            ):  # scalars are even: columns first, then whole rows with the corners
                 q[low], q[high] = q[low + 1], q[high - 1]
                 q[:, low], q[:, high] = q[:, low + 1], q[:, high - 1]
             self.mirror(v, moving=True)
@@ -65,40 +80,63 @@ class ReferenceClosedBox:
         scaled = self.x * self.inv_dx
         base = (scaled - f(0.5)).astype(np.int32)
         offset = scaled - base.astype(f)
-        outer, middle, inner = f(1.5) - offset, offset - f(1.0), offset - f(0.5)
-        return base, offset, [f(0.5) * (outer * outer), f(0.75) - middle * middle, f(0.5) * (inner * inner)]
+        outer = f(1.5) - offset
+        middle = offset - f(1.0)
+        inner = offset - f(0.5)
+        return (
+            base,
+            offset,
+            [
+                f(0.5) * (outer * outer),
+                f(0.75) - middle * middle,
+                f(0.5) * (inner * inner),
+            ],
+        )
 
     def to_grid(self) -> NDArray[np.int64]:
-        """P2G of (m v_x, m v_y, m, m J), in units of the particle mass and fixed point."""
+        """P2G of (m v_x, m v_y, m, m J), in units of the particle mass and fixed
+        point.
+        """
         base, offset, weight = self.weights()
         sums = np.zeros((self.p.grid + 1, self.p.grid + 1, 4), np.int64)
-        mv, m = f(2.0**self.mv_bits), f(2.0**self.m_bits)
-        east, north = self.cell_scale * self.c[:, :, 0], self.cell_scale * self.c[:, :, 1]
+        mv = f(2.0**self.mv_bits)
+        m = f(2.0**self.m_bits)
+        east = self.cell_scale * self.c[:, :, 0]
+        north = self.cell_scale * self.c[:, :, 1]
         centred = offset - f(1.0)
         middle = mv * self.v - centred[:, :1] * east - centred[:, 1:] * north
         for i, k in np.ndindex(3, 3):
             w = (weight[i][:, 0] * weight[k][:, 1])[:, None]
             momentum = (middle + f(i - 1) * east) + f(k - 1) * north
-            parts = np.concatenate([w * momentum, w * m, w * (m * self.j[:, None])], axis=1)
+            parts = np.concatenate(
+                [w * momentum, w * m, w * (m * self.j[:, None])], axis=1
+            )
             node = (base[:, 0] + i, base[:, 1] + k)
             np.add.at(sums, node, np.rint(parts.astype(np.float64)).astype(np.int64))
         return sums
 
     def fold(self, sums: NDArray[np.int64]) -> tuple[Single, Single, Single]:
         """Give what ghosts received to their mirror images; return v, r, Jbar."""
-        low, high, sign = self.low, self.high, self.sign
+        low = self.low
+        high = self.high
+        sign = self.sign
         total = sums.copy()
         drag = np.zeros((*sums.shape[:2], 2), f)
         unit = f(2.0**-self.m_bits)
-        side, level = np.array([-1, sign, 1, 1]), np.array([sign, -1, 1, 1])
+        side = np.array([-1, sign, 1, 1])
+        level = np.array([sign, -1, 1, 1])
         inner = slice(low + 1, high)
         for ghost, edge, wall in ((low, low + 1, 0), (high, high - 1, 1)):
             lost = sums[ghost, inner]
             total[edge, inner] += side * lost
-            drag[edge, inner, 1] += f(2.0) * self.wall[wall, 1] * (lost[:, 2].astype(f) * unit)
+            drag[edge, inner, 1] += (
+                f(2.0) * self.wall[wall, 1] * (lost[:, 2].astype(f) * unit)
+            )
             lost = sums[inner, ghost]
             total[inner, edge] += level * lost
-            drag[inner, edge, 0] += f(2.0) * self.wall[wall + 2, 0] * (lost[:, 2].astype(f) * unit)
+            drag[inner, edge, 0] += (
+                f(2.0) * self.wall[wall + 2, 0] * (lost[:, 2].astype(f) * unit)
+            )
         for ghost_x, x, side_wall in ((low, low + 1, 0), (high, high - 1, 1)):
             for ghost_y, y, level_wall in ((low, low + 1, 2), (high, high - 1, 3)):
                 lost = sums[ghost_x, ghost_y]
@@ -114,16 +152,24 @@ class ReferenceClosedBox:
         return v, r, np.where(filled, total[:, :, 3].astype(f) * unit / mass, f(1.0))
 
     def mirror(self, v: Single, *, moving: bool) -> None:
-        """Mirror a vector: normal odd, tangential odd about the wall's velocity (even: free slip)."""
-        low, high, sign = self.low, self.high, f(self.sign)
+        """Mirror a vector: normal odd, tangential odd about the wall's velocity (even:
+        free slip).
+        """
+        low = self.low
+        high = self.high
+        sign = f(self.sign)
         inner = slice(low + 1, high)
         taper = np.ones(high - low - 1, f)
         taper[[0, -1]] = f(0.5)
         speed = self.wall if moving else np.zeros_like(self.wall)
         for ghost, edge, wall in ((low, low + 1, 0), (high, high - 1, 1)):
             v[ghost, inner, 0] = -v[edge, inner, 0]
-            v[ghost, inner, 1] = sign * v[edge, inner, 1] + taper * (f(2.0) * speed[wall, 1])
-            v[inner, ghost, 0] = sign * v[inner, edge, 0] + taper * (f(2.0) * speed[wall + 2, 0])
+            v[ghost, inner, 1] = sign * v[edge, inner, 1] + taper * (
+                f(2.0) * speed[wall, 1]
+            )
+            v[inner, ghost, 0] = sign * v[inner, edge, 0] + taper * (
+                f(2.0) * speed[wall + 2, 0]
+            )
             v[inner, ghost, 1] = -v[inner, edge, 1]
         for ghost_x, x in ((low, low + 1), (high, high - 1)):
             for ghost_y, y in ((low, low + 1), (high, high - 1)):
@@ -133,15 +179,23 @@ class ReferenceClosedBox:
         """Return dt ((E/rho) grad Jbar + nu lap v) at interior nodes, 0 elsewhere."""
 
         def at(q: Any, di: int, dj: int) -> Any:
-            low, high = self.low + 1, self.high
+            low = self.low + 1
+            high = self.high
             return q[low + di : high + di, low + dj : high + dj]
 
-        rising, falling = at(jbar, 1, 1) - at(jbar, -1, -1), at(jbar, 1, -1) - at(jbar, -1, 1)
+        rising = at(jbar, 1, 1) - at(jbar, -1, -1)
+        falling = at(jbar, 1, -1) - at(jbar, -1, 1)
         x = f(0.75) * (at(jbar, 1, 0) - at(jbar, -1, 0)) + f(0.125) * (rising + falling)
         y = f(0.75) * (at(jbar, 0, 1) - at(jbar, 0, -1)) + f(0.125) * (rising - falling)
-        laplacian = (at(v, 1, 0) + at(v, -1, 0)) + (at(v, 0, 1) + at(v, 0, -1)) - f(4.0) * at(v, 0, 0)
+        laplacian = (
+            (at(v, 1, 0) + at(v, -1, 0))
+            + (at(v, 0, 1) + at(v, 0, -1))
+            - f(4.0) * at(v, 0, 0)
+        )
         a = np.zeros_like(v)
-        at(a, 0, 0)[...] = self.stiffness * np.stack([x, y], axis=-1) + self.diffusion * laplacian
+        at(a, 0, 0)[...] = (
+            self.stiffness * np.stack([x, y], axis=-1) + self.diffusion * laplacian
+        )
         return a
 
     def to_particles(self, v: Single, a: Single, r: Single, jbar: Single) -> None:
@@ -162,7 +216,9 @@ class ReferenceClosedBox:
         slope_x = self.gradient * (slope_x - (offset[:, :1] - f(1.0)) * here)
         slope_y = self.gradient * (slope_y - (offset[:, 1:] - f(1.0)) * here)
         volume = f(1.0) / np.maximum(here[:, 2], f(0.5))
-        push = (self.shift * volume)[:, None] * np.stack([slope_x[:, 2], slope_y[:, 2]], axis=1)
+        push = (self.shift * volume)[:, None] * np.stack(
+            [slope_x[:, 2], slope_y[:, 2]], axis=1
+        )
         push = np.clip(push, -self.shift_bound, self.shift_bound)
         u = self.v + gain
         u = u + f(p.velocity_relaxation) * (here[:, :2] - u)

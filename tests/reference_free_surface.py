@@ -1,8 +1,10 @@
-"""The free-surface solver in plain NumPy float32, written from the equations of design 4.4.
+"""The free-surface solver in plain NumPy float32, written from the equations of design
+4.4.
 
-Independent of Taichi and of ``generators/``: it reads only parameters and initial states. Every
-operation rounds to float32 in the order in which the equation is written; sums over particles
-are 64-bit integers. Slow (two to three microseconds per particle and substep) and plain.
+Independent of Taichi and of ``generators/``: it reads only parameters and initial
+states. Every operation rounds to float32 in the order in which the equation is written;
+sums over particles are 64-bit integers. Slow (two to three microseconds per particle
+and substep) and plain.
 """
 
 from __future__ import annotations
@@ -19,13 +21,17 @@ Float = np.float32
 Floats = NDArray[np.float32]
 Components = tuple[Floats, Floats, Floats, Floats]
 
-ONE, TWO, HALF = Float(1.0), Float(2.0), Float(0.5)
+ONE = Float(1.0)
+TWO = Float(2.0)
+HALF = Float(0.5)
 WEIGHT_SCALE = 2.0**50
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
     """Lame's constants in float64."""
-    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    return young / (2 * (1 + poisson)), young * poisson / (
+        (1 + poisson) * (1 - 2 * poisson)
+    )
 
 
 def fixed(value: Floats, scale: float) -> NDArray[np.int64]:
@@ -58,17 +64,21 @@ class Split:
     def of(cls, f: Components) -> Split:
         """Divide gradients into a scaled rotation and a scaled reflection."""
         a, b, c, d = f
-        e, g = HALF * (a + d), HALF * (c - b)
+        e = HALF * (a + d)
+        g = HALF * (c - b)
         q = np.sqrt(e * e + g * g)
         turns = q > Float(1e-6)
         inverse = ONE / np.where(turns, q, ONE)
-        cos, sin = np.where(turns, e * inverse, ONE), np.where(turns, g * inverse, Float(0))
+        cos = np.where(turns, e * inverse, ONE)
+        sin = np.where(turns, g * inverse, Float(0))
         return cls(q, cos, sin, HALF * (a - d), HALF * (c + b))
 
 
 @dataclass
 class Stencil:
-    """Where a particle touches the grid: lowest node, distance to it [cells], weights per axis."""
+    """Where a particle touches the grid: lowest node, distance to it [cells], weights
+    per axis.
+    """
 
     base: NDArray[np.int32]
     distance: Floats
@@ -87,8 +97,12 @@ class Stencil:
         )
         return cls(base, d, weights)
 
-    def nodes(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
-        """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the nine nodes."""
+    def nodes(
+        self,
+    ) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
+        """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the
+        nine nodes.
+        """
         for i, k in np.ndindex(3, 3):
             weight = self.weights[i][:, 0] * self.weights[k][:, 1]
             offset = Float(i) - self.distance[:, 0], Float(k) - self.distance[:, 1]
@@ -99,14 +113,17 @@ class FreeSurfaceReference:
     """One scenario of the free-surface solver."""
 
     def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
-        """Start from an initial state; constants are computed in float64, then rounded once."""
+        """Start from an initial state; constants are computed in float64, then rounded
+        once.
+        """
         p = self.p = parameters
         count = len(state.position)
         self.position = state.position.astype(Float)  # [length], shape [particle, 2]
         self.velocity = state.velocity.astype(Float)  # [length/s], shape [particle, 2]
         # C [1/s] and F [1], components (xx, xy, yx, yy) of shape [particle]
         self.affine: Components = tuple(state.affine.reshape(count, 4).T.astype(Float))
-        ones, zeros = np.ones(count, Float), np.zeros(count, Float)
+        ones = np.ones(count, Float)
+        zeros = np.zeros(count, Float)
         self.deformation: Components = (ones, zeros, zeros, ones)
         self.ratio = ones  # J of liquid, Jp of snow, 1 elsewhere [1], shape [particle]
         self.liquid = state.material == Material.LIQUID
@@ -117,14 +134,21 @@ class FreeSurfaceReference:
             Material.SNOW: lame(p.snow_modulus, p.snow_poisson),
             Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
         }
-        self.mu, self.la = np.array([moduli[Material(m)] for m in state.material], Float).T
-        kinematic = np.where(self.liquid, p.liquid_viscosity, np.where(self.snow, 0.0, p.elastic_damping))
+        self.mu, self.la = np.array(
+            [moduli[Material(m)] for m in state.material], Float
+        ).T
+        kinematic = np.where(
+            self.liquid, p.liquid_viscosity, np.where(self.snow, 0.0, p.elastic_damping)
+        )
         self.viscosity = (p.density * kinematic).astype(Float)
         self.friction = Float(state.friction)
         self.node_share = Float(state.area / count * p.grid**2)
-        # Velocities up to 64 cells per substep, in 62 bits less those of the particle count.
+        # Velocities up to 64 cells per substep, in 62 bits less those of the particle
+        # count.
         bits = min(50, 62 - (count - 1).bit_length())
-        self.velocity_scale = 2.0 ** (bits - int(np.ceil(np.log2(64 / (p.grid * p.dt)))))
+        self.velocity_scale = 2.0 ** (
+            bits - int(np.ceil(np.log2(64 / (p.grid * p.dt))))
+        )
 
     def advance(self, substeps: int) -> None:
         """Run substeps."""
@@ -134,17 +158,27 @@ class FreeSurfaceReference:
 
     def stress(self) -> tuple[Floats, Floats, Floats]:
         """Kirchhoff stress (xx, xy, yy)."""
-        p, f = self.p, Split.of(self.deformation)
-        exponent = np.clip(Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4))
-        stiff = np.clip(exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max))
+        p = self.p
+        f = Split.of(self.deformation)
+        exponent = np.clip(
+            Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4)
+        )
+        stiff = np.clip(
+            exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max)
+        )
         factor = np.where(self.snow, stiff, ONE)
-        mu, la = self.mu * factor, self.la * factor
+        mu = self.mu * factor
+        la = self.la * factor
         square = f.h * f.h + f.k * f.k
         jacobian = f.q * f.q - square
-        mean = TWO * mu * (f.q * (f.q - ONE) + square) + la * (jacobian - ONE) * jacobian
+        mean = (
+            TWO * mu * (f.q * (f.q - ONE) + square) + la * (jacobian - ONE) * jacobian
+        )
         stretch = TWO * mu * (TWO * f.q - ONE)
-        normal, xy = stretch * (f.cos * f.h - f.sin * f.k), stretch * (f.cos * f.k + f.sin * f.h)
-        xx, yy = mean + normal, mean - normal
+        normal = stretch * (f.cos * f.h - f.sin * f.k)
+        xy = stretch * (f.cos * f.k + f.sin * f.h)
+        xx = mean + normal
+        yy = mean - normal
         pressure = Float(p.liquid_modulus) * (self.ratio - ONE)
         cxx, cxy, cyx, cyy = self.affine
         return (
@@ -154,7 +188,8 @@ class FreeSurfaceReference:
         )
 
     def to_grid(self, stencil: Stencil) -> NDArray[np.int64]:
-        """Sum weighted velocity (x, y), weights and weighted J at the nodes, shape [4, node, node].
+        """Sum weighted velocity (x, y), weights and weighted J at the nodes, shape [4,
+        node, node].
 
         All particles of a scenario weigh the same, so that their mass cancels.
         """
@@ -169,19 +204,29 @@ class FreeSurfaceReference:
         x, y = (stencil.distance - ONE).T
         jacobian = np.where(self.liquid, self.ratio, ONE)
         for component in range(2):
-            a, b = slopes_x[component], slopes_y[component]
+            a = slopes_x[component]
+            b = slopes_y[component]
             centre = self.velocity[:, component] - x * a - y * b
-            for (i, k), (node_i, node_k, w, _, _) in zip(np.ndindex(3, 3), stencil.nodes(), strict=True):
+            for (i, k), (node_i, node_k, w, _, _) in zip(
+                np.ndindex(3, 3), stencil.nodes(), strict=True
+            ):
                 value = w * ((centre + Float(i - 1) * a) + Float(k - 1) * b)
-                np.add.at(sums[component], (node_i, node_k), fixed(value, self.velocity_scale))
+                np.add.at(
+                    sums[component], (node_i, node_k), fixed(value, self.velocity_scale)
+                )
         for node_i, node_k, w, _, _ in stencil.nodes():
             np.add.at(sums[2], (node_i, node_k), fixed(w, WEIGHT_SCALE))
             np.add.at(sums[3], (node_i, node_k), fixed(w * jacobian, WEIGHT_SCALE))
         return sums
 
-    def grid_update(self, sums: NDArray[np.int64]) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return nodal velocity (x, y), relative density and J after gravity and walls."""
-        low, high = self.p.wall, self.p.grid - self.p.wall
+    def grid_update(
+        self, sums: NDArray[np.int64]
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return nodal velocity (x, y), relative density and J after gravity and
+        walls.
+        """
+        low = self.p.wall
+        high = self.p.grid - self.p.wall
         filled = sums[2] > 0
         n, mj = (sums[c].astype(Float) / Float(WEIGHT_SCALE) for c in (2, 3))
         px, py = (sums[c].astype(Float) / Float(self.velocity_scale) for c in (0, 1))
@@ -189,12 +234,16 @@ class FreeSurfaceReference:
         u = np.where(filled, px / n, Float(0))
         v = np.where(filled, py / n - Float(self.p.gravity * self.p.dt), Float(0))
         index = np.arange(self.p.grid + 1)
-        below, above = index <= low, index >= high
+        below = index <= low
+        above = index >= high
         u, v = self.wall_contact(u, v, below[:, None], above[:, None])
         v, u = self.wall_contact(v, u, below[None, :], above[None, :])
         mirrored = sums[2].copy()
         for count in (mirrored, mirrored.T):
-            for wall, inside, outside in ((low, low + 1, low - 1), (high, high - 1, high + 1)):
+            for wall, inside, outside in (
+                (low, low + 1, low - 1),
+                (high, high - 1, high + 1),
+            ):
                 count[wall] *= 2
                 count[inside] += count[outside]
                 count[outside] = count[inside]
@@ -202,40 +251,69 @@ class FreeSurfaceReference:
         return u, v, density, np.where(filled, mj / n, ONE)
 
     def wall_contact(
-        self, normal: Floats, tangential: Floats, below: NDArray[np.bool_], above: NDArray[np.bool_]
+        self,
+        normal: Floats,
+        tangential: Floats,
+        below: NDArray[np.bool_],
+        above: NDArray[np.bool_],
     ) -> tuple[Floats, Floats]:
-        """Remove the outward normal velocity; Coulomb friction brakes the tangential one by its share."""
+        """Remove the outward normal velocity; Coulomb friction brakes the tangential
+        one by its share.
+        """
         hits = (below & (normal < 0)) | (above & (normal > 0))
-        loss = self.friction * np.abs(normal) / np.maximum(np.abs(tangential), Float(1e-9))
+        loss = (
+            self.friction * np.abs(normal) / np.maximum(np.abs(tangential), Float(1e-9))
+        )
         braked = tangential * np.maximum(Float(0), ONE - loss)
         return np.where(hits, Float(0), normal), np.where(hits, braked, tangential)
 
-    def to_particles(self, stencil: Stencil, u: Floats, v: Floats, density: Floats, jacobian: Floats) -> None:
-        """Gather velocity, gradient, density and J; move; update the constitutive state."""
+    def to_particles(
+        self, stencil: Stencil, u: Floats, v: Floats, density: Floats, jacobian: Floats
+    ) -> None:
+        """Gather velocity, gradient, density and J; move; update the constitutive
+        state.
+        """
         zeros = np.zeros(len(self.position), Float)
         vx = vy = cxx = cxy = cyx = cyy = r = smooth = zeros
         for i, k, w, ox, oy in stencil.nodes():
-            x, y = w * u[i, k], w * v[i, k]
-            vx, vy = vx + x, vy + y
-            cxx, cxy, cyx, cyy = cxx + x * ox, cxy + x * oy, cyx + y * ox, cyy + y * oy
-            r, smooth = r + w * density[i, k], smooth + w * jacobian[i, k]
+            x = w * u[i, k]
+            y = w * v[i, k]
+            vx = vx + x
+            vy = vy + y
+            cxx = cxx + x * ox
+            cxy = cxy + x * oy
+            cyx = cyx + y * ox
+            cyy = cyy + y * oy
+            r = r + w * density[i, k]
+            smooth = smooth + w * jacobian[i, k]
         scale = Float(4 * self.p.grid)
         self.affine = (scale * cxx, scale * cxy, scale * cyx, scale * cyy)
         self.velocity = np.stack([vx, vy], 1)
         dx = 1 / self.p.grid
-        low, high = Float((self.p.wall + 1e-3) * dx), Float((self.p.grid - self.p.wall - 1e-3) * dx)
-        self.position = np.clip(self.position + Float(self.p.dt) * self.velocity, low, high)
-        # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J); limits.
-        p, old = self.p, self.ratio
+        low = Float((self.p.wall + 1e-3) * dx)
+        high = Float((self.p.grid - self.p.wall - 1e-3) * dx)
+        self.position = np.clip(
+            self.position + Float(self.p.dt) * self.velocity, low, high
+        )
+        # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J);
+        # limits.
+        p = self.p
+        old = self.ratio
         j = old + Float(p.dt) * (self.affine[0] + self.affine[3]) * old
         j = j + Float(p.jacobian_relaxation) * (smooth - old)
         j = j + Float(p.density_coupling) * (ONE / np.maximum(r, ONE) - j)
-        self.ratio = np.where(self.liquid, np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max)), old)
+        self.ratio = np.where(
+            self.liquid, np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max)), old
+        )
         self.deform()
 
     def deform(self) -> None:
         """F <- (I + dt C) F for solids; snow then yields."""
-        (a, b, c, d), (cxx, cxy, cyx, cyy), dt = self.deformation, self.affine, Float(self.p.dt)
+        (a, b, c, d), (cxx, cxy, cyx, cyy), dt = (
+            self.deformation,
+            self.affine,
+            Float(self.p.dt),
+        )
         trial = (
             a + dt * (cxx * a + cxy * c),
             b + dt * (cxx * b + cxy * d),
@@ -243,18 +321,29 @@ class FreeSurfaceReference:
             d + dt * (cyx * b + cyy * d),
         )
         # Snow: the principal stretches are clamped; Jp takes the rest.
-        low, high = Float(1 - self.p.snow_compression), Float(1 + self.p.snow_stretch)
+        low = Float(1 - self.p.snow_compression)
+        high = Float(1 + self.p.snow_stretch)
         f = Split.of(trial)  # type: ignore[arg-type]
         r = np.sqrt(f.h * f.h + f.k * f.k)
-        first, second = np.clip(f.q + r, low, high), np.clip(f.q - r, low, high)
+        first = np.clip(f.q + r, low, high)
+        second = np.clip(f.q - r, low, high)
         sheared = r > Float(1e-12)
-        shrink = np.where(sheared, HALF * (first - second) / np.where(sheared, r, ONE), Float(0))
+        shrink = np.where(
+            sheared, HALF * (first - second) / np.where(sheared, r, ONE), Float(0)
+        )
         mean = HALF * (first + second)
-        e, g, h, k = mean * f.cos, mean * f.sin, shrink * f.h, shrink * f.k
+        e = mean * f.cos
+        g = mean * f.sin
+        h = shrink * f.h
+        k = shrink * f.k
         floor = Float(0.1)
-        factor = np.maximum(f.q + r, floor) * np.maximum(f.q - r, floor) / (first * second)
+        factor = (
+            np.maximum(f.q + r, floor) * np.maximum(f.q - r, floor) / (first * second)
+        )
         elastic = e + h, k - g, k + g, e - h
-        plastic = np.clip(self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max))
+        plastic = np.clip(
+            self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max)
+        )
         self.ratio = np.where(self.snow, plastic, self.ratio)
         self.deformation = tuple(  # type: ignore[assignment]
             np.where(self.liquid, old, np.where(self.snow, kept, new))

@@ -12,7 +12,8 @@ from score_bench import Floats, Predict, ScoreBench
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.metrics import METRICS, Score
 
-SPLIT, SIZE = "cavity", "tiny"
+SPLIT = "cavity"
+SIZE = "tiny"
 
 NOISE = {
     "supergat": 0.0,
@@ -32,21 +33,39 @@ RECORD = {
     "windows": 100,
     "recipe": {"name": "cavity/tiny", "training": {"batch": 2}},
     "hardware": {"device": "cpu", "processor": "a core", "threads": 1},
-    "validation": [{"step": 10, "rmse": 4.0}, {"step": 20, "rmse": 2.0}, {"step": 40, "rmse": 0.5}],
+    "validation": [
+        {"step": 10, "rmse": 4.0},
+        {"step": 20, "rmse": 2.0},
+        {"step": 40, "rmse": 0.5},
+    ],
 }
 """What a pretended training recorded."""
 
 
 def a_score(values: list[float], metric: str) -> Score:
-    """Return a score with values over the horizon, the same at the cavity's frame 54, its only one."""
+    """Return a score with values over the horizon, the same at the cavity's frame 54,
+    its only one.
+    """
     held = np.array(values)
-    return Score(METRICS[metric], tuple(range(len(values))), (54,), held[:, None], held, (0,) * len(values))
+    return Score(
+        METRICS[metric],
+        tuple(range(len(values))),
+        (54,),
+        held[:, None],
+        held,
+        (0,) * len(values),
+    )
 
 
 def a_method(name: str, *seeds: list[float]) -> Method:
     """Return a model whose every metric has these values, one list per seed."""
     held = [
-        Seeded(seed=i, scores={m: a_score(values, m) for m in METRICS}, record={}, path=Path())
+        Seeded(
+            seed=i,
+            scores={m: a_score(values, m) for m in METRICS},
+            record={},
+            path=Path(),
+        )
         for i, values in enumerate(seeds)
     ]
     return Method(name=name, seeds=tuple(held))
@@ -65,7 +84,9 @@ def noisy(noise: float) -> Predict:
 
     def predict(truth: Floats, n: int, h: int) -> Floats:
         held = truth[n : n + h]
-        return np.asarray(np.clip(held + noise * draw.standard_normal(held.shape), 0.0, 1.0))
+        return np.asarray(
+            np.clip(held + noise * draw.standard_normal(held.shape), 0.0, 1.0)
+        )
 
     return predict
 
@@ -77,7 +98,9 @@ def pretend(bench: ScoreBench, folder: Path) -> Path:
         home.mkdir(parents=True)
         bench.score(bench.submit(home / "predictions.nc", noisy(noise), method=name))
         (home / "training.json").write_text(json.dumps(RECORD))
-        (home / "predictions.json").write_text(json.dumps({"seconds_per_frame": 0.5, "device": "a core"}))
+        (home / "predictions.json").write_text(
+            json.dumps({"seconds_per_frame": 0.5, "device": "a core"})
+        )
     return folder
 
 

@@ -1,4 +1,6 @@
-"""Small scenario files and data sets with made-up values, for tests of everything around them."""
+"""Small scenario files and data sets with made-up values, for tests of everything
+around them.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,16 @@ DIMS = {
 
 
 def make_key(
-    scenario: int = 3, *, split: str = "cavity", size: str = "tiny", subset: str = "test"
+    scenario: int = 3,
+    *,
+    split: str = "cavity",
+    size: str = "tiny",
+    subset: str = "test",
 ) -> ScenarioKey:
     """Return the key of a cavity tiny scenario unless told otherwise."""
-    return ScenarioKey(split=split, size=size, version="2.2.0", scenario=scenario, subset=subset)
+    return ScenarioKey(
+        split=split, size=size, version="2.2.0", scenario=scenario, subset=subset
+    )
 
 
 def frames_of(scenario: int, frames: int, particles: int) -> NDArray[np.float32]:

@@ -19,7 +19,9 @@ from lagbench.submission import write
 
 Floats = NDArray[np.floating[Any]]
 Predict = Callable[[Floats, int, int], Floats]
-"""From all true positions [frame, particle, 2], given frames n and horizon h to predictions."""
+"""From all true positions [frame, particle, 2], given frames n and horizon h to
+predictions.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class ScoreBench:
 
     def submit(self, path: Path, predict: Predict, **labels: Any) -> Path:
         """Write the submission of a method."""
-        n, h = self.size.task.input_frames, self.size.task.horizon
+        n = self.size.task.input_frames
+        h = self.size.task.horizon
         guesses = {i: predict(self.truth(i), n, h) for i in self.size.subsets["test"]}
         return write(
             path,
@@ -56,7 +59,9 @@ class ScoreBench:
 
     def evaluate(self, path: Path, **options: Any) -> ScoreCard:
         """Return the score card of a submission."""
-        return score(path, root=self.root, registry=self.registry, write=False, **options)
+        return score(
+            path, root=self.root, registry=self.registry, write=False, **options
+        )
 
     def score(self, path: Path, **options: Any) -> ScoreCard:
         """Score a submission and write the card."""
@@ -65,7 +70,9 @@ class ScoreBench:
 
 def bench_of(generated: GenerationResult, registry: Registry) -> ScoreBench:
     """Return the bench of a generated data set."""
-    return ScoreBench(generated.root, registry, registry.size(generated.split, generated.size))
+    return ScoreBench(
+        generated.root, registry, registry.size(generated.split, generated.size)
+    )
 
 
 def right(truth: Floats, n: int, h: int) -> Floats:

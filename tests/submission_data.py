@@ -1,4 +1,6 @@
-"""A small data set, its registry and a valid predictions.nc, for tests of submissions."""
+"""A small data set, its registry and a valid predictions.nc, for tests of
+submissions.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,18 @@ from lagbench.submission import ValidationResult, validate, write
 TESTS = (3, 4, 5)
 """Ids of the test scenarios."""
 
-GIVEN, HORIZON, PARTICLES = 3, 8, 48
+GIVEN = 3
+HORIZON = 8
+PARTICLES = 48
 FRAMES = GIVEN + HORIZON
 VERSION = "2.2.0"
 
 
 @dataclass(frozen=True)
 class Bench:
-    """A root folder with test scenarios, the registry that describes them, a valid submission."""
+    """A root folder with test scenarios, the registry that describes them, a valid
+    submission.
+    """
 
     folder: Path
     root: Path
@@ -49,28 +55,41 @@ class Bench:
     ) -> ValidationResult:
         """Validate a file against this data set."""
         return validate(
-            path, root=self.root, registry=self.registry, isolated=isolated, require_truth=require_truth
+            path,
+            root=self.root,
+            registry=self.registry,
+            isolated=isolated,
+            require_truth=require_truth,
         )
 
 
 def truth(scenario: int) -> NDArray[np.float32]:
-    """Positions of a test scenario at the frames to predict, shape [frame, particle, 2]."""
+    """Positions of a test scenario at the frames to predict, shape [frame, particle,
+    2].
+    """
     return frames_of(scenario, FRAMES, PARTICLES)[GIVEN:]
 
 
 def frozen(values: NDArray[np.float32], mark: int) -> NDArray[np.float32]:
-    """Return a rollout that repeats the frame before an absolute frame number from there on."""
+    """Return a rollout that repeats the frame before an absolute frame number from
+    there on.
+    """
     values = values.copy()
     values[mark - GIVEN :] = values[mark - GIVEN - 1]
     return values
 
 
 def make_bench(folder: Path) -> Bench:
-    """Write the data set (test only), its registry with hashes, and the truth as predictions."""
+    """Write the data set (test only), its registry with hashes, and the truth as
+    predictions.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     root = folder / "root"
     keys = {i: make_key(i, split="cavity", size="tiny", subset="test") for i in TESTS}
-    hashes = {i: write_scenario(root, k, frames=FRAMES, particles=PARTICLES)[1] for i, k in keys.items()}
+    hashes = {
+        i: write_scenario(root, k, frames=FRAMES, particles=PARTICLES)[1]
+        for i, k in keys.items()
+    }
     registry_path = folder / "datasets.yaml"
     registry_path.write_text(_registry(hashes))
     valid = folder / "valid.nc"
@@ -89,7 +108,9 @@ def make_bench(folder: Path) -> Bench:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Bench:
-    """A small data set and a valid submission; modules that test submissions call it ``bench``."""
+    """A small data set and a valid submission; modules that test submissions call it
+    ``bench``.
+    """
     return make_bench(tmp_path_factory.mktemp("bench"))
 
 
@@ -103,7 +124,11 @@ def _registry(hashes: dict[int, str]) -> str:
     size["subsets"] = {"train": "0-1", "valid": 2, "test": "3-5"}
     size["frames"] = FRAMES
     size["parameters"]["particles"] = PARTICLES
-    size["task"] |= {"input_frames": GIVEN, "horizon": HORIZON, "frames_of_interest": [5]}
+    size["task"] |= {
+        "input_frames": GIVEN,
+        "horizon": HORIZON,
+        "frames_of_interest": [5],
+    }
     subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
     measured = {
         "dataset_sha256": dataset_hash("cavity", "tiny", 1, subsets),

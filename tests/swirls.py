@@ -20,7 +20,8 @@ TOP_TO_THE_RIGHT = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.125, 0.0]])
 def disc(count: int, radius: float) -> NDArray[np.float64]:
     """Points of a sunflower pattern of even density around the middle of the box."""
     k = np.arange(count) + 0.5
-    r, angle = radius * np.sqrt(k / count), k * np.pi * (3.0 - np.sqrt(5.0))
+    r = radius * np.sqrt(k / count)
+    angle = k * np.pi * (3.0 - np.sqrt(5.0))
     return 0.5 + np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
 
 
@@ -35,10 +36,14 @@ def write_swirl(
     materials: int = 1,
     parameters: Mapping[str, object] | None = None,
 ) -> Path:
-    """Write a disc of radius 0.4 that turns by OMEGA a frame; return the file's path."""
+    """Write a disc of radius 0.4 that turns by OMEGA a frame; return the file's
+    path.
+    """
     tier = registry.load().size(split, size)
     subset = tier.subset_of(scenario)
-    key = ScenarioKey(split=split, size=size, version=tier.version, scenario=scenario, subset=subset)
+    key = ScenarioKey(
+        split=split, size=size, version=tier.version, scenario=scenario, subset=subset
+    )
     count = tier.particles
     start = disc(count, 0.4) - 0.5
     path = scenario_path(root, key)
@@ -58,8 +63,11 @@ def write_swirl(
         reynolds=None if walls is None else 100.0,
     ) as writer:
         for frame in range(frames):
-            c, s = np.cos(OMEGA * frame), np.sin(OMEGA * frame)
+            c = np.cos(OMEGA * frame)
+            s = np.sin(OMEGA * frame)
             x = start @ np.array([[c, s], [-s, c]])
-            velocity = OMEGA / tier.frame_interval * np.stack([-x[:, 1], x[:, 0]], axis=-1)
+            velocity = (
+                OMEGA / tier.frame_interval * np.stack([-x[:, 1], x[:, 0]], axis=-1)
+            )
             writer.append((x + 0.5).astype(np.float32), velocity.astype(np.float32))
     return path

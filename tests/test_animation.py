@@ -1,4 +1,6 @@
-"""Animations: pixels where particles are, right lengths and sizes, whole files or none."""
+"""Animations: pixels where particles are, right lengths and sizes, whole files or
+none.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,12 @@ def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_swirl(tmp_path_factory.mktemp("root"), frames=8)
 
 
-@given(hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=5).map(lambda s: (*s, 3))))
+@given(
+    hnp.arrays(
+        np.uint8,
+        hnp.array_shapes(min_dims=2, max_dims=2, max_side=5).map(lambda s: (*s, 3)),
+    )
+)
 def test_packing_keeps_every_pixel(pixels: NDArray[np.uint8]) -> None:
     """Unpack is the inverse of pack."""
     np.testing.assert_array_equal(unpack(pack(pixels)), pixels)
@@ -40,7 +47,9 @@ def test_packing_keeps_every_pixel(pixels: NDArray[np.uint8]) -> None:
 
 @given(hnp.arrays(np.uint8, st.integers(1, 4).map(lambda n: (2 * n, 2 * n, 3))))
 def test_halving_takes_the_mean_of_four(pixels: NDArray[np.uint8]) -> None:
-    """Each colour of each pixel is the mean of four, at most 1.5 below for the two roundings."""
+    """Each colour of each pixel is the mean of four, at most 1.5 below for the two
+    roundings.
+    """
     n = len(pixels) // 2
     exact = pixels.reshape(n, 2, n, 2, 3).mean(axis=(1, 3))
     short = exact - unpack(halve(pack(pixels)))
@@ -68,11 +77,15 @@ def test_dots_lie_where_the_particles_are(swirl: Path) -> None:
 
 
 def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
-    """Materials by particle number: the sunflower's last points lie on the rim, the first in the middle."""
+    """Materials by particle number: the sunflower's last points lie on the rim, the
+    first in the middle.
+    """
     path = write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=2)
     image = paint(path, Panel.MATERIAL, 0)
     assert tuple(image[64, 64]) == tuple(style.rgb(style.MATERIAL_COLOURS[0]))
-    rim = image[64 - int(0.35 * 128), 60:68]  # 0.35 above the middle: the second material
+    rim = image[
+        64 - int(0.35 * 128), 60:68
+    ]  # 0.35 above the middle: the second material
     assert (rim == style.rgb(style.MATERIAL_COLOURS[1])).all(axis=-1).any()
 
 
@@ -91,7 +104,9 @@ def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:
 
 
 def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> None:
-    """Eight frames at 30 a second, even sides; no date, so that the same frames give the same bytes."""
+    """Eight frames at 30 a second, even sides; no date, so that the same frames give
+    the same bytes.
+    """
     first, second = (animate(swirl, tmp_path / name) for name in ("a.mp4", "b.mp4"))
     frames, seconds = imageio_ffmpeg.count_frames_and_secs(first)
     assert (frames, seconds) == (8, pytest.approx(8 / 30, abs=0.02))
@@ -101,8 +116,12 @@ def test_mp4_has_every_frame_and_an_even_size(swirl: Path, tmp_path: Path) -> No
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_two_scenarios_side_by_side_end_with_the_shorter(swirl: Path, tmp_path: Path) -> None:
-    """The picture is wider by a panel and a gap and has as many frames as the shorter scenario."""
+def test_two_scenarios_side_by_side_end_with_the_shorter(
+    swirl: Path, tmp_path: Path
+) -> None:
+    """The picture is wider by a panel and a gap and has as many frames as the shorter
+    scenario.
+    """
     shorter = write_swirl(tmp_path, scenario=3, frames=5)
     path = animate(swirl, tmp_path / "pair.gif", beside=shorter)
     with GifImageFile(path) as image:
@@ -113,20 +132,34 @@ def test_two_scenarios_side_by_side_end_with_the_shorter(swirl: Path, tmp_path: 
 def test_gif_repeats_and_has_the_same_bytes_twice(
     swirl: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Frames differ, all keep the exact white of the paper, the loop never ends; nothing is logged."""
+    """Frames differ, all keep the exact white of the paper, the loop never ends;
+    nothing is logged.
+    """
     options: dict[str, Any] = {"every": 3, "frames_per_second": 10}
-    first, second = (animate(swirl, tmp_path / name, **options) for name in ("a.gif", "b.gif"))
+    first, second = (
+        animate(swirl, tmp_path / name, **options) for name in ("a.gif", "b.gif")
+    )
     assert capfd.readouterr() == ("", "")
     assert first.read_bytes() == second.read_bytes()
     with GifImageFile(first) as image:
-        assert (image.n_frames, image.info["loop"], image.info["duration"]) == (3, 0, 100)
-        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)]
+        assert (image.n_frames, image.info["loop"], image.info["duration"]) == (
+            3,
+            0,
+            100,
+        )
+        frames = [
+            np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)
+        ]
     assert all(tuple(frame[-1, -1]) == (255, 255, 255) for frame in frames)
     assert (frames[0] != frames[2]).any()
 
 
-def test_an_error_leaves_no_file(swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A painter that fails half-way leaves the target as it was and no temporary file."""
+def test_an_error_leaves_no_file(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A painter that fails half-way leaves the target as it was and no temporary
+    file.
+    """
     target = tmp_path / "old.mp4"
     target.write_bytes(b"old")
     original = Painter.paint
@@ -143,7 +176,9 @@ def test_an_error_leaves_no_file(swirl: Path, tmp_path: Path, monkeypatch: pytes
     assert target.read_bytes() == b"old"
 
 
-def test_ffmpeg_that_fails_is_reported(swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ffmpeg_that_fails_is_reported(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What ffmpeg refuses becomes an error of lagbench, and no file is left."""
     monkeypatch.setattr(animation, "_CODING", ["-no_such_option", "1"])
     with pytest.raises(WorkFailedError, match="encode"):
@@ -162,13 +197,20 @@ def test_a_film_that_cannot_be_written_names_its_option(swirl: Path) -> None:
     "options",
     [
         *({"kind": kind} for kind in ("streamlines", "sped")),
-        *({"frames_per_second": rate} for rate in (0, float("nan"), float("inf"), 1e-9)),
+        *(
+            {"frames_per_second": rate}
+            for rate in (0, float("nan"), float("inf"), 1e-9)
+        ),
         *({"every": step} for step in (0, 1.5, 2.0)),
     ],
 )
-def test_bad_options_are_refused(swirl: Path, tmp_path: Path, options: dict[str, object]) -> None:
+def test_bad_options_are_refused(
+    swirl: Path, tmp_path: Path, options: dict[str, object]
+) -> None:
     """The error names the option, and nothing is written."""
     with pytest.raises(UsageError) as error:
         animate(swirl, tmp_path / "x.mp4", **options)  # type: ignore[arg-type]
-    assert str(error.value.where) == ("--kind" if "kind" in options else "--fps, --every")
+    assert str(error.value.where) == (
+        "--kind" if "kind" in options else "--fps, --every"
+    )
     assert not list(tmp_path.iterdir())

@@ -6,7 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.atomic import atomic_path, check_writable, move_together, remove_leftovers, write_atomically
+from lagbench.atomic import (
+    atomic_path,
+    check_writable,
+    move_together,
+    remove_leftovers,
+    write_atomically,
+)
 from lagbench.errors import DataError, WorkFailedError
 
 
@@ -22,7 +28,9 @@ def test_a_file_appears_only_on_the_clean_exit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, DataError("what")])
-def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException] | BaseException) -> None:
+def test_an_error_keeps_the_old_file(
+    tmp_path: Path, error: type[BaseException] | BaseException
+) -> None:
     """Whatever is raised passes through; the old file stays, the temporary one goes."""
     target = tmp_path / "file"
     write_atomically(target, b"old")
@@ -39,7 +47,8 @@ def test_an_error_keeps_the_old_file(tmp_path: Path, error: type[BaseException] 
 
 
 def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
-    """A usable folder is made and left empty; an unusable one is told with the option that names it.
+    """A usable folder is made and left empty; an unusable one is told with the option
+    that names it.
 
     So is one that is met by the work itself.
     """
@@ -47,15 +56,23 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     assert list((tmp_path / "deep" / "folder").iterdir()) == []
     (tmp_path / "file").touch()
     file = tmp_path / "file"
-    for folder, remedy in ((file, "remove it"), (file / "below", "remove it"), (Path("/proc/self"), "free")):
-        with pytest.raises(WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"):
+    for folder, remedy in (
+        (file, "remove it"),
+        (file / "below", "remove it"),
+        (Path("/proc/self"), "free"),
+    ):
+        with pytest.raises(
+            WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"
+        ):
             check_writable(folder, option="--output")
     with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*in-the-way.*--root"):
         write_atomically(file / "in-the-way", b"")
 
 
 def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:
-    """A folder at one of the places is met before the first file moves; a link to one is replaced."""
+    """A folder at one of the places is met before the first file moves; a link to one
+    is replaced.
+    """
     sources = [tmp_path / "new-a", tmp_path / "new-b"]
     for path in sources:
         path.write_text(path.name)
@@ -74,7 +91,8 @@ def test_files_move_together_or_not_at_all(tmp_path: Path) -> None:
 def test_leftovers_of_killed_writers_are_removed(tmp_path: Path) -> None:
     """Only temporary names go, in subfolders too."""
     (tmp_path / "test").mkdir()
-    kept, left = tmp_path / "test" / "0003.nc", tmp_path / "test" / ".0004.nc.77.partial"
+    kept = tmp_path / "test" / "0003.nc"
+    left = tmp_path / "test" / ".0004.nc.77.partial"
     kept.touch()
     left.touch()
     assert remove_leftovers(tmp_path) == [left]

@@ -1,4 +1,6 @@
-"""A blow-up names its scenario, the first broken substep, the broken bound and its value."""
+"""A blow-up names its scenario, the first broken substep, the broken bound and its
+value.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,11 @@ def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def stiff_registry(unmeasured_path: Path, tmp_path: Path) -> Registry:
-    """Curl noise that is too stiff for its dt: all scenarios blow up, some later than others."""
-    text, own = unmeasured_path.read_text(), tmp_path / "stiff.yaml"
+    """Curl noise that is too stiff for its dt: all scenarios blow up, some later than
+    others.
+    """
+    text = unmeasured_path.read_text()
+    own = tmp_path / "stiff.yaml"
     assert "modulus: {value: 5.0e-4" in text
     own.write_text(text.replace("modulus: {value: 5.0e-4", "modulus: {value: 0.1"))
     return load(own)
@@ -47,9 +52,16 @@ def stiff(stiff_registry: Registry) -> Size:
 
 
 def first_bad(size: Size, scenarios: tuple[int, ...]) -> tuple[int, int]:
-    """Return (scenario, substep) of the first failure, one substep and one solver at a time."""
+    """Return (scenario, substep) of the first failure, one substep and one solver at a
+    time.
+    """
     ends = {}
-    solver = compiled(split_module(size).solver_parameters(size), device=Device.CPU, scenarios=1, threads=1)
+    solver = compiled(
+        split_module(size).solver_parameters(size),
+        device=Device.CPU,
+        scenarios=1,
+        threads=1,
+    )
     for scenario in scenarios:
         solver.load([batch.draw(size, scenario)])
         for substep in range(1, 313):
@@ -66,7 +78,10 @@ def failure(
 ) -> WorkFailedError:
     """Return the error that simulating some scenarios ends with."""
     with pytest.raises(WorkFailedError, match="the simulation blew up") as caught:
-        simulate(SimulationJob(size=size, scenarios=scenarios, root=root, device=device), lambda units: None)
+        simulate(
+            SimulationJob(size=size, scenarios=scenarios, root=root, device=device),
+            lambda units: None,
+        )
     return caught.value
 
 
@@ -78,9 +93,16 @@ def failure(
     ],
 )
 def test_substep_and_bounds_are_those_that_broke_first(
-    scenario: int, expected: str, got: str, stiff: Size, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scenario: int,
+    expected: str,
+    got: str,
+    stiff: Size,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A solver that is asked after every substep agrees, however many lie between two reports."""
+    """A solver that is asked after every substep agrees, however many lie between two
+    reports.
+    """
     _, substep = first_bad(stiff, (scenario,))
     assert substep > 1
     for stride in (1, 5, 10_000):
@@ -93,7 +115,9 @@ def test_substep_and_bounds_are_those_that_broke_first(
 
 
 def test_the_first_scenario_of_a_batch_is_named(stiff: Size, tmp_path: Path) -> None:
-    """Of scenarios that advance together, the one that breaks first; not the first of the batch."""
+    """Of scenarios that advance together, the one that breaks first; not the first of
+    the batch.
+    """
     together = (2, 1, 3)
     scenario, substep = first_bad(stiff, together)
     error = failure(stiff, together, tmp_path, Device.PARALLEL)
@@ -113,17 +137,23 @@ def test_a_good_run_loads_its_states_once(
         load_states(solver, states)
 
     monkeypatch.setattr(ClosedBox, "load", counted)
-    simulate(SimulationJob(size=size, scenarios=(2,), root=tmp_path), lambda units: None)
+    simulate(
+        SimulationJob(size=size, scenarios=(2,), root=tmp_path), lambda units: None
+    )
     assert loads == [1]
 
 
 def test_a_twin_is_replayed_with_its_nudge(
     copied: Callable[[], Path], unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A nudge that is not a number breaks the twin, in the replay as well, one substep later."""
+    """A nudge that is not a number breaks the twin, in the replay as well, one substep
+    later.
+    """
     size = unmeasured.size(SPLIT, SIZE)
 
-    monkeypatch.setattr(twin, "nudge", lambda size, _: np.full((size.particles, 2), np.nan, np.float32))
+    monkeypatch.setattr(
+        twin, "nudge", lambda size, _: np.full((size.particles, 2), np.nan, np.float32)
+    )
     job = SimulationJob(size=size, scenarios=(3,), root=copied())
     with pytest.raises(WorkFailedError, match="blew up") as caught:
         twin.twin_floors(job, lambda units: None)
@@ -135,14 +165,20 @@ def test_a_twin_is_replayed_with_its_nudge(
 def test_a_failure_that_does_not_repeat_keeps_its_range(
     stiff: Size, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where the replay passes (a bit that flipped), the range of the first report is all there is."""
-    running = Batch(SimulationJob(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None)
+    """Where the replay passes (a bit that flipped), the range of the first report is
+    all there is.
+    """
+    running = Batch(
+        SimulationJob(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None
+    )
     failed: list[int] = []
 
     def flaky(substeps: int) -> None:
         if not failed:
             failed.append(substeps)
-            raise WorkFailedError("the simulation blew up", where=f"scenario 0, substeps 0 to {substeps}")
+            raise WorkFailedError(
+                "the simulation blew up", where=f"scenario 0, substeps 0 to {substeps}"
+            )
 
     monkeypatch.setattr(running.solver, "advance", flaky)
     with pytest.raises(WorkFailedError, match="scenario 2, substeps 0 to 12"):
@@ -152,12 +188,21 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
 def test_a_failed_scenario_leaves_what_was_there(
     copied: Callable[[], Path], stiff_registry: Registry, tmp_path: Path
 ) -> None:
-    """Neither file nor manifest of it; files of an earlier generation and their manifest stay."""
+    """Neither file nor manifest of it; files of an earlier generation and their
+    manifest stay.
+    """
     before = copied()
     (before / SPLIT / SIZE / "v2" / "valid" / "0002.nc").unlink()
     for root in (tmp_path / "data", before):
         with pytest.raises(WorkFailedError, match="blew up"):
-            generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, registry=stiff_registry)
+            generate(
+                SPLIT,
+                SIZE,
+                scenarios="2",
+                root=root,
+                workers=1,
+                registry=stiff_registry,
+            )
     found = [p.name for p in (tmp_path / "data").rglob("*") if p.is_file()]
     assert all(name.startswith(".lock") for name in found)
     after = read_manifest(before, SPLIT, SIZE, 2)

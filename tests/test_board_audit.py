@@ -1,4 +1,6 @@
-"""What lies outside a leaderboard's folder: predictions scored again, and the base of a change."""
+"""What lies outside a leaderboard's folder: predictions scored again, and the base of a
+change.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,19 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from made_up import PLACE, SCORES, BoardBench, copied, damped, nearer, noisy, reform, scale, set_mean, still
+from made_up import (
+    PLACE,
+    SCORES,
+    BoardBench,
+    copied,
+    damped,
+    nearer,
+    noisy,
+    reform,
+    scale,
+    set_mean,
+    still,
+)
 
 from lagbench.board import submit as submitting
 from lagbench.board.build import collect
@@ -29,7 +43,11 @@ FLOOR = "floors/cavity/tiny/persistence.nc"
 @pytest.fixture
 def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard that the test may damage."""
-    return copied(home, tmp_path, without=["flipping", "constant-velocity", "frozen-field", "analog"])
+    return copied(
+        home,
+        tmp_path,
+        without=["flipping", "constant-velocity", "frozen-field", "analog"],
+    )
 
 
 def checked(bench: BoardBench, **options: Any) -> CheckResult:
@@ -55,17 +73,27 @@ def rescored(bench: BoardBench, *paths: Path, **options: Any) -> CheckResult:
 
 def verified(bench: BoardBench) -> set[str]:
     """Return the entries that the board calls verified."""
-    return {row.id for row in collect(bench.folder, registry=bench.registry).tabs[0].rows if row.verified}
+    return {
+        row.id
+        for row in collect(bench.folder, registry=bench.registry).tabs[0].rows
+        if row.verified
+    }
 
 
-def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Path) -> None:
-    """The entry is named with how close it came; only the list makes it verified, while its files stay."""
+def test_scoring_again_confirms_and_is_recorded(
+    own: BoardBench, predictions: Path
+) -> None:
+    """The entry is named with how close it came; only the list makes it verified, while
+    its files stay.
+    """
     result = rescored(own, predictions)
     assert not result.findings
     (one,) = result.confirmed
     assert (one.entry, one.difference) == (Path(PLACE, "noisy.yaml"), 0.0)
     assert not (own.folder / "verified.yaml").exists()
-    assert rescored(own, predictions, recording=True).recorded == (f"{PLACE}/noisy.yaml",)
+    assert rescored(own, predictions, recording=True).recorded == (
+        f"{PLACE}/noisy.yaml",
+    )
     assert (verified(own), found(own)) == ({"noisy"}, [])
     before = (own.folder / "verified.yaml").read_bytes()
     rescored(own, predictions, recording=True)
@@ -77,14 +105,20 @@ def test_scoring_again_confirms_and_is_recorded(own: BoardBench, predictions: Pa
 def test_metrics_of_packages_decide_nothing(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever scores again may have a package that measures more, or lack the submitter's."""
-    own_metric = replace(available()["position_mse"], name="other", of=(), statistic=lambda pair: 1.0)
+    """Whoever scores again may have a package that measures more, or lack the
+    submitter's.
+    """
+    own_metric = replace(
+        available()["position_mse"], name="other", of=(), statistic=lambda pair: 1.0
+    )
     more = {**available(), "other": own_metric}
     with monkeypatch.context() as patch:
         patch.setattr("lagbench.metrics.table.available", lambda: more)
         assert len(rescored(own, predictions).confirmed) == 1
         own.submit(predictions, replace=True)
-        with pytest.raises(UsageError):  # the same predictions by another name, measured otherwise
+        with pytest.raises(
+            UsageError
+        ):  # the same predictions by another name, measured otherwise
             own.submit(own.predict(noisy, "twin"))
     assert len(rescored(own, predictions).confirmed) == 1
 
@@ -93,24 +127,39 @@ def test_a_method_is_verified_with_all_its_seeds(own: BoardBench) -> None:
     """One of two seeds confirms its score file, not the entry."""
     path = own.predict(damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25)
     result = rescored(own, path, recording=True)
-    assert ([one.score_file.name for one in result.confirmed], result.recorded) == (["damped_0.nc"], ())
+    assert ([one.score_file.name for one in result.confirmed], result.recorded) == (
+        ["damped_0.nc"],
+        (),
+    )
     assert result.partly == (f"{PLACE}/damped.yaml",)
 
 
-def test_scoring_again_finds_what_a_forger_hid(own: BoardBench, predictions: Path) -> None:
-    """Statistics halved, hashes and aggregates forged: only the predictions themselves tell."""
+def test_scoring_again_finds_what_a_forger_hid(
+    own: BoardBench, predictions: Path
+) -> None:
+    """Statistics halved, hashes and aggregates forged: only the predictions themselves
+    tell.
+    """
     reform(own, scale("vorticity_mse", 0.5))
     assert found(own) == []
     result = rescored(own, predictions, recording=True)
     told = [(one.check, one.got) for one in result.findings]
-    assert (told, result.confirmed, result.recorded) == ([("rescored", "other vorticity_mse")], (), ())
+    assert (told, result.confirmed, result.recorded) == (
+        [("rescored", "other vorticity_mse")],
+        (),
+        (),
+    )
     own.entry("noisy").unlink()
     (own.folder / SCORES / "noisy.nc").unlink()
     assert [f.check for f in rescored(own, predictions).findings] == ["rescored"]
 
 
-def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, predictions: Path) -> None:
-    """Flags and frozen scenarios are those that the scorer tells; so are the scores of floors."""
+def test_what_is_said_beside_the_numbers_is_compared(
+    own: BoardBench, predictions: Path
+) -> None:
+    """Flags and frozen scenarios are those that the scorer tells; so are the scores of
+    floors.
+    """
     said = {"diverged_at": {0: 7}, "flags": [{"name": "physics"}]}
     own.edit("noisy", lambda held: held["score"]["files"][0].update(said))
     with netCDF4.Dataset(own.folder / FLOOR, "r+") as file:
@@ -120,8 +169,12 @@ def test_what_is_said_beside_the_numbers_is_compared(own: BoardBench, prediction
     assert got == ["other position_mse", "[]", "{}"]
 
 
-def test_pictures_and_statistics_are_compared(own: BoardBench, predictions: Path) -> None:
-    """A preview that is not of these predictions is found, and so is a statistic that is lacking."""
+def test_pictures_and_statistics_are_compared(
+    own: BoardBench, predictions: Path
+) -> None:
+    """A preview that is not of these predictions is found, and so is a statistic that
+    is lacking.
+    """
 
     def repaint(file: Any) -> None:
         film = file["preview"]["film"]
@@ -129,19 +182,27 @@ def test_pictures_and_statistics_are_compared(own: BoardBench, predictions: Path
         film[1] = np.clip(film[1].astype(np.int64) + 500, 0, 60_000).astype(np.uint16)
 
     reform(own, repaint)
-    assert [finding.got for finding in rescored(own, predictions).findings] == ["other film pictures"]
+    assert [finding.got for finding in rescored(own, predictions).findings] == [
+        "other film pictures"
+    ]
     with netCDF4.Dataset(own.folder / SCORES / "noisy.nc", "a") as file:
         names = file.statistics.split()
-        file.statistics = " ".join("made_up" if name == "velocity_mse" else name for name in names)
+        file.statistics = " ".join(
+            "made_up" if name == "velocity_mse" else name for name in names
+        )
     own.rehash("noisy")
     findings = rescored(own, predictions).findings
-    assert "velocity_mse" in next(str(one.got) for one in findings if one.check == "rescored")
+    assert "velocity_mse" in next(
+        str(one.got) for one in findings if one.check == "rescored"
+    )
 
 
 def test_broken_predictions_are_opened_in_the_child_only(
     own: BoardBench, predictions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever is wrong with the file is found before this process opens it; other findings remain."""
+    """Whatever is wrong with the file is found before this process opens it; other
+    findings remain.
+    """
     cut = tmp_path / "cut.nc"
     cut.write_bytes(predictions.read_bytes()[:-9999])
     own.edit("damped", set_mean)
@@ -156,7 +217,14 @@ def test_broken_predictions_are_opened_in_the_child_only(
 
 def git(folder: Path, *words: str) -> str:
     """Run git as somebody without settings of his own."""
-    about = ("-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "init.defaultBranch=main")
+    about = (
+        "-c",
+        "user.name=A",
+        "-c",
+        "user.email=a@example.org",
+        "-c",
+        "init.defaultBranch=main",
+    )
     command = ["git", *about, "-C", str(folder), *words]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
@@ -183,18 +251,27 @@ def branch(home: Path, tmp_path: Path) -> BoardBench:
 def touched(bench: BoardBench, **options: Any) -> dict[str, str]:
     """Return where and got of what the check against main finds."""
     findings = checked(bench, base="main", **options).findings
-    return {finding.where: finding.got for finding in findings if finding.check == "base"}
+    return {
+        finding.where: finding.got for finding in findings if finding.check == "base"
+    }
 
 
 def new_entry(bench: BoardBench) -> None:
     """Add an entry of one's own."""
-    held = yaml.safe_load(bench.entry("noisy").read_text()) | {"method": "mine", "name": "Mine"}
+    held = yaml.safe_load(bench.entry("noisy").read_text()) | {
+        "method": "mine",
+        "name": "Mine",
+    }
     bench.entry("mine").write_text(yaml.safe_dump(held))
-    shutil.copyfile(bench.folder / SCORES / "noisy.nc", bench.folder / SCORES / "mine.nc")
+    shutil.copyfile(
+        bench.folder / SCORES / "noisy.nc", bench.folder / SCORES / "mine.nc"
+    )
 
 
 def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
-    """A new entry, committed or not, and a page built anew are nobody else's; nor is what main got since."""
+    """A new entry, committed or not, and a page built anew are nobody else's; nor is
+    what main got since.
+    """
     new_entry(branch)
     (branch.folder / "index.html").write_text("built anew")
     assert touched(branch) == {}
@@ -205,7 +282,9 @@ def test_what_only_adds_touches_nobody(branch: BoardBench) -> None:
     assert touched(branch) == {}
 
 
-NOISY, DAMPED, LISTED = f"{PLACE}/noisy.yaml", f"{SCORES}/damped_3.nc", "verified.yaml"
+NOISY = f"{PLACE}/noisy.yaml"
+DAMPED = f"{SCORES}/damped_3.nc"
+LISTED = "verified.yaml"
 
 
 def said(**keys: str) -> Callable[[BoardBench], object]:
@@ -222,25 +301,44 @@ CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
         "superseded_by None -> 'damped'",
     ),
     "withdrawn": (said(status="withdrawn"), NOISY, "status None -> 'withdrawn'"),
-    "scores changed": (lambda b: (b.folder / DAMPED).write_bytes(b"x"), DAMPED, "changed"),
+    "scores changed": (
+        lambda b: (b.folder / DAMPED).write_bytes(b"x"),
+        DAMPED,
+        "changed",
+    ),
     "scores removed": (lambda b: (b.folder / DAMPED).unlink(), DAMPED, "removed"),
     "a seed added": (
-        lambda b: shutil.copyfile(b.folder / SCORES / "noisy.nc", b.folder / SCORES / "damped_9.nc"),
+        lambda b: shutil.copyfile(
+            b.folder / SCORES / "noisy.nc", b.folder / SCORES / "damped_9.nc"
+        ),
         *(f"{SCORES}/damped_9.nc", "added"),
     ),
     "made a link": (
-        lambda b: (b.entry("noisy").unlink(), b.entry("noisy").symlink_to("damped.yaml")),
+        lambda b: (
+            b.entry("noisy").unlink(),
+            b.entry("noisy").symlink_to("damped.yaml"),
+        ),
         *(NOISY, "link"),
     ),
-    "made a bomb": (lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"), NOISY, "another content"),
-    "verified claimed": (lambda b: (b.folder / LISTED).write_text(f"{NOISY}: x\n"), LISTED, "changed"),
+    "made a bomb": (
+        lambda b: b.entry("noisy").write_text("a: &a [x]\nb: *a\n"),
+        NOISY,
+        "another content",
+    ),
+    "verified claimed": (
+        lambda b: (b.folder / LISTED).write_text(f"{NOISY}: x\n"),
+        LISTED,
+        "changed",
+    ),
     "floors changed": (lambda b: (b.folder / FLOOR).unlink(), FLOOR, "removed"),
 }
 
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_what_touches_others_is_named(name: str, branch: BoardBench) -> None:
-    """Each way is found, in the working tree and in a commit, with the file and what became of it."""
+    """Each way is found, in the working tree and in a commit, with the file and what
+    became of it.
+    """
     change, where, got = CHANGES[name]
     change(branch)
     here = touched(branch)
@@ -263,8 +361,11 @@ def test_ones_own_may_be_altered(branch: BoardBench, tmp_path: Path) -> None:
 
 
 def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
-    """Its line goes with it: that is one's own to remove, and nothing else of the list."""
-    other, listed = branch.predict(nearer, "other"), branch.folder / "verified.yaml"
+    """Its line goes with it: that is one's own to remove, and nothing else of the
+    list.
+    """
+    other = branch.predict(nearer, "other")
+    listed = branch.folder / "verified.yaml"
     branch.submit(other)
     own = branch.predict(noisy, "noisy", parameters=5)
     assert len(rescored(branch, own, other, recording=True).recorded) == 2
@@ -275,7 +376,10 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
     assert listed in branch.submit(branch.predict(still, "noisy"), replace=True).files
 
     def told(*own: str) -> set[tuple[str, str]]:
-        return {(one.check, str(one.where)) for one in checked(branch, own=own, base="HEAD").findings}
+        return {
+            (one.check, str(one.where))
+            for one in checked(branch, own=own, base="HEAD").findings
+        }
 
     assert told("noisy") == set()
     assert ("base", "verified.yaml") in told()
@@ -289,10 +393,12 @@ def test_a_verified_entry_may_be_replaced(branch: BoardBench) -> None:
 
 def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
     """After its scores and the list of the verified, whatever the method is called."""
-    first, about = own.predict(nearer, "new"), {"method": "verified", "name": "Verified"}
+    first = own.predict(nearer, "new")
+    about = {"method": "verified", "name": "Verified"}
     own.submit(first, **about)
     rescored(own, first, recording=True)
-    moved, move = [], os.replace
+    moved = []
+    move = os.replace
 
     def note(source: Path, target: Path) -> None:
         moved.append(os.path.relpath(target, own.folder))
@@ -302,14 +408,20 @@ def test_the_entry_comes_last(own: BoardBench, monkeypatch: pytest.MonkeyPatch) 
         patch.setattr(os, "replace", note)
         own.submit(own.predict(still, "new"), replace=True, **about)
     ours = [name for name in moved if "verified" in name and ".submit-" not in name]
-    assert ours == ["scores/cavity/tiny/verified.nc", "verified.yaml", f"{PLACE}/verified.yaml"]
+    assert ours == [
+        "scores/cavity/tiny/verified.nc",
+        "verified.yaml",
+        f"{PLACE}/verified.yaml",
+    ]
     assert ((own.folder / "verified.yaml").read_text(), found(own)) == ("{}\n", [])
 
 
 def test_without_git_it_says_so(
     branch: BoardBench, home: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """An unknown revision, and a folder outside any repository, are a matter of usage."""
+    """An unknown revision, and a folder outside any repository, are a matter of
+    usage.
+    """
     with pytest.raises(UsageError) as error:
         checked(branch, base="nowhere")
     assert "--base" in str(error.value.where)

@@ -1,4 +1,6 @@
-"""The check of a leaderboard's folder finds what it should, names it, and opens nothing outside."""
+"""The check of a leaderboard's folder finds what it should, names it, and opens nothing
+outside.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +24,25 @@ from lagbench.board.findings import CHECKS, skeleton
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
 
-NOISY, FLOOR = f"{SCORES}/noisy.nc", "floors/cavity/tiny/persistence.nc"
+NOISY = f"{SCORES}/noisy.nc"
+FLOOR = "floors/cavity/tiny/persistence.nc"
 
 
 @pytest.fixture
 def own(home: Path, tmp_path: Path) -> BoardBench:
     """A copy of the leaderboard that the test may damage."""
-    return copied(home, tmp_path, without=["flipping", "constant-velocity", "frozen-field", "analog"])
+    return copied(
+        home,
+        tmp_path,
+        without=["flipping", "constant-velocity", "frozen-field", "analog"],
+    )
 
 
 def found(bench: BoardBench, *, page: bool = False) -> list[str]:
     """Return the names of the checks that found something."""
-    result = check_board(bench.folder, registry=bench.registry, page=page, isolated=False)
+    result = check_board(
+        bench.folder, registry=bench.registry, page=page, isolated=False
+    )
     for finding in result.findings:
         assert finding.check in CHECKS
         assert all((finding.what, finding.where, finding.fix))
@@ -64,19 +73,28 @@ def link(path: Path, target: Path) -> None:
 
 def copy_of(bench: BoardBench, method: str, other: str, **changes: Any) -> None:
     """Enter a method once more under another id."""
-    held = yaml.safe_load(bench.entry(method).read_text()) | {"method": other, **changes}
+    held = yaml.safe_load(bench.entry(method).read_text()) | {
+        "method": other,
+        **changes,
+    }
     bench.entry(other).write_text(yaml.safe_dump(held, sort_keys=False))
-    shutil.copyfile(bench.folder / SCORES / f"{method}.nc", bench.folder / SCORES / f"{other}.nc")
+    shutil.copyfile(
+        bench.folder / SCORES / f"{method}.nc", bench.folder / SCORES / f"{other}.nc"
+    )
 
 
 def disguised(bench: BoardBench) -> None:
-    """Enter the predictions of another once more, with another hash of them everywhere."""
+    """Enter the predictions of another once more, with another hash of them
+    everywhere.
+    """
     copy_of(bench, "noisy", "other", name="Something else")
     with netCDF4.Dataset(bench.folder / SCORES / "other.nc", "r+") as file:
         file.predictions_sha256 = "1" * 64
 
     def change(held: dict[str, Any]) -> None:
-        held["predictions"][0]["sha256"] = held["score"]["files"][0]["predictions_sha256"] = "1" * 64
+        held["predictions"][0]["sha256"] = held["score"]["files"][0][
+            "predictions_sha256"
+        ] = "1" * 64
 
     bench.edit("other", change)
     bench.rehash("other")
@@ -85,7 +103,9 @@ def disguised(bench: BoardBench) -> None:
 def verify(bench: BoardBench, method: str) -> None:
     """Write a list of verified entries, with scores that nobody has."""
     line = {"scores": ["0" * 64], "lagbench": "0.1.0", "date": "2026-01-31"}
-    (bench.folder / "verified.yaml").write_text(yaml.safe_dump({f"{PLACE}/{method}.yaml": line}))
+    (bench.folder / "verified.yaml").write_text(
+        yaml.safe_dump({f"{PLACE}/{method}.yaml": line})
+    )
 
 
 def superseded(bench: BoardBench, one: str, two: str) -> None:
@@ -95,20 +115,33 @@ def superseded(bench: BoardBench, one: str, two: str) -> None:
 
 def put(*place: str | int, **changes: object) -> Callable[[BoardBench], object]:
     """Return what writes keys into the entry of noisy, at a place of it."""
-    return lambda bench: bench.edit("noisy", lambda held: reduce(getitem, place, held).update(changes))
+    return lambda bench: bench.edit(
+        "noisy", lambda held: reduce(getitem, place, held).update(changes)
+    )
 
 
-def text(held: str, path: str = f"{PLACE}/noisy.yaml") -> Callable[[BoardBench], object]:
-    """Return what writes a file of the folder, the entry of noisy unless told otherwise."""
+def text(
+    held: str, path: str = f"{PLACE}/noisy.yaml"
+) -> Callable[[BoardBench], object]:
+    """Return what writes a file of the folder, the entry of noisy unless told
+    otherwise.
+    """
     return lambda bench: (bench.folder / path).write_text(held)
 
 
 DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "score: edited score": lambda b: b.edit("noisy", set_mean),
-    "score: edited score by a millionth": lambda b: b.edit("noisy", lambda h: set_mean(h, 1 - 3e-6)),
-    "score: metric removed": lambda b: b.edit("noisy", lambda h: h["score"]["metrics"].pop("mse_avg")),
+    "score: edited score by a millionth": lambda b: b.edit(
+        "noisy", lambda h: set_mean(h, 1 - 3e-6)
+    ),
+    "score: metric removed": lambda b: b.edit(
+        "noisy", lambda h: h["score"]["metrics"].pop("mse_avg")
+    ),
     "score: metric invented": lambda b: b.edit(
-        "noisy", lambda h: h["score"]["metrics"].update(best=dict(h["score"]["metrics"]["mse_avg"]))
+        "noisy",
+        lambda h: h["score"]["metrics"].update(
+            best=dict(h["score"]["metrics"]["mse_avg"])
+        ),
     ),
     "score: data set edited": put("score", dataset_sha256="0" * 64),
     "schema: unknown key": put(lisence="MIT"),
@@ -134,7 +167,9 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
         superseded(b, "damped", "noisy"),
     ),
     "nothing: notes edited": put(notes="new"),
-    "predictions: predictions that are not there": put("predictions", 0, path="predictions/x.nc"),
+    "predictions: predictions that are not there": put(
+        "predictions", 0, path="predictions/x.nc"
+    ),
     "predictions folder: predictions behind a link": lambda b: (
         (b.folder / "x.nc").symlink_to(b.entry("noisy")),
         put("predictions", 0, path="x.nc")(b),
@@ -156,26 +191,47 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
         os.truncate(b.folder / NOISY, (b.folder / NOISY).stat().st_size - 999),
         b.rehash("noisy"),
     ),
-    "missing: missing score file": lambda b: (b.folder / SCORES / "damped_3.nc").unlink(),
-    "stray: stray score file": lambda b: shutil.copyfile(b.folder / NOISY, b.folder / SCORES / "other.nc"),
+    "missing: missing score file": lambda b: (
+        b.folder / SCORES / "damped_3.nc"
+    ).unlink(),
+    "stray: stray score file": lambda b: shutil.copyfile(
+        b.folder / NOISY, b.folder / SCORES / "other.nc"
+    ),
     "stray: missing entry": lambda b: b.entry("noisy").unlink(),
-    "oversize: oversize score file": lambda b: (b.folder / NOISY).write_bytes(bytes(1_000_001)),
+    "oversize: oversize score file": lambda b: (b.folder / NOISY).write_bytes(
+        bytes(1_000_001)
+    ),
     "folder missing: score file that is a link": lambda b: link(
         b.folder / NOISY, b.folder / SCORES / "damped_0.nc"
     ),
-    "values: negative square": lambda b: reform(b, scale("position_mse", -1.0), whole=False),
-    "values: correlation above one": lambda b: reform(b, scale("vorticity_pearson", 2.0)),
-    "values: no error where there is one": lambda b: reform(b, scale("vorticity_mse", 0.0)),
-    "twin: the same predictions again": lambda b: copy_of(b, "noisy", "other", name="Something else"),
-    "twin: the same errors again": disguised,
-    "folder: entry that is a link": lambda b: link(b.entry("noisy"), Path("/etc/passwd")),
-    "folder: folder that is a link": lambda b: (b.folder / "submissions" / "fluid").symlink_to(
-        "/etc", target_is_directory=True
+    "values: negative square": lambda b: reform(
+        b, scale("position_mse", -1.0), whole=False
     ),
+    "values: correlation above one": lambda b: reform(
+        b, scale("vorticity_pearson", 2.0)
+    ),
+    "values: no error where there is one": lambda b: reform(
+        b, scale("vorticity_mse", 0.0)
+    ),
+    "twin: the same predictions again": lambda b: copy_of(
+        b, "noisy", "other", name="Something else"
+    ),
+    "twin: the same errors again": disguised,
+    "folder: entry that is a link": lambda b: link(
+        b.entry("noisy"), Path("/etc/passwd")
+    ),
+    "folder: folder that is a link": lambda b: (
+        b.folder / "submissions" / "fluid"
+    ).symlink_to("/etc", target_is_directory=True),
     "folder: other files": text("import os", f"{PLACE}/evil.py"),
     "folder: other files beside the page": text("alert(1)", "index.js"),
-    "folder: folder of its own": lambda b: ((b.folder / "more").mkdir(), (b.folder / "more/a.yaml").touch()),
-    "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to("/etc/passwd"),
+    "folder: folder of its own": lambda b: (
+        (b.folder / "more").mkdir(),
+        (b.folder / "more/a.yaml").touch(),
+    ),
+    "folder: page that is a link": lambda b: (b.folder / "README.md").symlink_to(
+        "/etc/passwd"
+    ),
     "folder: name that a log would obey": text("a: 1", f"{PLACE}/a\n::warning::x.yaml"),
     "folder stray: entry at another depth": lambda b: b.entry("noisy").rename(
         b.folder / "submissions/noisy.yaml"
@@ -192,7 +248,9 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
         shutil.copy(b.folder / FLOOR, b.folder / "floors/fluid/tiny"),
     ),
 }
-"""What somebody may write into an entry, then what may happen to files: the checks that find it, its name."""
+"""What somebody may write into an entry, then what may happen to files: the checks that
+find it, its name.
+"""
 
 
 def checks_of(name: str) -> set[str]:
@@ -208,15 +266,21 @@ def test_damage_is_found(name: str, own: BoardBench) -> None:
 
 
 def test_all_checks_have_damage() -> None:
-    """No check is without a test; those that need more than the folder have suites of their own."""
+    """No check is without a test; those that need more than the folder have suites of
+    their own.
+    """
     tested = set().union(*map(checks_of, DAMAGE))
     elsewhere = {"page", "rescored", "base", "measured", "weights", "budget"}
     assert not tested & elsewhere
     assert tested | elsewhere == set(CHECKS)
 
 
-def test_one_bad_file_hides_nothing(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An error that nobody thought of, in one entry, leaves the findings on the others."""
+def test_one_bad_file_hides_nothing(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An error that nobody thought of, in one entry, leaves the findings on the
+    others.
+    """
     original = checking.load_plain
 
     def failing(path: Path) -> Any:
@@ -230,7 +294,9 @@ def test_one_bad_file_hides_nothing(own: BoardBench, monkeypatch: pytest.MonkeyP
 
 
 def test_later_entries_may_supersede_twins(own: BoardBench) -> None:
-    """The same predictions under a new name, and a name of old, are well where the old entry steps back."""
+    """The same predictions under a new name, and a name of old, are well where the old
+    entry steps back.
+    """
     copy_of(own, "noisy", "new-name")
     assert set(found(own)) == {"twin", "name"}
     superseded(own, "noisy", "new-name")
@@ -257,22 +323,31 @@ def test_names_that_look_alike(one: str, other: str) -> None:
 def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:
     """What is not active need not belong to the data set of today."""
     newer = own.folder.parent / "newer.yaml"
-    newer.write_text(own.data.size.file.read_text().replace("version: 2.0.0", "version: 3.0.0"))
+    newer.write_text(
+        own.data.size.file.read_text().replace("version: 2.0.0", "version: 3.0.0")
+    )
     result = check_board(own.folder, registry=load(newer), isolated=False)
     assert {finding.check for finding in result.findings} == {"version", "floor"}
     assert len(result.findings) == 2 + len(list((own.folder / "floors").rglob("*.nc")))
     for path in own.entry("noisy").parent.glob("*.yaml"):
         held = yaml.safe_load(path.read_text())
-        path.write_text(yaml.safe_dump(held | {"status": "withdrawn", "reason": "old data"}))
+        path.write_text(
+            yaml.safe_dump(held | {"status": "withdrawn", "reason": "old data"})
+        )
     shutil.rmtree(own.folder / "floors")
     assert not check_board(own.folder, registry=load(newer), isolated=False).findings
 
 
 def test_a_stale_page_is_found(own: BoardBench) -> None:
-    """No page, an edited one, a link and a page of other entries are stale; a new build mends it."""
+    """No page, an edited one, a link and a page of other entries are stale; a new build
+    mends it.
+    """
     assert found(own, page=True) == ["page"]
     page = build(own.folder, registry=own.registry).page
-    assert (found(own, page=True), build(own.folder, registry=own.registry).written) == ([], ())
+    assert (
+        found(own, page=True),
+        build(own.folder, registry=own.registry).written,
+    ) == ([], ())
     data = page.read_bytes()
     page.write_bytes(data.replace(b"noisy", b"nOisy", 1))
     assert found(own, page=True) == ["page"]
@@ -286,5 +361,8 @@ def test_a_stale_page_is_found(own: BoardBench) -> None:
         build(own.folder, check=True, registry=own.registry)
     assert found(own, page=True) == ["page"]
     (own.folder / "schema.json").write_text("{}")
-    assert build(own.folder, registry=own.registry).written == (page, own.folder / "schema.json")
+    assert build(own.folder, registry=own.registry).written == (
+        page,
+        own.folder / "schema.json",
+    )
     assert found(own, page=True) == []

@@ -1,4 +1,6 @@
-"""The commands submit and leaderboard build, check, show; the stranger's path of docs/submitting.md."""
+"""The commands submit and leaderboard build, check, show; the stranger's path of
+docs/submitting.md.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,12 @@ Run = Callable[..., Result]
 
 
 @pytest.fixture
-def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult, tmp_path: Path) -> Run:
+def run(
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    generated: GenerationResult,
+    tmp_path: Path,
+) -> Run:
     """A function that runs lagbench in an empty folder on the generated data set."""
     monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
     monkeypatch.chdir(tmp_path)
@@ -48,7 +55,9 @@ def toy(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("toy")
 def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
-    """From an own model to a page, each command as documented, nothing asked on stdin."""
+    """From an own model to a page, each command as documented, nothing asked on
+    stdin.
+    """
     assert run("validate", "predictions.nc").exit_code == 0
     assert run(*SUBMIT).exit_code == 2
     submitted = run(*SUBMIT, "--new-board")
@@ -75,10 +84,15 @@ def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("toy")
 def test_machines_are_answered_in_json(run: Run) -> None:
-    """Every command has --json; the next step keeps --board; a drifted page fails with exit code 1."""
+    """Every command has --json; the next step keeps --board; a drifted page fails with
+    exit code 1.
+    """
     board = ("--board", "trial")
     assert run(*SUBMIT, *board, "--new-board").stdout.count("--board trial") == 2
-    assert json.loads(run(*SUBMIT, *board, "--replace", "--json").stdout)["ranking"] == "vorticity_nrmse"
+    assert (
+        json.loads(run(*SUBMIT, *board, "--replace", "--json").stdout)["ranking"]
+        == "vorticity_nrmse"
+    )
 
     def told(command: str, *words: str) -> Any:
         return json.loads(run("leaderboard", command, *board, *words, "--json").stdout)
@@ -104,15 +118,23 @@ def test_machines_are_answered_in_json(run: Run) -> None:
     [
         (["submit"], 2, "FILE"),
         (["submit", "none.nc"], 3, "none.nc"),
-        (["submit", "x.nc", "--url", "javascript:alert(1)"], 2, "is not an http:// or https:// address"),
+        (
+            ["submit", "x.nc", "--url", "javascript:alert(1)"],
+            2,
+            "is not an http:// or https:// address",
+        ),
         (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
         (["leaderboard", "build"], 2, "no leaderboard here"),
         (["leaderboard", "check"], 2, "--board FOLDER"),
         (["leaderboard", "show"], 2, "no leaderboard here"),
     ],
 )
-def test_errors_have_their_codes(run: Run, words: list[str], code: int, message: str, tmp_path: Path) -> None:
-    """One message on stderr, no traceback, the code of docs/scoring.md, nothing written."""
+def test_errors_have_their_codes(
+    run: Run, words: list[str], code: int, message: str, tmp_path: Path
+) -> None:
+    """One message on stderr, no traceback, the code of docs/scoring.md, nothing
+    written.
+    """
     result = run(*words)
     assert result.exit_code == code, result.output
     assert message in " ".join(result.stderr.split())
@@ -121,7 +143,9 @@ def test_errors_have_their_codes(run: Run, words: list[str], code: int, message:
 
 
 def test_the_page_of_docs_is_true(run: Run) -> None:
-    """docs/submitting.md names every check and key; its commands are accepted, its example is the file's."""
+    """docs/submitting.md names every check and key; its commands are accepted, its
+    example is the file's.
+    """
     text = (DOCS / "submitting.md").read_text()
     for name, check in CHECKS.items():
         assert f"| `{name}` | {check.meaning} |" in text
@@ -130,7 +154,11 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
     assert (TOY / "meta.yaml").read_text() in text
     blocks = re.findall(r"```(?:bash|console)\n(.*?)```", text, re.DOTALL)
     lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
-    commands = [shlex.split(line, comments=True)[1:] for line in lines if line.startswith("lagbench ")]
+    commands = [
+        shlex.split(line, comments=True)[1:]
+        for line in lines
+        if line.startswith("lagbench ")
+    ]
     assert len(commands) >= 8
     for words in commands:
         result = run(*words, "--help")
@@ -139,14 +167,18 @@ def test_the_page_of_docs_is_true(run: Run) -> None:
 
 @pytest.mark.usefixtures("toy")
 def test_scores_of_earlier_tasks_alone(run: Run, tmp_path: Path) -> None:
-    """Scores that do not fit the task of today are no table, and are not taken for no entries at all."""
+    """Scores that do not fit the task of today are no table, and are not taken for no
+    entries at all.
+    """
     assert run(*SUBMIT, "--new-board").exit_code == 0
     board = tmp_path / "leaderboard"
     entry = board / "submissions" / SPLIT / SIZE / "toy-model.yaml"
     held = yaml.safe_load(entry.read_text())
     held["dataset"]["version"] = "1.0.0"
     entry.write_text(yaml.safe_dump(held))
-    (board / "scores" / SPLIT / SIZE / "toy-model.nc").write_bytes(b"of an earlier format")
+    (board / "scores" / SPLIT / SIZE / "toy-model.nc").write_bytes(
+        b"of an earlier format"
+    )
     for words in ((), (SPLIT, "--size", SIZE)):
         result = run("leaderboard", "show", *words)
         assert result.exit_code == 0, result.output

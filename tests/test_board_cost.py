@@ -1,4 +1,6 @@
-"""Accuracy against cost: places of dots, the front, and what those who do not see it are told."""
+"""Accuracy against cost: places of dots, the front, and what those who do not see it
+are told.
+"""
 
 from __future__ import annotations
 
@@ -32,27 +34,46 @@ def mark(seconds: float, error: float, kind: str = "entry") -> Mark:
 
 
 def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
-    """An entry twice as fast as the solver on its own machine costs half of the solver here."""
+    """An entry twice as fast as the solver on its own machine costs half of the solver
+    here.
+    """
     raw = {one.name: one.seconds for one in marks_of(tab)}
-    here = {one.name: one.seconds for one in marks_of(replace(tab, solver_seconds=0.02))}
+    here = {
+        one.name: one.seconds for one in marks_of(replace(tab, solver_seconds=0.02))
+    }
     for row in tab.rows:
         if row.active and row.entry.cost is not None:
             assert raw[row.entry.name] == row.entry.cost.seconds_per_frame
-            assert here[row.entry.name] == pytest.approx(0.02 / (row.entry.cost.speed_up or math.nan))
+            assert here[row.entry.name] == pytest.approx(
+                0.02 / (row.entry.cost.speed_up or math.nan)
+            )
     silent = {row.entry.name for row in tab.rows if row.entry.cost is None}
     assert silent
     assert silent.isdisjoint(raw)
 
 
 def test_the_front_holds_what_no_other_beats() -> None:
-    """By hand: (2, 5) is beaten by (1, 4); (3, 4) costs more than (1, 4) and is no better."""
+    """By hand: (2, 5) is beaten by (1, 4); (3, 4) costs more than (1, 4) and is no
+    better.
+    """
     marks = [mark(2, 5), mark(1, 4), mark(3, 4), mark(4, 1), mark(5, 0.5)]
-    assert [(one.seconds, one.error) for one in front(marks)] == [(1, 4), (4, 1), (5, 0.5)]
+    assert [(one.seconds, one.error) for one in front(marks)] == [
+        (1, 4),
+        (4, 1),
+        (5, 0.5),
+    ]
 
 
 def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
-    """Ten times the cost is the same step to the right; every dot has words and the keyboard reaches it."""
-    marks = [mark(0.001, 1.0), mark(0.01, 0.5), mark(0.1, 0.25, "coarse"), mark(0.05, 0.9, "floor")]
+    """Ten times the cost is the same step to the right; every dot has words and the
+    keyboard reaches it.
+    """
+    marks = [
+        mark(0.001, 1.0),
+        mark(0.01, 0.5),
+        mark(0.1, 0.25, "coarse"),
+        mark(0.05, 0.9, "floor"),
+    ]
     svg = ElementTree.fromstring(draw(marks, 0.02, "vorticity_nrmse", "title"))
     dots = [e for e in svg.iter() if "dot" in e.attrib.get("class", "").split()]
     places = [(float(e[1].attrib["cx"]), float(e[1].attrib["cy"])) for e in dots]
@@ -67,25 +88,40 @@ def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
     assert "script" not in {e.tag for e in svg.iter()}
 
 
-def boxes(svg: ElementTree.Element, kind: str, letter: float) -> list[tuple[float, float, float, float]]:
-    """Return left, top, right and bottom of every name, with so many pixels to a letter."""
+def boxes(
+    svg: ElementTree.Element, kind: str, letter: float
+) -> list[tuple[float, float, float, float]]:
+    """Return left, top, right and bottom of every name, with so many pixels to a
+    letter.
+    """
     found = []
     for text in svg.iter("text"):
-        classes, width = text.attrib["class"].split(), letter * len(text.text or "")
+        classes = text.attrib["class"].split()
+        width = letter * len(text.text or "")
         if classes[0] == kind:
             share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
-            left, base = float(text.attrib["x"]) - share * width, float(text.attrib["y"])
+            left = float(text.attrib["x"]) - share * width
+            base = float(text.attrib["y"])
             found.append((left, base - 9, left + width, base + 2))
     return found
 
 
-def apart(one: tuple[float, float, float, float], other: tuple[float, float, float, float]) -> bool:
+def apart(
+    one: tuple[float, float, float, float], other: tuple[float, float, float, float]
+) -> bool:
     """Tell whether two boxes do not overlap."""
-    return one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+    return (
+        one[2] <= other[0]
+        or other[2] <= one[0]
+        or one[3] <= other[1]
+        or other[3] <= one[1]
+    )
 
 
 def test_names_do_not_meet_names_or_dots() -> None:
-    """Twenty dots in one place and five near it: whatever is named, no name covers another or a dot."""
+    """Twenty dots in one place and five near it: whatever is named, no name covers
+    another or a dot.
+    """
     marks = [mark(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
     marks += [mark(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
     svg = ElementTree.fromstring(draw(marks, 0.02, "vorticity_nrmse", "title"))
@@ -98,7 +134,9 @@ def test_names_do_not_meet_names_or_dots() -> None:
 
 
 def test_a_name_in_a_crowd_has_a_line_to_its_dot() -> None:
-    """Of nine dots on nine places ten pixels apart most are named; lines begin in the middle of a dot."""
+    """Of nine dots on nine places ten pixels apart most are named; lines begin in the
+    middle of a dot.
+    """
     marks = [mark(0.01 * 1.3 ** (i % 3), 0.5 * 1.2 ** (i // 3)) for i in range(9)]
     svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))
     area = svg.find(".//svg/g")
@@ -114,10 +152,19 @@ def test_a_name_in_a_crowd_has_a_line_to_its_dot() -> None:
 def test_a_crowd_at_the_edge_keeps_its_names() -> None:
     """Five dots close together near the right edge: each has its name."""
     crowd = {"VAR(1)": (0.052, 50.0), "SuperGAT": (0.075, 1.2), "GNS": (0.045, 0.89)}
-    crowd |= {"GNS, noise 1e-3": (0.036, 0.59), "analog": (0.0245, 1.5), "persistence": (4e-6, 1.0)}
-    marks = [Mark(name=name, seconds=s, error=e, kind="entry") for name, (s, e) in crowd.items()]
+    crowd |= {
+        "GNS, noise 1e-3": (0.036, 0.59),
+        "analog": (0.0245, 1.5),
+        "persistence": (4e-6, 1.0),
+    }
+    marks = [
+        Mark(name=name, seconds=s, error=e, kind="entry")
+        for name, (s, e) in crowd.items()
+    ]
     svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))
-    assert {e.text for e in svg.iter("text") if e.attrib["class"].startswith("name")} == set(crowd)
+    assert {
+        e.text for e in svg.iter("text") if e.attrib["class"].startswith("name")
+    } == set(crowd)
 
 
 def test_axes_end_past_their_values() -> None:
@@ -125,14 +172,25 @@ def test_axes_end_past_their_values() -> None:
     scale = close_logarithmic(0.3, 1.4)
     assert scale.low < 0.3 < 1.4 < scale.high
     assert all(scale.low <= tick.value <= scale.high for tick in scale.ticks)
-    assert next(tick.label for tick in close_logarithmic(1e-6, 1e-2).ticks) in ("10⁻⁶", "10⁻⁷")
+    assert next(tick.label for tick in close_logarithmic(1e-6, 1e-2).ticks) in (
+        "10⁻⁶",
+        "10⁻⁷",
+    )
 
 
 def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
     """Without any entry the floors stand there, and what the solver itself takes."""
     (tmp_path / "board" / "submissions").mkdir(parents=True)
     target = tmp_path / "cost.svg"
-    words = ["leaderboard", "picture", "cavity", "--size", "mini", "--board", str(tmp_path / "board")]
+    words = [
+        "leaderboard",
+        "picture",
+        "cavity",
+        "--size",
+        "mini",
+        "--board",
+        str(tmp_path / "board"),
+    ]
     done = CliRunner().invoke(app, [*words, "-o", str(target)])
     assert done.exit_code == 0, done.output
     said = target.read_text()

@@ -1,4 +1,6 @@
-"""The entry of a leaderboard: what its schema takes, what it refuses, and that YAML round-trips."""
+"""The entry of a leaderboard: what its schema takes, what it refuses, and that YAML
+round-trips.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lagbench.board.entry import About, Entry, Meta
-from lagbench.board.entry_file import MAX_ENTRY_BYTES, examine, read_entry, read_meta, schema_bytes, spell
+from lagbench.board.entry_file import (
+    MAX_ENTRY_BYTES,
+    examine,
+    read_entry,
+    read_meta,
+    schema_bytes,
+    spell,
+)
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 
 LEADERBOARD = Path(__file__).parent.parent / "leaderboard"
@@ -40,7 +49,9 @@ def plain(**changes: Any) -> dict[str, Any]:
             "dataset_sha256": HASH,
             "ranking_metric": "vorticity_rmse",
             "files": [{"sha256": HASH, "predictions_sha256": HASH}],
-            "metrics": {"vorticity_rmse": {"mean": 0.5, "std": None, "low": 0.25, "high": 1.0}},
+            "metrics": {
+                "vorticity_rmse": {"mean": 0.5, "std": None, "low": 0.25, "high": 1.0}
+            },
         },
     }
     return value | changes
@@ -49,8 +60,13 @@ def plain(**changes: Any) -> dict[str, Any]:
 def seeded(*seeds: int | None) -> dict[str, Any]:
     """Return the changes that make an entry one of several seeds."""
     value = plain()
-    made = [{"sha256": HASH} | ({} if seed is None else {"seed": seed}) for seed in seeds]
-    return {"predictions": made, "score": value["score"] | {"files": value["score"]["files"] * len(seeds)}}
+    made = [
+        {"sha256": HASH} | ({} if seed is None else {"seed": seed}) for seed in seeds
+    ]
+    return {
+        "predictions": made,
+        "score": value["score"] | {"files": value["score"]["files"] * len(seeds)},
+    }
 
 
 def test_the_plain_entry_fits() -> None:
@@ -61,19 +77,73 @@ def test_the_plain_entry_fits() -> None:
     assert entry.yaml_path == Path("submissions/cavity/tiny/my-model.yaml")
     assert entry.score_paths == (Path("scores/cavity/tiny/my-model.nc"),)
     several = Entry.model_validate(plain(**seeded(0, 12)))
-    assert [path.name for path in several.score_paths] == ["my-model_0.nc", "my-model_12.nc"]
+    assert [path.name for path in several.score_paths] == [
+        "my-model_0.nc",
+        "my-model_12.nc",
+    ]
 
 
 LINKS = (
-    *("javascript:alert(1)", "JAVASCRIPT:alert(1)", "data:text/html,x", "ftp://a.org/x", "//a.org", "a.org"),
-    *("https://", "https://a.org/ b", 'https://a.org/"onload=x', "https://a.org/<x>", "https://a.org/'x"),
-    *("https://a.org/\n", "https://a.org/`x`", "https://a.org/é", " https://a.org", "http:a.org"),
-    *("https://user@a.org/", "https://user:pass@a.org", "https://xn--80ak6aa92e.com", "https://a.xn--p1ai/x"),
-    *("http://localhost/x", "http://127.0.0.1/x", "https://[::1]/", "https://a..org/", "http://1/"),
+    *(
+        "javascript:alert(1)",
+        "JAVASCRIPT:alert(1)",
+        "data:text/html,x",
+        "ftp://a.org/x",
+        "//a.org",
+        "a.org",
+    ),
+    *(
+        "https://",
+        "https://a.org/ b",
+        'https://a.org/"onload=x',
+        "https://a.org/<x>",
+        "https://a.org/'x",
+    ),
+    *(
+        "https://a.org/\n",
+        "https://a.org/`x`",
+        "https://a.org/é",
+        " https://a.org",
+        "http:a.org",
+    ),
+    *(
+        "https://user@a.org/",
+        "https://user:pass@a.org",
+        "https://xn--80ak6aa92e.com",
+        "https://a.xn--p1ai/x",
+    ),
+    *(
+        "http://localhost/x",
+        "http://127.0.0.1/x",
+        "https://[::1]/",
+        "https://a..org/",
+        "http://1/",
+    ),
     f"https://a.org/{'x' * 300}",
 )
-PATHS = ("../x.nc", "/etc/passwd", "a/../../x", "a//b", "./x", "a\\..\\x", "", "a/./b", "x" * 201, "a\nb")
-BLANKS = ("   ", "\u3164", "\u2800\u2800", "\u115f\u1160", "a\u3164b", "--", " a", "a ", "\ufe0f")
+PATHS = (
+    "../x.nc",
+    "/etc/passwd",
+    "a/../../x",
+    "a//b",
+    "./x",
+    "a\\..\\x",
+    "",
+    "a/./b",
+    "x" * 201,
+    "a\nb",
+)
+BLANKS = (
+    "   ",
+    "\u3164",
+    "\u2800\u2800",
+    "\u115f\u1160",
+    "a\u3164b",
+    "--",
+    " a",
+    "a ",
+    "\ufe0f",
+)
 ZALGO = ("a" + "\u0301\u0302\u0303" * 2, "Z\u0351\u036b\u0343\u036a\u0302a\u036b")
 TEXTS = (
     *(*BLANKS, *ZALGO, "", "n" * 10_000),
@@ -85,8 +155,14 @@ TEXTS = (
     ("where", "changes"),
     [
         *((f"{key}", {key: link}) for key in ("code", "paper") for link in LINKS),
-        *(("predictions.0.url", {"predictions": [{"sha256": HASH, "url": link}]}) for link in LINKS),
-        *(("predictions.0.path", {"predictions": [{"sha256": HASH, "path": path}]}) for path in PATHS),
+        *(
+            ("predictions.0.url", {"predictions": [{"sha256": HASH, "url": link}]})
+            for link in LINKS
+        ),
+        *(
+            ("predictions.0.path", {"predictions": [{"sha256": HASH, "path": path}]})
+            for path in PATHS
+        ),
         *(("name", {"name": text}) for text in TEXTS),
         *(("authors.0", {"authors": [text]}) for text in TEXTS),
         ("authors", {"authors": []}),
@@ -106,8 +182,14 @@ TEXTS = (
         ("parameters", {"parameters": 1.5}),
         ("dataset.sha256", {"dataset": {"version": "1.0.0", "sha256": "abc"}}),
         ("dataset.version", {"dataset": {"version": "1.0", "sha256": HASH}}),
-        ("cost.seconds_per_frame", {"cost": {"device": "cpu", "seconds_per_frame": 0.0}}),
-        ("cost.seconds_per_frame", {"cost": {"device": "cpu", "seconds_per_frame": float("inf")}}),
+        (
+            "cost.seconds_per_frame",
+            {"cost": {"device": "cpu", "seconds_per_frame": 0.0}},
+        ),
+        (
+            "cost.seconds_per_frame",
+            {"cost": {"device": "cpu", "seconds_per_frame": float("inf")}},
+        ),
         ("predictions", {"predictions": []}),
         ("the file", {"superseded_by": "other"}),
         ("the file", {"status": "superseded"}),
@@ -117,23 +199,41 @@ TEXTS = (
     ],
 )
 def test_what_does_not_fit_is_refused(where: str, changes: dict[str, Any]) -> None:
-    """Links, paths, texts, numbers and their combinations: the mistake names the key, shortly."""
+    """Links, paths, texts, numbers and their combinations: the mistake names the key,
+    shortly.
+    """
     entry, mistakes = examine(Entry, plain(**changes))
     assert entry is None
     assert where in {mistake.where for mistake in mistakes}
-    assert all(str(mistake).isprintable() and len(str(mistake)) < 500 for mistake in mistakes)
+    assert all(
+        str(mistake).isprintable() and len(str(mistake)) < 500 for mistake in mistakes
+    )
 
 
 @pytest.mark.parametrize(
     ("changes", "where", "fix"),
     [
         ({"licenze": "MIT"}, "licenze", "did you mean 'licence'?"),
-        ({"dataset": {"version": "1.0.0", "sha256": HASH, "verion": 1}}, "dataset.verion", "'version'"),
-        ({"predictions": [{"sha256": HASH, "urll": "x"}]}, "predictions.0.urll", "'url'"),
-        ({"cost": {"device": "a", "seconds_per_frame": 1, "devise": "b"}}, "cost.devise", "'device'"),
+        (
+            {"dataset": {"version": "1.0.0", "sha256": HASH, "verion": 1}},
+            "dataset.verion",
+            "'version'",
+        ),
+        (
+            {"predictions": [{"sha256": HASH, "urll": "x"}]},
+            "predictions.0.urll",
+            "'url'",
+        ),
+        (
+            {"cost": {"device": "a", "seconds_per_frame": 1, "devise": "b"}},
+            "cost.devise",
+            "'device'",
+        ),
     ],
 )
-def test_unknown_keys_name_the_nearest(changes: dict[str, Any], where: str, fix: str) -> None:
+def test_unknown_keys_name_the_nearest(
+    changes: dict[str, Any], where: str, fix: str
+) -> None:
     """At the top, in mappings and in lists."""
     _, (mistake,) = examine(Entry, plain(**changes))
     assert mistake.where == where
@@ -144,12 +244,19 @@ def test_unknown_keys_name_the_nearest(changes: dict[str, Any], where: str, fix:
 @pytest.mark.parametrize(
     "name",
     [
-        *("<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "Ünïcode 模型 😀", "'; DROP TABLE"),
+        *(
+            "<script>alert(1)</script>",
+            "<img src=x onerror=alert(1)>",
+            "Ünïcode 模型 😀",
+            "'; DROP TABLE",
+        ),
         *("{{x}}", "ไม่มีที่ติ", "नेटवर्क १", "Việt ngữ", "1e5", "0o17"),
     ],
 )
 def test_odd_names_are_text(name: str) -> None:
-    """Markup in a name is neither refused nor changed: it is the page that escapes it."""
+    """Markup in a name is neither refused nor changed: it is the page that escapes
+    it.
+    """
     assert Entry.model_validate(plain(name=name)).name == name
 
 
@@ -162,9 +269,16 @@ PRINTABLE = st.text(min_size=1, max_size=100).filter(str.isprintable).filter(acc
 
 
 @settings(max_examples=60, deadline=None)
-@given(name=PRINTABLE | st.from_regex(r"[-+]?[0-9_.:eExoab]{1,9}[0-9]", fullmatch=True).filter(acceptable))
-def test_any_text_survives_yaml(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
-    """Written and read again, an entry is the same, and so are the bytes of its file."""
+@given(
+    name=PRINTABLE
+    | st.from_regex(r"[-+]?[0-9_.:eExoab]{1,9}[0-9]", fullmatch=True).filter(acceptable)
+)
+def test_any_text_survives_yaml(
+    tmp_path_factory: pytest.TempPathFactory, name: str
+) -> None:
+    """Written and read again, an entry is the same, and so are the bytes of its
+    file.
+    """
     entry = Entry.model_validate(plain(name=name, notes=name, affiliation=name))
     data = spell(entry)
     path = tmp_path_factory.getbasetemp() / "entry.yaml"
@@ -185,12 +299,25 @@ def bomb() -> str:
 @pytest.mark.parametrize(
     "text",
     [
-        *(bomb(), "!!python/object/apply:os.system ['touch ran']", "name: !!python/name:os.system"),
-        *("[" * 5000, "name: a\nname: b", "name: \xff\xfe", "x" * (MAX_ENTRY_BYTES + 1)),
+        *(
+            bomb(),
+            "!!python/object/apply:os.system ['touch ran']",
+            "name: !!python/name:os.system",
+        ),
+        *(
+            "[" * 5000,
+            "name: a\nname: b",
+            "name: \xff\xfe",
+            "x" * (MAX_ENTRY_BYTES + 1),
+        ),
     ],
 )
-def test_hostile_yaml_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bombs, Python tags, deep nesting, double keys, other encodings, length: unreadable, nothing run."""
+def test_hostile_yaml_is_refused(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bombs, Python tags, deep nesting, double keys, other encodings, length:
+    unreadable, nothing run.
+    """
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "entry.yaml"
     path.write_bytes(text.encode("latin-1"))
@@ -199,10 +326,15 @@ def test_hostile_yaml_is_refused(text: str, tmp_path: Path, monkeypatch: pytest.
     assert [found.name for found in tmp_path.iterdir()] == ["entry.yaml"]
 
 
-def test_large_files_and_pipes_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """100 MB, a pipe without a writer, a folder, nothing: refused by looking at them, at once."""
+def test_large_files_and_pipes_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """100 MB, a pipe without a writer, a folder, nothing: refused by looking at them,
+    at once.
+    """
     monkeypatch.setattr(Path, "read_text", pytest.fail)
-    large, pipe = tmp_path / "large.yaml", tmp_path / "pipe.yaml"
+    large = tmp_path / "large.yaml"
+    pipe = tmp_path / "pipe.yaml"
     with large.open("wb") as stream:
         stream.truncate(100_000_000)
     os.mkfifo(pipe)
@@ -216,7 +348,9 @@ def test_large_files_and_pipes_are_not_read(tmp_path: Path, monkeypatch: pytest.
 def test_mistakes_of_a_file_are_told_together(tmp_path: Path) -> None:
     """The error names every wrong key of the file."""
     path = tmp_path / "entry.yaml"
-    path.write_text(yaml.safe_dump(plain(licenze="MIT", code="javascript:x", parameters=-1)))
+    path.write_text(
+        yaml.safe_dump(plain(licenze="MIT", code="javascript:x", parameters=-1))
+    )
     with pytest.raises(ChecksFailedError, match="3 mistake") as error:
         read_entry(path)
     assert all(key in str(error.value) for key in ("licenze", "code", "parameters"))
@@ -232,7 +366,9 @@ def objects(value: Any) -> Iterator[dict[str, Any]]:
 
 
 def test_the_schema_is_the_committed_one_and_closed() -> None:
-    """leaderboard/schema.json is generated; it takes no other keys than the model, at any depth."""
+    """leaderboard/schema.json is generated; it takes no other keys than the model, at
+    any depth.
+    """
     assert (LEADERBOARD / "schema.json").read_bytes() == schema_bytes()
     schema = json.loads(schema_bytes())
     assert set(schema["properties"]) == set(Entry.model_fields)
@@ -242,11 +378,18 @@ def test_the_schema_is_the_committed_one_and_closed() -> None:
 
 
 def test_options_win_over_the_file(tmp_path: Path) -> None:
-    """Keys come from --from and from options; what is empty is not given; unknown keys are refused."""
+    """Keys come from --from and from options; what is empty is not given; unknown keys
+    are refused.
+    """
     path = tmp_path / "meta.yaml"
     path.write_text("name: From file\nauthors: [A, B]\ndate: 2026-01-31\nmethod: a\n")
     meta = read_meta(path, {"method": "b", "authors": None, "urls": [], "notes": ""})
-    assert (meta.method, meta.name, meta.authors, meta.urls) == ("b", "From file", ("A", "B"), ())
+    assert (meta.method, meta.name, meta.authors, meta.urls) == (
+        "b",
+        "From file",
+        ("A", "B"),
+        (),
+    )
     path.write_text("- a list\n")
     with pytest.raises(UsageError, match="does not describe"):
         read_meta(path, {})

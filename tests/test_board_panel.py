@@ -1,4 +1,6 @@
-"""The panel of an entry in a real browser, and what text of strangers does there: nothing."""
+"""The panel of an entry in a real browser, and what text of strangers does there:
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +13,27 @@ from typing import Any
 import numpy as np
 import pytest
 from board_worlds import make_board, with_entry
-from browser import CHROMIUM, Browser, Page, close, names, press, restored, run, still, until
+from browser import (
+    CHROMIUM,
+    Browser,
+    Page,
+    close,
+    names,
+    press,
+    restored,
+    run,
+    still,
+    until,
+)
 
 from lagbench.board.cost import marks_of
 from lagbench.board.entry import Flag
 from lagbench.board.model import Board
 from lagbench.board.page import render
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
+)
 
 HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
 
@@ -39,32 +54,55 @@ def file(board: Board, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def page(running: Browser, file: Path) -> Iterator[Page]:
-    """The page opened, still films; nothing complained of and nothing asked for in the end."""
+    """The page opened, still films; nothing complained of and nothing asked for in the
+    end.
+    """
     opened = running.open(file, width=1280)
     still(opened)
     yield opened
     assert opened.messages == []
-    assert {request.partition("#")[0] for request in opened.requests} == {file.absolute().as_uri()}
+    assert {request.partition("#")[0] for request in opened.requests} == {
+        file.absolute().as_uri()
+    }
     close(opened)
 
 
 def test_panel_by_keyboard(page: Page, board: Board) -> None:
-    """Enter on a name opens its panel, Escape closes it; the focus comes back to the name."""
+    """Enter on a name opens its panel, Escape closes it; the focus comes back to the
+    name.
+    """
     row = next(row for row in board.tabs[0].rows if row.flags)
     restored(page, "#tab=cavity-full")
-    run(page, f"document.querySelector('section:not([hidden]) [data-entry={row.id}] .name').focus()")
+    run(
+        page,
+        f"document.querySelector('section:not([hidden]) [data-entry={row.id}] "
+        f".name').focus()",
+    )
     press(page, "Enter")
     until(page, "document.getElementById('panel').open")
     text = page.value("document.getElementById('panel').textContent")
     entry = row.entry
-    for said in (entry.name, entry.command, entry.training, row.flags[0].reasons[0], entry.authors[0]):
+    for said in (
+        entry.name,
+        entry.command,
+        entry.training,
+        row.flags[0].reasons[0],
+        entry.authors[0],
+    ):
         assert said in text
     assert f"entry={row.id}" in page.value("location.hash")
-    assert page.value("document.getElementById('panel').contains(document.activeElement)")
+    assert page.value(
+        "document.getElementById('panel').contains(document.activeElement)"
+    )
     press(page, "Tab")
-    assert page.value("document.getElementById('panel').contains(document.activeElement)")
+    assert page.value(
+        "document.getElementById('panel').contains(document.activeElement)"
+    )
     press(page, "Escape")
-    until(page, "!document.getElementById('panel').open && !location.hash.includes('entry=')")
+    until(
+        page,
+        "!document.getElementById('panel').open && !location.hash.includes('entry=')",
+    )
     assert page.value("document.activeElement.textContent") == entry.name
 
 
@@ -72,13 +110,26 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
     """Curves, dots per scenario, maps, histograms, energy and the film are drawn."""
     tab = board.tabs[0]
     restored(page, "#tab=cavity-full&entry=gns")
-    drawn = page.value("[...document.querySelectorAll('#panel [data-figure]')].map(f => f.dataset.figure)")
-    assert drawn == ["errors", "scenarios", "maps", "film", "energy", "residual", "distribution"]
+    drawn = page.value(
+        "[...document.querySelectorAll('#panel [data-figure]')].map(f => "
+        "f.dataset.figure)"
+    )
+    assert drawn == [
+        "errors",
+        "scenarios",
+        "maps",
+        "film",
+        "energy",
+        "residual",
+        "distribution",
+    ]
     count = "document.querySelectorAll('#panel [data-figure={}] {}').length"
     lines = 1 + (tab.rows[0].id != "gns") + len(tab.floors)
     assert page.value(count.format("errors", ".line:not(.swatch *)")) == lines
     assert page.value(count.format("errors", ".band")) == 1
-    assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(tab.scenarios)
+    assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(
+        tab.scenarios
+    )
     assert page.value(count.format("energy", ".chart .line")) == 4
     fields = page.value(
         "[...document.querySelectorAll('#panel canvas')].map(c =>"
@@ -94,18 +145,25 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
 
 
 def test_map_shows_the_field(page: Page, board: Board) -> None:
-    """Pixels of the truth's map: opacity is the share of the greatest value, colour its sign."""
+    """Pixels of the truth's map: opacity is the share of the greatest value, colour its
+    sign.
+    """
     restored(page, "#tab=cavity-full&entry=gns")
     data = page.value(
-        "[...document.querySelector('#panel canvas').getContext('2d').getImageData(0, 0, 16, 16).data]"
+        "[...document.querySelector('#panel canvas').getContext('2d').getImageData(0, "
+        "0, 16, 16).data]"
     )
-    pixels = np.array(data).reshape(16, 16, 4)[::-1].transpose(1, 0, 2)  # [x node, y node]
+    pixels = (
+        np.array(data).reshape(16, 16, 4)[::-1].transpose(1, 0, 2)
+    )  # [x node, y node]
     truth = board.tabs[0].truth.vorticity
     field = truth[0]
     limit = np.nanmax(np.abs(field))
     known = np.isfinite(field)
     assert np.all(pixels[~known] == [128, 128, 128, 34])
-    np.testing.assert_allclose(pixels[known][:, 3], 255 * np.abs(field[known]) / limit, atol=1.6)
+    np.testing.assert_allclose(
+        pixels[known][:, 3], 255 * np.abs(field[known]) / limit, atol=1.6
+    )
     strong = known & (np.abs(field) > 0.2 * limit)
     assert np.all((pixels[strong][:, 0] > pixels[strong][:, 2]) == (field[strong] > 0))
 
@@ -129,13 +187,22 @@ def test_film_plays_unless_motion_is_unwanted(page: Page) -> None:
 def test_command_is_copied(page: Page, board: Board) -> None:
     """The button puts the exact command into the clipboard."""
     page.browser.call(
-        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
+        "Browser.grantPermissions",
+        permissions=["clipboardReadWrite", "clipboardSanitizedWrite"],
     )
     restored(page, "#tab=cavity-full&entry=gns")
     page.call("Page.bringToFront")
-    page.call("Runtime.evaluate", expression="document.querySelector('.copy').click()", userGesture=True)
+    page.call(
+        "Runtime.evaluate",
+        expression="document.querySelector('.copy').click()",
+        userGesture=True,
+    )
     until(page, "document.querySelector('.copy').textContent === 'Copied'")
-    held = page.call("Runtime.evaluate", expression="navigator.clipboard.readText()", awaitPromise=True)
+    held = page.call(
+        "Runtime.evaluate",
+        expression="navigator.clipboard.readText()",
+        awaitPromise=True,
+    )
     row = next(row for row in board.tabs[0].rows if row.id == "gns")
     assert held["result"]["value"] == row.entry.command
 
@@ -144,10 +211,13 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     """Every entry with a cost is a dot that is a link; the best in both are joined."""
     restored(page, "#tab=cavity-full")
     dots: Any = page.value(
-        "[...document.querySelectorAll('section:not([hidden]) [data-figure=cost] a.dot')]"
+        "[...document.querySelectorAll('section:not([hidden]) [data-figure=cost] "
+        "a.dot')]"
         ".map(a => [a.href.baseVal, a.classList.contains('best')])"
     )
-    rows = [row for row in board.tabs[0].rows if row.active and row.entry.cost is not None]
+    rows = [
+        row for row in board.tabs[0].rows if row.active and row.entry.cost is not None
+    ]
     assert len(dots) == len(rows)
     marks = {mark.name: (mark.seconds, mark.error) for mark in marks_of(board.tabs[0])}
     points = {row.id: marks[row.entry.name] for row in rows}
@@ -158,15 +228,23 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
     }
     assert {href.partition("entry=")[2] for href, front in dots if front} == best
     press(page, "Tab")
-    run(page, "document.querySelector('section:not([hidden]) [data-figure=cost] a.dot').focus()")
+    run(
+        page,
+        "document.querySelector('section:not([hidden]) [data-figure=cost] "
+        "a.dot').focus()",
+    )
     ring = "getComputedStyle(document.activeElement.querySelector('.reach')).stroke"
     assert page.value(ring) != "none"
     press(page, "Enter")
     until(page, "document.getElementById('panel').open")
 
 
-def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Path) -> None:
-    """Scripts, images and odd addresses in a submission show as text in table, panel and CSV."""
+def test_hostile_text_does_nothing(
+    running: Browser, board: Board, tmp_path: Path
+) -> None:
+    """Scripts, images and odd addresses in a submission show as text in table, panel
+    and CSV.
+    """
     tab = board.tabs[0]
     texts = dict.fromkeys(("command", "notes", "training", "name"), HOSTILE)
     bad = with_entry(
@@ -191,27 +269,44 @@ def test_hostile_text_does_nothing(running: Browser, board: Board, tmp_path: Pat
         restored(page, f"#tab=cavity-full&{hash_}")
         assert page.value("document.images.length") == 0
         assert page.value("document.scripts.length") == 3
-        assert page.value("[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))")
+        assert page.value(
+            "[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))"
+        )
         assert page.value("document.documentElement.scrollWidth") <= 390
         assert HOSTILE in page.value(
-            "document.querySelector('section:not([hidden]) tr[data-entry] .name').textContent"
+            "document.querySelector('section:not([hidden]) tr[data-entry] "
+            ".name').textContent"
         )
         if hash_.endswith(bad.id):
             until(page, "document.getElementById('panel').open")
-            assert HOSTILE in page.value("document.querySelector('#panel h2').textContent")
+            assert HOSTILE in page.value(
+                "document.querySelector('#panel h2').textContent"
+            )
     assert page.messages == []
-    assert {request.partition("#")[0] for request in page.requests} == {path.absolute().as_uri()}
+    assert {request.partition("#")[0] for request in page.requests} == {
+        path.absolute().as_uri()
+    }
     close(page)
 
 
-def test_fifty_entries_are_there_within_a_second(running: Browser, tmp_path: Path) -> None:
+def test_fifty_entries_are_there_within_a_second(
+    running: Browser, tmp_path: Path
+) -> None:
     """Loading to a page that answers takes less than a second of processor time."""
     path = tmp_path / "index.html"
-    path.write_text(render(make_board((("cavity", "full"),), entries=50, nodes=40)), encoding="utf-8")
+    path.write_text(
+        render(make_board((("cavity", "full"),), entries=50, nodes=40)),
+        encoding="utf-8",
+    )
     page = running.open(path, width=1280)
-    page.call("Performance.enable", timeDomain="threadTicks")  # the clock of a busy machine says nothing
+    page.call(
+        "Performance.enable", timeDomain="threadTicks"
+    )  # the clock of a busy machine says nothing
     restored(page, "#tab=cavity-full")
-    told = {one["name"]: one["value"] for one in page.call("Performance.getMetrics")["metrics"]}
+    told = {
+        one["name"]: one["value"]
+        for one in page.call("Performance.getMetrics")["metrics"]
+    }
     assert len(names(page)) == 48
     assert 0.01 < told["TaskDuration"] < 1.0
     close(page)

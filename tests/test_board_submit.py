@@ -18,7 +18,13 @@ from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import ChecksFailedError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import (
+    ChecksFailedError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.floors import floors_of
 from lagbench.scoring.stored import read_stored
 from lagbench.submission import open_predictions
@@ -33,7 +39,12 @@ def own(home: Path, tmp_path: Path) -> BoardBench:
 @pytest.fixture
 def predictions(own: BoardBench) -> Path:
     """Predictions of a model that is not on the board yet."""
-    labels = {"device": "a laptop", "seconds_per_frame": 0.25, "parameters": 9, "training": "train"}
+    labels = {
+        "device": "a laptop",
+        "seconds_per_frame": 0.25,
+        "parameters": 9,
+        "training": "train",
+    }
     return own.predict(nearer, "my-model", **labels)
 
 
@@ -45,19 +56,31 @@ def unscored(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def well(bench: BoardBench) -> bool:
     """Tell whether the check of the folder finds nothing."""
-    return not check_board(bench.folder, registry=bench.registry, isolated=False).findings
+    return not check_board(
+        bench.folder, registry=bench.registry, isolated=False
+    ).findings
 
 
 @pytest.mark.usefixtures("as_shipped")
 def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
-    """Labels of the predictions, what the submitter adds, data set, hashes, scores and their origin."""
-    said = {"name": "My model", "code": "https://a.org/x", "solver_seconds_per_frame": 0.5}
+    """Labels of the predictions, what the submitter adds, data set, hashes, scores and
+    their origin.
+    """
+    said = {
+        "name": "My model",
+        "code": "https://a.org/x",
+        "solver_seconds_per_frame": 0.5,
+    }
     result = own.submit(predictions, **said)
     entry = read_entry(own.entry("my-model"))
     assert (entry.name, entry.code, entry.date) == ("My model", "https://a.org/x", DAY)
     assert (entry.parameters, entry.training) == (9, "train")
     assert entry.cost is not None
-    cost = {"seconds_per_frame": 0.25, "device": "a laptop", "solver_seconds_per_frame": 0.5}
+    cost = {
+        "seconds_per_frame": 0.25,
+        "device": "a laptop",
+        "solver_seconds_per_frame": 0.5,
+    }
     assert entry.cost.model_dump() == cost
     with open_predictions(predictions) as opened:
         assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
@@ -77,13 +100,19 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
 
 
 def test_replacing_leaves_no_score_file_over(own: BoardBench) -> None:
-    """Two seeds that become one: the score files of both are gone, the new one is there."""
+    """Two seeds that become one: the score files of both are gone, the new one is
+    there.
+    """
     own.submit(own.predict(damped, "damped"), replace=True)
-    assert [path.name for path in (own.folder / "scores/cavity/tiny").glob("damped*")] == ["damped.nc"]
+    assert [
+        path.name for path in (own.folder / "scores/cavity/tiny").glob("damped*")
+    ] == ["damped.nc"]
 
 
 def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
-    """A file inside the leaderboard's folder is named by its path there, one elsewhere is not."""
+    """A file inside the leaderboard's folder is named by its path there, one elsewhere
+    is not.
+    """
     inside = own.folder / "predictions" / "mine.nc"
     inside.parent.mkdir()
     own.data.submit(inside, nearer, "inside")
@@ -95,7 +124,9 @@ def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
 
 @pytest.mark.usefixtures("unscored")
 def test_a_name_that_no_entry_can_hold(own: BoardBench) -> None:
-    """A path inside the folder that the schema refuses is told before anything is scored."""
+    """A path inside the folder that the schema refuses is told before anything is
+    scored.
+    """
     inside = own.folder / ("p" * 150) / f"{'q' * 100}.nc"
     inside.parent.mkdir()
     own.data.submit(inside, nearer, "inside")
@@ -110,8 +141,12 @@ def tree(folder: Path) -> set[str]:
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of another entry or seed are refused under any label; one file twice is told before the work."""
+def test_predictions_are_submitted_once(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of another entry or seed are refused under any label; one file twice is
+    told before the work.
+    """
     first = own.predict(nearer, "first")
     own.submit(first)
     before = tree(own.folder)
@@ -120,7 +155,10 @@ def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.Mon
         own.submit(again)
     with monkeypatch.context() as patch:
         patch.setattr(submitting, "score", pytest.fail)
-        for files in ((first,), tuple(own.predict(still, "third", seed=seed) for seed in (0, 1))):
+        for files in (
+            (first,),
+            tuple(own.predict(still, "third", seed=seed) for seed in (0, 1)),
+        ):
             with pytest.raises(UsageError):
                 own.submit(*files, method="other", name="Other")
     assert tree(own.folder) == before
@@ -131,14 +169,26 @@ def test_predictions_are_submitted_once(own: BoardBench, monkeypatch: pytest.Mon
 @pytest.mark.parametrize(
     "keys",
     [
-        *({"authors": ()}, {"command": ""}, {"method": "noisy"}, {"method": "persistence"}),
+        *(
+            {"authors": ()},
+            {"command": ""},
+            {"method": "noisy"},
+            {"method": "persistence"},
+        ),
         *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
-        *({"urls": ("https://a.org/1", "https://a.org/2")}, {"date": datetime.date(2999, 1, 1)}),
+        *(
+            {"urls": ("https://a.org/1", "https://a.org/2")},
+            {"date": datetime.date(2999, 1, 1)},
+        ),
         {"budget": {"track": "converged"}},
     ],
 )
-def test_refused_before_the_work(keys: dict[str, Any], own: BoardBench, predictions: Path) -> None:
-    """What is missing, taken, of a day to come or nobody's to say, before anything is scored or written."""
+def test_refused_before_the_work(
+    keys: dict[str, Any], own: BoardBench, predictions: Path
+) -> None:
+    """What is missing, taken, of a day to come or nobody's to say, before anything is
+    scored or written.
+    """
     before = tree(own.folder)
     with pytest.raises(UsageError) as caught:
         own.submit(predictions, **keys)
@@ -149,7 +199,9 @@ def test_refused_before_the_work(keys: dict[str, Any], own: BoardBench, predicti
 
 @pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
 def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -> None:
-    """What predictions say of their training may be anything; an entry that cannot hold it is refused."""
+    """What predictions say of their training may be anything; an entry that cannot hold
+    it is refused.
+    """
     before = tree(own.folder)
     with pytest.raises(LagbenchError):
         own.submit(own.predict(nearer, "odd", training=text))
@@ -169,15 +221,21 @@ def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -
 def test_a_cost_of_predictions_that_no_entry_can_hold(
     own: BoardBench, key: str, labels: dict[str, Any]
 ) -> None:
-    """Valid predictions may tell a cost beyond what the board takes: the key is named before the work."""
-    path = own.predict(nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels})
+    """Valid predictions may tell a cost beyond what the board takes: the key is named
+    before the work.
+    """
+    path = own.predict(
+        nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels}
+    )
     with pytest.raises(ChecksFailedError) as told:
         own.submit(path)
     assert f"{key}: " in str(told.value.got)
 
 
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
-    """All that is wrong with an entry is in one error: whoever mends it all can submit."""
+    """All that is wrong with an entry is in one error: whoever mends it all can
+    submit.
+    """
     keys = {"name": "NO\u0406SY", "urls": ("https://a.org/1", "https://a.org/2")}
     mended = {"name": "Fine", "urls": (), "method": "fine"}
     alone = []
@@ -193,12 +251,17 @@ def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
 
 @pytest.mark.usefixtures("unscored")
 def test_files_that_do_not_belong_together(own: BoardBench) -> None:
-    """Several files need seeds that differ; a label that is no id needs --method; no file is no entry."""
-    plain, other = own.predict(still, "plain"), own.predict(noisy, "other")
+    """Several files need seeds that differ; a label that is no id needs --method; no
+    file is no entry.
+    """
+    plain = own.predict(still, "plain")
+    other = own.predict(noisy, "other")
     same = own.predict(still, "same", seed=4)
     two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
     odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
-    small, large = (own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1))
+    small, large = (
+        own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1)
+    )
     for files, keys in (
         ((), {}),
         ((small, large), {}),
@@ -211,7 +274,9 @@ def test_files_that_do_not_belong_together(own: BoardBench) -> None:
             own.submit(*files, **keys)
 
 
-def test_invalid_predictions_leave_nothing(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
+def test_invalid_predictions_leave_nothing(
+    own: BoardBench, predictions: Path, tmp_path: Path
+) -> None:
     """A damaged second file: the first is not scored, nothing is written."""
     import h5py
 
@@ -230,8 +295,11 @@ def test_invalid_predictions_leave_nothing(own: BoardBench, predictions: Path, t
 def test_an_interruption_is_found(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Score files come first, the entry last: what a kill leaves is a score file without an entry."""
-    before, move = own.state(), os.replace
+    """Score files come first, the entry last: what a kill leaves is a score file
+    without an entry.
+    """
+    before = own.state()
+    move = os.replace
 
     def killed(source: Path, target: Path) -> None:
         if target.suffix == ".yaml":
@@ -262,11 +330,15 @@ def test_a_score_file_that_is_too_long_is_not_published(
 
 
 def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> None:
-    """Those that are missing, or of another data set, are written anew, the same bytes whoever submits."""
+    """Those that are missing, or of another data set, are written anew, the same bytes
+    whoever submits.
+    """
     folder = own.folder / "floors/cavity/tiny"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {
-        f"{floor.name}.nc" for floor in floors_of(own.data.size) if floor.counts and not floor.reads_train
+        f"{floor.name}.nc"
+        for floor in floors_of(own.data.size)
+        if floor.counts and not floor.reads_train
     }
     first = min(before)
     (folder / first).unlink()
@@ -280,7 +352,9 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
 
 
 def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
-    """One particle in 2048, say, that lies outside at all frames but some: the share is that of positions."""
+    """One particle in 2048, say, that lies outside at all frames but some: the share is
+    that of positions.
+    """
 
     def leaving(truth: Any, n: int, h: int) -> Any:
         guess = np.array(nearer(truth, n, h))
@@ -290,7 +364,9 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
     own.submit(own.predict(leaving, "leaving"))
     told = read_entry(own.entry("leaving")).score.files[0].warnings
     (warning,) = (one for one in told if one.name == "in_domain")
-    size, task, outside = own.data.size, own.data.size.task, 0
+    task = own.data.size.task
+    size = own.data.size
+    outside = 0
     room = size.bounds[0][1] + 1.0 / size.grid
     for scenario in size.subsets["test"]:
         guess = leaving(motion(size, scenario), task.input_frames, task.horizon)
@@ -300,9 +376,14 @@ def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
     assert warning.share == pytest.approx(outside / count, rel=1e-3)
 
 
-def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_path: Path) -> None:
-    """It has to be asked for, and not among other files; what git and a README put there is no obstacle."""
-    meta, board = Meta(authors=("A. Author",), command="make", date=DAY), tmp_path / "site"
+def test_no_board_is_begun_by_mistake(
+    own: BoardBench, predictions: Path, tmp_path: Path
+) -> None:
+    """It has to be asked for, and not among other files; what git and a README put
+    there is no obstacle.
+    """
+    meta = Meta(authors=("A. Author",), command="make", date=DAY)
+    board = tmp_path / "site"
     where = own.where | {"board": board}
     with pytest.raises(UsageError) as error:
         submitting.submit([predictions], meta, **where)
@@ -317,7 +398,11 @@ def test_no_board_is_begun_by_mistake(own: BoardBench, predictions: Path, tmp_pa
     with pytest.raises(UsageError) as error:
         submitting.submit([predictions], meta, **where)
     assert (error.value.where, error.value.got) == (str(board), "'index.html'")
-    assert sorted(path.name for path in board.iterdir()) == [".git", "README.md", "index.html"]
+    assert sorted(path.name for path in board.iterdir()) == [
+        ".git",
+        "README.md",
+        "index.html",
+    ]
     (board / "index.html").unlink()
     assert submitting.submit([predictions], meta, **where).board == board
 
@@ -329,4 +414,6 @@ def test_what_is_not_given(own: BoardBench) -> None:
     own.submit(first, second, date=None)
     entry = read_entry(own.entry("mixed"))
     assert entry.cost is None
-    assert abs(entry.date - datetime.datetime.now(datetime.UTC).date()) <= datetime.timedelta(days=1)
+    assert abs(
+        entry.date - datetime.datetime.now(datetime.UTC).date()
+    ) <= datetime.timedelta(days=1)

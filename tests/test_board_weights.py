@@ -22,7 +22,13 @@ from lagbench.board.entry import EntryBudget, Meta
 from lagbench.board.entry_file import read_entry
 from lagbench.board.submit import SubmitResult, submit
 from lagbench.data.checksums import file_sha256
-from lagbench.errors import ChecksFailedError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import (
+    ChecksFailedError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.submission import open_predictions
@@ -47,24 +53,43 @@ COUNT = 1  # parameters of that model
 
 
 def trained(
-    own: BoardBench, seed: int, training: str | None = OURS, parameters: int | None = None, share: float = 0.6
+    own: BoardBench,
+    seed: int,
+    training: str | None = OURS,
+    parameters: int | None = None,
+    share: float = 0.6,
 ) -> Path:
     """Write the weights of a run, with its record beside them and its predictions."""
     folder = own.folder.parent / f"drift-{seed}-{share}"
     folder.mkdir()
-    said = {"training": training, "parameters": parameters, "seed": seed, "budget": BUDGET.model_dump_json()}
+    said = {
+        "training": training,
+        "parameters": parameters,
+        "seed": seed,
+        "budget": BUDGET.model_dump_json(),
+    }
     labels = {key: held for key, held in said.items() if held is not None}
 
     def between(truth: Any, n: int, h: int) -> Any:
-        return truth[n : n + h] + (share + 0.1 * seed) * (noisy(truth, n, h) - truth[n : n + h])
+        return truth[n : n + h] + (share + 0.1 * seed) * (
+            noisy(truth, n, h) - truth[n : n + h]
+        )
 
     own.predict(between, "drift", **labels).rename(folder / "predictions.nc")
     with open_predictions(folder / "predictions.nc") as opened:
         header = opened.header
-    facts = replace(FACTS, split=header.split, size=header.size, dataset_sha256=header.dataset_sha256)
+    facts = replace(
+        FACTS,
+        split=header.split,
+        size=header.size,
+        dataset_sha256=header.dataset_sha256,
+    )
     recipe = {"name": "cavity/tiny", "training": {"seed": seed}}
-    held, told = rounded_weights(Drift.build({}, facts)), {"step": 6, "recipe": recipe}
-    weights = Checkpoint(baseline="drift", options={}, facts=facts, weights=held, training=told)
+    held = rounded_weights(Drift.build({}, facts))
+    told = {"step": 6, "recipe": recipe}
+    weights = Checkpoint(
+        baseline="drift", options={}, facts=facts, weights=held, training=told
+    )
     save(folder / "weights.pt", weights)
     (folder / "training.json").write_text(json.dumps({"step": 6}))
     return folder
@@ -79,7 +104,11 @@ def submitted(
 ) -> SubmitResult:
     """Submit the predictions of runs, with their weights unless others are given."""
     files = [folder / "predictions.nc" for folder in folders]
-    given = tuple(folder / "weights.pt" for folder in folders) if weights is None else weights
+    given = (
+        tuple(folder / "weights.pt" for folder in folders)
+        if weights is None
+        else weights
+    )
     meta = Meta(authors=("A. Author",), command="make", method=method, name=method)
     return submit(files, meta, weights=given, **own.where, **options)
 
@@ -100,7 +129,9 @@ def hashes(own: BoardBench, method: str = "drift") -> list[str | None]:
 
 def lying(own: BoardBench) -> dict[str, bytes]:
     """Return name and content of the weights and records on the board."""
-    return {path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")}
+    return {
+        path.name: path.read_bytes() for path in (own.folder / "weights").rglob("*.*")
+    }
 
 
 def claim(own: BoardBench, path: str, source: Path) -> None:
@@ -116,9 +147,11 @@ def found(own: BoardBench) -> set[str]:
 
 
 def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
-    """Weights and records of both seeds are copied and named by hash, and the entry has their mean budget.
+    """Weights and records of both seeds are copied and named by hash, and the entry has
+    their mean budget.
 
-    They go to their seeds in any order, and of some only; those of others stay while the predictions do.
+    They go to their seeds in any order, and of some only; those of others stay while
+    the predictions do.
     """
     runs = [trained(own, 0), trained(own, 3)]
     submitted(own, *runs)
@@ -131,7 +164,11 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
         assert (file_sha256(file), made.budget) == (made.weights.sha256, BUDGET)
         assert json.loads(file.with_suffix(".json").read_text()) == {"step": 6}
     assert entry.budget is not None
-    assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (48, 0.1, None)  # tiny
+    assert (entry.budget.windows, entry.budget.cpu_hours, entry.budget.track) == (
+        48,
+        0.1,
+        None,
+    )  # tiny
     assert found(own) == set()
     first, second = (run / "weights.pt" for run in runs)
     own.entry("drift").unlink()
@@ -148,13 +185,18 @@ def test_weights_lie_beside_their_entry(own: BoardBench) -> None:
 
 
 def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> None:
-    """Weights stay with their predictions, and go with them: an entry leaves none behind."""
-    before, file = lying(own), own.folder / f"{KEPT}.pt"
+    """Weights stay with their predictions, and go with them: an entry leaves none
+    behind.
+    """
+    before = lying(own)
+    file = own.folder / f"{KEPT}.pt"
     assert json.loads(before["drift_0.json"]) == {"step": 6}
     for weights in ((), (file,)):  # those of the board, told or not, keep their record
         again = submitted(own, first, weights=weights, replace=True)
         assert (lying(own), again.removed, found(own)) == (before, (), set())
-    (first / "training.json").unlink()  # new weights without a record leave none of the old
+    (
+        first / "training.json"
+    ).unlink()  # new weights without a record leave none of the old
     assert submitted(own, first, replace=True).removed == (file.with_suffix(".json"),)
     assert (list(lying(own)), found(own)) == (["drift_0.pt"], set())
     later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)
@@ -178,7 +220,8 @@ def test_weights_of_another_are_not_kept(own: BoardBench, first: Path) -> None:
     """Nor those that lie elsewhere: what the old entry says of them is not believed."""
     second = trained(own, 0, share=0.3)
     submitted(own, second, weights=(), method="glide")
-    source, target = own.folder / f"{KEPT}.pt", own.folder / f"{GLIDE}.pt"
+    source = own.folder / f"{KEPT}.pt"
+    target = own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
     for path, alone in ((GLIDE, False), (KEPT, False), (KEPT, True)):
         if alone:
@@ -190,8 +233,12 @@ def test_weights_of_another_are_not_kept(own: BoardBench, first: Path) -> None:
 
 
 def test_a_new_name_takes_the_weights_along(own: BoardBench, first: Path) -> None:
-    """A superseded entry and its successor have one file of weights each, with the same bytes."""
-    own.edit("drift", lambda held: held.update(status="superseded", superseded_by="glide"))
+    """A superseded entry and its successor have one file of weights each, with the same
+    bytes.
+    """
+    own.edit(
+        "drift", lambda held: held.update(status="superseded", superseded_by="glide")
+    )
     submitted(own, first, method="glide")
     assert found(own) == set()
 
@@ -219,11 +266,14 @@ def test_no_link_leads_out_of_the_board(own: BoardBench, tmp_path: Path) -> None
 
 
 def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> None:
-    """A folder where a record was: told before anything moves. A link that leads nowhere just goes."""
+    """A folder where a record was: told before anything moves. A link that leads
+    nowhere just goes.
+    """
     record = next((own.folder / "weights").rglob("*.json"))
     record.unlink()
     record.mkdir()
-    second, before = trained(own, 0, share=0.3), own.state()
+    second = trained(own, 0, share=0.3)
+    before = own.state()
     (second / "training.json").unlink()
     with pytest.raises(WorkFailedError):
         submitted(own, second, replace=True)
@@ -235,10 +285,17 @@ def test_an_idle_place_that_cannot_be_cleared(own: BoardBench, first: Path) -> N
 
 
 def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> None:
-    """Score files fit, weights do not: nothing of the old entry is lost, nothing of the new one is there."""
-    second, before = trained(own, 0, share=0.3), own.state()
-    (second / "training.json").write_text(json.dumps({"step": 6, "note": "x" * (kept.MOST_RECORD - 100)}))
-    room = 1000 + max(path.stat().st_size for path in (own.folder / "scores").rglob("drift*"))
+    """Score files fit, weights do not: nothing of the old entry is lost, nothing of the
+    new one is there.
+    """
+    second = trained(own, 0, share=0.3)
+    before = own.state()
+    (second / "training.json").write_text(
+        json.dumps({"step": 6, "note": "x" * (kept.MOST_RECORD - 100)})
+    )
+    room = 1000 + max(
+        path.stat().st_size for path in (own.folder / "scores").rglob("drift*")
+    )
     assert room < (second / "training.json").stat().st_size
     with largest_file(room), pytest.raises(WorkFailedError):
         submitted(own, second, replace=True)
@@ -263,7 +320,9 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
 def test_weights_are_those_of_the_predictions(
     own: BoardBench, training: str | None, parameters: int | None, fits: bool
 ) -> None:
-    """Training in words and parameters are those of the weights; the number tells GNS from SuperGAT."""
+    """Training in words and parameters are those of the weights; the number tells GNS
+    from SuperGAT.
+    """
     run = trained(own, 0, training, parameters)
     if fits:
         submitted(own, run)
@@ -273,9 +332,13 @@ def test_weights_are_those_of_the_predictions(
     assert caught.value.where == str(run / "weights.pt")
 
 
-@pytest.mark.parametrize(("change", "fits"), [("", True), (", model.noise_std=0.001", False)])
+@pytest.mark.parametrize(
+    ("change", "fits"), [("", True), (", model.noise_std=0.001", False)]
+)
 def test_seeds_differ_in_nothing_else(own: BoardBench, change: str, fits: bool) -> None:
-    """The step of the best weights is each seed's own; a changed recipe is another method."""
+    """The step of the best weights is each seed's own; a changed recipe is another
+    method.
+    """
     words = "cavity tiny train, recipe cavity/tiny, step"
     runs = [trained(own, 0, f"{words} 6"), trained(own, 3, f"{words} 9{change}")]
     with nullcontext() if fits else pytest.raises(UsageError, match=r"noise_std"):
@@ -290,20 +353,27 @@ def test_weights_of_another_entry_are_refused(own: BoardBench) -> None:
         submitted(own, second, method="glide")
     assert caught.value.where == str(second / "weights.pt")
     submitted(own, second, weights=(), method="glide")
-    source, target = own.folder / f"{KEPT}.pt", own.folder / f"{GLIDE}.pt"
+    source = own.folder / f"{KEPT}.pt"
+    target = own.folder / f"{GLIDE}.pt"
     target.write_bytes(source.read_bytes())
     claim(own, f"{GLIDE}.pt", source)
     assert found(own) == {"weights"}
 
 
 def test_other_weights_are_refused(own: BoardBench) -> None:
-    """Weights of another seed, one twice, a state to go on from, files that are none; nothing is written."""
+    """Weights of another seed, one twice, a state to go on from, files that are none;
+    nothing is written.
+    """
     runs = [trained(own, 0), trained(own, 3)]
     before = own.state()
     first, second = (run / "weights.pt" for run in runs)
     state = runs[0] / "checkpoint.pt"
     save(state, replace(load(first), optimizer={"state": {}}))
-    for folders, weights in (runs[:1], (second,)), (runs, (first, first)), (runs[:1], (state,)):
+    for folders, weights in (
+        (runs[:1], (second,)),
+        (runs, (first, first)),
+        (runs[:1], (state,)),
+    ):
         with pytest.raises(UsageError) as caught:
             submitted(own, *folders, weights=weights)
         assert caught.value.where == str(weights[0])
@@ -321,13 +391,22 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "weights: edited": lambda b: put("pt", lying(b)["drift_0.pt"][:-1] + b"x")(b),
     "weights: lost": lambda b: (b.folder / f"{KEPT}.pt").unlink(),
     "weights: those of another method": lambda b: b.edit(
-        "drift", lambda held: held["predictions"][0]["weights"].update(path="weights/cavity/tiny/a_0.pt")
+        "drift",
+        lambda held: held["predictions"][0]["weights"].update(
+            path="weights/cavity/tiny/a_0.pt"
+        ),
     ),
-    "weights: of no entry": lambda b: (b.folder / "weights/cavity/tiny/other_0.pt").write_bytes(b"1"),
-    "weights: long record": put("json", json.dumps({"note": "x" * kept.MOST_RECORD}).encode()),
+    "weights: of no entry": lambda b: (
+        b.folder / "weights/cavity/tiny/other_0.pt"
+    ).write_bytes(b"1"),
+    "weights: long record": put(
+        "json", json.dumps({"note": "x" * kept.MOST_RECORD}).encode()
+    ),
     "weights: record nested far deeper than one is": put("json", b"[" * 100_000),
     "weights: JSON that is no record": put("json", b"[1]"),
-    "budget: track claimed": lambda b: b.edit("drift", lambda held: held["budget"].update(track="converged")),
+    "budget: track claimed": lambda b: b.edit(
+        "drift", lambda held: held["budget"].update(track="converged")
+    ),
     "budget: track claimed without a budget": lambda b: b.edit(
         "noisy", lambda held: held.update(budget={"track": "equal compute"})
     ),
@@ -336,14 +415,20 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
 
 @pytest.mark.parametrize("name", DAMAGE)
 def test_what_the_check_finds(own: BoardBench, name: str) -> None:
-    """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that no budget gives."""
+    """Weights edited, lost, elsewhere or nobody's; records that are none; tracks that
+    no budget gives.
+    """
     submitted(own, trained(own, 0))
     DAMAGE[name](own)
     assert found(own) == {name.partition(":")[0]}
 
 
-def test_what_is_no_record_is_not_copied(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The entry does without, as it may: too long, or what predictions cost. All weights have a bound."""
+def test_what_is_no_record_is_not_copied(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The entry does without, as it may: too long, or what predictions cost. All
+    weights have a bound.
+    """
     run = trained(own, 0)
     (run / "training.json").unlink()
     for name, held in (
@@ -360,10 +445,14 @@ def test_what_is_no_record_is_not_copied(own: BoardBench, monkeypatch: pytest.Mo
 
 
 def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
-    """Scored again, predictions that tell another budget are found, though the entry is sound by itself."""
+    """Scored again, predictions that tell another budget are found, though the entry is
+    sound by itself.
+    """
 
     def shorten(held: dict[str, Any]) -> None:
-        held["predictions"][0]["budget"]["cpu_hours"] = held["budget"]["cpu_hours"] = 0.05
+        held["predictions"][0]["budget"]["cpu_hours"] = held["budget"]["cpu_hours"] = (
+            0.05
+        )
 
     own.edit("drift", shorten)
     assert found(own) == set()
@@ -375,7 +464,9 @@ def test_a_budget_is_that_of_the_file(own: BoardBench, first: Path) -> None:
 def test_seeds_that_come_later_make_the_entry_of_all_at_once(
     own: BoardBench, home: Path, tmp_path: Path
 ) -> None:
-    """Byte for byte, weights included, though the predictions of the first seeds are gone by then."""
+    """Byte for byte, weights included, though the predictions of the first seeds are
+    gone by then.
+    """
     runs = [trained(own, seed) for seed in (0, 3, 5)]
     submitted(own, runs[0])
     (runs[0] / "predictions.nc").rename(tmp_path / "gone.nc")
@@ -383,7 +474,9 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
         result = submitted(own, run, add=True)
     assert found(own) == set()
     written = {f"drift{end}" for end in (".yaml", "_5.nc", "_5.pt", "_5.json")}
-    assert {path.name for path in result.files} == written  # the others stay as they lie
+    assert {
+        path.name for path in result.files
+    } == written  # the others stay as they lie
     assert not (own.folder / "scores/cavity/tiny/drift.nc").exists()
     (tmp_path / "gone.nc").rename(runs[0] / "predictions.nc")
     (tmp_path / "other").mkdir()
@@ -393,8 +486,11 @@ def test_seeds_that_come_later_make_the_entry_of_all_at_once(
 
 
 def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
-    """An entry of that method, its parameters, training in words and score files; another seed."""
-    first, same = trained(own, 0), trained(own, 3)
+    """An entry of that method, its parameters, training in words and score files;
+    another seed.
+    """
+    first = trained(own, 0)
+    same = trained(own, 3)
     other = trained(own, 4, training="cavity tiny train, recipe cavity/other, step 6")
     many = trained(own, 6, parameters=7)
 
@@ -425,20 +521,33 @@ def test_what_seeds_to_add_must_share_with_the_entry(own: BoardBench) -> None:
 
 
 def test_what_is_said_of_a_method_stays_when_seeds_are_added(own: BoardBench) -> None:
-    """Budget and parameters of meta.yaml too, where the files say none; what is said anew wins."""
+    """Budget and parameters of meta.yaml too, where the files say none; what is said
+    anew wins.
+    """
     files = [own.predict(nearer, "mine", seed=0), own.predict(still, "mine", seed=1)]
     budget = EntryBudget(epochs=10.0, gpu_hours=2.5)
-    own.submit(files[0], parameters=1000, budget=budget, notes="first", hardware="a GPU")
+    own.submit(
+        files[0], parameters=1000, budget=budget, notes="first", hardware="a GPU"
+    )
     files[0].unlink()
     own.submit(files[1], add=True, notes="both")
     entry = read_entry(own.entry("mine"))
-    assert (entry.budget, entry.parameters, entry.notes, entry.hardware) == (budget, 1000, "both", "a GPU")
+    assert (entry.budget, entry.parameters, entry.notes, entry.hardware) == (
+        budget,
+        1000,
+        "both",
+        "a GPU",
+    )
     assert [made.seed for made in entry.predictions] == [0, 1]
     assert found(own) == set()
 
 
-def test_only_sound_active_entries_get_seeds(own: BoardBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not a withdrawn one, nor one whose weights changed, nor one that changed while files were scored."""
+def test_only_sound_active_entries_get_seeds(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not a withdrawn one, nor one whose weights changed, nor one that changed while
+    files were scored.
+    """
     runs = [trained(own, seed) for seed in (0, 3, 5)]
     submitted(own, runs[0])
     held = lying(own)["drift_0.pt"]
@@ -446,7 +555,9 @@ def test_only_sound_active_entries_get_seeds(own: BoardBench, monkeypatch: pytes
     with pytest.raises(ChecksFailedError, match="weights"):
         submitted(own, runs[1], add=True)
     put("pt", held)(own)
-    own.edit("drift", lambda entry: entry.update(status="withdrawn", reason="a mistake"))
+    own.edit(
+        "drift", lambda entry: entry.update(status="withdrawn", reason="a mistake")
+    )
     with pytest.raises(UsageError, match="active"):
         submitted(own, runs[1], add=True)
     own.edit("drift", lambda entry: entry.update(status="active", reason="it was none"))
@@ -460,7 +571,10 @@ def test_only_sound_active_entries_get_seeds(own: BoardBench, monkeypatch: pytes
     with pytest.raises(UsageError, match="while"):
         submitted(own, runs[2], add=True)
     entry = read_entry(own.entry("drift"))
-    assert ([made.seed for made in entry.predictions], entry.reason) == ([0, 3], "it was none")
+    assert ([made.seed for made in entry.predictions], entry.reason) == (
+        [0, 3],
+        "it was none",
+    )
     assert found(own) == set()
 
 
@@ -469,11 +583,18 @@ def test_each_seed_has_its_own_step_and_start(
 ) -> None:
     """Trainings that differ in these alone belong together, on the command line too."""
     words = "cavity tiny train, recipe cavity/tiny, step {}, started from cavity/mini, weights {}"
-    own.submit(own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")), name="My model")
+    own.submit(
+        own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")),
+        name="My model",
+    )
     added = own.predict(still, "mine", seed=1, training=words.format(8, "4567cdef"))
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(own.registry.files["cavity"]))
     where = ["--board", own.folder, "--root", own.data.root, "--method", "mine"]
     result = run("submit", added, "--add", *where, "--command", "make both")
     assert result.exit_code == 0, result.output
     entry = read_entry(own.entry("mine"))
-    assert (entry.name, entry.command, len(entry.predictions)) == ("My model", "make both", 2)
+    assert (entry.name, entry.command, len(entry.predictions)) == (
+        "My model",
+        "make both",
+        2,
+    )

@@ -1,4 +1,6 @@
-"""Budgets of trainings: which track follows from them, and their way from a training to the board."""
+"""Budgets of trainings: which track follows from them, and their way from a training to
+the board.
+"""
 
 from __future__ import annotations
 
@@ -23,9 +25,16 @@ from lagbench.submission.budget import MOST_VALIDATIONS, Budget, budget_in, trac
         ("tiny", 0.1, 0.0, None),
     ],
 )
-def test_equal_compute(size: str, minutes: float, gpu: float, track: str | None) -> None:
-    """At most 15 minutes of processor time at mini, 60 at full, 5 % more allowed, and no GPU."""
-    for beside in (None, 0.2):  # processor time of validations is told apart and decides nothing
+def test_equal_compute(
+    size: str, minutes: float, gpu: float, track: str | None
+) -> None:
+    """At most 15 minutes of processor time at mini, 60 at full, 5 % more allowed, and
+    no GPU.
+    """
+    for beside in (
+        None,
+        0.2,
+    ):  # processor time of validations is told apart and decides nothing
         spent = Budget(cpu_hours=minutes / 60, gpu_hours=gpu, validation_hours=beside)
         assert track_of(size, spent) == track
 
@@ -35,17 +44,29 @@ def test_equal_compute(size: str, minutes: float, gpu: float, track: str | None)
     [
         (((500, 1.0), (1000, 0.99)), "converged"),
         (((500, 1.0), (1000, 0.97)), None),
-        (((500, 1.0), (1000, 1.2)), "converged"),  # what came later is worse: nothing was gained
-        (((250, 1.0), (500, 1.1), (1000, 0.97)), None),  # the best of the first half counts
+        (
+            ((500, 1.0), (1000, 1.2)),
+            "converged",
+        ),  # what came later is worse: nothing was gained
+        (
+            ((250, 1.0), (500, 1.1), (1000, 0.97)),
+            None,
+        ),  # the best of the first half counts
         (((250, 1.0), (1000, 1.0)), None),  # nobody looked at half the steps
         (((1000, 1.0),), None),
         ((), None),
     ],
 )
-def test_converged(validations: tuple[tuple[int, float], ...], track: str | None) -> None:
-    """The best validation falls by less than 2 % over the last doubling of the steps."""
+def test_converged(
+    validations: tuple[tuple[int, float], ...], track: str | None
+) -> None:
+    """The best validation falls by less than 2 % over the last doubling of the
+    steps.
+    """
     best = min((value for _, value in validations), default=None)
-    long = Budget(steps=1000, cpu_hours=5.0, gpu_hours=0.0, best=best, validations=validations)
+    long = Budget(
+        steps=1000, cpu_hours=5.0, gpu_hours=0.0, best=best, validations=validations
+    )
     assert track_of("mini", long) == track
 
 
@@ -55,22 +76,43 @@ VALIDATIONS = [[i, 1.0] for i in range(MOST_VALIDATIONS + 1)]
 @pytest.mark.parametrize(
     "text",
     [
-        *("", "null", "[]", "{", '{"track": "converged"}', '{"cpu_hours": -1}', '{"cpu_hours": NaN}'),
+        *(
+            "",
+            "null",
+            "[]",
+            "{",
+            '{"track": "converged"}',
+            '{"cpu_hours": -1}',
+            '{"cpu_hours": NaN}',
+        ),
         *('{"device": "\\n"}', json.dumps({"validations": VALIDATIONS})),
     ],
 )
 def test_texts_that_are_no_budget(text: str) -> None:
-    """A track is not stated, hours are not negative, names printable; validations as many as entries hold."""
+    """A track is not stated, hours are not negative, names printable; validations as
+    many as entries hold.
+    """
     assert budget_in(text) is None
     assert budget_in(json.dumps({"validations": VALIDATIONS[1:]})) is not None
 
 
 def test_the_mean_over_seeds() -> None:
     """An entry has the mean of its seeds' budgets, and their track where it is one."""
-    one: dict[str, Any] = {"windows": 100, "epochs": 0.5, "cpu_hours": 0.25, "gpu_hours": 0.0, "device": "a"}
+    one: dict[str, Any] = {
+        "windows": 100,
+        "epochs": 0.5,
+        "cpu_hours": 0.25,
+        "gpu_hours": 0.0,
+        "device": "a",
+    }
     two = {**one, "windows": 201, "cpu_hours": 0.26, "device": "b"}
     found = EntryBudget.of("mini", [Budget(**one), Budget(**two)])
-    means: dict[str, Any] = {"windows": 150, "epochs": 0.5, "cpu_hours": 0.255, "gpu_hours": 0.0}
+    means: dict[str, Any] = {
+        "windows": 150,
+        "epochs": 0.5,
+        "cpu_hours": 0.255,
+        "gpu_hours": 0.0,
+    }
     assert found == EntryBudget(track="equal compute", **means)
     mixed = EntryBudget.of("mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})])
     assert mixed.track is None

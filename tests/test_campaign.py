@@ -1,4 +1,6 @@
-"""What a generation checks, what it compares with datasets.yaml, and what it then leaves."""
+"""What a generation checks, what it compares with datasets.yaml, and what it then
+leaves.
+"""
 
 from __future__ import annotations
 
@@ -50,14 +52,21 @@ def card_of(root: Path) -> str:
     return (root / SPLIT / SIZE / "v2" / "README.md").read_text()
 
 
-def test_all_hashes_are_compared(copied: Copy, unmeasured: Registry, right: Measured) -> None:
-    """Equal scenarios are not enough to be equal to datasets.yaml; an id without a hash equals nothing."""
+def test_all_hashes_are_compared(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Equal scenarios are not enough to be equal to datasets.yaml; an id without a hash
+    equals nothing.
+    """
     listed = {i: digest for i, digest in right.scenario_sha256.items() if i != 2}
     root = copied()
     for change, named in (
         ({"dataset_sha256": "0" * 64}, "data set"),
         ({"subset_sha256": {"train": "0" * 64}}, "train"),
-        ({"scenario_sha256": listed}, "1 of 5 scenarios have another hash(?s:.*)scenarios 2"),
+        (
+            {"scenario_sha256": listed},
+            "1 of 5 scenarios have another hash(?s:.*)scenarios 2",
+        ),
     ):
         registry = with_measured(unmeasured, right.model_copy(update=change))
         with pytest.raises(DataError, match="another hash") as caught:
@@ -66,14 +75,22 @@ def test_all_hashes_are_compared(copied: Copy, unmeasured: Registry, right: Meas
         assert caught.value.exit_code == 4
 
 
-def test_equal_hashes_are_told(copied: Copy, unmeasured: Registry, right: Measured) -> None:
+def test_equal_hashes_are_told(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
     """All hashes hold: the verdict says so and nothing is simulated."""
-    result = generate(SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right))
+    result = generate(
+        SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right)
+    )
     assert (result.verdict, result.simulated) == ("equal to datasets.yaml", ())
 
 
-def test_a_forged_file_is_made_anew(copied: Copy, unmeasured: Registry, generated: GenerationResult) -> None:
-    """Without a recorded hash the manifest's counts: a file that agrees with itself is not adopted."""
+def test_a_forged_file_is_made_anew(
+    copied: Copy, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """Without a recorded hash the manifest's counts: a file that agrees with itself is
+    not adopted.
+    """
     root = copied()
     forge(root / SPLIT / SIZE / "v2" / "test" / "0003.nc")
     result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
@@ -84,7 +101,9 @@ def test_a_forged_file_is_made_anew(copied: Copy, unmeasured: Registry, generate
 def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
     copied: Copy, unmeasured: Registry, right: Measured
 ) -> None:
-    """Without a recorded hash nothing shows that the bits are equal; the card says it too."""
+    """Without a recorded hash nothing shows that the bits are equal; the card says it
+    too.
+    """
     root = copied()
     manifest = manifest_of(root)
     environment = {**manifest.environments[0], "machine": "aarch64"}
@@ -98,11 +117,18 @@ def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
 
 
 def test_other_bits_of_another_machine_are_kept_and_told(
-    tmp_path: Path, unmeasured: Registry, right: Measured, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    unmeasured: Registry,
+    right: Measured,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An ARM CPU whose bits differ: tolerance in manifest and card, no error, nothing simulated twice."""
+    """An ARM CPU whose bits differ: tolerance in manifest and card, no error, nothing
+    simulated twice.
+    """
     wrong = {**right.scenario_sha256, 4: "0" * 16}
-    registry = with_measured(unmeasured, right.model_copy(update={"scenario_sha256": wrong}))
+    registry = with_measured(
+        unmeasured, right.model_copy(update={"scenario_sha256": wrong})
+    )
     options = {"root": tmp_path, "scenarios": "4", "workers": 1, "registry": registry}
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     first = generate(SPLIT, SIZE, **options)  # type: ignore[arg-type]
@@ -125,7 +151,9 @@ def test_other_bits_of_another_machine_are_kept_and_told(
     assert not (root / SPLIT / SIZE / "v2" / "README.md").exists()
 
 
-def test_wrong_statistics_are_mended(copied: Copy, unmeasured: Registry, right: Measured) -> None:
+def test_wrong_statistics_are_mended(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
     """Where datasets.yaml says otherwise, the statistics of train are computed anew."""
     root = copied()
     manifest = manifest_of(root)
@@ -135,7 +163,9 @@ def test_wrong_statistics_are_mended(copied: Copy, unmeasured: Registry, right: 
     assert manifest_of(root).statistics == right.statistics
 
 
-def test_paths_of_a_manifest_are_not_published(copied: Copy, unmeasured: Registry) -> None:
+def test_paths_of_a_manifest_are_not_published(
+    copied: Copy, unmeasured: Registry
+) -> None:
     """A manifest that names a file elsewhere is written anew from the files."""
     root = copied()
     folder = root / SPLIT / SIZE / "v2"
@@ -150,7 +180,9 @@ def test_paths_of_a_manifest_are_not_published(copied: Copy, unmeasured: Registr
 def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Bytes are read once, progress is told meanwhile, and cards that would be the same stay."""
+    """Bytes are read once, progress is told meanwhile, and cards that would be the same
+    stay.
+    """
     root = copied()
     read: Counter[str] = Counter()
     news: list[Progress] = []
@@ -173,8 +205,12 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     assert (checking[0].done, checking[-1].done, checking[-1].total) == (0, 5, 5)
 
 
-def test_values_are_hashed_once(copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the first call of a copied folder; a dry run takes the manifest's word, later calls the note."""
+def test_values_are_hashed_once(
+    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first call of a copied folder; a dry run takes the manifest's word, later
+    calls the note.
+    """
 
     def refuse(*_: object) -> str:
         pytest.fail("values are hashed again")
@@ -184,15 +220,21 @@ def test_values_are_hashed_once(copied: Copy, unmeasured: Registry, monkeypatch:
         with monkeypatch.context() as patch:
             if not allowed:
                 patch.setattr("lagbench.make.inventory.check_scenario", refuse)
-            result = generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run)
+            result = generate(
+                SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run
+            )
         assert result.kept == (0, 1, 2, 3, 4)
 
 
 @pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
-def test_a_card_that_is_gone_or_changed_is_made_anew(name: str, copied: Copy, unmeasured: Registry) -> None:
+def test_a_card_that_is_gone_or_changed_is_made_anew(
+    name: str, copied: Copy, unmeasured: Registry
+) -> None:
     """Only cards that are there and the same are left alone."""
     path = copied() / SPLIT / SIZE / "v2" / name
     before = path.read_bytes()
     path.unlink()
-    generate(SPLIT, SIZE, root=path.parents[4 if "/" in name else 3], registry=unmeasured)
+    generate(
+        SPLIT, SIZE, root=path.parents[4 if "/" in name else 3], registry=unmeasured
+    )
     assert path.read_bytes() == before

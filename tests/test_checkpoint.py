@@ -1,4 +1,6 @@
-"""Checkpoints: what comes back; what is refused, larger models too; and that nothing in a file is run."""
+"""Checkpoints: what comes back; what is refused, larger models too; and that nothing in
+a file is run.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,14 @@ from simple_models import FACTS, Drift, install
 
 from lagbench.baselines.baseline import Facts
 from lagbench.baselines.catalogue import find, names
-from lagbench.baselines.checkpoint import Checkpoint, check_data, load, restore, rounded_weights, save
+from lagbench.baselines.checkpoint import (
+    Checkpoint,
+    check_data,
+    load,
+    restore,
+    rounded_weights,
+    save,
+)
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.make.generate import GenerationResult
@@ -48,7 +57,11 @@ def test_round_trip(tmp_path: Path) -> None:
     stored = example(optimizer=optimizer.state_dict())
     save(tmp_path / "a.pt", stored)
     found = load(tmp_path / "a.pt")
-    assert (found.baseline, found.options, found.facts) == (stored.baseline, stored.options, FACTS)
+    assert (found.baseline, found.options, found.facts) == (
+        stored.baseline,
+        stored.options,
+        FACTS,
+    )
     assert found.training == stored.training
     assert torch.equal(found.weights["a"], stored.weights["a"])
     # Adam's first moment after one step: (1 - 0.9) x gradient.
@@ -56,10 +69,14 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 def test_rounding() -> None:
-    """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every bit."""
+    """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every
+    bit.
+    """
     model = torch.nn.BatchNorm1d(1000)
     torch.nn.init.normal_(model.weight, generator=torch.Generator().manual_seed(0))
-    torch.nn.init.normal_(model.running_mean, generator=torch.Generator().manual_seed(1))
+    torch.nn.init.normal_(
+        model.running_mean, generator=torch.Generator().manual_seed(1)
+    )
     bits = model.weight.detach().numpy().view(np.uint32)
     expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
     found = rounded_weights(model)
@@ -82,26 +99,36 @@ class Bomb:
 @pytest.mark.parametrize("writer", ["pickle", "torch", "torch, old layout", "inside"])
 def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
     """A file that would run code when unpickled is refused, and the code is not run."""
-    file, target = tmp_path / "bomb.pt", tmp_path / "exploded"
+    file = tmp_path / "bomb.pt"
+    target = tmp_path / "exploded"
     bomb = Bomb(target)
     if writer == "pickle":
         file.write_bytes(pickle.dumps(bomb))
     elif writer == "inside":
-        torch.save({"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb}, file)
+        torch.save(
+            {"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb},
+            file,
+        )
     else:
         torch.save(bomb, file, _use_new_zipfile_serialization=writer == "torch")
     with pytest.raises(UnreadableFileError, match="more than tensors") as caught:
         load(file)
-    assert "weights_only" not in str(caught.value)  # torch's own words advise to load it unsafely
+    assert "weights_only" not in str(
+        caught.value
+    )  # torch's own words advise to load it unsafely
     assert not target.exists()
     pickle.loads(pickle.dumps(bomb))  # the bomb is a real one
     assert target.exists()
 
 
 def test_text_is_no_pickle(tmp_path: Path) -> None:
-    """Of any other file it is said that it is no checkpoint; of a folder, which file to name."""
+    """Of any other file it is said that it is no checkpoint; of a folder, which file to
+    name.
+    """
     (tmp_path / "notes.md").write_text("# hello\n")
-    with pytest.raises(UnreadableFileError, match=r"not a checkpoint(.|\n)*lagbench train"):
+    with pytest.raises(
+        UnreadableFileError, match=r"not a checkpoint(.|\n)*lagbench train"
+    ):
         load(tmp_path / "notes.md")
     with pytest.raises(UnreadableFileError) as caught:
         load(tmp_path)
@@ -171,7 +198,9 @@ def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
 def test_strange_words_and_tensors_are_refused(
     tmp_path: Path, change: tuple[Any, ...] | dict[str, Any]
 ) -> None:
-    """A stranger's words are what they should be, or nothing; weights are numbers that the file holds."""
+    """A stranger's words are what they should be, or nothing; weights are numbers that
+    the file holds.
+    """
     file = tmp_path / "strange.pt"
     save(file, example())
     content = torch.load(file, weights_only=True)
@@ -188,12 +217,18 @@ def test_strange_words_and_tensors_are_refused(
 
 
 def test_missing_cut_and_never_written(tmp_path: Path) -> None:
-    """A missing file, one that was cut short, and a pipe, which would be waited for, are unreadable."""
+    """A missing file, one that was cut short, and a pipe, which would be waited for,
+    are unreadable.
+    """
     os.mkfifo(tmp_path / "pipe.pt")
     save(tmp_path / "cut.pt", example())
     whole = (tmp_path / "cut.pt").read_bytes()
     (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
-    for name, words in (("none.pt", "No such file"), ("cut.pt", None), ("pipe.pt", None)):
+    for name, words in (
+        ("none.pt", "No such file"),
+        ("cut.pt", None),
+        ("pipe.pt", None),
+    ):
         with pytest.raises(UnreadableFileError, match=words) as caught:
             load(tmp_path / name)
         assert caught.value.where == str(tmp_path / name)
@@ -202,18 +237,33 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"weights": {"a": torch.tensor([float("nan")]), "calls": torch.tensor(0)}}, "not finite"),
-        ({"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}}, "do not fit the model"),
+        (
+            {"weights": {"a": torch.tensor([float("nan")]), "calls": torch.tensor(0)}},
+            "not finite",
+        ),
+        (
+            {"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}},
+            "do not fit the model",
+        ),
         ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
         ({"options": {"sart": 1}}, "sart"),
-        ({"baseline": "mlp", "options": {}, "facts": replace(FACTS, statistics={})}, "position_mean"),
         (
-            {"baseline": "gns", "options": {}, "facts": replace(FACTS, score_placement="edges")},
+            {"baseline": "mlp", "options": {}, "facts": replace(FACTS, statistics={})},
+            "position_mean",
+        ),
+        (
+            {
+                "baseline": "gns",
+                "options": {},
+                "facts": replace(FACTS, score_placement="edges"),
+            },
             "statistics|edges|acceleration",
         ),
     ],
 )
-def test_unfit_weights(changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unfit_weights(
+    changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Weights that are not finite or belong to another model are refused."""
     install(monkeypatch, drift=Drift)
     with pytest.raises(UnreadableFileError, match=message):
@@ -221,13 +271,17 @@ def test_unfit_weights(changes: dict[str, Any], message: str, monkeypatch: pytes
 
 
 def test_unknown_baseline() -> None:
-    """A checkpoint of a baseline that is not installed says so, and which file it is."""
+    """A checkpoint of a baseline that is not installed says so, and which file it
+    is.
+    """
     with pytest.raises(UsageError, match="no baseline 'drift'") as caught:
         restore(example(), where="a.pt")
     assert caught.value.where == "a.pt"
 
 
-def test_data_of_another_version(generated: GenerationResult, unmeasured: Registry) -> None:
+def test_data_of_another_version(
+    generated: GenerationResult, unmeasured: Registry
+) -> None:
     """The data at hand must have the hash of the data that the model was trained on."""
     root = generated.root
     for split, there, words in (
@@ -244,7 +298,10 @@ def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
     """100 MB of zeros in 100 kB: refused by its directory, before they are unpacked."""
     save(tmp_path / "a.pt", example())
     bomb = tmp_path / "bomb.pt"
-    with zipfile.ZipFile(tmp_path / "a.pt") as old, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as new:
+    with (
+        zipfile.ZipFile(tmp_path / "a.pt") as old,
+        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
         for member in old.infolist():
             new.writestr(member.filename, old.read(member))
         new.writestr("big", bytes(10**8))
@@ -259,7 +316,9 @@ def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
 
 
 def test_overlapping_members_are_refused(tmp_path: Path) -> None:
-    """A directory that names the same bytes many times promises more than the file holds."""
+    """A directory that names the same bytes many times promises more than the file
+    holds.
+    """
     with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
         archive.writestr("kernel", bytes(10**5))
         first = archive.infolist()[0]
@@ -272,7 +331,9 @@ def test_overlapping_members_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
-    """Any byte of any member: its checksum is another. Bytes between members are padding."""
+    """Any byte of any member: its checksum is another. Bytes between members are
+    padding.
+    """
     save(tmp_path / "a.pt", example())
     data = (tmp_path / "a.pt").read_bytes()
     with zipfile.ZipFile(tmp_path / "a.pt") as archive:
@@ -281,19 +342,30 @@ def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
                 continue
             name, extra = struct.unpack_from("<HH", data, member.header_offset + 26)
             flipped = bytearray(data)
-            flipped[member.header_offset + 30 + name + extra + member.file_size // 2] ^= 1
+            flipped[
+                member.header_offset + 30 + name + extra + member.file_size // 2
+            ] ^= 1
             (tmp_path / "b.pt").write_bytes(flipped)
             with pytest.raises(UnreadableFileError):
                 load(tmp_path / "b.pt")
 
 
-KINDS = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
+KINDS = [
+    f"{name}_{of}"
+    for name in ("position", "velocity", "acceleration")
+    for of in ("mean", "std")
+]
 WHOLE = replace(FACTS, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
 
 SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "neuralmpm": ({"cells": 8, "width": 4, "materials": [0, 1, 2, 3]}, {"width": 4 * 10**5}),
+    "neuralmpm": (
+        {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
+        {"width": 4 * 10**5},
+    ),
     "mlp": ({"widths": [4]}, {"widths": [10**7, 10**7]}),
-    **dict.fromkeys(("lstm", "lstm-mlp"), ({"latent": 4, "decoder": [4]}, {"latent": 10**7})),
+    **dict.fromkeys(
+        ("lstm", "lstm-mlp"), ({"latent": 4, "decoder": [4]}, {"latent": 10**7})
+    ),
     "var": ({"lags": 1}, {"lags": 10**9}),
     "var-stable": ({"rank": 2}, {}),
 }
@@ -311,7 +383,9 @@ def stored(baseline: str) -> Checkpoint:
 
 @pytest.mark.parametrize("baseline", names())
 def test_what_the_weights_fill_is_built(baseline: str) -> None:
-    """Every baseline comes back with the numbers of its weights; no random number is drawn for the check."""
+    """Every baseline comes back with the numbers of its weights; no random number is
+    drawn for the check.
+    """
     found = stored(baseline)
     torch.manual_seed(3)
     find(baseline).model.build(found.options, WHOLE)
@@ -325,7 +399,9 @@ def test_what_the_weights_fill_is_built(baseline: str) -> None:
 
 @pytest.mark.parametrize("baseline", names())
 def test_larger_models_are_refused(baseline: str) -> None:
-    """Options for 10^10 numbers and more are refused as those of an unreadable file, at once."""
+    """Options for 10^10 numbers and more are refused as those of an unreadable file, at
+    once.
+    """
     found = stored(baseline)
     facts = replace(WHOLE, particles=10**9) if baseline == "var-stable" else WHOLE
     options = {**found.options, **SIZES.get(baseline, GRAPHS)[1]}
@@ -334,7 +410,9 @@ def test_larger_models_are_refused(baseline: str) -> None:
 
 
 def test_small_numbers_and_shared_bytes_are_seen_through() -> None:
-    """Ten million layers of one number each are not built; names for the same bytes make no large file."""
+    """Ten million layers of one number each are not built; names for the same bytes
+    make no large file.
+    """
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*tensors"):
         restore(replace(stored("gns"), options={"latent": 1, "layers": 10**7}))
     found = stored("mlp")
@@ -345,15 +423,21 @@ def test_small_numbers_and_shared_bytes_are_seen_through() -> None:
 
 
 class Reading(Drift):
-    """Reads a number while it is built, which a tensor without numbers does not have."""
+    """Reads a number while it is built, which a tensor without numbers does not
+    have.
+    """
 
     def __init__(self, options: Any, facts: Facts) -> None:
         super().__init__(options, facts)
         self.half = float(torch.full((1,), 0.5))
 
 
-def test_a_baseline_that_reads_numbers_is_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stranger's baseline that cannot be measured is built as it is, in float32 from bfloat16."""
+def test_a_baseline_that_reads_numbers_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stranger's baseline that cannot be measured is built as it is, in float32 from
+    bfloat16.
+    """
     install(monkeypatch, reading=Reading)
     weights = {"a": torch.tensor([0.25]).bfloat16(), "calls": torch.tensor(0)}
     save(tmp_path / "a.pt", example(baseline="reading", options={}, weights=weights))
@@ -363,8 +447,12 @@ def test_a_baseline_that_reads_numbers_is_built(tmp_path: Path, monkeypatch: pyt
 
 
 def test_weights_of_the_board_can_be_run() -> None:
-    """Every file that stands beside an entry is one that today's models are built from."""
-    files = sorted((Path(__file__).parent.parent / "leaderboard" / "weights").rglob("*.pt"))
+    """Every file that stands beside an entry is one that today's models are built
+    from.
+    """
+    files = sorted(
+        (Path(__file__).parent.parent / "leaderboard" / "weights").rglob("*.pt")
+    )
     assert len(files) > 60
     for file in files:
         assert restore(load(file), where=str(file)).method

@@ -30,14 +30,25 @@ FLOATS = hnp.arrays(
     hnp.array_shapes(min_dims=1, max_dims=3, max_side=5),
     elements={"allow_nan": True, "allow_subnormal": True},
 )
-IDENTITY = {"split": "cavity", "size": "tiny", "major": 1, "scenario": 3, "subset": "test", "seed": "s"}
+IDENTITY = {
+    "split": "cavity",
+    "size": "tiny",
+    "major": 1,
+    "scenario": 3,
+    "subset": "test",
+    "seed": "s",
+}
 IDENTITY["parameters"] = {"dt": 0.002, "grid": 16, "name": "ä"}
 
 
-def digest(values: NDArray[Any], *, name: str = "position", dims: tuple[str, ...] | None = None) -> str:
+def digest(
+    values: NDArray[Any], *, name: str = "position", dims: tuple[str, ...] | None = None
+) -> str:
     """Return the hash of values given in one piece."""
     values = np.asarray(values)
-    hasher = VariableHasher(name, values.dtype, dims or tuple("abcdef"[: values.ndim]), values.shape)
+    hasher = VariableHasher(
+        name, values.dtype, dims or tuple("abcdef"[: values.ndim]), values.shape
+    )
     hasher.update(values)
     return hasher.hexdigest()
 
@@ -50,7 +61,9 @@ def test_hashes_of_variables_by_hand() -> None:
     header = b'{"dims":["frame"],"dtype":"float32","name":"x","shape":[2]}\n'
     data = bytes.fromhex("0000803f00000000")  # 1.0f, and 0.0f for -0.0f
     expected = hashlib.sha256(header + data).hexdigest()
-    assert digest(np.array([1.0, -0.0], np.float32), name="x", dims=("frame",)) == expected
+    assert (
+        digest(np.array([1.0, -0.0], np.float32), name="x", dims=("frame",)) == expected
+    )
     header = b'{"dims":["space"],"dtype":"string","name":"s","shape":[2]}\n'
     expected = hashlib.sha256(header + "x\0ä".encode()).hexdigest()
     for kind in (None, object, np.dtypes.StringDType()):
@@ -60,7 +73,9 @@ def test_hashes_of_variables_by_hand() -> None:
 def test_content_hash_by_hand() -> None:
     """The content hash is the SHA-256 of one JSON text."""
     values = np.array([1, 2], np.int32)
-    inner = hashlib.sha256(b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n' + values.tobytes())
+    inner = hashlib.sha256(
+        b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n' + values.tobytes()
+    )
     text = (
         '{"major":1,"parameters":{"dt":0.002,"grid":16,"name":"ä"},"scenario":3,"seed":"s","size":"tiny",'
         f'"split":"cavity","subset":"test","variables":{{"v":"{inner.hexdigest()}"}}}}'
@@ -69,38 +84,63 @@ def test_content_hash_by_hand() -> None:
     hasher.declare("v", values.dtype, ("a",), values.shape)
     hasher.update("v", values)
     assert hasher.hexdigest() == hashlib.sha256(text.encode()).hexdigest()
-    for key in ("split", "size", "major", "scenario", "subset", "seed"):  # another one is another scenario
-        assert ContentHasher({**IDENTITY, key: 7}).hexdigest() != ContentHasher(IDENTITY).hexdigest()
+    for key in (
+        "split",
+        "size",
+        "major",
+        "scenario",
+        "subset",
+        "seed",
+    ):  # another one is another scenario
+        assert (
+            ContentHasher({**IDENTITY, key: 7}).hexdigest()
+            != ContentHasher(IDENTITY).hexdigest()
+        )
 
 
 @given(FLOATS, st.data())
-def test_pieces_order_and_endianness_do_not_matter(values: NDArray[Any], data: st.DataObject) -> None:
+def test_pieces_order_and_endianness_do_not_matter(
+    values: NDArray[Any], data: st.DataObject
+) -> None:
     """Any cut into pieces, memory order and byte order gives the hash of the whole."""
     cut = data.draw(st.integers(0, values.shape[0]))
-    hasher = VariableHasher("position", values.dtype, tuple("abcdef"[: values.ndim]), values.shape)
+    hasher = VariableHasher(
+        "position", values.dtype, tuple("abcdef"[: values.ndim]), values.shape
+    )
     hasher.update(values[:cut])
-    hasher.update(np.asfortranarray(values[cut:]).astype(values.dtype.newbyteorder(">")))
+    hasher.update(
+        np.asfortranarray(values[cut:]).astype(values.dtype.newbyteorder(">"))
+    )
     assert hasher.hexdigest() == digest(values)
 
 
 @given(FLOATS, st.data())
-def test_any_change_of_a_value_changes_the_hash(values: NDArray[Any], data: st.DataObject) -> None:
+def test_any_change_of_a_value_changes_the_hash(
+    values: NDArray[Any], data: st.DataObject
+) -> None:
     """One flipped bit matters, except the sign of zero and what a NaN carries."""
     flat = values.reshape(-1).copy()
     where = data.draw(st.integers(0, flat.size - 1))
     bits = flat.view(f"<u{flat.itemsize}")
     before = flat[where].copy()
-    bits[where] ^= bits.dtype.type(1) << bits.dtype.type(data.draw(st.integers(0, 8 * flat.itemsize - 1)))
-    same = (before == 0 and flat[where] == 0) or (np.isnan(before) and np.isnan(flat[where]))
+    bits[where] ^= bits.dtype.type(1) << bits.dtype.type(
+        data.draw(st.integers(0, 8 * flat.itemsize - 1))
+    )
+    same = (before == 0 and flat[where] == 0) or (
+        np.isnan(before) and np.isnan(flat[where])
+    )
     assert (digest(flat.reshape(values.shape)) == digest(values)) == same
     # The smallest integer is a value like any other, not a zero.
-    whole, least = np.zeros((2, 3), np.int32), np.full((2, 3), -(2**31), np.int32)
+    whole = np.zeros((2, 3), np.int32)
+    least = np.full((2, 3), -(2**31), np.int32)
     assert len({digest(whole), digest(least), digest(whole + 1)}) == 3
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_every_nan_is_one(dtype: Any) -> None:
-    """NaN of either sign, quiet or signalling, with any payload, hashes as the canonical one."""
+    """NaN of either sign, quiet or signalling, with any payload, hashes as the
+    canonical one.
+    """
     width = np.dtype(dtype).itemsize * 8
     quiet = np.full(4, np.nan, dtype)
     odd = quiet.view(f"u{width // 8}").copy()
@@ -118,14 +158,23 @@ def test_name_type_dims_and_shape_matter(values: NDArray[Any]) -> None:
     with np.errstate(all="ignore"):
         wider = values.astype(np.float64)
     longer = values[None]
-    others = {digest(values, name="velocity"), digest(values, dims=tuple("zyxwvu"[: values.ndim]))}
+    others = {
+        digest(values, name="velocity"),
+        digest(values, dims=tuple("zyxwvu"[: values.ndim])),
+    }
     others |= {digest(wider), digest(longer, dims=(*"abcdef"[: values.ndim], "g"))}
     others |= {digest(values.reshape(-1).view(np.int32).reshape(values.shape))}
     assert base not in others
     assert len(others) == 5
 
 
-@given(st.lists(st.text(st.characters(codec="utf-8", exclude_characters="\0")), min_size=2, max_size=5))
+@given(
+    st.lists(
+        st.text(st.characters(codec="utf-8", exclude_characters="\0")),
+        min_size=2,
+        max_size=5,
+    )
+)
 def test_string_borders_matter(texts: list[str]) -> None:
     """Moving a letter from one string to the next changes the hash."""
     moved = [texts[0] + texts[1], "", *texts[2:]]
@@ -145,7 +194,9 @@ def test_string_borders_matter(texts: list[str]) -> None:
     ),
     st.data(),
 )
-def test_any_change_of_a_parameter_matters(parameters: dict[str, Any], data: st.DataObject) -> None:
+def test_any_change_of_a_parameter_matters(
+    parameters: dict[str, Any], data: st.DataObject
+) -> None:
     """Name and value of each parameter enter; their order does not."""
     hashed = ContentHasher({**IDENTITY, "parameters": parameters}).hexdigest()
     backwards = dict(reversed(parameters.items()))
@@ -154,7 +205,12 @@ def test_any_change_of_a_parameter_matters(parameters: dict[str, Any], data: st.
     renamed = {**parameters, name + "d": parameters[name]}
     del renamed[name]
     assert ContentHasher({**IDENTITY, "parameters": renamed}).hexdigest() != hashed
-    assert ContentHasher({**IDENTITY, "parameters": {**parameters, name: "other"}}).hexdigest() != hashed
+    assert (
+        ContentHasher(
+            {**IDENTITY, "parameters": {**parameters, name: "other"}}
+        ).hexdigest()
+        != hashed
+    )
 
 
 def test_variables_can_arrive_side_by_side() -> None:
@@ -164,7 +220,9 @@ def test_variables_can_arrive_side_by_side() -> None:
     for pieces in (position, position[None]):
         hasher = ContentHasher(IDENTITY)
         for name in ("velocity", "position"):
-            hasher.declare(name, np.float32, ("frame", "particle", "space"), position.shape)
+            hasher.declare(
+                name, np.float32, ("frame", "particle", "space"), position.shape
+            )
         for piece in pieces:
             hasher.update("position", piece)
             hasher.update("velocity", -piece)
@@ -188,22 +246,41 @@ def test_values_must_fit_what_was_declared() -> None:
         dtype_name(np.complex64)
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), "a\0b", None, {1, 2}, [float("nan")]])
+@pytest.mark.parametrize(
+    "bad", [float("nan"), float("inf"), "a\0b", None, {1, 2}, [float("nan")]]
+)
 def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
-    """Values that JSON cannot hold, or would hold ambiguously; those of NumPy become what JSON has."""
+    """Values that JSON cannot hold, or would hold ambiguously; those of NumPy become
+    what JSON has.
+    """
     with pytest.raises(DataError, match="cannot be hashed"):
         canonical_json({"a": bad})
-    given_values = [np.float32(0.5), np.array([3]), b"a", True, np.int8(-1), -0.0, [np.float64(2)]]
-    assert repr([plain(value) for value in given_values]) == repr([0.5, 3, "a", 1, -1, 0.0, [2.0]])
+    given_values = [
+        np.float32(0.5),
+        np.array([3]),
+        b"a",
+        True,
+        np.int8(-1),
+        -0.0,
+        [np.float64(2)],
+    ]
+    assert repr([plain(value) for value in given_values]) == repr(
+        [0.5, 3, "a", 1, -1, 0.0, [2.0]]
+    )
 
 
 def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
-    """Lines by id, then one JSON text; `extra` stays outside, a missing subset is an error."""
+    """Lines by id, then one JSON text; `extra` stays outside, a missing subset is an
+    error.
+    """
     (tmp_path / "f").write_bytes(b"abc")  # FIPS 180-2, appendix B.1
     known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert file_sha256(tmp_path / "f") == known
     lines = f"0002 {'a' * 64}\n0010 {'b' * 64}\n"
-    assert subset_hash({10: "b" * 64, 2: "a" * 64}) == hashlib.sha256(lines.encode()).hexdigest()
+    assert (
+        subset_hash({10: "b" * 64, 2: "a" * 64})
+        == hashlib.sha256(lines.encode()).hexdigest()
+    )
     subsets = {"valid": "1" * 64, "train": "0" * 64, "test": "2" * 64}
     text = (
         f'{{"major":1,"size":"tiny","split":"cavity","subsets":{{"test":"{"2" * 64}","train":"{"0" * 64}",'

@@ -29,7 +29,9 @@ Run = Callable[..., Result]
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult) -> Run:
-    """A function that runs lagbench on the generated data set with no recorded hashes."""
+    """A function that runs lagbench on the generated data set with no recorded
+    hashes.
+    """
     monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
     return run
 
@@ -43,7 +45,9 @@ def predictions(run: Run, tmp_path: Path) -> Path:
 
 
 def test_from_template_to_tables(run: Run, predictions: Path) -> None:
-    """A template validates, scores, and its tables name floors, undefined frames, flags and files."""
+    """A template validates, scores, and its tables name floors, undefined frames, flags
+    and files.
+    """
     assert run("validate", predictions).exit_code == 0
     result = run("score", predictions)
     assert result.exit_code == 0
@@ -56,11 +60,15 @@ def test_from_template_to_tables(run: Run, predictions: Path) -> None:
         "scores.nc",
     )
     assert [word for word in words if word not in result.stdout] == []
-    assert all("scenarios" in line for line in result.stderr.splitlines())  # progress, on a slow machine
+    assert all(
+        "scenarios" in line for line in result.stderr.splitlines()
+    )  # progress, on a slow machine
 
 
 def test_json_is_the_file(run: Run, predictions: Path) -> None:
-    """Score --json prints what scores.json holds; --output moves both files; --quiet prints nothing."""
+    """Score --json prints what scores.json holds; --output moves both files; --quiet
+    prints nothing.
+    """
     folder = predictions.parent / "scores"
     result = run("score", predictions, "--json", "--output", folder)
     assert json.loads(result.stdout) == json.loads((folder / "scores.json").read_text())
@@ -69,8 +77,12 @@ def test_json_is_the_file(run: Run, predictions: Path) -> None:
     assert run("score", predictions, "--quiet").stdout == ""
 
 
-def test_a_template_keeps_what_is_there(run: Run, predictions: Path, tmp_path: Path) -> None:
-    """Predictions are not replaced unless one says so; the only size that is here is the default."""
+def test_a_template_keeps_what_is_there(
+    run: Run, predictions: Path, tmp_path: Path
+) -> None:
+    """Predictions are not replaced unless one says so; the only size that is here is
+    the default.
+    """
     predictions.write_bytes(b"the work of a week")
     words = ("template", SPLIT, "-o", predictions)
     assert run(*words).exit_code == 2
@@ -78,7 +90,9 @@ def test_a_template_keeps_what_is_there(run: Run, predictions: Path, tmp_path: P
     assert run(*words, "--overwrite").exit_code == 0
     assert run("validate", predictions).exit_code == 0
     assert run("template", SPLIT, "-o", tmp_path, "--overwrite").exit_code == 2
-    nothing = run("template", SPLIT, "-o", tmp_path / "u.nc", "--root", tmp_path / "empty")
+    nothing = run(
+        "template", SPLIT, "-o", tmp_path / "u.nc", "--root", tmp_path / "empty"
+    )
     assert nothing.exit_code == 2
     assert f"lagbench generate --split {SPLIT} --size" in nothing.stderr
 
@@ -102,7 +116,11 @@ def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> 
 def too_wide(text: str) -> list[str]:
     """Return lines wider than 80 columns, colours left out, but paths and remarks."""
     lines = re.sub(r"\x1b\[[0-9;]*m", "", text).split("\n")
-    return [line for line in lines if len(line.rstrip()) > 80 and not re.search(r":|\w/\w+/", line)]
+    return [
+        line
+        for line in lines
+        if len(line.rstrip()) > 80 and not re.search(r":|\w/\w+/", line)
+    ]
 
 
 @pytest.fixture
@@ -117,7 +135,8 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
     """No line of any table is wider, with every metric and every floor too."""
     run("score", predictions)
-    board, here = Path(lagbench.__file__).parents[1] / "leaderboard", f"{SPLIT} --size {SIZE}"
+    board = Path(lagbench.__file__).parents[1] / "leaderboard"
+    here = f"{SPLIT} --size {SIZE}"
     for line in (
         f"score {predictions}",
         f"score {predictions} --all --all-floors",
@@ -137,16 +156,24 @@ def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
 def commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
     """Yield the words of every command below a group."""
     for name, command in group.commands.items():
-        yield from commands(command, *before, name) if hasattr(command, "commands") else [(*before, name)]
+        yield from (
+            commands(command, *before, name)
+            if hasattr(command, "commands")
+            else [(*before, name)]
+        )
 
 
 @pytest.mark.usefixtures("terminal")
-@pytest.mark.parametrize("words", [(), ("leaderboard",), *commands(get_command(app))], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [(), ("leaderboard",), *commands(get_command(app))], ids=" ".join
+)
 def test_help_fits_eighty_columns(run: Run, words: tuple[str, ...]) -> None:
     """The help of each command, and of those above, is told in 80 columns."""
     result = run(*words, "--help")
     assert result.exit_code == 0
-    assert [line for line in result.stdout.split("\n") if too_wide(line.replace(":", "."))] == []
+    assert [
+        line for line in result.stdout.split("\n") if too_wide(line.replace(":", "."))
+    ] == []
 
 
 def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) -> None:
@@ -155,21 +182,38 @@ def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) ->
     result = run("compare", predictions.parent, "constant-velocity")
     assert result.exit_code == 0
     assert "no significance is claimed under 6" in result.stdout
-    said = json.loads(run("compare", predictions.parent, "constant-velocity", "--json").stdout)
+    said = json.loads(
+        run("compare", predictions.parent, "constant-velocity", "--json").stdout
+    )
     assert said["metrics"]["vorticity_rmse"]["p"] is None
-    assert run("compare", predictions.parent, "constant-velocity", "--metric", "mse").exit_code == 2
+    assert (
+        run(
+            "compare", predictions.parent, "constant-velocity", "--metric", "mse"
+        ).exit_code
+        == 2
+    )
 
 
-def test_unreadable_files(run: Run, predictions: Path, generated: GenerationResult) -> None:
-    """Score and validate agree on the exit code and say what to do; one finding tells files of ours."""
+def test_unreadable_files(
+    run: Run, predictions: Path, generated: GenerationResult
+) -> None:
+    """Score and validate agree on the exit code and say what to do; one finding tells
+    files of ours.
+    """
     run("score", predictions)
-    for path in (predictions.with_name("scores.nc"), next(generated.folder.glob("test/*.nc"))):
-        assert [finding.check for finding in submission.validate(path).findings] == ["readable"]
+    for path in (
+        predictions.with_name("scores.nc"),
+        next(generated.folder.glob("test/*.nc")),
+    ):
+        assert [finding.check for finding in submission.validate(path).findings] == [
+            "readable"
+        ]
         assert run("validate", path).exit_code == 3
     whole = predictions.read_bytes()
     for content in (b"text", whole[:20_000], None):
         predictions.unlink() if content is None else predictions.write_bytes(content)
-        scored, validated = run("score", predictions), run("validate", predictions)
+        scored = run("score", predictions)
+        validated = run("validate", predictions)
         assert scored.exit_code == validated.exit_code == 3
         assert "fix:" in scored.stderr
         assert "Traceback" not in scored.stderr + scored.stdout
@@ -177,7 +221,9 @@ def test_unreadable_files(run: Run, predictions: Path, generated: GenerationResu
 
 @pytest.mark.parametrize("method", ["[/b]", "[red]x[/red]", "a [link=http://b]"])
 def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
-    """A method's name with square brackets is printed as it is, in titles and heads of columns."""
+    """A method's name with square brackets is printed as it is, in titles and heads of
+    columns.
+    """
     with h5py.File(predictions, "r+") as file:
         file.attrs["method"] = method
     scored = run("score", predictions)
@@ -217,8 +263,12 @@ METRICS = (
 """
 
 
-def test_where_a_metric_of_a_package_fails(run: Run, predictions: Path, package: Callable[..., Path]) -> None:
-    """What a user's own metric raises is told with its line, name, frame and scenario."""
+def test_where_a_metric_of_a_package_fails(
+    run: Run, predictions: Path, package: Callable[..., Path]
+) -> None:
+    """What a user's own metric raises is told with its line, name, frame and
+    scenario.
+    """
     module = package("metrics", "failing_metric:METRICS", FAILING)
     with h5py.File(predictions) as file:
         first = min(file["scenario"][:])
@@ -229,12 +279,22 @@ def test_where_a_metric_of_a_package_fails(run: Run, predictions: Path, package:
     assert not predictions.with_name("scores.json").exists()
 
 
-def test_several_files_keep_their_scores(run: Run, two: list[Path], tmp_path: Path) -> None:
-    """Scores go beside each file, the page into the report folder; namesakes are compared as (1) and (2)."""
-    result, compared = run("score", *two, "--report", tmp_path / "rep"), run("compare", *two)
-    assert (result.exit_code, compared.exit_code) == (0, 0), result.stderr + compared.stderr
+def test_several_files_keep_their_scores(
+    run: Run, two: list[Path], tmp_path: Path
+) -> None:
+    """Scores go beside each file, the page into the report folder; namesakes are
+    compared as (1) and (2).
+    """
+    result = run("score", *two, "--report", tmp_path / "rep")
+    compared = run("compare", *two)
+    assert (result.exit_code, compared.exit_code) == (0, 0), (
+        result.stderr + compared.stderr
+    )
     for number, path in enumerate(two, start=1):
-        assert {held.name for held in (path.parent / "p").iterdir()} == {"scores.json", "scores.nc"}
+        assert {held.name for held in (path.parent / "p").iterdir()} == {
+            "scores.json",
+            "scores.nc",
+        }
         assert f"({number}): {path}" in compared.stdout
     assert [path.name for path in (tmp_path / "rep").iterdir()] == ["index.html"]
 
@@ -242,18 +302,25 @@ def test_several_files_keep_their_scores(run: Run, two: list[Path], tmp_path: Pa
 def test_a_reader_that_leaves_early_leaves_the_report(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``score --report R | head`` closes the pipe after ten lines: by then the report is there."""
+    """``score --report R | head`` closes the pipe after ten lines: by then the report
+    is there.
+    """
 
     def gone(*_: object, **__: object) -> None:
         raise BrokenPipeError
 
     monkeypatch.setattr(typer, "echo", gone)
-    assert run("score", predictions, "--report", predictions.parent / "rep").exit_code == 141
+    assert (
+        run("score", predictions, "--report", predictions.parent / "rep").exit_code
+        == 141
+    )
     assert (predictions.parent / "rep" / "index.html").is_file()
 
 
 def test_scores_never_share_a_folder(run: Run, two: list[Path], tmp_path: Path) -> None:
-    """Two files whose scores would overwrite each other are a usage error before any is scored."""
+    """Two files whose scores would overwrite each other are a usage error before any is
+    scored.
+    """
     for words in ((*two, "--output", tmp_path / "rep"), (two[0], two[0])):
         result = run("score", *words, "--report", tmp_path / "rep")
         assert result.exit_code == 2
@@ -265,12 +332,16 @@ def test_scores_never_share_a_folder(run: Run, two: list[Path], tmp_path: Path) 
 def test_several_files_are_checked_before_any_is_scored(
     run: Run, two: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another size, or a broken last file, ends the command before the first is scored."""
+    """Another size, or a broken last file, ends the command before the first is
+    scored.
+    """
     real = validation.validate
 
     def other(path: Path, **options: Any) -> submission.ValidationResult:
         found = real(path, **options)
-        return dataclasses.replace(found, size="mini") if Path(path) == two[1] else found
+        return (
+            dataclasses.replace(found, size="mini") if Path(path) == two[1] else found
+        )
 
     with monkeypatch.context() as patch:
         patch.setattr(validation, "validate", other)
@@ -287,7 +358,9 @@ def test_several_files_are_checked_before_any_is_scored(
 def test_an_unusable_folder_is_told_before_the_work(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    """A file in the place of the folder ends the command before any scenario is measured."""
+    """A file in the place of the folder ends the command before any scenario is
+    measured.
+    """
     monkeypatch.setattr(score, "run_all", None)
     taken = predictions.parent / "taken"
     taken.write_text("")
@@ -297,8 +370,12 @@ def test_an_unusable_folder_is_told_before_the_work(
 
 
 @pytest.mark.parametrize("method", ["\x1b[31mred", "bell\a", "x" * 201, " "])
-def test_foreign_text_does_not_reach_the_terminal(run: Run, predictions: Path, method: str) -> None:
-    """Control characters or endless text in a scores.json make it unreadable; none is printed."""
+def test_foreign_text_does_not_reach_the_terminal(
+    run: Run, predictions: Path, method: str
+) -> None:
+    """Control characters or endless text in a scores.json make it unreadable; none is
+    printed.
+    """
     run("score", predictions, "--quiet")
     path = predictions.parent / "scores.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"method": method}))

@@ -1,4 +1,6 @@
-"""Every command that reads a file of the user's refuses one that cannot be read: an error, an exit code."""
+"""Every command that reads a file of the user's refuses one that cannot be read: an
+error, an exit code.
+"""
 
 from __future__ import annotations
 
@@ -58,15 +60,80 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "plot": ("plot", "{}.nc"),
     "animate": ("animate", "{}.nc", "-o", "film.gif"),
     "predict": ("predict", "{}.pt", "-o", "new.nc"),
-    "train recipe": ("train", "curl-noise", "--size", "tiny", "--baseline", "mlp", "--recipe", "./{}.yaml"),
-    "submit": ("submit", "{}.nc", "--method", "x", "--author", "y", "--command", "z", "--new-board"),
+    "train recipe": (
+        "train",
+        "curl-noise",
+        "--size",
+        "tiny",
+        "--baseline",
+        "mlp",
+        "--recipe",
+        "./{}.yaml",
+    ),
+    "submit": (
+        "submit",
+        "{}.nc",
+        "--method",
+        "x",
+        "--author",
+        "y",
+        "--command",
+        "z",
+        "--new-board",
+    ),
     "submit meta": ("submit", "predictions.nc", "--from", "{}.yaml"),
-    "adopt npy": ("adopt", "{}.npy", "good.npy", "-o", "own", "--radius", "0.1", "--frame-interval", "0.1"),
-    "adopt npz": ("adopt", "{}.npz", "good.npy", "-o", "own", "--radius", "0.1", "--frame-interval", "0.1"),
-    "adopt nc": ("adopt", "{}.nc", "good.npy", "-o", "own", "--radius", "0.1", "--frame-interval", "0.1"),
+    "adopt npy": (
+        "adopt",
+        "{}.npy",
+        "good.npy",
+        "-o",
+        "own",
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        "0.1",
+    ),
+    "adopt npz": (
+        "adopt",
+        "{}.npz",
+        "good.npy",
+        "-o",
+        "own",
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        "0.1",
+    ),
+    "adopt nc": (
+        "adopt",
+        "{}.nc",
+        "good.npy",
+        "-o",
+        "own",
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        "0.1",
+    ),
     "adopt describe": ("adopt", "good.npy", "-o", "own", "--describe", "{}.yaml"),
-    "import gns": ("import", "gns", "--format", "gns-npz", "--allow-pickle", "-o", "own"),
-    "import gns metadata": ("import", "gns-meta", "--format", "gns-npz", "--allow-pickle", "-o", "own"),
+    "import gns": (
+        "import",
+        "gns",
+        "--format",
+        "gns-npz",
+        "--allow-pickle",
+        "-o",
+        "own",
+    ),
+    "import gns metadata": (
+        "import",
+        "gns-meta",
+        "--format",
+        "gns-npz",
+        "--allow-pickle",
+        "-o",
+        "own",
+    ),
     "import h5": ("import", "h5", "--format", "lagrangebench-h5", "-o", "own"),
     "check predictions": ("leaderboard", "check", "--predictions", "{}.nc"),
     "verify": ("verify", "local/"),
@@ -100,13 +167,19 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 NOT_RIGHT = 1
-"""Exit code of a file that can be read but is not right, and of a check that names what it cannot read."""
+"""Exit code of a file that can be read but is not right, and of a check that names what
+it cannot read.
+"""
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("command", COMMANDS)
-def test_an_unreadable_file_is_one_error(command: str, fault: str, run: Run, folder: Path) -> None:
-    """The documented exit code, one message of few lines that names the file, and nothing is written."""
+def test_an_unreadable_file_is_one_error(
+    command: str, fault: str, run: Run, folder: Path
+) -> None:
+    """The documented exit code, one message of few lines that names the file, and
+    nothing is written.
+    """
     words = [word.format("bad") for word in COMMANDS[command]]
     named = [word for word in words if word.startswith(("bad.", "./bad."))]
     place = folder / PLACES.get(command, named[0] if named else "")

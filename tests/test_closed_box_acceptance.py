@@ -1,11 +1,19 @@
-"""Acceptance of the closed-box solver (design 4.3): Ghia's cavity, lid off, curl noise."""
+"""Acceptance of the closed-box solver (design 4.3): Ghia's cavity, lid off, curl
+noise.
+"""
 
 from __future__ import annotations
 
 import pytest
 from scenario_draws import of_this_turn
 
-from lagbench.generators.acceptance.experiment import CHECK_EVERY, Case, Result, plan, run
+from lagbench.generators.acceptance.experiment import (
+    CHECK_EVERY,
+    Case,
+    Result,
+    plan,
+    run,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -24,10 +32,16 @@ def _assert_sound(result: Result) -> None:
 
 @pytest.mark.parametrize(
     ("reynolds", "substeps", "u_bound", "v_bound"),
-    of_this_turn([(100.0, 40_000, 0.010, 0.015), (400.0, 100_000, 0.020, 0.020)], turns=2),
+    of_this_turn(
+        [(100.0, 40_000, 0.010, 0.015), (400.0, 100_000, 0.020, 0.020)], turns=2
+    ),
 )
-def test_cavity_agrees_with_ghia(reynolds: float, substeps: int, u_bound: float, v_bound: float) -> None:
-    """RMSE of u and v on the centre lines against Ghia, Ghia & Shin 1982, on 40 x 40 cells."""
+def test_cavity_agrees_with_ghia(
+    reynolds: float, substeps: int, u_bound: float, v_bound: float
+) -> None:
+    """RMSE of u and v on the centre lines against Ghia, Ghia & Shin 1982, on 40 x 40
+    cells.
+    """
     result = run(plan(Case.CAVITY, reynolds=reynolds, substeps=substeps))
     _assert_sound(result)
     deviations = result.deviations()
@@ -39,14 +53,18 @@ def test_cavity_agrees_with_ghia(reynolds: float, substeps: int, u_bound: float,
 
 def test_energy_falls_when_the_lid_stops() -> None:
     """Walls at rest do no work: kinetic energy falls from every frame to the next."""
-    result = run(plan(Case.CAVITY, reynolds=100.0, substeps=20_000, lid_off_after=10_000))
+    result = run(
+        plan(Case.CAVITY, reynolds=100.0, substeps=20_000, lid_off_after=10_000)
+    )
     _assert_sound(result)
     assert result.largest_rise_after_lid_off is not None
     assert result.largest_rise_after_lid_off < 0.0
 
 
 def test_curl_noise_keeps_its_energy() -> None:
-    """At frequency 4 at least 65 % of the energy is left after 600 frames, nearly divergence-free."""
+    """At frequency 4 at least 65 % of the energy is left after 600 frames, nearly
+    divergence-free.
+    """
     result = run(plan(Case.CURL_NOISE, frequency=4, substeps=30_000))
     _assert_sound(result)
     assert len(result.displacement_energy) == 600

@@ -1,5 +1,7 @@
 # mypy: disallow-untyped-decorators=False
-"""Constitutive models against SciPy's decompositions, finite differences and closed forms."""
+"""Constitutive models against SciPy's decompositions, finite differences and closed
+forms.
+"""
 
 import math
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -21,7 +23,8 @@ else:
 
 COUNT = 4096
 MU, LAMBDA = constitutive.lame(30.0, 0.3)
-LOW, HIGH = 1.0 - 2.5e-2, 1.0 + 4.5e-3
+LOW = 1.0 - 2.5e-2
+HIGH = 1.0 + 4.5e-3
 
 
 @pytest.fixture(autouse=True)
@@ -39,20 +42,26 @@ def evaluate_scalars(z: Array, exponential: Array, hardening: Array) -> Nothing:
 
 
 @ti.kernel
-def evaluate(f: Array, turn: Array, stress: Array, elastic: Array, ratio: Array) -> Nothing:
+def evaluate(
+    f: Array, turn: Array, stress: Array, elastic: Array, ratio: Array
+) -> Nothing:
     """Evaluate rotation, corotated stress and plastic return for every gradient."""
     for i in range(f.shape[0]):
         m = ti.Matrix([[f[i, 0, 0], f[i, 0, 1]], [f[i, 1, 0], f[i, 1, 1]]])
-        rotation, tau = constitutive.rotation(m), constitutive.corotated_stress(m, MU, LAMBDA)
+        rotation = constitutive.rotation(m)
+        tau = constitutive.corotated_stress(m, MU, LAMBDA)
         kept, factor = constitutive.plastic_return(m, LOW, HIGH)
         ratio[i] = factor
         for a in ti.static(range(2)):
             turn[i, a] = rotation[a]
             for b in ti.static(range(2)):
-                stress[i, a, b], elastic[i, a, b] = tau[a, b], kept[a, b]
+                stress[i, a, b] = tau[a, b]
+                elastic[i, a, b] = kept[a, b]
 
 
-def scalars(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def scalars(
+    values: NDArray[np.float32],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return exponential and hardening of numbers."""
     found = np.empty_like(values), np.empty_like(values)
     evaluate_scalars(values, *found)
@@ -60,26 +69,37 @@ def scalars(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
 
 
 def models(gradients: Any) -> tuple[NDArray[np.float32], ...]:
-    """Return (cosine, sine), corotated stress, elastic part and volume ratio of gradients [n, 2, 2]."""
+    """Return (cosine, sine), corotated stress, elastic part and volume ratio of
+    gradients [n, 2, 2].
+    """
     f = np.ascontiguousarray(gradients, np.float32)
-    turn, stress, elastic = np.empty(f.shape[:2], np.float32), np.empty_like(f), np.empty_like(f)
+    turn = np.empty(f.shape[:2], np.float32)
+    stress = np.empty_like(f)
+    elastic = np.empty_like(f)
     ratio = np.empty(len(f), np.float32)
     evaluate(f, turn, stress, elastic, ratio)
     return turn, stress, elastic, ratio
 
 
 def deformations(spread: float) -> NDArray[np.float32]:
-    """Draw gradients near the identity, then turn each by a random angle, shape [COUNT, 2, 2]."""
+    """Draw gradients near the identity, then turn each by a random angle, shape [COUNT,
+    2, 2].
+    """
     rng = np.random.default_rng(5)
     near = np.eye(2) + spread * (2.0 * rng.random((COUNT, 2, 2)) - 1.0)
     angle = 2.0 * np.pi * rng.random(COUNT)
-    turn = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
+    turn = np.stack(
+        [np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1
+    ).reshape(-1, 2, 2)
     return (turn @ near).astype(np.float32)
 
 
 def energy(f: NDArray[np.float64]) -> float:
     """Fixed corotated energy mu |F - R|^2 + lambda/2 (J - 1)^2, R from SciPy."""
-    return float(MU * ((f - polar(f)[0]) ** 2).sum() + 0.5 * LAMBDA * (np.linalg.det(f) - 1.0) ** 2)
+    return float(
+        MU * ((f - polar(f)[0]) ** 2).sum()
+        + 0.5 * LAMBDA * (np.linalg.det(f) - 1.0) ** 2
+    )
 
 
 def test_exponential_holds_its_stated_error() -> None:
@@ -89,7 +109,9 @@ def test_exponential_holds_its_stated_error() -> None:
 
 
 def test_hardening_is_capped_and_monotone() -> None:
-    """Compacted snow is never stiffer than the cap, stretched snow never softer than the floor."""
+    """Compacted snow is never stiffer than the cap, stretched snow never softer than
+    the floor.
+    """
     jp = np.linspace(0.3, 4.0, 10_001, dtype=np.float32)
     _, out = scalars(jp)
     assert out.max() == np.float32(5.0)
@@ -105,13 +127,17 @@ def test_rotation_is_the_polar_factor() -> None:
     expected = np.array([polar(m.astype(np.float64))[0][:, 0] for m in f])
     np.testing.assert_allclose(models(f)[0], expected, atol=2e-6)
     # A gradient without a direction (all zero, or a pure reflection) gives R = I.
-    assert models([np.zeros((2, 2)), np.diag([1.0, -1.0])])[0].tolist() == [[1.0, 0.0], [1.0, 0.0]]
+    assert models([np.zeros((2, 2)), np.diag([1.0, -1.0])])[0].tolist() == [
+        [1.0, 0.0],
+        [1.0, 0.0],
+    ]
 
 
 def test_corotated_stress_is_the_derivative_of_its_energy() -> None:
     """Tau = (d psi / dF) F^T, with psi differentiated by central differences."""
     f = deformations(0.3)[:64]
-    stress, step = models(f)[1], 1e-6
+    stress = models(f)[1]
+    step = 1e-6
     for m, tau in zip(f.astype(np.float64), stress, strict=True):
         gradient = np.empty((2, 2))
         for entry in np.ndindex(2, 2):
@@ -134,7 +160,9 @@ def test_small_strain_is_hookes_law() -> None:
     """For F = I + eps e the stress is 2 mu e + lambda tr(e) I to first order."""
     strain = np.array([[2.0, 0.5], [0.5, -1.0]]) * 1e-3
     hooke = 2.0 * MU * strain + LAMBDA * np.trace(strain) * np.eye(2)
-    np.testing.assert_allclose(models([np.eye(2) + strain])[1][0], hooke, rtol=5e-3, atol=2e-4)
+    np.testing.assert_allclose(
+        models([np.eye(2) + strain])[1][0], hooke, rtol=5e-3, atol=2e-4
+    )
 
 
 def test_plastic_return_clamps_numpys_singular_values() -> None:
@@ -159,15 +187,22 @@ def test_plastic_return_leaves_elastic_states_alone() -> None:
 
 def test_inverted_snow_stays_finite() -> None:
     """Even a collapsed or inverted gradient gives a positive, finite volume ratio."""
-    *_, elastic, ratio = models([np.zeros((2, 2)), -np.eye(2), np.diag([1.0, -1.0]), np.eye(2)[::-1]])
+    *_, elastic, ratio = models(
+        [np.zeros((2, 2)), -np.eye(2), np.diag([1.0, -1.0]), np.eye(2)[::-1]]
+    )
     assert np.isfinite(elastic).all()
     assert (ratio > 0.0).all()
     assert np.isfinite(ratio).all()
 
 
 def test_lame_constants() -> None:
-    """By hand; lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave modulus."""
-    assert constitutive.lame(40.0, 0.25) == (16.0, 16.0)  # 40 / 2.5; 40 * 0.25 / (1.25 * 0.5)
+    """By hand; lambda + 2 mu equals E (1 - nu) / ((1 + nu)(1 - 2 nu)), the P-wave
+    modulus.
+    """
+    assert constitutive.lame(40.0, 0.25) == (
+        16.0,
+        16.0,
+    )  # 40 / 2.5; 40 * 0.25 / (1.25 * 0.5)
     assert constitutive.lame(30.0, 0.0) == (15.0, 0.0)
     mu, la = constitutive.lame(100.0, 0.3)
     assert math.isclose(la + 2.0 * mu, 100.0 * 0.7 / (1.3 * 0.4))

@@ -27,24 +27,34 @@ FLOORS = [floor.name for floor in floors_of(load().size(SPLIT, SIZE))]
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """A function that runs lagbench in an empty folder, with our splits and no recorded hashes."""
+    """A function that runs lagbench in an empty folder, with our splits and no recorded
+    hashes.
+    """
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path / "empty")
     return run
 
 
 @pytest.fixture
-def only_one(run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path) -> Registry:
-    """A registry of two splits, of which one has a size tiny; the demo's model, quickly trained, is its."""
+def only_one(
+    run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path
+) -> Registry:
+    """A registry of two splits, of which one has a size tiny; the demo's model, quickly
+    trained, is its.
+    """
     file = read_yaml(unmeasured_path)
     small = file["splits"][SPLIT]
     large = {**small, "sizes": {"full": small["sizes"]["full"]}}
     path = tmp_path / "datasets.yaml"
-    path.write_text(json.dumps({**file, "splits": {"large": large, SPLIT: small}}))  # JSON is YAML
+    path.write_text(
+        json.dumps({**file, "splits": {"large": large, SPLIT: small}})
+    )  # JSON is YAML
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.width=4"))
-    timed = SolverBench(split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5)
+    timed = SolverBench(
+        split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5
+    )
     monkeypatch.setattr("lagbench.cli.machine.bench_apart", lambda *_: timed)
     return load(path)
 
@@ -57,12 +67,19 @@ def made_in(root: Path, run: Run) -> Any:
 
 
 def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
-    run: Run, only_one: Registry, copied: Callable[[], Path], monkeypatch: pytest.MonkeyPatch
+    run: Run,
+    only_one: Registry,
+    copied: Callable[[], Path],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It says how to install it; no leaderboard, null in JSON; a split without a tiny size is left out."""
+    """It says how to install it; no leaderboard, null in JSON; a split without a tiny
+    size is left out.
+    """
 
     def no_torch(name: str, *, extra: str) -> None:
-        raise UsageError(f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'")
+        raise UsageError(
+            f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'"
+        )
 
     def no_solver(*_: str) -> SolverBench:
         raise WorkFailedError("the solver could not be timed")
@@ -91,8 +108,12 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
 
 @pytest.mark.usefixtures("only_one")
 @pytest.mark.slow
-def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[[], Path]) -> None:
-    """Model and floors are on its page, nothing in the current folder; a second run gives the same entry."""
+def test_the_demo_ends_with_a_leaderboard_of_its_own(
+    run: Run, copied: Callable[[], Path]
+) -> None:
+    """Model and floors are on its page, nothing in the current folder; a second run
+    gives the same entry.
+    """
     root = copied()
     first = made_in(root, run)["model"]
     result = run("demo", "--root", root)
@@ -101,12 +122,17 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(run: Run, copied: Callable[
     assert f"leaderboard page: {page}" in result.stdout.splitlines()
     assert all(name in page.read_text() for name in (*FLOORS, "NeuralMPM, 2 steps"))
     assert list(Path.cwd().iterdir()) == []
-    entry = yaml.safe_load((root / f"leaderboard/submissions/{SPLIT}/{SIZE}/neuralmpm.yaml").read_text())
+    entry = yaml.safe_load(
+        (root / f"leaderboard/submissions/{SPLIT}/{SIZE}/neuralmpm.yaml").read_text()
+    )
     assert entry["cost"]["solver_seconds_per_frame"] == 0.5
     checked = run("leaderboard", "check", "--board", root / "leaderboard", "--page")
     assert checked.exit_code == 0, checked.output
     second = made_in(root, run)["model"]
-    assert second["training"] == {**first["training"], "first_step": first["training"]["step"]}
+    assert second["training"] == {
+        **first["training"],
+        "first_step": first["training"]["step"],
+    }
     assert second["card"]["predictions_sha256"] == first["card"]["predictions_sha256"]
     assert second["card"]["rows"] == first["card"]["rows"]
     assert (second["page"]["rows"], second["page"]["tabs"]) == (1, 1)
@@ -130,8 +156,12 @@ def test_what_another_version_left_is_trained_anew(
     assert torch.load(again.weights, weights_only=True)
 
 
-def test_anothers_leaderboard_is_refused_before_the_work(run: Run, tmp_path: Path) -> None:
-    """A folder with entries of another size is left alone: exit code 2, and nothing generated."""
+def test_anothers_leaderboard_is_refused_before_the_work(
+    run: Run, tmp_path: Path
+) -> None:
+    """A folder with entries of another size is left alone: exit code 2, and nothing
+    generated.
+    """
     entry = tmp_path / "leaderboard" / "submissions" / "cavity" / "mini" / "mine.yaml"
     entry.parent.mkdir(parents=True)
     entry.touch()
@@ -146,10 +176,17 @@ def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
     """Four verified data sets, and a model that beats what costs no learning."""
     made = made_in(tmp_path / "demo", run)
     assert list(made["splits"]) == ["cavity", "curl-noise", "fluid", "multimaterial"]
-    assert [one["verification"]["problems"] for one in made["splits"].values()] == [[], [], [], []]
+    assert [one["verification"]["problems"] for one in made["splits"].values()] == [
+        [],
+        [],
+        [],
+        [],
+    ]
     model = made["model"]
     assert model["training"]["split"] == "cavity"
     assert model["solver"]["seconds_per_frame"] > 0
-    assert model["card"]["skill"]["value"] > 0.2  # better than anything that costs no learning
+    assert (
+        model["card"]["skill"]["value"] > 0.2
+    )  # better than anything that costs no learning
     assert (model["page"]["rows"], model["page"]["tabs"]) == (1, 1)
     assert Path(model["page"]["page"]).stat().st_size == model["page"]["bytes"]

@@ -1,4 +1,6 @@
-"""Draws: seeds, distributions and bits against independent routes and published laws."""
+"""Draws: seeds, distributions and bits against independent routes and published
+laws.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ def pcg64(state: int, increment: int, count: int) -> list[float]:
     values = []
     for _ in range(count):
         state = (state * 0x2360ED051FC65DA44385DF649FCCF645 + increment) % 2**128
-        word, turn = (state >> 64) ^ (state % 2**64), state >> 122
+        word = (state >> 64) ^ (state % 2**64)
+        turn = state >> 122
         turned = ((word >> turn) | (word << (64 - turn))) % 2**64
         values.append((turned >> 11) * 2.0**-53)
     return values
@@ -54,12 +57,17 @@ def test_generator_is_pcg64_as_published() -> None:
 
 
 def test_seed_text_rebuilds_the_stream() -> None:
-    """A reader gets the generator back from a file's seed: 16 hex digits of SHA-256, MAJOR and scenario."""
+    """A reader gets the generator back from a file's seed: 16 hex digits of SHA-256,
+    MAJOR and scenario.
+    """
     digest = hashlib.sha256(b"curl-noise/mini").hexdigest()
     assert draws.entropy("curl-noise", "mini", 2, 11) == (int(digest[:16], 16), 2, 11)
     words = [int(word) for word in draws.seed_text("fluid", "tiny", 1, 3).split(", ")]
     again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
-    assert again.random(5).tolist() == draws.generator("fluid", "tiny", 1, 3).random(5).tolist()
+    assert (
+        again.random(5).tolist()
+        == draws.generator("fluid", "tiny", 1, 3).random(5).tolist()
+    )
 
 
 def test_every_name_changes_the_stream() -> None:
@@ -71,7 +79,9 @@ def test_every_name_changes_the_stream() -> None:
 
 @given(st.floats(-15.9, 15.9, allow_subnormal=False))
 def test_quantise_rounds_to_the_nearest_exact_float32(value: float) -> None:
-    """The result is a multiple of 2^-20, the nearest one, halves to even, exact in float32 and stable."""
+    """The result is a multiple of 2^-20, the nearest one, halves to even, exact in
+    float32 and stable.
+    """
     assert draws.quantise([0.5 * 2.0**-20, 1.5 * 2.0**-20]).tolist() == [0.0, 2.0**-19]
     result = float(draws.quantise(value))
     assert (result * 2**20).is_integer()
@@ -84,7 +94,9 @@ def test_quantise_rounds_to_the_nearest_exact_float32(value: float) -> None:
 @pytest.mark.parametrize("value", [16.0, -16.0, math.inf, math.nan])
 def test_quantise_refuses_what_float32_would_round(value: float) -> None:
     """Too large or not finite is an error that says where to look."""
-    with pytest.raises(WorkFailedError, match=r"(?s)magnitude below 16.*datasets\.yaml") as caught:
+    with pytest.raises(
+        WorkFailedError, match=r"(?s)magnitude below 16.*datasets\.yaml"
+    ) as caught:
         draws.quantise([0.0, value])
     assert caught.value.exit_code == 5
 
@@ -99,7 +111,9 @@ def test_uniform_follows_its_law() -> None:
 
 
 def test_log_uniform_follows_its_law() -> None:
-    """Its logarithm is uniform (SciPy's reciprocal law); a range that is empty or not positive is refused."""
+    """Its logarithm is uniform (SciPy's reciprocal law); a range that is empty or not
+    positive is refused.
+    """
     rng = source()
     values = [draws.log_uniform(rng, 20.0, 400.0) for _ in range(2000)]
     assert stats.kstest(values, stats.loguniform(20.0, 400.0).cdf).pvalue > 0.01
@@ -111,16 +125,25 @@ def test_log_uniform_follows_its_law() -> None:
             draws.log_uniform(rng, *ends)
 
 
-@given(st.floats(0.0, 1.0, exclude_max=True), st.floats(1e-3, 10.0), st.floats(1.0, 1e4))
-def test_log_uniform_agrees_with_extended_precision(u: float, low: float, ratio: float) -> None:
+@given(
+    st.floats(0.0, 1.0, exclude_max=True), st.floats(1e-3, 10.0), st.floats(1.0, 1e4)
+)
+def test_log_uniform_agrees_with_extended_precision(
+    u: float, low: float, ratio: float
+) -> None:
     """It is the 80-bit result of low (high/low)^u to one unit in the last place."""
-    least, most = np.longdouble(low), np.longdouble(low * ratio)
+    least = np.longdouble(low)
+    most = np.longdouble(low * ratio)
     wide = least * np.exp(np.log(most / least) * np.longdouble(u))
-    assert draws.log_uniform(Script(u), low, low * ratio) == pytest.approx(float(wide), rel=2.3e-16, abs=0.0)
+    assert draws.log_uniform(Script(u), low, low * ratio) == pytest.approx(
+        float(wide), rel=2.3e-16, abs=0.0
+    )
 
 
 def test_normal_has_the_moments_of_twelve_uniforms() -> None:
-    """Mean 0, variance 1, skewness 0, excess kurtosis -6/5/12 = -0.1, nothing beyond six."""
+    """Mean 0, variance 1, skewness 0, excess kurtosis -6/5/12 = -0.1, nothing beyond
+    six.
+    """
     values = draws.normal(source(), 1.0, (100_000,))
     assert abs(values.mean()) < 0.01
     assert values.var() == pytest.approx(1.0, abs=0.015)
@@ -133,7 +156,9 @@ def test_normal_has_the_moments_of_twelve_uniforms() -> None:
 
 
 def test_choice_is_fair_and_never_reaches_its_count() -> None:
-    """Chi-squared over six; the largest variate below 1 gives the last choice, the least the first."""
+    """Chi-squared over six; the largest variate below 1 gives the last choice, the
+    least the first.
+    """
     for count in (*range(1, 40), 10**6, 2**40 - 1, 2**40):
         assert draws.choice(Script(1.0 - 2.0**-53), count) == count - 1
         assert draws.choice(Script(0.0), count) == 0

@@ -1,4 +1,6 @@
-"""Adopting one's own trajectories: what goes in comes out, hashed, with a task, or an error says why not."""
+"""Adopting one's own trajectories: what goes in comes out, hashed, with a task, or an
+error says why not.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,13 @@ import lagbench
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate
 from lagbench.data.scenario import check_scenario, read_scenario
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, WorkFailedError
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.exchange import adopt, import_split, local_split
 from lagbench.exchange.adoption import _by_subset
 from lagbench.exchange.local_split import LocalSplit
@@ -41,7 +49,9 @@ def save_runs(folder: Path, runs: Runs) -> list[Path]:
 
 def adopted(folder: Path, runs: Runs, **wishes: Any) -> LocalSplit:
     """Adopt each trajectory from a file of its own."""
-    return adopt(save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **wishes})
+    return adopt(
+        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **wishes}
+    )
 
 
 def stored(made: LocalSplit, number: int, name: str) -> NDArray[Any]:
@@ -64,11 +74,16 @@ def own(tmp_path_factory: pytest.TempPathFactory, runs: Runs) -> LocalSplit:
 
 
 def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None:
-    """Every subset of the opened split holds the arrays bit for bit, the last ones in test.
+    """Every subset of the opened split holds the arrays bit for bit, the last ones in
+    test.
 
     v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
     """
-    for subset, wanted in {"train": runs[:4], "valid": runs[4:5], "test": runs[5:]}.items():
+    for subset, wanted in {
+        "train": runs[:4],
+        "valid": runs[4:5],
+        "test": runs[5:],
+    }.items():
         with lagbench.open_split(str(own.folder), subset=subset) as data:
             np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
             assert data["time"].values[-1] == 11 * 0.25
@@ -79,32 +94,48 @@ def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None
 
 
 def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
-    """The data set hash is that of the files' own content hashes, and what split.yaml records."""
+    """The data set hash is that of the files' own content hashes, and what split.yaml
+    records.
+    """
     size, root, _ = locate(str(own.folder))
     content = {i: check_scenario(size.path(root, i)) for i in range(6)}
     parts = {"train": range(4), "valid": [4], "test": [5]}
-    subsets = {name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()}
+    subsets = {
+        name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()
+    }
     assert own.dataset_sha256 == dataset_hash("mine", "full", 1, subsets)
     assert size.measured is not None
     assert size.measured.dataset_sha256 == own.dataset_sha256
-    assert size.measured.scenario_sha256 == {i: digest[:16] for i, digest in content.items()}
+    assert size.measured.scenario_sha256 == {
+        i: digest[:16] for i, digest in content.items()
+    }
 
 
-def test_the_same_arrays_give_the_same_split(own: LocalSplit, tmp_path: Path, runs: Runs) -> None:
+def test_the_same_arrays_give_the_same_split(
+    own: LocalSplit, tmp_path: Path, runs: Runs
+) -> None:
     """Once in files of their own, once as one array of four dimensions."""
     np.save(tmp_path / "all.npy", np.stack(runs))
     made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", **BASIC)
     assert made.dataset_sha256 == own.dataset_sha256
-    assert (made.folder / "split.yaml").read_bytes() == (own.folder / "split.yaml").read_bytes()
+    assert (made.folder / "split.yaml").read_bytes() == (
+        own.folder / "split.yaml"
+    ).read_bytes()
 
 
-def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_path: Path) -> None:
-    """Commands take its folder; straight flight is what the constant-velocity floor predicts."""
+def test_a_local_split_is_verified_templated_and_scored(
+    own: LocalSplit, tmp_path: Path
+) -> None:
+    """Commands take its folder; straight flight is what the constant-velocity floor
+    predicts.
+    """
     path = str(own.folder)
     assert lagbench.verify(path).verdict == "equal to split.yaml"
     target = tmp_path / "predictions.nc"
     lagbench.template(path, output=target)
-    card = lagbench.score(target, root=own.folder.parent, output_dir=tmp_path, workers=1)
+    card = lagbench.score(
+        target, root=own.folder.parent, output_dir=tmp_path, workers=1
+    )
     floor = card.scores["constant-velocity"]["position_rmse"]
     assert np.max(floor.per_frame) < 1e-5
     assert np.min(card.scores["persistence"]["position_rmse"].per_frame) > 1e-3
@@ -114,13 +145,27 @@ def test_a_local_split_is_verified_templated_and_scored(own: LocalSplit, tmp_pat
 def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
     """Each subset ends with all of its trajectories written, of as many."""
     told: dict[str, Progress] = {}
-    adopted(tmp_path, straight_runs(6), test=2, progress=lambda news: told.update({news.stage: news}))
-    counts = {stage: (news.scenarios_done, news.scenarios, news.total) for stage, news in told.items()}
-    assert counts == {"writing train": (3, 3, 3), "writing valid": (1, 1, 1), "writing test": (2, 2, 2)}
+    adopted(
+        tmp_path,
+        straight_runs(6),
+        test=2,
+        progress=lambda news: told.update({news.stage: news}),
+    )
+    counts = {
+        stage: (news.scenarios_done, news.scenarios, news.total)
+        for stage, news in told.items()
+    }
+    assert counts == {
+        "writing train": (3, 3, 3),
+        "writing valid": (1, 1, 1),
+        "writing test": (2, 2, 2),
+    }
 
 
 def test_ten_comes_after_two(tmp_path: Path) -> None:
-    """Files count by the numbers in their names, as a shell lists them or in a folder; others stay."""
+    """Files count by the numbers in their names, as a shell lists them or in a folder;
+    others stay.
+    """
     names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
     for name in names:
         (tmp_path / name).write_bytes(b"1")
@@ -128,7 +173,9 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     wanted = {"train": ["run0", "run1", "run2"], "valid": ["run10"], "test": ["run11"]}
     for paths in (given, [tmp_path]):
         found = _by_subset(paths, valid=1, test=1)
-        assert {subset: [path.stem for path, _ in rows] for subset, rows in found.items()} == wanted
+        assert {
+            subset: [path.stem for path, _ in rows] for subset, rows in found.items()
+        } == wanted
     found = _by_subset(given[::-1], valid=1, test=1)
     assert [path.stem for path, _ in found["test"]] == ["run0"]
 
@@ -145,16 +192,25 @@ def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
 
 def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
-    named = {"material": np.arange(40) % 4, "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]])}
+    named = {
+        "material": np.arange(40) % 4,
+        "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]]),
+    }
     for number, run in enumerate(runs[:3]):
         np.savez(tmp_path / f"{number}.npz", position=run, velocity=-run, **named)
-    made = adopt([tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC)
+    made = adopt(
+        [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
+    )
     np.testing.assert_array_equal(stored(made, 2, "velocity"), -runs[2])
     np.testing.assert_array_equal(stored(made, 2, "material"), named["material"])
-    np.testing.assert_array_equal(stored(made, 2, "wall_velocity")[5], named["wall_velocity"])
+    np.testing.assert_array_equal(
+        stored(made, 2, "wall_velocity")[5], named["wall_velocity"]
+    )
 
 
-def variable(file: netCDF4.Dataset, shape: tuple[int, ...], kind: str) -> netCDF4.Variable:
+def variable(
+    file: netCDF4.Dataset, shape: tuple[int, ...], kind: str
+) -> netCDF4.Variable:
     """Return a new variable for positions."""
     names = ("time", "point", "axis")
     for name, length in zip(names, shape, strict=True):
@@ -163,7 +219,9 @@ def variable(file: netCDF4.Dataset, shape: tuple[int, ...], kind: str) -> netCDF
 
 
 def test_netcdf(tmp_path: Path, runs: Runs) -> None:
-    """NetCDF files of double precision in subset folders are read frame by frame, rounded once."""
+    """NetCDF files of double precision in subset folders are read frame by frame,
+    rounded once.
+    """
     for number, subset in enumerate(("train", "valid", "test")):
         (tmp_path / "in" / subset).mkdir(parents=True)
         with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
@@ -175,7 +233,9 @@ def test_netcdf(tmp_path: Path, runs: Runs) -> None:
 
 
 def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
-    """Values that stand for others by scale_factor would be taken for positions: the file is named."""
+    """Values that stand for others by scale_factor would be taken for positions: the
+    file is named.
+    """
     paths = save_runs(tmp_path, runs[:2])
     with netCDF4.Dataset(tmp_path / "packed.nc", "w") as file:
         position = variable(file, runs[2].shape, "f4")
@@ -188,7 +248,9 @@ def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
 def test_the_folder_of_another_writer_is_left_alone(
     tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A temporary folder of the same name, as of another machine, is neither used nor removed."""
+    """A temporary folder of the same name, as of another machine, is neither used nor
+    removed.
+    """
     theirs = tmp_path / ".mine.partial"
     theirs.mkdir()
     monkeypatch.setattr(local_split, "temporary_name", lambda _: theirs)
@@ -198,7 +260,9 @@ def test_the_folder_of_another_writer_is_left_alone(
 
 
 def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
-    """Ragged trajectories are padded when opened; the task follows the shortest test scenario."""
+    """Ragged trajectories are padded when opened; the task follows the shortest test
+    scenario.
+    """
     shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
     ragged = [straight_runs(1, frames=f, particles=p, seed=f)[0] for f, p in shapes]
     made = adopted(tmp_path, ragged, test=2)
@@ -212,7 +276,9 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
 
 
 def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
-    """Test scenarios of different particle numbers can be opened, and a note says what cannot be."""
+    """Test scenarios of different particle numbers can be opened, and a note says what
+    cannot be.
+    """
     ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
     made = adopted(tmp_path, ragged, test=2, valid=1)
     assert "20 to 30 particles" in made.notes[0]
@@ -223,9 +289,15 @@ def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
 def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     """A box of 3 is divided by 4: times 4, every position is the source's."""
     wide = straight_runs(3, box=3.0)
-    made = adopted(tmp_path, wide, radius=0.3, bounds=((0.0, 3.0), (0.0, 3.0)), rescale=True)
+    made = adopted(
+        tmp_path, wide, radius=0.3, bounds=((0.0, 3.0), (0.0, 3.0)), rescale=True
+    )
     size = locate(str(made.folder)).size
-    assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (0.075, (0.0, 0.75), 4.0)
+    assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (
+        0.075,
+        (0.0, 0.75),
+        4.0,
+    )
     np.testing.assert_array_equal(stored(made, 0, "position") * 4, wide[0])
 
 
@@ -238,7 +310,9 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
         (((7.0, 7.5), (7.0, 7.25)), 8.0, (0.0, 0.0)),
     ],
 )
-def test_measures_hold_the_box(bounds: Any, scale: float, corner: tuple[float, float]) -> None:
+def test_measures_hold_the_box(
+    bounds: Any, scale: float, corner: tuple[float, float]
+) -> None:
     """Scale and corner are the least that bring a box into the unit box."""
     measure = Measure.fitting(bounds)
     assert (measure.scale, measure.corner) == (scale, corner)
@@ -258,16 +332,30 @@ def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.floa
     return run
 
 
-BROKEN: dict[str, tuple[Callable[[NDArray[np.float32]], NDArray[Any]], type[LagbenchError], str]] = {
+BROKEN: dict[
+    str, tuple[Callable[[NDArray[np.float32]], NDArray[Any]], type[LagbenchError], str]
+] = {
     "flat": (lambda run: run[0], UnreadableFileError, "no positions"),
-    "space": (lambda run: np.concatenate([run, run[..., :1]], axis=-1), DataError, "3 components"),
+    "space": (
+        lambda run: np.concatenate([run, run[..., :1]], axis=-1),
+        DataError,
+        "3 components",
+    ),
     "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
     "single": (lambda run: run[:1], DataError, "too little"),
     "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
     "missing at once": (lambda run: holed(run, 0, np.nan), DataError, "not finite"),
-    "beyond float32": (lambda run: run.astype(np.float64) * 1e300, DataError, "not finite"),
+    "beyond float32": (
+        lambda run: run.astype(np.float64) * 1e300,
+        DataError,
+        "not finite",
+    ),
     "outside": (lambda run: holed(run, 3, 1.5), DataError, "outside the unit box"),
-    "objects": (lambda run: np.array([run, None], dtype=object), UnreadableFileError, "pickled"),
+    "objects": (
+        lambda run: np.array([run, None], dtype=object),
+        UnreadableFileError,
+        "pickled",
+    ),
 }
 
 
@@ -301,7 +389,9 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"output": "in"}, "there already"),
     ],
 )
-def test_what_a_user_says_is_checked(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+def test_what_a_user_says_is_checked(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
     """Wrong options are usage errors that name the option, and no folder is made."""
     paths = save_runs(tmp_path / "in", straight_runs(4))
     options = {"output": "mine", **BASIC, **changes}
@@ -311,9 +401,19 @@ def test_what_a_user_says_is_checked(tmp_path: Path, changes: dict[str, Any], wo
 
 
 def test_command(tmp_path: Path, run: Run) -> None:
-    """`lagbench adopt` says what it made, and other commands take the folder it names."""
-    paths, target = save_runs(tmp_path / "in", straight_runs(4)), tmp_path / "mine"
-    options = ["--radius", "0.1", "--frame-interval", "0.25", "--frames-of-interest", "8,10"]
+    """`lagbench adopt` says what it made, and other commands take the folder it
+    names.
+    """
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    target = tmp_path / "mine"
+    options = [
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        "0.25",
+        "--frames-of-interest",
+        "8,10",
+    ]
     done = run("adopt", *paths, "-o", target, *options, "--bounds", "0,1,0.25,1")
     assert done.exit_code == 0, done.output
     assert "2 train, 1 valid, 1 test, 48 frames, 40 particles" in done.stdout
@@ -342,14 +442,26 @@ PLAIN: dict[str, Any] = {
 
 @pytest.mark.parametrize("spelled", ["numpy", "texts and floats"])
 def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
-    """NumPy's scalars and arrays, and what --describe takes for numbers, give the same description."""
+    """NumPy's scalars and arrays, and what --describe takes for numbers, give the same
+    description.
+    """
     paths = save_runs(tmp_path / "in", straight_runs(3))
-    other = {**PLAIN, "radius": "0.15", "cells": 8.0, "horizon": 8.0, "density": "1.5", "title": None}
+    other = {
+        **PLAIN,
+        "radius": "0.15",
+        "cells": 8.0,
+        "horizon": 8.0,
+        "density": "1.5",
+        "title": None,
+    }
     if spelled == "numpy":
         other = {name: np.asarray(value)[()] for name, value in PLAIN.items()}
         other["density"] = np.float32(1.5)
     texts = [
-        (adopt(paths, output=tmp_path / kind / "mine", **wishes).folder / "split.yaml").read_bytes()
+        (
+            adopt(paths, output=tmp_path / kind / "mine", **wishes).folder
+            / "split.yaml"
+        ).read_bytes()
         for kind, wishes in (("plain", PLAIN), ("other", other))
     ]
     assert texts[0] == texts[1]
@@ -373,12 +485,16 @@ def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
         ({"raduis": 0.1}, "raduis"),
     ],
 )
-def test_a_value_that_does_not_fit_names_its_key(tmp_path: Path, wish: dict[str, Any], key: str) -> None:
+def test_a_value_that_does_not_fit_names_its_key(
+    tmp_path: Path, wish: dict[str, Any], key: str
+) -> None:
     """By adopt and by import, before a file is looked at."""
     with pytest.raises(UsageError) as adopted:
         adopt(tmp_path / "none", output=tmp_path / "mine", **{**BASIC, **wish})
     with pytest.raises(UsageError) as imported:
-        import_split(tmp_path / "none", format="gns-npz", output=tmp_path / "mine", **wish)
+        import_split(
+            tmp_path / "none", format="gns-npz", output=tmp_path / "mine", **wish
+        )
     assert adopted.value.where == imported.value.where == key
     assert not list(tmp_path.iterdir())
 
@@ -399,10 +515,16 @@ def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("way", ["twice", "folder", "link", "subsets"])
 def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
-    """It would be trained on and tested: by its name, in its folder, by a link, and in two subsets."""
+    """It would be trained on and tested: by its name, in its folder, by a link, and in
+    two subsets.
+    """
     paths = save_runs(tmp_path / "in", straight_runs(4))
     link = tmp_path / ("in/test/run9.npy" if way == "subsets" else "run9.npy")
-    given = {"twice": [*paths, paths[0]], "folder": [tmp_path / "in", paths[2]], "link": [*paths, link]}
+    given = {
+        "twice": [*paths, paths[0]],
+        "folder": [tmp_path / "in", paths[2]],
+        "link": [*paths, link],
+    }
     if way == "subsets":
         for subset, path in zip(("train", "valid", "test"), paths, strict=False):
             (tmp_path / "in" / subset).mkdir()
@@ -417,7 +539,9 @@ def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
 
 
 @pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
-def test_bad_frames_of_interest_name_their_option(tmp_path: Path, run: Run, text: str) -> None:
+def test_bad_frames_of_interest_name_their_option(
+    tmp_path: Path, run: Run, text: str
+) -> None:
     """The list is read as one of scenarios is, and the message speaks of frames."""
     paths = save_runs(tmp_path / "in", straight_runs(3))
     options = ["-o", tmp_path / "mine", "--radius", "0.1", "--frame-interval", "0.25"]
@@ -428,25 +552,46 @@ def test_bad_frames_of_interest_name_their_option(tmp_path: Path, run: Run, text
 
 
 def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> None:
-    """Keys of `--describe` count where no option says otherwise; unknown keys and wrong types are refused."""
+    """Keys of `--describe` count where no option says otherwise; unknown keys and wrong
+    types are refused.
+    """
     paths = save_runs(tmp_path / "in", straight_runs(4))
     told = tmp_path / "data.yaml"
-    options = ["-o", tmp_path / "mine", "--describe", told, "--free-surface", "--horizon", "3"]
+    options = [
+        "-o",
+        tmp_path / "mine",
+        "--describe",
+        told,
+        "--free-surface",
+        "--horizon",
+        "3",
+    ]
     words = ["adopt", *paths, *options]
     endless = f"0x{'f' * 5000}"  # an integer whose digits Python does not spell
-    wrong = ["colour: red", "radius: far", "- radius", f"title: {endless}", f"horizon: {endless}"]
+    wrong = [
+        "colour: red",
+        "radius: far",
+        "- radius",
+        f"title: {endless}",
+        f"horizon: {endless}",
+    ]
     for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
         told.write_text(line)
         assert run(*words).exit_code == 2
     assert not (tmp_path / "mine").exists()
     told.write_text(
         "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
-        "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: 0.05\nfull_box: true\n"
+        "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: "
+        "0.05\nfull_box: true\n"
     )
     done = run(*words)
     assert done.exit_code == 0, done.output
     size, _, splits = locate(str(tmp_path / "mine"))
-    assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (0.1, 3, (8,))
+    assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (
+        0.1,
+        3,
+        (8,),
+    )
     assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
     assert size.value("density") == 2.0
     assert splits.split("mine").licence == "CC0-1.0"

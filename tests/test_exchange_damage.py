@@ -1,4 +1,6 @@
-"""Imports of what is damaged, made to do harm, or out of range: an error by name, and nothing left."""
+"""Imports of what is damaged, made to do harm, or out of range: an error by name, and
+nothing left.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,9 @@ def h5(tmp_path: Path) -> Path:
 def imported(source: Path) -> LocalSplit:
     """Import from the folder of a fixture."""
     form = "gns-npz" if list(source.glob("*.npz")) else "lagrangebench-h5"
-    return import_split(source, format=form, output=source.parent / "own", allow_pickle=True)
+    return import_split(
+        source, format=form, output=source.parent / "own", allow_pickle=True
+    )
 
 
 def adopted(bad: Path, **wishes: Any) -> LocalSplit:
@@ -63,13 +67,19 @@ def save_parts(folder: Path, *parts: Any) -> None:
 
 
 @contextlib.contextmanager
-def array_file(path: Path, shape: tuple[int, ...], kind: str = "<f4") -> Iterator[IO[bytes]]:
-    """Yield a .npy file, or its place in an .npz file, after a header that claims a shape."""
+def array_file(
+    path: Path, shape: tuple[int, ...], kind: str = "<f4"
+) -> Iterator[IO[bytes]]:
+    """Yield a .npy file, or its place in an .npz file, after a header that claims a
+    shape.
+    """
     with contextlib.ExitStack() as stack:
         if path.suffix == ".npy":
             stream = stack.enter_context(path.open("wb"))
         else:
-            archive = stack.enter_context(zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1))
+            archive = stack.enter_context(
+                zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
+            )
             member = "simulation_0.npy" if kind == "|O" else "position.npy"
             stream = stack.enter_context(archive.open(member, "w"))
         header = {"descr": kind, "fortran_order": False, "shape": shape}
@@ -79,7 +89,9 @@ def array_file(path: Path, shape: tuple[int, ...], kind: str = "<f4") -> Iterato
 
 @contextlib.contextmanager
 def refused(folder: Path, where: str, *others: type[LagbenchError]) -> Iterator[None]:
-    """Expect an unreadable file, or another error, named by the file or what is in it, and nothing left."""
+    """Expect an unreadable file, or another error, named by the file or what is in it,
+    and nothing left.
+    """
     with pytest.raises((UnreadableFileError, *others)) as caught:
         yield
     assert where in str(caught.value.where)
@@ -97,8 +109,11 @@ class _Reduced:
 
 
 @pytest.mark.parametrize("allow", [False, True])
-def test_a_malicious_pickle_is_never_run(gns: Path, tmp_path: Path, allow: bool) -> None:
-    """A pickle that calls anything but NumPy's constructors is refused even when pickles are allowed.
+def test_a_malicious_pickle_is_never_run(
+    gns: Path, tmp_path: Path, allow: bool
+) -> None:
+    """A pickle that calls anything but NumPy's constructors is refused even when
+    pickles are allowed.
 
     Where they are not, nothing of gns-npz is read, and the message names the flag.
     """
@@ -109,7 +124,9 @@ def test_a_malicious_pickle_is_never_run(gns: Path, tmp_path: Path, allow: bool)
     assert isinstance(caught.value, UnreadableFileError if allow else UsageError)
     assert ("wants to call" if allow else "--allow-pickle") in str(caught.value)
     assert not (tmp_path / "own").exists()
-    with np.load(gns / "train.npz", allow_pickle=True) as file:  # numpy's own reader does run it
+    with np.load(
+        gns / "train.npz", allow_pickle=True
+    ) as file:  # numpy's own reader does run it
         file["simulation_0"]
     assert (tmp_path / "trace").exists()
 
@@ -124,8 +141,14 @@ MANY = [np.zeros(1)] * 4
 @pytest.mark.parametrize(
     ("item", "words"),
     [
-        (_Reduced(np.zeros(0).__reduce__()[0], (np.ndarray, (0,), b"b"), STATE), "bytes for the objects"),
-        (_Reduced(np.float64(0).__reduce__()[0], (OBJECTS, ADDRESSES[:8])), "wants to call"),
+        (
+            _Reduced(np.zeros(0).__reduce__()[0], (np.ndarray, (0,), b"b"), STATE),
+            "bytes for the objects",
+        ),
+        (
+            _Reduced(np.float64(0).__reduce__()[0], (OBJECTS, ADDRESSES[:8])),
+            "wants to call",
+        ),
         (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
         (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
         ("text", "holds a str"),
@@ -133,7 +156,9 @@ MANY = [np.zeros(1)] * 4
     ],
 )
 def test_no_pickle_gets_at_memory(gns: Path, item: Any, words: str) -> None:
-    """Made-up objects, addresses, giant arrays and codecs are refused before NumPy sees them."""
+    """Made-up objects, addresses, giant arrays and codecs are refused before NumPy sees
+    them.
+    """
     save_parts(gns, item)
     with pytest.raises(UnreadableFileError, match=words):
         imported(gns)
@@ -142,19 +167,26 @@ def test_no_pickle_gets_at_memory(gns: Path, item: Any, words: str) -> None:
 @pytest.mark.parametrize(
     "program",
     [
-        b"\x80\x04Nr\xf0\xff\xff\xff.",  # remembers nothing, under the number 4294967280
-        b"\x80\x04\x8e" + (1 << 40).to_bytes(8, "little") + b"short.",  # announces a terabyte
+        # remembers nothing, under the number 4294967280
+        b"\x80\x04Nr\xf0\xff\xff\xff.",
+        b"\x80\x04\x8e"
+        + (1 << 40).to_bytes(8, "little")
+        + b"short.",  # announces a terabyte
         b"\x80\x04\x8e" + b"\xff" * 8 + b".",
         b"\x80\x04(" * 99 + b".",  # marks that nothing ends
         b"\x80\x04" + b"]" * (1 << 25) + b".",  # lists, 56 bytes for each byte
     ],
 )
 def test_no_pickle_reserves_memory(gns: Path, program: bytes) -> None:
-    """What a pickle announces and does not hold is refused before anything is reserved for it."""
+    """What a pickle announces and does not hold is refused before anything is reserved
+    for it.
+    """
     with array_file(gns / "train.npz", (2,), "|O") as stream:
         stream.write(program)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    mapped = (
+        int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    )
     resource.setrlimit(resource.RLIMIT_AS, (mapped + (1 << 30), hard))
     try:
         with pytest.raises(UnreadableFileError) as caught:
@@ -165,7 +197,9 @@ def test_no_pickle_reserves_memory(gns: Path, program: bytes) -> None:
 
 
 def test_filters_upon_filters_are_refused(h5: Path, tmp_path: Path) -> None:
-    """Deflated four times, a chunk of a few hundred bytes would fill the memory on its way."""
+    """Deflated four times, a chunk of a few hundred bytes would fill the memory on its
+    way.
+    """
     with h5py.File(h5 / "train.h5", "w") as file:
         group = file.create_group("00000")
         group["particle_type"] = np.zeros(40, int)
@@ -174,13 +208,17 @@ def test_filters_upon_filters_are_refused(h5: Path, tmp_path: Path) -> None:
         for _ in range(4):
             created.set_deflate(9)
         space = h5py.h5s.create_simple((12, 40, 2))
-        stored = h5py.h5d.create(group.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created)
+        stored = h5py.h5d.create(
+            group.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created
+        )
         h5py.Dataset(stored)[:] = straight_runs(1)[0]
     with refused(tmp_path, "position"):
         imported(h5)
 
 
-def test_an_npz_file_that_unpacks_to_far_more_is_refused(gns: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_npz_file_that_unpacks_to_far_more_is_refused(
+    gns: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A member of 8 MB of zeros in some 30 kB."""
     monkeypatch.setattr(trajectory, "HARMLESS", 1 << 20)
     with array_file(gns / "train.npz", (2,), "|O") as stream:
@@ -189,18 +227,26 @@ def test_an_npz_file_that_unpacks_to_far_more_is_refused(gns: Path, monkeypatch:
         imported(gns)
 
 
-def test_an_empty_hdf5_file_of_many_particles_is_refused(h5: Path, tmp_path: Path) -> None:
+def test_an_empty_hdf5_file_of_many_particles_is_refused(
+    h5: Path, tmp_path: Path
+) -> None:
     """Arrays of 10^11 particles without a chunk."""
     with h5py.File(h5 / "train.h5", "w") as file:
-        file.create_dataset("00000/position", shape=(12, 10**11, 2), dtype="f4", chunks=(1, 1000, 2))
-        file.create_dataset("00000/particle_type", shape=(10**11,), dtype="i8", chunks=(1000,))
+        file.create_dataset(
+            "00000/position", shape=(12, 10**11, 2), dtype="f4", chunks=(1, 1000, 2)
+        )
+        file.create_dataset(
+            "00000/particle_type", shape=(10**11,), dtype="i8", chunks=(1000,)
+        )
     with refused(tmp_path, "00000/"):
         imported(h5)
 
 
 @pytest.mark.parametrize("place", [5, 6, 7])
 def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
-    """Whatever HDF5 raises where its structures are overwritten, it becomes an error of ours."""
+    """Whatever HDF5 raises where its structures are overwritten, it becomes an error of
+    ours.
+    """
     whole = (h5 / "train.h5").read_bytes()
     start = 96 + 100 * place  # past the superblock: headers, heaps and trees
     (h5 / "train.h5").write_bytes(whole[:start] + b"\xad" * 100 + whole[start + 100 :])
@@ -211,8 +257,14 @@ def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"lagbench": {"frames_of_interest": [99]}}, "frame of interest is not predicted"),
-        ({"lagbench": {"frames_of_interest": [-1]}}, "frame of interest is not predicted"),
+        (
+            {"lagbench": {"frames_of_interest": [99]}},
+            "frame of interest is not predicted",
+        ),
+        (
+            {"lagbench": {"frames_of_interest": [-1]}},
+            "frame of interest is not predicted",
+        ),
         ({"lagbench": {"cells": 10**9}}, "--cells"),
         ({"bounds": [[-1e308, 1e308], [0, 1]]}, "--bounds"),
         ({"default_connectivity_radius": 1e300}, "--radius"),
@@ -220,8 +272,12 @@ def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
         ({"dt": 1e-320}, "--frame-interval"),
     ],
 )
-def test_numbers_that_do_not_compute(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    """Metadata out of range are usage errors that name the option which overrules them."""
+def test_numbers_that_do_not_compute(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    """Metadata out of range are usage errors that name the option which overrules
+    them.
+    """
     with pytest.raises(UsageError, match=words):
         imported(write_gns(tmp_path / "in", straight_runs(3), **changes))
     assert not (tmp_path / "own").exists()
@@ -244,10 +300,17 @@ def test_numbers_that_do_not_compute(tmp_path: Path, changes: dict[str, Any], wo
         ("no time", UsageError, "no time between frames"),
     ],
 )
-def test_damaged_sources_leave_nothing(h5: Path, fault: str, error: type[LagbenchError], words: str) -> None:
+def test_damaged_sources_leave_nothing(
+    h5: Path, fault: str, error: type[LagbenchError], words: str
+) -> None:
     """Each fault is told by name, and no folder is made."""
-    target, metadata = h5 / "test.h5", h5 / "metadata.json"
-    changes = {"no radius": {"default_connectivity_radius": None}, "3D": {"dim": 3}, "no time": {"dt": 0}}
+    target = h5 / "test.h5"
+    metadata = h5 / "metadata.json"
+    changes = {
+        "no radius": {"default_connectivity_radius": None},
+        "3D": {"dim": 3},
+        "no time": {"dt": 0},
+    }
     match fault:
         case "no metadata":
             metadata.unlink()
@@ -260,12 +323,19 @@ def test_damaged_sources_leave_nothing(h5: Path, fault: str, error: type[Lagbenc
         case "half a file":
             target.write_bytes(target.read_bytes()[:1000])
         case _:
-            kinds, run = np.zeros(40, int), straight_runs(1)[0]
+            kinds = np.zeros(40, int)
+            run = straight_runs(1)[0]
             held: dict[str, dict[str, Any]] = {
                 "array for a group": {"00000": np.zeros(3)},
-                "nothing in an array": {"00000/position": h5py.Empty("f4"), "00000/particle_type": kinds},
+                "nothing in an array": {
+                    "00000/position": h5py.Empty("f4"),
+                    "00000/particle_type": kinds,
+                },
                 "no positions": {"00000/particle_type": kinds},
-                "too few kinds": {"00000/position": run, "00000/particle_type": kinds[:39]},
+                "too few kinds": {
+                    "00000/position": run,
+                    "00000/particle_type": kinds[:39],
+                },
                 "empty": {},
             }
             with h5py.File(target, "w") as file:
@@ -276,9 +346,15 @@ def test_damaged_sources_leave_nothing(h5: Path, fault: str, error: type[Lagbenc
     assert [path.name for path in h5.parent.iterdir()] == ["in"]
 
 
-@pytest.mark.parametrize("arrays", [None, {"note": np.array("no trajectory")}, {"run": np.zeros((4, 3))}])
-def test_a_damaged_npz_is_told(gns: Path, tmp_path: Path, arrays: dict[str, Any] | None) -> None:
-    """Half an npz file, and a member that is no array or no trajectory, are unreadable files."""
+@pytest.mark.parametrize(
+    "arrays", [None, {"note": np.array("no trajectory")}, {"run": np.zeros((4, 3))}]
+)
+def test_a_damaged_npz_is_told(
+    gns: Path, tmp_path: Path, arrays: dict[str, Any] | None
+) -> None:
+    """Half an npz file, and a member that is no array or no trajectory, are unreadable
+    files.
+    """
     target = gns / "test.npz"
     if arrays is None:
         target.write_bytes(target.read_bytes()[: target.stat().st_size // 2])
@@ -290,9 +366,15 @@ def test_a_damaged_npz_is_told(gns: Path, tmp_path: Path, arrays: dict[str, Any]
 
 @pytest.mark.parametrize("name", ["00000/position", "position"])
 @pytest.mark.parametrize("way", ["soft", "external", "beside", "virtual", "raw"])
-def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, name: str, way: str) -> None:
-    """HDF5 and netCDF would take positions from wherever a stranger's file points to, imported or adopted."""
-    bad, other, run = h5 / "train.h5", tmp_path / "other", straight_runs(1)[0]
+def test_a_file_that_leads_elsewhere_is_refused(
+    h5: Path, tmp_path: Path, name: str, way: str
+) -> None:
+    """HDF5 and netCDF would take positions from wherever a stranger's file points to,
+    imported or adopted.
+    """
+    bad = h5 / "train.h5"
+    other = tmp_path / "other"
+    run = straight_runs(1)[0]
     with h5py.File(other, "w") as file:
         file["there"] = run
     if name == "position":
@@ -315,7 +397,9 @@ def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, name: 
                 file.create_virtual_dataset(name, layout)
             case _:
                 other.write_bytes(run.tobytes())
-                file.create_dataset(name, run.shape, "f4", external=[(str(other), 0, run.nbytes)])
+                file.create_dataset(
+                    name, run.shape, "f4", external=[(str(other), 0, run.nbytes)]
+                )
     led = "a/wall_velocity" if way == "beside" else name
     with refused(tmp_path, f"{bad.name}, {led!r}"):
         adopted(bad) if name == "position" else imported(h5)
@@ -323,7 +407,9 @@ def test_a_file_that_leads_elsewhere_is_refused(h5: Path, tmp_path: Path, name: 
 
 @pytest.mark.parametrize("kind", ["empty chunks", "a hole", "classic", "npy", "rows"])
 def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
-    """A few bytes on disk that claim 10^9 particles, or 10^12 trajectories, are refused by their header."""
+    """A few bytes on disk that claim 10^9 particles, or 10^12 trajectories, are refused
+    by their header.
+    """
     bad = tmp_path / ("bad.npy" if kind in ("npy", "rows") else "bad.nc")
     shape = (12, 10**9, 2)
     if kind == "classic":
@@ -342,7 +428,9 @@ def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
                 created.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
                 created.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
                 space = h5py.h5s.create_simple(shape)
-                h5py.h5d.create(file.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created)
+                h5py.h5d.create(
+                    file.id, b"position", h5py.h5t.IEEE_F32LE, space, dcpl=created
+                )
             else:
                 file.create_dataset("position", shape, "f4", chunks=(1, 10**6, 2))
     assert bad.stat().st_blocks * 512 < 1 << 20
@@ -352,14 +440,22 @@ def test_a_sparse_file_fills_no_memory(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("form", ["NETCDF3_CLASSIC", "NETCDF3_64BIT_OFFSET", "NETCDF4"])
 def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
-    """Older formats too, and files with texts, a group and dimensions without values beside positions."""
-    path, run = tmp_path / "own.nc", straight_runs(1)[0]
+    """Older formats too, and files with texts, a group and dimensions without values
+    beside positions.
+    """
+    path = tmp_path / "own.nc"
+    run = straight_runs(1)[0]
     with netCDF4.Dataset(path, "w", format=form) as file:
-        names = [file.createDimension(name, n).name for name, n in zip("fps", run.shape, strict=True)]
+        names = [
+            file.createDimension(name, n).name
+            for name, n in zip("fps", run.shape, strict=True)
+        ]
         file.createVariable("position", "f4", names)[:] = run
         file.createVariable("letters", "S1", names[-1:])
         if form == "NETCDF4":
-            file.createVariable("names", str, names[-1:])[:] = np.array(["x", "y"], object)
+            file.createVariable("names", str, names[-1:])[:] = np.array(
+                ["x", "y"], object
+            )
             file.createGroup("more").createVariable("note", "i4", ())
     assert adopted(path).scenarios == {"train": 1, "valid": 1, "test": 1}
 
@@ -389,7 +485,8 @@ def test_arrays_that_are_no_numbers_are_refused(
     tmp_path: Path, ending: str, name: str, values: np.ndarray
 ) -> None:
     """Texts, complex and missing numbers would fail halfway, or enter the hashes."""
-    bad, arrays = tmp_path / f"bad.{ending}", {"position": straight_runs(1)[0], name: values}
+    bad = tmp_path / f"bad.{ending}"
+    arrays = {"position": straight_runs(1)[0], name: values}
     if ending == "npz":
         np.savez(bad, **arrays)  # type: ignore[arg-type]
     else:
@@ -401,8 +498,12 @@ def test_arrays_that_are_no_numbers_are_refused(
 
 
 @pytest.mark.parametrize("ending", ["npz", "npy"])
-@pytest.mark.parametrize("shape", [(99999999999, 4, 2), (2**40, 2**40, 2**40), (-12, -40, 2)])
-def test_a_header_that_claims_other_values(tmp_path: Path, ending: str, shape: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    "shape", [(99999999999, 4, 2), (2**40, 2**40, 2**40), (-12, -40, 2)]
+)
+def test_a_header_that_claims_other_values(
+    tmp_path: Path, ending: str, shape: tuple[int, ...]
+) -> None:
     """Far more than follow it, more than any memory holds, or fewer than none."""
     bad = tmp_path / f"bad.{ending}"
     with array_file(bad, shape) as stream:
@@ -418,7 +519,8 @@ def test_a_damaged_npz_is_told_when_adopted(tmp_path: Path, fault: str) -> None:
     with array_file(bad, (12, 40, 2)) as stream:
         stream.write(straight_runs(1)[0].tobytes())
     raw = bytearray(bad.read_bytes())
-    start, central = 30 + len("position.npy"), raw.index(b"PK\x01\x02")
+    start = 30 + len("position.npy")
+    central = raw.index(b"PK\x01\x02")
     match fault:
         case "stream":
             raw[start + 5 : start + 90] = b"\xff" * 85
@@ -442,11 +544,21 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
     """What a stranger's file says is shown with its control characters spelled out."""
     changes = {"bounds": ESCAPES} if place == "metadata" else {}
     source = write_gns(tmp_path / "in", straight_runs(3), **changes)
-    words = ["import", str(source), "--format", "gns-npz", "--allow-pickle", "-o", str(tmp_path / "own")]
+    words = [
+        "import",
+        str(source),
+        "--format",
+        "gns-npz",
+        "--allow-pickle",
+        "-o",
+        str(tmp_path / "own"),
+    ]
     if place == "pickle":
         with array_file(source / "train.npz", (2,), "|O") as stream:
             name = ESCAPES[:-2].encode()
-            stream.write(b"\x80\x04\x8c" + bytes([len(name)]) + name + b"\x8c\x01x\x93.")
+            stream.write(
+                b"\x80\x04\x8c" + bytes([len(name)]) + name + b"\x8c\x01x\x93."
+            )
     elif place == "describe":
         (tmp_path / "data.yaml").write_text(json.dumps({"radius": ESCAPES[:-2]}))
         words += ["--describe", str(tmp_path / "data.yaml")]
@@ -467,8 +579,12 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
         (5, np.array([np.inf])),
     ],
 )
-def test_odd_parts_of_a_pickled_trajectory(gns: Path, tmp_path: Path, parts: tuple[Any, Any]) -> None:
-    """Kinds and a material property that are no numbers are told by the key they stand at."""
+def test_odd_parts_of_a_pickled_trajectory(
+    gns: Path, tmp_path: Path, parts: tuple[Any, Any]
+) -> None:
+    """Kinds and a material property that are no numbers are told by the key they stand
+    at.
+    """
     save_parts(gns, *parts)
     with refused(tmp_path, "simulation_0", DataError):
         imported(gns)
@@ -482,7 +598,8 @@ def test_a_number_for_a_trajectory(gns: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["--5=drop", f"{'9' * 5000}=drop", "5-=drop", "\u0663=drop", "=drop", "-=drop"]
+    "text",
+    ["--5=drop", f"{'9' * 5000}=drop", "5-=drop", "\u0663=drop", "=drop", "-=drop"],
 )
 def test_kinds_that_are_no_numbers(text: str) -> None:
     """Only plain digits with one sign are numbers of kinds."""

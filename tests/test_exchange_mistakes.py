@@ -1,4 +1,6 @@
-"""Arrays that mean something else than they say are refused by name; odd but honest ones are adopted."""
+"""Arrays that mean something else than they say are refused by name; odd but honest
+ones are adopted.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,12 @@ SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 
 
 @pytest.fixture(scope="module", params=SPLITS)
-def ours(request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]) -> list[Any]:
-    """The scenarios of a split: positions, the solver's velocities, the time between frames."""
+def ours(
+    request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]
+) -> list[Any]:
+    """The scenarios of a split: positions, the solver's velocities, the time between
+    frames.
+    """
     return scenarios(tiny_split(request.param))
 
 
@@ -33,7 +39,9 @@ def scenarios(made: GenerationResult) -> list[Any]:
     for path in sorted(made.folder.rglob("*.nc")):
         with read_scenario(path) as file:
             time = file.read("time")
-            found.append((file.read("position"), file.read("velocity"), float(time[1] - time[0])))
+            found.append(
+                (file.read("position"), file.read("velocity"), float(time[1] - time[0]))
+            )
     assert found
     return found
 
@@ -54,7 +62,9 @@ def differences(position: Array, interval: float) -> Array:
 
 
 def test_our_own_data_pass(ours: list[Any]) -> None:
-    """As they are; with differences to the frame before, after, or both; without velocities; at rest."""
+    """As they are; with differences to the frame before, after, or both; without
+    velocities; at rest.
+    """
     for position, velocity, interval in ours:
         backward = differences(position, interval)
         forward = np.concatenate([backward[1:], backward[-1:]])
@@ -76,31 +86,55 @@ def test_transposed_axes_are_named(ours: list[Any]) -> None:
 
 
 def test_swapped_components_are_named(ours: list[Any]) -> None:
-    """X and y of the solver's velocities, and of differences, in length/s and per frame."""
+    """X and y of the solver's velocities, and of differences, in length/s and per
+    frame.
+    """
     for position, velocity, interval in ours:
-        for own in (velocity, differences(position, interval), differences(position, 1.0)):
-            assert "x and y of the velocity are swapped" in said(position, own[..., ::-1], interval)
+        for own in (
+            velocity,
+            differences(position, interval),
+            differences(position, 1.0),
+        ):
+            assert "x and y of the velocity are swapped" in said(
+                position, own[..., ::-1], interval
+            )
         assert said(position[..., ::-1], velocity[..., ::-1], interval) == ""
 
 
 def test_other_units_are_named(ours: list[Any]) -> None:
-    """Displacements per frame, a constant factor, of which the fix names the interval, or turned round."""
+    """Displacements per frame, a constant factor, of which the fix names the interval,
+    or turned round.
+    """
     for position, _, interval in ours[:2]:
         assert "per frame" in said(position, differences(position, 1.0), interval)
         for factor, word in ((3, "3 times"), (-1, "backwards"), (-3, "backwards")):
             with pytest.raises(DataError, match=word) as caught:
-                check_meaning("runs.npy", position, factor * differences(position, interval), interval)
-            named = f"--frame-interval {interval / 3:.3g}" if factor > 0 else "--frame-interval"
+                check_meaning(
+                    "runs.npy",
+                    position,
+                    factor * differences(position, interval),
+                    interval,
+                )
+            named = (
+                f"--frame-interval {interval / 3:.3g}"
+                if factor > 0
+                else "--frame-interval"
+            )
             assert (named in str(caught.value.fix)) == (factor > 0)
 
 
 @pytest.mark.parametrize("split", ["fluid", "multimaterial"])
-def test_shifted_velocities_are_named(split: str, tiny_split: Callable[..., GenerationResult]) -> None:
-    """By one frame, late and early, in most scenarios whose velocities are those of the motion.
+def test_shifted_velocities_are_named(
+    split: str, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """By one frame, late and early, in most scenarios whose velocities are those of the
+    motion.
 
-    In our closed boxes the particles' own velocities lag behind their motion by some of a frame.
+    In our closed boxes the particles' own velocities lag behind their motion by some of
+    a frame.
     """
-    found, named = scenarios(tiny_split(split)), {"late": 0, "early": 0}
+    found = scenarios(tiny_split(split))
+    named = {"late": 0, "early": 0}
     for position, velocity, interval in found:
         for shift, word in ((1, "late"), (-1, "early")):
             what = said(position, np.roll(velocity, shift, axis=0), interval)
@@ -110,17 +144,24 @@ def test_shifted_velocities_are_named(split: str, tiny_split: Callable[..., Gene
 
 
 def test_shifted_differences_are_named(ours: list[Any]) -> None:
-    """Differences that came one frame late fit nothing; swapped and per frame too, all is named."""
+    """Differences that came one frame late fit nothing; swapped and per frame too, all
+    is named.
+    """
     for position, _, interval in ours:
         late = np.roll(differences(position, interval), 1, axis=0)
         assert said(position, late, interval) == "velocities are one frame late"
     position, _, interval = ours[0]
-    what = said(position, np.roll(differences(position, 1.0), 1, axis=0)[..., ::-1], interval)
+    what = said(
+        position, np.roll(differences(position, 1.0), 1, axis=0)[..., ::-1], interval
+    )
     assert [word in what for word in ("swapped", "per frame", "late")] == [True] * 3
 
 
 ODD: dict[str, Callable[[np.random.Generator], tuple[Array, Array]]] = {
-    "random places": lambda rng: (rng.random((20, 300, 2)), rng.normal(size=(20, 300, 2))),
+    "random places": lambda rng: (
+        rng.random((20, 300, 2)),
+        rng.normal(size=(20, 300, 2)),
+    ),
     "random walk": lambda rng: (
         rng.random((300, 2)) + np.cumsum(rng.normal(size=(20, 300, 2)), axis=0) / 50,
         rng.normal(size=(20, 300, 2)),
@@ -134,29 +175,40 @@ ODD: dict[str, Callable[[np.random.Generator], tuple[Array, Array]]] = {
         rng.normal(size=(20, 300, 2)),
     ),
     "straight flight, meaningless velocities": lambda rng: (
-        rng.random((300, 2)) + 0.01 * np.arange(20)[:, None, None] * rng.normal(size=(300, 2)),
+        rng.random((300, 2))
+        + 0.01 * np.arange(20)[:, None, None] * rng.normal(size=(300, 2)),
         rng.normal(size=(20, 300, 2)),
     ),
     "fall as one block": lambda rng: (
-        rng.random((300, 2)) * 0.1 + 0.02 * np.arange(20)[:, None, None] * np.array([1, 1]),
+        rng.random((300, 2)) * 0.1
+        + 0.02 * np.arange(20)[:, None, None] * np.array([1, 1]),
         np.full((20, 300, 2), 0.2),
     ),
     "flight along the diagonal, exactly": lambda rng: _diagonal(rng, 1.0),
     "flight along the other diagonal, exactly": lambda rng: _diagonal(rng, -1.0),
-    "wheel that turns by half a radian per frame": lambda rng: _wheel(rng.random(300), 0.5),
+    "wheel that turns by half a radian per frame": lambda rng: _wheel(
+        rng.random(300), 0.5
+    ),
     "wheel that turns nearly round per frame": lambda rng: _wheel(rng.random(300), 2.5),
     "filament that turns": lambda rng: _wheel(np.zeros(300), 0.3),
     "filament that turns by much": lambda rng: _wheel(np.zeros(300), 0.7),
     "one particle": lambda rng: (rng.random((20, 1, 2)), rng.normal(size=(20, 1, 2))),
     "three frames": lambda rng: (rng.random((3, 300, 2)), rng.normal(size=(3, 300, 2))),
-    "not finite": lambda rng: (np.full((20, 300, 2), np.nan), np.full((20, 300, 2), np.inf)),
+    "not finite": lambda rng: (
+        np.full((20, 300, 2), np.nan),
+        np.full((20, 300, 2), np.inf),
+    ),
 }
 
 
 def _diagonal(rng: np.random.Generator, side: float) -> tuple[Array, Array]:
-    """Return particles that fly together, all numbers powers of two apart: nothing is rounded."""
+    """Return particles that fly together, all numbers powers of two apart: nothing is
+    rounded.
+    """
     velocity = np.array([1.0, side]) / 8
-    place = rng.integers(0, 64, (300, 2)) / 64 + np.arange(20)[:, None, None] * velocity / 8
+    place = (
+        rng.integers(0, 64, (300, 2)) / 64 + np.arange(20)[:, None, None] * velocity / 8
+    )
     return place, np.broadcast_to(velocity / 8 / 0.1, place.shape)
 
 
@@ -170,21 +222,36 @@ def _wheel(turn: Array, speed: float) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("kind", ODD)
 def test_odd_data_pass(kind: str) -> None:
-    """What is random, noisy, rigid or coarse in time is no mistake, in ten draws of each."""
+    """What is random, noisy, rigid or coarse in time is no mistake, in ten draws of
+    each.
+    """
     for seed in range(10):
         position, velocity = ODD[kind](np.random.default_rng(seed))
         assert said(position, velocity, 0.1) == ""
         assert said(position, None, 0.1) == ""
 
 
-def test_adopting_says_so_and_can_be_told_otherwise(tmp_path: Path, run: Callable[..., Result]) -> None:
-    """`adopt` refuses swapped velocities, leaves nothing, and takes them with --as-is."""
+def test_adopting_says_so_and_can_be_told_otherwise(
+    tmp_path: Path, run: Callable[..., Result]
+) -> None:
+    """`adopt` refuses swapped velocities, leaves nothing, and takes them with
+    --as-is.
+    """
     interval = 0.1
     position = 0.5 + 0.5 * _wheel(np.random.default_rng(0).random(60), 0.2)[0]
     for number in range(3):
         swapped = differences(position, interval)[..., ::-1]
         np.savez(tmp_path / f"{number}.npz", position=position, velocity=swapped)
-    words = ["adopt", tmp_path, "-o", tmp_path / "own", "--radius", "0.1", "--frame-interval", interval]
+    words = [
+        "adopt",
+        tmp_path,
+        "-o",
+        tmp_path / "own",
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        interval,
+    ]
     refused = run(*words)
     assert refused.exit_code == DataError.exit_code
     assert "0.npz" in refused.stderr
@@ -202,14 +269,27 @@ def test_adopting_says_so_and_can_be_told_otherwise(tmp_path: Path, run: Callabl
         ((50, 2, 3), "3 components"),
     ],
 )
-def test_components_that_do_not_come_last(tmp_path: Path, shape: tuple[int, ...], words: str) -> None:
-    """The shape alone gives them away, and what is said mends it; three components are data in space."""
+def test_components_that_do_not_come_last(
+    tmp_path: Path, shape: tuple[int, ...], words: str
+) -> None:
+    """The shape alone gives them away, and what is said mends it; three components are
+    data in space.
+    """
     array = np.zeros(shape)
     np.save(tmp_path / "runs.npy", np.stack([array] * 3))
     with pytest.raises(DataError) as caught:
-        adopt(tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1)
+        adopt(
+            tmp_path / "runs.npy",
+            output=tmp_path / "own",
+            radius=0.1,
+            frame_interval=0.1,
+        )
     assert words in str(caught.value)
     if shape[2] == 3:
         assert "moveaxis" not in str(caught.value)
     else:
-        assert eval(str(caught.value.fix), {"np": np, "array": array}).shape == (12, 40, 2)
+        assert eval(str(caught.value.fix), {"np": np, "array": array}).shape == (
+            12,
+            40,
+            2,
+        )

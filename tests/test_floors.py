@@ -1,4 +1,6 @@
-"""Floors against closed forms, copies, the solver itself; those of one's own data, those that are shipped."""
+"""Floors against closed forms, copies, the solver itself; those of one's own data,
+those that are shipped.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,14 @@ from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
 from lagbench.floors import FLOORS, Given, coarse_solver, floors_of, given_in, shipped
-from lagbench.floors.analog import DIRECTIONS, Start, assigned, distance, nearest, start_of
+from lagbench.floors.analog import (
+    DIRECTIONS,
+    Start,
+    assigned,
+    distance,
+    nearest,
+    start_of,
+)
 from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
 from lagbench.floors.floor import linear_field, mirrored
 from lagbench.floors.frozen_field import decay
@@ -36,8 +45,17 @@ from lagbench.scoring.floors import measurable
 Floats = NDArray[np.float64]
 
 
-def given(split: str, position: Floats, *, size: str = "tiny", root: Path = Path(), **changes: Any) -> Given:
-    """Return what a made-up scenario gives; its walls are at rest unless told otherwise."""
+def given(
+    split: str,
+    position: Floats,
+    *,
+    size: str = "tiny",
+    root: Path = Path(),
+    **changes: Any,
+) -> Given:
+    """Return what a made-up scenario gives; its walls are at rest unless told
+    otherwise.
+    """
     tier = load().size(split, size)
     frames = tier.task.input_frames + tier.task.horizon
     walls = np.zeros((frames, 4, 2))
@@ -56,7 +74,9 @@ def given(split: str, position: Floats, *, size: str = "tiny", root: Path = Path
 
 def scattered(count: int, low: float, high: float, seed: int = 0) -> Floats:
     """Return points of a square, shape [point, 2]."""
-    return np.asarray(low + (high - low) * np.random.default_rng(seed).random((count, 2)))
+    return np.asarray(
+        low + (high - low) * np.random.default_rng(seed).random((count, 2))
+    )
 
 
 def predicted(name: str, held: Given) -> NDArray[np.float32]:
@@ -66,30 +86,52 @@ def predicted(name: str, held: Given) -> NDArray[np.float32]:
 
 def own(size: Size, *, placement: str) -> Size:
     """Return a split of a user's own: without generator, gravity or recorded scores."""
-    parameters = {name: value for name, value in size.parameters.items() if name != "gravity"}
+    parameters = {
+        name: value for name, value in size.parameters.items() if name != "gravity"
+    }
     grid = size.task.score_grid.model_copy(update={"placement": placement})
     task = size.task.model_copy(update={"score_grid": grid})
-    told = {"split": "own", "name": "full", "generator": "none", "parameters": parameters, "task": task}
+    told = {
+        "split": "own",
+        "name": "full",
+        "generator": "none",
+        "parameters": parameters,
+        "task": task,
+    }
     return size.model_copy(update=told)
 
 
 @pytest.mark.parametrize(
     ("split", "size", "names"),
     [
-        ("cavity", "full", "persistence constant-velocity frozen-field analog coarse-solver"),
+        (
+            "cavity",
+            "full",
+            "persistence constant-velocity frozen-field analog coarse-solver",
+        ),
         ("cavity", "mini", "persistence constant-velocity frozen-field analog"),
         ("curl-noise", "full", "persistence constant-velocity frozen-field analog"),
-        ("fluid", "mini", "persistence constant-velocity free-flight analog coarse-solver"),
-        ("multimaterial", "full", "persistence constant-velocity free-flight analog coarse-solver"),
+        (
+            "fluid",
+            "mini",
+            "persistence constant-velocity free-flight analog coarse-solver",
+        ),
+        (
+            "multimaterial",
+            "full",
+            "persistence constant-velocity free-flight analog coarse-solver",
+        ),
         ("fluid", "tiny", "persistence constant-velocity free-flight analog"),
         ("own", "cell_centres", "persistence constant-velocity frozen-field analog"),
         ("own", "nodes", "persistence constant-velocity analog"),
     ],
 )
 def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
-    """Full boxes have the frozen field, free surfaces free flight; what is solved has a coarser grid.
+    """Full boxes have the frozen field, free surfaces free flight; what is solved has a
+    coarser grid.
 
-    A user's own split goes by its kind of box; without gravity there is no free flight, nothing is solved.
+    A user's own split goes by its kind of box; without gravity there is no free flight,
+    nothing is solved.
     """
     if split == "own":
         tier = own(load().size("fluid", "mini"), placement=size)
@@ -100,13 +142,18 @@ def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
     solved = coarser(tier)
     assert solved is None or solved.grid < tier.grid
     assert all(
-        floor.name == name and floor.title and floor.definition[-1] == "." for name, floor in FLOORS.items()
+        floor.name == name and floor.title and floor.definition[-1] == "."
+        for name, floor in FLOORS.items()
     )
-    assert [floor.name for floor in FLOORS.values() if not floor.counts] == ["coarse-solver"]
+    assert [floor.name for floor in FLOORS.values() if not floor.counts] == [
+        "coarse-solver"
+    ]
 
 
 def test_every_floor_predicts_its_frames_inside_the_walls() -> None:
-    """Fast particles stop at the walls; positions are float32, one frame per frame of the horizon."""
+    """Fast particles stop at the walls; positions are float32, one frame per frame of
+    the horizon.
+    """
     start = scattered(300, 0.2, 0.8)
     fast = np.stack([start, start + 0.05])
     for name in ("persistence", "constant-velocity", "free-flight"):
@@ -133,22 +180,31 @@ def test_free_flight_is_a_parabola() -> None:
 
 
 def test_a_frozen_rotation_stays_a_rotation() -> None:
-    """Particles of a rigid rotation by 0.05 a frame keep their distance and turn by 0.05 a frame."""
-    centre, angle = np.array([0.5, 0.5]), 0.05
+    """Particles of a rigid rotation by 0.05 a frame keep their distance and turn by
+    0.05 a frame.
+    """
+    centre = np.array([0.5, 0.5])
+    angle = 0.05
     offset = scattered(4000, -0.4, 0.4)
-    cos, sin = math.cos(angle), math.sin(angle)
+    cos = math.cos(angle)
+    sin = math.sin(angle)
     before = centre + offset @ np.array([[cos, -sin], [sin, cos]])
     held = given("cavity", np.stack([*([before] * 5), centre + offset]), wall=1e-9)
     found = predicted("frozen-field", held)
     inner = np.hypot(*offset.T) < 0.25
-    now, steps = found[-1][inner] - centre, held.size.task.horizon
+    now = found[-1][inner] - centre
+    steps = held.size.task.horizon
     np.testing.assert_allclose(np.hypot(*now.T), np.hypot(*offset[inner].T), rtol=2e-3)
-    gone = np.arctan2(now[:, 1], now[:, 0]) - np.arctan2(offset[inner, 1], offset[inner, 0])
+    gone = np.arctan2(now[:, 1], now[:, 0]) - np.arctan2(
+        offset[inner, 1], offset[inner, 0]
+    )
     np.testing.assert_allclose(np.cos(gone - steps * angle), 1.0, atol=1e-3)
 
 
 def test_decay_of_an_exponential() -> None:
-    """Displacements that shrink by 0.9 a frame decay by 0.9; growing ones and rest do not decay."""
+    """Displacements that shrink by 0.9 a frame decay by 0.9; growing ones and rest do
+    not decay.
+    """
     step = scattered(20, -0.01, 0.01)
     shrinking = np.cumsum([step * 0.9**k for k in range(6)], axis=0)
     assert decay(shrinking) == pytest.approx(0.9)
@@ -158,7 +214,9 @@ def test_decay_of_an_exponential() -> None:
 
 @pytest.mark.parametrize("speed", [0.0, 0.02])
 def test_the_mirrored_field_meets_the_wall(speed: float) -> None:
-    """A shear flow goes on through a wall that slides at 0.02; one at rest lets a stagnation flow slide."""
+    """A shear flow goes on through a wall that slides at 0.02; one at rest lets a
+    stagnation flow slide.
+    """
     wall = np.zeros((4, 2))
     wall[3, 0] = speed
     held = given("cavity", np.zeros((6, 1, 2)), wall=wall)
@@ -166,13 +224,19 @@ def test_the_mirrored_field_meets_the_wall(speed: float) -> None:
     points = scattered(3000, low, high)
     depth = high - points[:, 1]
     tangential = speed + 0.3 * depth if speed else np.full_like(depth, 0.01)
-    field = linear_field(*mirrored(held, points, np.stack([tangential, 0.2 * depth], axis=1), wall))
+    field = linear_field(
+        *mirrored(held, points, np.stack([tangential, 0.2 * depth], axis=1), wall)
+    )
     at_wall = np.stack([np.linspace(0.3, 0.7, 20), np.full(20, high)], axis=1)
-    np.testing.assert_allclose(field(at_wall), np.tile((speed or 0.01, 0.0), (20, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        field(at_wall), np.tile((speed or 0.01, 0.0), (20, 1)), atol=1e-12
+    )
 
 
 def test_the_field_is_linear_and_has_no_holes() -> None:
-    """A linear field is met exactly between the points; far outside, the nearest point answers."""
+    """A linear field is met exactly between the points; far outside, the nearest point
+    answers.
+    """
     points = scattered(200, 0.0, 1.0)
     gradient = np.array([[0.1, -0.3], [0.2, 0.05]])
     field = linear_field(points, points @ gradient)
@@ -199,9 +263,11 @@ def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.flo
 
 
 def test_analogs_of_a_copy_and_of_another(bench: ScoreBench) -> None:
-    """A full box that stands in train is its own analog, and its motion carries it where it goes.
+    """A full box that stands in train is its own analog, and its motion carries it
+    where it goes.
 
-    A test scenario gets another one's motion: particles start where they are and stay in the box.
+    A test scenario gets another one's motion: particles start where they are and stay
+    in the box.
     """
     own = bench.size.subsets["train"][1]
     held, future = opened(bench.root, bench.size, own)
@@ -215,26 +281,38 @@ def test_analogs_of_a_copy_and_of_another(bench: ScoreBench) -> None:
 
 
 def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None:
-    """Moved together two clouds stay as far apart; 0.1 over the deviation along a direction."""
+    """Moved together two clouds stay as far apart; 0.1 over the deviation along a
+    direction.
+    """
     held, _ = opened(bench.root, bench.size, bench.size.subsets["test"][0])
     start = start_of(held)
 
     def moved(by: Floats) -> Start:
-        return replace(start, clouds={kind: c + by @ DIRECTIONS for kind, c in start.clouds.items()})
+        return replace(
+            start,
+            clouds={kind: c + by @ DIRECTIONS for kind, c in start.clouds.items()},
+        )
 
     near = distance(start, moved(np.array([0.1, 0.0])))
-    assert distance(moved(np.array([0.3, -0.2])), moved(np.array([0.4, -0.2]))) == pytest.approx(near)
-    # on the mean over directions 0.1 along x has half its square, and the cloud half of its variances' sum
+    assert distance(
+        moved(np.array([0.3, -0.2])), moved(np.array([0.4, -0.2]))
+    ) == pytest.approx(near)
+    # on the mean over directions 0.1 along x has half its square, and the cloud half of
+    # its variances' sum
     assert near == pytest.approx(0.1 / np.sqrt(held.last.var(axis=0).sum()), rel=0.01)
 
 
 def test_assignment_goes_by_material() -> None:
-    """A permuted, slightly moved cloud is matched particle by particle, each material on its own.
+    """A permuted, slightly moved cloud is matched particle by particle, each material
+    on its own.
 
-    Fewer particles are taken more than once, more are left out; a lacking material takes any.
+    Fewer particles are taken more than once, more are left out; a lacking material
+    takes any.
     """
-    points, rng = scattered(120, 0.0, 1.0), np.random.default_rng(1)
-    material, order = np.repeat([0, 2], 60), rng.permutation(120)
+    points = scattered(120, 0.0, 1.0)
+    rng = np.random.default_rng(1)
+    material = np.repeat([0, 2], 60)
+    order = rng.permutation(120)
     partner = assigned(points, points[order] + 1e-6, material, material[order])
     np.testing.assert_array_equal(order[partner], np.arange(120))
     points = scattered(90, 0.0, 1.0)
@@ -243,11 +321,15 @@ def test_assignment_goes_by_material() -> None:
     assert np.bincount(fewer, minlength=30).tolist() == [3] * 30
     more = assigned(points[:30], points, zeros[:30], zeros)
     assert len(set(more.tolist())) == 30
-    assert set(assigned(points[:9], points[:9], zeros[:9] + 3, zeros[:9]).tolist()) == set(range(9))
+    assert set(
+        assigned(points[:9], points[:9], zeros[:9] + 3, zeros[:9]).tolist()
+    ) == set(range(9))
 
 
 def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
-    """A quarter of a jittered lattice has four in 4 x 4 spacings, far more evenly than by chance."""
+    """A quarter of a jittered lattice has four in 4 x 4 spacings, far more evenly than
+    by chance.
+    """
     side = np.stack(np.meshgrid(np.arange(48), np.arange(48)), axis=-1).reshape(-1, 2)
     points = (side + 0.5 + 0.2 * scattered(48 * 48, -0.5, 0.5)) / 48
     material = (points[:, 0] > 0.5).astype(np.int8)
@@ -262,10 +344,16 @@ def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
 
 
 def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
-    """With the grid, time step and particles of its own size it moves them as the solver does."""
+    """With the grid, time step and particles of its own size it moves them as the
+    solver does.
+    """
     size = load().size("fluid", "tiny")
-    n, count = size.task.input_frames, size.particles
-    block = np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).reshape(-1, 2) / 80 + 0.4
+    n = size.task.input_frames
+    count = size.particles
+    block = (
+        np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).reshape(-1, 2) / 80
+        + 0.4
+    )
     speed = np.tile([0.5, 0.2], (count, 1))
     path = np.stack([block - speed * size.frame_interval * k for k in range(n)[::-1]])
     held = given("fluid", path, area=0.04)
@@ -273,7 +361,11 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
     fall = np.array([0.0, -0.5 * size.value("gravity") * size.frame_interval])
     solver = compiled(solver_constants(size))
     velocity = (path[-1] - path[-2]) / size.frame_interval + fall
-    rest = {"affine": np.zeros((count, 2, 2)), "material": np.zeros(count, np.int8), "area": 0.04}
+    rest = {
+        "affine": np.zeros((count, 2, 2)),
+        "material": np.zeros(count, np.int8),
+        "area": 0.04,
+    }
     solver.load([InitialState(position=path[-1], velocity=velocity, **rest)])
     for frame in found:
         solver.advance(size.substeps_per_frame)
@@ -281,20 +373,36 @@ def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
 
 
 def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
-    """A solver that is told each frame's walls before it moves there goes the same way, to the bit."""
+    """A solver that is told each frame's walls before it moves there goes the same way,
+    to the bit.
+    """
     size = load().size("cavity", "tiny")
-    n, frames = size.task.input_frames, size.task.input_frames + size.task.horizon
+    n = size.task.input_frames
+    frames = size.task.input_frames + size.task.horizon
     (left, right), (bottom, top) = size.bounds
-    unit = (np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=-1).reshape(-1, 2) + 0.5) / 18
+    unit = (
+        np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=-1).reshape(-1, 2)
+        + 0.5
+    ) / 18
     place = np.array([left, bottom]) + unit * np.array([right - left, top - bottom])
     walls = np.zeros((frames, 4, 2))
-    walls[:, 3, 0] = 0.2 * np.random.default_rng(0).normal(size=frames) * size.frame_interval
+    walls[:, 3, 0] = (
+        0.2 * np.random.default_rng(0).normal(size=frames) * size.frame_interval
+    )
     held = given("cavity", np.stack([place] * n), area=(right - left) * (top - bottom))
     held = replace(held, walls=walls, parameters={"viscosity": 1e-3})
     found = list(predict_with(held, size))
     solver = compiled(replace(solver_constants(size), particles=len(place)))
-    still = {"affine": np.zeros((len(place), 2, 2)), "material": held.material, "area": held.area}
-    still |= {"velocity": np.zeros_like(place), "wall_velocity": np.zeros((4, 2)), "viscosity": 1e-3}
+    still = {
+        "affine": np.zeros((len(place), 2, 2)),
+        "material": held.material,
+        "area": held.area,
+    }
+    still |= {
+        "velocity": np.zeros_like(place),
+        "wall_velocity": np.zeros((4, 2)),
+        "viscosity": 1e-3,
+    }
     solver.load([InitialState(position=place, **still)])
     for frame, speed in zip(found, walls[n:] / size.frame_interval, strict=True):
         solver.move_walls(speed[None].astype(np.float32))
@@ -303,7 +411,9 @@ def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
 
 
 def test_the_coarse_solver_moves_all_particles() -> None:
-    """A falling block on the coarser grid falls as a whole: bodies in flight keep their parabola."""
+    """A falling block on the coarser grid falls as a whole: bodies in flight keep their
+    parabola.
+    """
     size = load().size("fluid", "mini")
     coarse = coarser(size)
     assert coarse is not None
@@ -313,12 +423,17 @@ def test_the_coarse_solver_moves_all_particles() -> None:
     frames = predict_with(held, coarse)
     for k, frame in zip(range(1, 11), frames, strict=False):
         fallen = 0.5 * size.value("gravity") * size.frame_interval**2 * k * (k + 1)
-        np.testing.assert_allclose(np.mean(block - frame, axis=0), [0.0, fallen], atol=1e-3)
+        np.testing.assert_allclose(
+            np.mean(block - frame, axis=0), [0.0, fallen], atol=1e-3
+        )
         assert frame.shape == block.shape
 
 
-def test_an_analog_needs_all_of_train(bench: ScoreBench, copied: Callable[[], Path]) -> None:
-    """One scenario of train that is missing: the other floors are measured, and scoring works.
+def test_an_analog_needs_all_of_train(
+    bench: ScoreBench, copied: Callable[[], Path]
+) -> None:
+    """One scenario of train that is missing: the other floors are measured, and scoring
+    works.
 
     Who asks for an analog all the same is told.
     """
@@ -337,9 +452,13 @@ def test_an_analog_needs_all_of_train(bench: ScoreBench, copied: Callable[[], Pa
     assert card.skill is not None
 
 
-@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem
+)
 def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
-    """Hash, floors, scenarios and ranking metric are those of the size that the file names."""
+    """Hash, floors, scenarios and ranking metric are those of the size that the file
+    names.
+    """
     said = json.loads(path.read_text())
     size = load().size(said["split"], said["size"])
     assert path == shipped_path(size)
@@ -354,4 +473,9 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
         assert score.scenarios == tuple(sorted(size.subsets["test"]))
         assert score.mean > 0.0
         assert floor.correlation.shape == score.values.shape
-    assert best_floor({name: held[name].scores[ranking] for name in COUNTING.intersection(held)}) is not None
+    assert (
+        best_floor(
+            {name: held[name].scores[ranking] for name in COUNTING.intersection(held)}
+        )
+        is not None
+    )

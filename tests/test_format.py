@@ -1,4 +1,6 @@
-"""Scenario files open anywhere, hash alike whoever wrote them, and tell when they are damaged."""
+"""Scenario files open anywhere, hash alike whoever wrote them, and tell when they are
+damaged.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,12 @@ def written(tmp_path: Path) -> tuple[Path, str]:
     return write_scenario(tmp_path, KEY)
 
 
-def damaged(path: Path, *parts: str, check: Callable[[Path], object] = check_scenario) -> None:
-    """Assert that a file is refused with its name and these parts, in this order or another."""
+def damaged(
+    path: Path, *parts: str, check: Callable[[Path], object] = check_scenario
+) -> None:
+    """Assert that a file is refused with its name and these parts, in this order or
+    another.
+    """
     with pytest.raises(DataError) as caught:
         check(path)
     text = str(caught.value)
@@ -47,7 +53,9 @@ def damaged(path: Path, *parts: str, check: Callable[[Path], object] = check_sce
 
 @pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
 def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None:
-    """Plain open_dataset gives the dims, types and coordinates of the design, nothing decoded away."""
+    """Plain open_dataset gives the dims, types and coordinates of the design, nothing
+    decoded away.
+    """
     pytest.importorskip(engine if engine == "h5netcdf" else "netCDF4")
     with xr.open_dataset(written[0], engine=engine) as scenario:
         assert {str(name): v.dims for name, v in scenario.variables.items()} == DIMS
@@ -68,12 +76,17 @@ def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None
 def test_plain_h5py_opens_it(written: tuple[Path, str], tmp_path: Path) -> None:
     """Chunks hold one frame; the only filters are shuffle and zlib level 1.
 
-    With one set of libraries even the packed bytes are the same: nothing depends on the clock.
+    With one set of libraries even the packed bytes are the same: nothing depends on the
+    clock.
     """
     with h5py.File(written[0]) as file:
         for held in (file["position"], file["velocity"]):
             assert held.chunks == (1, 8, 2)
-            assert (held.compression, held.compression_opts, held.shuffle) == ("gzip", 1, True)
+            assert (held.compression, held.compression_opts, held.shuffle) == (
+                "gzip",
+                1,
+                True,
+            )
         np.testing.assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
     first, _ = write_scenario(tmp_path / "a", KEY)
     second, _ = write_scenario(tmp_path / "b", KEY)
@@ -83,11 +96,16 @@ def test_plain_h5py_opens_it(written: tuple[Path, str], tmp_path: Path) -> None:
 def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None:
     """Ours, xarray's variables in memory, and thirty lines written from docs/format.md.
 
-    Sixteen digits suffice where one is expected; another one is told. A patch release may better a
-    long_name: no reader computes with it.
+    Sixteen digits suffice where one is expected; another one is told. A patch release
+    may better a long_name: no reader computes with it.
     """
     path, content = written
-    assert independent_hash.content_hash(path) == content == rehash(path) == check_scenario(path)
+    assert (
+        independent_hash.content_hash(path)
+        == content
+        == rehash(path)
+        == check_scenario(path)
+    )
     with xr.open_dataset(path) as scenario, read_scenario(path) as file:
         hasher = ContentHasher(KEY.identity(file.header.seed, file.header.parameters))
         for name, variable in scenario.variables.items():
@@ -95,7 +113,9 @@ def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None
             hasher.update(str(name), variable.values)
     assert hasher.hexdigest() == content
     assert check_scenario(path, content[:16]) == content
-    with pytest.raises(DataError, match=r"(?s)another content hash.*expected: 0123.*got: " + content):
+    with pytest.raises(
+        DataError, match=r"(?s)another content hash.*expected: 0123.*got: " + content
+    ):
         check_scenario(path, "0123456789abcdef")
     with h5py.File(path, "r+") as file:
         file["position"].attrs["long_name"] = "where the particles are"
@@ -103,7 +123,9 @@ def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None
 
 
 def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
-    """Without wall velocities there is neither a wall dimension nor a Reynolds number."""
+    """Without wall velocities there is neither a wall dimension nor a Reynolds
+    number.
+    """
     path, content = write_scenario(tmp_path, KEY, walls=False)
     with xr.open_dataset(path) as scenario:
         assert "wall" not in scenario.dims
@@ -111,14 +133,19 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
     assert check_scenario(path) == content == independent_hash.content_hash(path)
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(
     parameters=st.dictionaries(
         st.from_regex("[a-z]{1,6}_p", fullmatch=True),
         st.one_of(
             st.booleans(),
             st.integers(-(2**63), 2**63 - 1),
-            # Taichi, once started in this process, makes its thread round subnormals to zero.
+            # Taichi, once started in this process, makes its thread round subnormals to
+            # zero.
             st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
             st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
         ),
@@ -126,8 +153,12 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
     ),
     seed=st.text(st.characters(codec="utf-8", exclude_characters="\0"), min_size=1),
 )
-def test_parameters_survive_the_file(tmp_path: Path, parameters: dict[str, Any], seed: str) -> None:
-    """What was hashed while writing is what two readers find, whatever the parameters are."""
+def test_parameters_survive_the_file(
+    tmp_path: Path, parameters: dict[str, Any], seed: str
+) -> None:
+    """What was hashed while writing is what two readers find, whatever the parameters
+    are.
+    """
     path, content = write_scenario(tmp_path, KEY, parameters=parameters, seed=seed)
     with read_scenario(path) as file:
         assert file.header.parameters == {**parameters, "reynolds_number": 100.0}
@@ -136,8 +167,12 @@ def test_parameters_survive_the_file(tmp_path: Path, parameters: dict[str, Any],
 
 
 @pytest.mark.parametrize("name", sorted(TYPES))
-def test_every_variable_is_hashed_and_named(written: tuple[Path, str], name: str) -> None:
-    """Changing one value of any variable is found, and the error names file and variable."""
+def test_every_variable_is_hashed_and_named(
+    written: tuple[Path, str], name: str
+) -> None:
+    """Changing one value of any variable is found, and the error names file and
+    variable.
+    """
     path, content = written
     with h5py.File(path, "r+") as file:
         values = file[name][()]
@@ -146,12 +181,17 @@ def test_every_variable_is_hashed_and_named(written: tuple[Path, str], name: str
     damaged(path, "differ", f"variable '{name}'")
 
 
-@pytest.mark.parametrize("name", ["dt", "wall_moving", "seed", "scenario", "subset", "hashed_parameters"])
+@pytest.mark.parametrize(
+    "name", ["dt", "wall_moving", "seed", "scenario", "subset", "hashed_parameters"]
+)
 def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> None:
     """Parameters and identity enter the hash; the error says that attributes differ."""
     path, _ = written
     with netCDF4.Dataset(path, "r+") as file:
-        file.setncattr(name, {"dt": 0.0021, "scenario": 4, "hashed_parameters": "dt"}.get(name, "other"))
+        file.setncattr(
+            name,
+            {"dt": 0.0021, "scenario": 4, "hashed_parameters": "dt"}.get(name, "other"),
+        )
     damaged(path, "attributes differ", "attributes")
 
 
@@ -175,7 +215,9 @@ def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> N
 def test_attributes_that_change_the_meaning_are_refused(
     written: tuple[Path, str], variable: str, name: str, value: object
 ) -> None:
-    """The values are the same, yet readers that follow CF would read others: file, variable, attribute."""
+    """The values are the same, yet readers that follow CF would read others: file,
+    variable, attribute.
+    """
     path, content = written
     with h5py.File(path, "r+") as file:
         if value is None:
@@ -187,7 +229,9 @@ def test_attributes_that_change_the_meaning_are_refused(
 
 
 def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -> None:
-    """Damage inside packed frames is told as damage of that variable, not as a traceback of HDF5."""
+    """Damage inside packed frames is told as damage of that variable, not as a
+    traceback of HDF5.
+    """
     path, _ = write_scenario(tmp_path, KEY, frames=4, particles=2000)
     with h5py.File(path) as file:
         offset = file["velocity"].id.get_chunk_info(2).byte_offset
@@ -195,12 +239,16 @@ def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -
     data[offset + 100] ^= 1
     path.write_bytes(data)
     for check in (rehash, check_scenario):
-        damaged(path, "damaged", "variable 'velocity'", "lagbench generate", check=check)
+        damaged(
+            path, "damaged", "variable 'velocity'", "lagbench generate", check=check
+        )
 
 
 @pytest.mark.slow
 def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> None:
-    """Each of 600 flips all over the file leaves the content as it is or gives a DataError."""
+    """Each of 600 flips all over the file leaves the content as it is or gives a
+    DataError.
+    """
     path, content = written
     good = path.read_bytes()
     noticed = 0
@@ -220,8 +268,11 @@ def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> 
         damaged(path, "damaged")
 
 
-def test_missing_foreign_and_impossible_files(written: tuple[Path, str], tmp_path: Path) -> None:
-    """Missing, somebody else's netCDF, a shape of terabytes in kilobytes, a type that no file of ours has.
+def test_missing_foreign_and_impossible_files(
+    written: tuple[Path, str], tmp_path: Path
+) -> None:
+    """Missing, somebody else's netCDF, a shape of terabytes in kilobytes, a type that
+    no file of ours has.
 
     The operating system's refusal becomes exit code 5 with the path and a remedy.
     """
@@ -230,13 +281,17 @@ def test_missing_foreign_and_impossible_files(written: tuple[Path, str], tmp_pat
     xr.Dataset({"a": ("b", [1.0])}).to_netcdf(other, engine="netcdf4")
     damaged(other, "not one of lagbench", check=read_scenario)
     old = tmp_path / "old.nc"  # has no HDF5 inside
-    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(old, engine="netcdf4", format="NETCDF3_CLASSIC")
+    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(
+        old, engine="netcdf4", format="NETCDF3_CLASSIC"
+    )
     damaged(old, "damaged", check=read_scenario)
     with h5py.File(other, "w") as file:
         file.create_dataset("position", (2**40,), "f4", chunks=(1024,))
     damaged(other, "larger than its file", "variable 'position'", check=read_scenario)
     with netCDF4.Dataset(written[0], "r+") as file:
-        file.createVariable("odd", file.createCompoundType(np.dtype([("a", "i4")]), "pair"), ())
+        file.createVariable(
+            "odd", file.createCompoundType(np.dtype([("a", "i4")]), "pair"), ()
+        )
     damaged(written[0], "damaged", "variable 'odd'", check=rehash)
     (tmp_path / "root").mkdir()
     (tmp_path / "root" / "cavity").write_text("in the way")
@@ -247,8 +302,19 @@ def test_missing_foreign_and_impossible_files(written: tuple[Path, str], tmp_pat
 
 def writer(path: Path, **changes: Any) -> ScenarioWriter:
     """Return a writer of two frames of eight particles, unless told otherwise."""
-    told: dict[str, Any] = {"particles": 8, "frames": 2, "frame_interval": 0.1, "particle_mass": 1.0}
-    told |= {"material": np.zeros(8), "parameters": {}, "seed": "s", "device": "cpu", "generator": "g"}
+    told: dict[str, Any] = {
+        "particles": 8,
+        "frames": 2,
+        "frame_interval": 0.1,
+        "particle_mass": 1.0,
+    }
+    told |= {
+        "material": np.zeros(8),
+        "parameters": {},
+        "seed": "s",
+        "device": "cpu",
+        "generator": "g",
+    }
     return ScenarioWriter(path, KEY, **(told | changes))
 
 
@@ -277,14 +343,22 @@ def _virtual(file: h5py.File) -> None:
 def _named_like_a_dimension(file: h5py.File) -> None:
     """Name values like a dimension, although they are no scale: netCDF shows them."""
     file["spin"] = np.zeros((4, 8), np.float32)
-    file["spin"].attrs["NAME"] = "This is a netCDF dimension but not a netCDF variable.         4"
+    file["spin"].attrs["NAME"] = (
+        "This is a netCDF dimension but not a netCDF variable.         4"
+    )
 
 
 @pytest.mark.parametrize(
     ("harm", "said"),
     [
-        (lambda file: file.update({"too": h5py.SoftLink("/position")}), "'too' is a soft link"),
-        (lambda file: file.update({"too": h5py.ExternalLink("other.nc", "/a")}), "'too' is a external link"),
+        (
+            lambda file: file.update({"too": h5py.SoftLink("/position")}),
+            "'too' is a soft link",
+        ),
+        (
+            lambda file: file.update({"too": h5py.ExternalLink("other.nc", "/a")}),
+            "'too' is a external link",
+        ),
         (_crowd, "members"),
         (_virtual, "'spin' lie elsewhere: virtual"),
         (_named_like_a_dimension, "spin"),
@@ -293,7 +367,9 @@ def _named_like_a_dimension(file: h5py.File) -> None:
 def test_what_other_readers_would_follow_or_show_is_damage(
     written: tuple[Path, str], harm: Callable[[h5py.File], None], said: str
 ) -> None:
-    """Links and virtual data sets are not followed, and no member is beyond the count."""
+    """Links and virtual data sets are not followed, and no member is beyond the
+    count.
+    """
     path, _ = written
     with h5py.File(path, "r+") as file:
         harm(file)
@@ -301,7 +377,9 @@ def test_what_other_readers_would_follow_or_show_is_damage(
 
 
 def test_texts_that_are_no_texts_are_damage(written: tuple[Path, str]) -> None:
-    """Bytes that are no UTF-8 in a text of no set length change the hash, and raise nothing else."""
+    """Bytes that are no UTF-8 in a text of no set length change the hash, and raise
+    nothing else.
+    """
     path, content = written
     with h5py.File(path, "r+") as file:
         del file.attrs["seed"]
@@ -311,24 +389,36 @@ def test_texts_that_are_no_texts_are_damage(written: tuple[Path, str]) -> None:
 
 
 def test_reading_parts(written: tuple[Path, str]) -> None:
-    """Method read takes frames or slices, blocks stream everything in order, unknown names are told."""
+    """Method read takes frames or slices, blocks stream everything in order, unknown
+    names are told.
+    """
     path, _ = written
     truth = frames_of(3, 4, 8)
     with read_scenario(path) as file:
         np.testing.assert_array_equal(file.read("position", 2), truth[2])
         np.testing.assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
-        np.testing.assert_array_equal(np.concatenate(list(file.blocks("position"))), truth)
+        np.testing.assert_array_equal(
+            np.concatenate(list(file.blocks("position"))), truth
+        )
         assert file.read("particle_mass") == 1e-4 / 8
-        assert (file.header.frames, file.header.particles, file.header.key) == (4, 8, KEY)
+        assert (file.header.frames, file.header.particles, file.header.key) == (
+            4,
+            8,
+            KEY,
+        )
         with pytest.raises(DataError, match="variable 'density'"):
             file.read("density")
 
 
-def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(tmp_path: Path) -> None:
+def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(
+    tmp_path: Path,
+) -> None:
     """A parameter stated after the frames gives the file that has it from the start."""
     frames = frames_of(3, 4, 8)
     digests = []
-    for place, (first, last) in enumerate([({"a": 1, "b": 2}, {}), ({"a": 1}, {"b": 2})]):
+    for place, (first, last) in enumerate(
+        [({"a": 1, "b": 2}, {}), ({"a": 1}, {"b": 2})]
+    ):
         path = tmp_path / f"{place}.nc"
         with writer(path, frames=4, parameters=first) as file:
             for position in frames:
@@ -344,7 +434,9 @@ def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(tmp_path: P
 
 
 def test_wrong_frames_are_refused(tmp_path: Path) -> None:
-    """Shape, type and number of frames; neither a file nor a temporary one appears, an old file survives."""
+    """Shape, type and number of frames; neither a file nor a temporary one appears, an
+    old file survives.
+    """
     path, content = write_scenario(tmp_path, KEY)
     frame = np.zeros((8, 2), np.float32)
     for pieces, said in {
@@ -354,7 +446,10 @@ def test_wrong_frames_are_refused(tmp_path: Path) -> None:
     }.items():
         with pytest.raises(DataError, match=said), writer(path) as file:
             file.append(*(frame[:length] for length in pieces))
-    with pytest.raises(DataError, match=r"(?s)another type.*'position'"), writer(path) as file:
+    with (
+        pytest.raises(DataError, match=r"(?s)another type.*'position'"),
+        writer(path) as file,
+    ):
         file.append(frame.astype(np.float64), frame)
     assert check_scenario(path) == content
     assert list(path.parent.iterdir()) == [path]
@@ -372,7 +467,11 @@ def test_wrong_frames_are_refused(tmp_path: Path) -> None:
         *(("depth", value) for value in ("", [1], {"a": 1}, np.array([1, 2]))),
     ],
 )
-def test_parameters_that_cannot_be_stored(tmp_path: Path, name: str, value: object) -> None:
-    """Names that would hide an attribute of the format, what netCDF would give back as something else."""
+def test_parameters_that_cannot_be_stored(
+    tmp_path: Path, name: str, value: object
+) -> None:
+    """Names that would hide an attribute of the format, what netCDF would give back as
+    something else.
+    """
     with pytest.raises(DataError, match="cannot be"):
         write_scenario(tmp_path, KEY, parameters={name: value})

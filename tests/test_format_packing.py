@@ -20,7 +20,11 @@ from lagbench.data.writer import rehash
 KEY = make_key()
 
 
-@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=20,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
 @given(
     library=st.sampled_from(["h5py", "netcdf4", "xarray"]),
     level=st.integers(0, 9),
@@ -29,7 +33,12 @@ KEY = make_key()
     order=st.randoms(use_true_random=False),
 )
 def test_packing_does_not_matter(
-    tmp_path: Path, library: str, level: int, shuffle: bool, chunk: tuple[int, int, int], order: random.Random
+    tmp_path: Path,
+    library: str,
+    level: int,
+    shuffle: bool,
+    chunk: tuple[int, int, int],
+    order: random.Random,
 ) -> None:
     """Chunks, compression, library and order of attributes leave the hash as it is."""
 
@@ -62,10 +71,16 @@ def repack_h5py(path: Path, other: Path, how: Packing) -> None:
     with h5py.File(path) as old, h5py.File(other, "w", track_order=True) as new:
         names = how.shuffled(old)
         for name in names:
-            packing = {"chunks": how.chunk, "shuffle": how.shuffle} if name in CHUNKED else {}
+            packing = (
+                {"chunks": how.chunk, "shuffle": how.shuffle} if name in CHUNKED else {}
+            )
             if packing and how.level:
                 packing |= {"compression": "gzip", "compression_opts": how.level}
-            dtype = h5py.string_dtype() if old[name].dtype.kind == "O" else old[name].dtype.newbyteorder(">")
+            dtype = (
+                h5py.string_dtype()
+                if old[name].dtype.kind == "O"
+                else old[name].dtype.newbyteorder(">")
+            )
             new.create_dataset(name, data=old[name][()], dtype=dtype, **packing)
             if DIMS[name] == (name,):
                 new[name].make_scale(name)
@@ -81,17 +96,28 @@ def repack_netcdf4(path: Path, other: Path, how: Packing) -> None:
     """Copy a scenario file by netCDF4 with other packing."""
     with netCDF4.Dataset(path) as old, netCDF4.Dataset(other, "w") as new:
         for name in how.shuffled(old.dimensions):
-            new.createDimension(name, None if name == "frame" else old.dimensions[name].size)
+            new.createDimension(
+                name, None if name == "frame" else old.dimensions[name].size
+            )
         for name in how.shuffled(old.variables):
             dtype = old[name].dtype
             packing: dict[str, Any] = {}
             if name in CHUNKED:
-                packing = {"chunksizes": how.chunk, "shuffle": how.shuffle, "endian": "big"}
-                packing |= {"compression": "zlib" if how.level else None, "complevel": how.level}
+                packing = {
+                    "chunksizes": how.chunk,
+                    "shuffle": how.shuffle,
+                    "endian": "big",
+                }
+                packing |= {
+                    "compression": "zlib" if how.level else None,
+                    "complevel": how.level,
+                }
                 dtype = dtype.newbyteorder(">")
             variable = new.createVariable(name, dtype, DIMS[name], **packing)
             variable[...] = old[name][...]
-        new.setncatts({name: old.getncattr(name) for name in how.shuffled(old.ncattrs())})
+        new.setncatts(
+            {name: old.getncattr(name) for name in how.shuffled(old.ncattrs())}
+        )
 
 
 def repack_xarray(path: Path, other: Path, how: Packing) -> None:
@@ -100,8 +126,15 @@ def repack_xarray(path: Path, other: Path, how: Packing) -> None:
         loaded = old.load().drop_encoding()
     loaded = loaded[how.shuffled(loaded.data_vars)]
     loaded.attrs = {name: loaded.attrs[name] for name in how.shuffled(loaded.attrs)}
-    packing = {"chunksizes": how.chunk, "zlib": how.level > 0, "complevel": how.level, "shuffle": how.shuffle}
-    encoding: dict[str, dict[str, Any]] = {str(name): {"_FillValue": None} for name in loaded.variables}
+    packing = {
+        "chunksizes": how.chunk,
+        "zlib": how.level > 0,
+        "complevel": how.level,
+        "shuffle": how.shuffle,
+    }
+    encoding: dict[str, dict[str, Any]] = {
+        str(name): {"_FillValue": None} for name in loaded.variables
+    }
     for name in ("position", "velocity"):
         encoding[name] |= packing
     loaded.to_netcdf(other, engine="netcdf4", encoding=encoding)

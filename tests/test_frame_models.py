@@ -1,4 +1,6 @@
-"""MLPs and LSTMs against the thesis's tables and transcriptions in NumPy; recipes of all frame models."""
+"""MLPs and LSTMs against the thesis's tables and transcriptions in NumPy; recipes of
+all frame models.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,15 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from simple_models import batch_of, counted, facts_of, rolled, rotations, share_of_persistence, train
+from simple_models import (
+    batch_of,
+    counted,
+    facts_of,
+    rolled,
+    rotations,
+    share_of_persistence,
+    train,
+)
 
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.frame_model import FrameNetwork, FrameState, FrameWindow
@@ -30,13 +40,22 @@ SMALL = {"widths": [16, 8]}
 Array = NDArray[np.float64]
 
 
-@pytest.mark.parametrize("study", STUDIES, ids=lambda study: f"{study.table}-{study.row}")
+@pytest.mark.parametrize(
+    "study", STUDIES, ids=lambda study: f"{study.table}-{study.row}"
+)
 def test_parameters_of_the_thesis(study: Study) -> None:
     """The recipes of Tables 4.2 to 4.5 have as many parameters as the thesis prints."""
     split = "fluid" if study.table < "4.4" else "multimaterial"
     # what tells a row's recipe from the others of its table
-    ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
-    recipe = recipe_for(find("mlp"), split, "full", variant=f"table-{study.table}-{ends[study.table]}")
+    ends = {
+        "4.2": study.activation,
+        "4.3": study.widths[0],
+        "4.4": len(study.widths),
+        "4.5": study.row,
+    }
+    recipe = recipe_for(
+        find("mlp"), split, "full", variant=f"table-{study.table}-{ends[study.table]}"
+    )
     with torch.device("meta"):  # no memory for the weights
         model = MLP.build(recipe.model, replace(FACTS, particles=2500))
     assert sum(p.numel() for p in model.parameters()) == study.parameters
@@ -61,32 +80,45 @@ def transcribed(model: MLP, before: Array, last: Array, activation: str) -> Arra
         state = layers[index] @ state + layers[index + 1]
         if index < len(layers) - 2:
             state = ACTIVATIONS[activation](state)
-    following: Array = state.reshape(-1, 4)[:, :2] * known["position_std"] + known["position_mean"]
+    following: Array = (
+        state.reshape(-1, 4)[:, :2] * known["position_std"] + known["position_mean"]
+    )
     return following
 
 
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_a_step_is_the_equation(activation: str) -> None:
-    """One step of a rollout equals layers, activations and standardisation written out in NumPy."""
+    """One step of a rollout equals layers, activations and standardisation written out
+    in NumPy.
+    """
     model = MLP.build({**SMALL, "activation": activation}, FACTS)
-    expected = transcribed(model, SCENARIOS[0][0].astype(float), SCENARIOS[0][1].astype(float), activation)
+    expected = transcribed(
+        model, SCENARIOS[0][0].astype(float), SCENARIOS[0][1].astype(float), activation
+    )
     found = rolled(model, batch_of([SCENARIOS[0][:2]]), 1)[:, 0].numpy()
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_the_loss_is_equation_4_16() -> None:
-    """Weighted terms add up to the mean square over particles and standardised attributes."""
+    """Weighted terms add up to the mean square over particles and standardised
+    attributes.
+    """
     model = MLP.build(SMALL, FACTS)
     window = SCENARIOS[1][5:8]
     terms = model(batch_of([window]))
-    loss = sum(model.weights[name] * float(term.detach()) for name, term in terms.items())
+    loss = sum(
+        model.weights[name] * float(term.detach()) for name, term in terms.items()
+    )
     state = FrameState(FACTS).of(torch.from_numpy(window))
     predicted = model.next_state(model.start(batch_of([window[:2]])))[0]
-    assert loss == pytest.approx(float((predicted - state[2]).square().mean().detach()), rel=1e-5)
+    assert loss == pytest.approx(
+        float((predicted - state[2]).square().mean().detach()), rel=1e-5
+    )
 
 
 def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
-    """A rollout of two scenarios side by side equals those of each alone, of their last two frames.
+    """A rollout of two scenarios side by side equals those of each alone, of their last
+    two frames.
 
     Scenarios of another size raise an error that says how many particles it takes.
     """
@@ -94,23 +126,31 @@ def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
     both = rolled(model, batch_of([SCENARIOS[0][:2], SCENARIOS[1][:2]]), 5)
     alone = [rolled(model, batch_of([x[:2]]), 5) for x in SCENARIOS[:2]]
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=1e-5)
-    long, short = (rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4))
+    long, short = (
+        rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4)
+    )
     assert torch.equal(long, short)
     with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
         model.start(batch_of([SCENARIOS[0][:2, :11]]))
 
 
 def test_a_change_of_nothing_is_persistence() -> None:
-    """With ``target: change`` a network that puts out zeros keeps every particle where it is."""
+    """With ``target: change`` a network that puts out zeros keeps every particle where
+    it is.
+    """
     model = MLP.build({**SMALL, "target": "change"}, FACTS)
     for parameter in model.network[-1].parameters():
         torch.nn.init.zeros_(parameter)
     given = batch_of([SCENARIOS[0][:2]])
-    torch.testing.assert_close(rolled(model, given, 3), given.position[:, -1:].expand(-1, 3, -1))
+    torch.testing.assert_close(
+        rolled(model, given, 3), given.position[:, -1:].expand(-1, 3, -1)
+    )
 
 
 def test_noise_is_as_large_as_asked_and_only_in_training() -> None:
-    """Inputs get normal noise of the recipe's deviation with a generator, and none without."""
+    """Inputs get normal noise of the recipe's deviation with a generator, and none
+    without.
+    """
     model = MLP.build({**SMALL, "noise_std": 0.3}, FACTS)
     state = torch.zeros(500, 1, 12, 4)
     noise = model.disturbed(state, torch.Generator().manual_seed(1))
@@ -132,7 +172,9 @@ def window_of() -> FrameWindow:
 @BOTH
 @pytest.mark.parametrize("material", [0, 1])
 def test_parameters_of_table_4_6(kind: type[LSTM], material: int) -> None:
-    """Encoder, two LSTM layers of 1250, decoder; the MLP between them adds 1250 x 1250 + 1250."""
+    """Encoder, two LSTM layers of 1250, decoder; the MLP between them adds 1250 x 1250
+    + 1250.
+    """
     with torch.device("meta"):
         model = kind.build({"material": bool(material)}, replace(FACTS, particles=2500))
     layer = 4 * (1250 * 1250 + 1250 * 1250 + 2 * 1250)
@@ -142,7 +184,9 @@ def test_parameters_of_table_4_6(kind: type[LSTM], material: int) -> None:
 
 
 def cells(layer: torch.nn.LSTM, inputs: Array) -> Array:
-    """Return the outputs of an LSTM layer over time by its gates, shape [time, latent]."""
+    """Return the outputs of an LSTM layer over time by its gates, shape [time,
+    latent].
+    """
     (w, r, b, c) = (p.detach().numpy().astype(float) for p in layer.parameters())
     sigmoid = ACTIVATIONS["sigmoid"]
     h = cell = np.zeros(layer.hidden_size)
@@ -164,35 +208,53 @@ def linear(layer: torch.nn.Module, x: Array) -> Array:
 
 @BOTH
 def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
-    """Encoder, pooling, gates, the MLP between, and decoder, written out, give the same state."""
-    model, window, elu = kind.build(GATED, FACTS).eval(), window_of(), ACTIVATIONS["elu"]
-    latent = elu(linear(model.encoder[0], window.state[0].numpy().astype(float))).mean(axis=1)
+    """Encoder, pooling, gates, the MLP between, and decoder, written out, give the same
+    state.
+    """
+    model = kind.build(GATED, FACTS).eval()
+    window = window_of()
+    elu = ACTIVATIONS["elu"]
+    latent = elu(linear(model.encoder[0], window.state[0].numpy().astype(float))).mean(
+        axis=1
+    )
     latent = cells(model.first, latent)
     if model.between is not None:
         latent = elu(linear(model.between[0], latent))
     last = cells(model.second, latent)[-1]
-    expected = linear(model.decoder[2], elu(linear(model.decoder[0], last))).reshape(12, 4)
+    expected = linear(model.decoder[2], elu(linear(model.decoder[0], last))).reshape(
+        12, 4
+    )
     found = model.next_state(window)[0].detach().numpy()
     np.testing.assert_allclose(found, expected, atol=1e-5)
     # the order of particles is nothing, that of frames is not
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     shuffled = FrameWindow(window.state[:, :, order], window.material)
-    torch.testing.assert_close(model.next_state(window), model.next_state(shuffled), atol=1e-6, rtol=1e-5)
+    torch.testing.assert_close(
+        model.next_state(window), model.next_state(shuffled), atol=1e-6, rtol=1e-5
+    )
     doubled = FrameWindow(window.state[:, [1, 1]], window.material)
-    assert not torch.allclose(model.next_state(window), model.next_state(doubled), atol=1e-6)
+    assert not torch.allclose(
+        model.next_state(window), model.next_state(doubled), atol=1e-6
+    )
 
 
 def test_a_rollout_starts_from_two_frames() -> None:
-    """Two given frames are enough: the first takes the second's velocity, as its own is unknown."""
+    """Two given frames are enough: the first takes the second's velocity, as its own is
+    unknown.
+    """
     model = LSTM.build(GATED, FACTS)
-    short, long = (model.start(batch_of([SCENARIOS[0][:frames]])).state[0] for frames in (2, 6))
+    short, long = (
+        model.start(batch_of([SCENARIOS[0][:frames]])).state[0] for frames in (2, 6)
+    )
     assert torch.equal(short[0, :, 2:], short[1, :, 2:])
     assert not torch.equal(long[0, :, 2:], long[1, :, 2:])
     assert model.history == 3
 
 
 def test_dropout_acts_in_training_only() -> None:
-    """Two passes differ in training and agree in a rollout; a share of 0 drops nothing."""
+    """Two passes differ in training and agree in a rollout; a share of 0 drops
+    nothing.
+    """
     window = window_of()
     model = LSTM.build(GATED, FACTS).train()
     assert not torch.equal(model.next_state(window), model.next_state(window))
@@ -202,22 +264,34 @@ def test_dropout_acts_in_training_only() -> None:
 
 
 def test_the_density_term_compares_maps() -> None:
-    """It is the squared error of the scorer's particle weights over their mean square."""
+    """It is the squared error of the scorer's particle weights over their mean
+    square.
+    """
     model = LSTM.build({**GATED, "dropout": [0.0, 0.0]}, FACTS)
     window = SCENARIOS[1][4:8]
     state = model.start(batch_of([window[:3]]))
     predicted = model.frame_state.position(model.next_state(state))[0].detach().numpy()
     grid = Grid(8, Placement.CELL_CENTRES)
-    guess, truth = (gridding.transfer(x, np.zeros_like(x), grid).weight for x in (predicted, window[3]))
+    guess, truth = (
+        gridding.transfer(x, np.zeros_like(x), grid).weight
+        for x in (predicted, window[3])
+    )
     expected = np.square(guess - truth).sum() / np.square(truth).sum()
-    assert float(model(batch_of([window]))["density"].detach()) == pytest.approx(expected, rel=1e-4)
+    assert float(model(batch_of([window]))["density"].detach()) == pytest.approx(
+        expected, rel=1e-4
+    )
     assert model.weights == {"density": 0.03}
 
 
 @pytest.mark.parametrize(("kind", "options"), [(MLP, SMALL), (LSTMWithMLP, GATED)])
-def test_the_material_is_a_fifth_input(kind: type[FrameNetwork], options: dict[str, Any]) -> None:
-    """Materials change the prediction where the recipe gives them to the network, and only there."""
-    window, kinds = [SCENARIOS[0][:2]], ([0] * 12, [0, 1, 2, 3] * 3)
+def test_the_material_is_a_fifth_input(
+    kind: type[FrameNetwork], options: dict[str, Any]
+) -> None:
+    """Materials change the prediction where the recipe gives them to the network, and
+    only there.
+    """
+    window = [SCENARIOS[0][:2]]
+    kinds = ([0] * 12, [0, 1, 2, 3] * 3)
     for given in (False, True):
         model = kind.build({**options, "material": given}, FACTS)
         first, second = (rolled(model, batch_of(window, kind), 1) for kind in kinds)
@@ -225,10 +299,15 @@ def test_the_material_is_a_fifth_input(kind: type[FrameNetwork], options: dict[s
 
 
 @pytest.mark.parametrize(
-    ("kind", "steps", "share"), [(MLP, 300, 0.1), (LSTM, 400, 0.2), (LSTMWithMLP, 400, 0.2)]
+    ("kind", "steps", "share"),
+    [(MLP, 300, 0.1), (LSTM, 400, 0.2), (LSTMWithMLP, 400, 0.2)],
 )
-def test_it_learns_a_rotation(kind: type[FrameNetwork], steps: int, share: float) -> None:
-    """After some hundred steps a rollout from a new angle is far better than standing still."""
+def test_it_learns_a_rotation(
+    kind: type[FrameNetwork], steps: int, share: float
+) -> None:
+    """After some hundred steps a rollout from a new angle is far better than standing
+    still.
+    """
     torch.manual_seed(0)
     recurrent = {"latent": 32, "decoder": [32], "dropout": [0.0, 0.0]}
     model = kind.build({"widths": [64, 64]} if kind is MLP else recurrent, FACTS)
@@ -244,7 +323,9 @@ SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 @pytest.mark.parametrize("split", SPLITS)
 @pytest.mark.parametrize("name", [*NETWORKS, "var", "var-stable"])
 def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) -> None:
-    """Plain VAR is not for full boxes; mini has at most 4 M numbers, a stable VAR 8 MB."""
+    """Plain VAR is not for full boxes; mini has at most 4 M numbers, a stable VAR 8
+    MB.
+    """
     if name == "var" and size == "full" and split in ("cavity", "curl-noise"):
         with pytest.raises(UsageError, match="no recipe"):
             recipe_for(find(name), split, size)
@@ -265,8 +346,13 @@ def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) ->
 @pytest.mark.parametrize("split", SPLITS)
 @pytest.mark.parametrize("name", NETWORKS)
 def test_variants_with_changes_differ_in_that_only(name: str, split: str) -> None:
-    """``mini-change`` has the layers and training of ``mini``; its target, and its noise, are others."""
-    plain, change = (recipe_for(find(name), split, "mini", variant=variant) for variant in (None, "change"))
+    """``mini-change`` has the layers and training of ``mini``; its target, and its
+    noise, are others.
+    """
+    plain, change = (
+        recipe_for(find(name), split, "mini", variant=variant)
+        for variant in (None, "change")
+    )
     assert change.training == plain.training
     differing = {key for key in plain.model if plain.model[key] != change.model[key]}
     assert {"target"} <= differing <= {"target", "noise_std"}

@@ -1,7 +1,8 @@
-"""Acceptance of the free-surface solver (design 4.4) on scenarios of the registry and set pieces.
+"""Acceptance of the free-surface solver (design 4.4) on scenarios of the registry and
+set pieces.
 
-Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least twice, in three
-commits.
+Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least
+twice, in three commits.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ FULL = parameters(particles=1250, grid=64, dt=1 / 1200, wall=3)
 FRAME = 20
 LIQUID_IDS = (0, 4, 1, 5, 2, 6, 3, 7)
 PAIR_IDS = (48, 54, 49, 55, 50, 56, 51, 57, 52, 58, 53, 59)
-# Equals stand side by side: families repeat with the id by 4, pairs by 6, and a commit takes every third.
+# Equals stand side by side: families repeat with the id by 4, pairs by 6, and a commit
+# takes every third.
 EVERY = [("fluid", i) for i in LIQUID_IDS] + [("multimaterial", i) for i in PAIR_IDS]
 SETTLING = [("fluid", i) for i in (4, 5, 6, 7)] + [("multimaterial", 53)]
 SMALL = [("fluid", size, i) for size in ("mini", "tiny") for i in range(4)]
@@ -41,7 +43,9 @@ SMALL += [("multimaterial", size, i) for size in ("mini", "tiny") for i in range
 
 @dataclass(frozen=True)
 class History:
-    """What a run of a registered scenario left behind; energies are one number per 4 frames."""
+    """What a run of a registered scenario left behind; energies are one number per 4
+    frames.
+    """
 
     parameters: FreeSurfaceParameters
     state: InitialState
@@ -55,7 +59,9 @@ class History:
 
 def constants(split: str, size: str) -> FreeSurfaceParameters:
     """Return the solver's constants at a size of the registry."""
-    return cast("FreeSurfaceParameters", solver_constants(registry.load().size(split, size)))
+    return cast(
+        "FreeSurfaceParameters", solver_constants(registry.load().size(split, size))
+    )
 
 
 def spacing(state: InitialState) -> float:
@@ -66,10 +72,14 @@ def spacing(state: InitialState) -> float:
 @functools.cache
 def history(split: str, size: str, scenario_id: int, frames: int) -> History:
     """Run a scenario of the registry once for all tests."""
-    chosen, state = constants(split, size), state_of(split, size, scenario_id)
+    chosen = constants(split, size)
+    state = state_of(split, size, scenario_id)
     solver = start(chosen, [state])
     substeps = registry.load().size(split, size).substeps_per_frame
-    kinetic, total, fastest, gap = [], [], 0.0, 0.0
+    kinetic = []
+    total = []
+    fastest = 0.0
+    gap = 0.0
     energy = solver.energy()
     for _ in range(frames // 4):
         kinetic.append(energy.kinetic[0])
@@ -95,22 +105,30 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
 
 
 def longest_edge(position: Array) -> float:
-    """Return the largest gap that holds a body together: the longest edge of its spanning tree."""
+    """Return the largest gap that holds a body together: the longest edge of its
+    spanning tree.
+    """
     triangles = Delaunay(position).simplices
-    first, second = np.concatenate([triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]).T
+    first, second = np.concatenate(
+        [triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]
+    ).T
     length = np.linalg.norm(position[first] - position[second], axis=1)
     graph = coo_matrix((length, (first, second)), shape=(len(position), len(position)))
     return float(minimum_spanning_tree(graph.tocsr()).data.max())
 
 
 def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> Array:
-    """Density over rest density at the particles, from B-splines mirrored at the walls, in float64."""
+    """Density over rest density at the particles, from B-splines mirrored at the walls,
+    in float64.
+    """
     scaled = position * p.grid
     base = np.floor(scaled - 0.5).astype(int)
     f = scaled - base
     weight = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1.0) ** 2, 0.5 * (f - 0.5) ** 2)
     count = np.zeros((p.grid + 1, p.grid + 1))
-    stencil = [(i, j, weight[i][:, 0] * weight[j][:, 1]) for i in range(3) for j in range(3)]
+    stencil = [
+        (i, j, weight[i][:, 0] * weight[j][:, 1]) for i in range(3) for j in range(3)
+    ]
     for i, j, w in stencil:
         np.add.at(count, (base[:, 0] + i, base[:, 1] + j), w)
     for n in (count, count.T):
@@ -118,19 +136,24 @@ def relative_density(position: Array, area: float, p: FreeSurfaceParameters) -> 
             n[wall] *= 2.0
             n[wall + inside] += n[wall + outside]
             n[wall + outside] = n[wall + inside]
-    gathered = np.sum([w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil], axis=0)
+    gathered = np.sum(
+        [w * count[base[:, 0] + i, base[:, 1] + j] for i, j, w in stencil], axis=0
+    )
     return np.asarray(gathered * area / p.particles * p.grid**2)
 
 
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
 def test_sound_stays_within_a_cell(size: str) -> None:
-    """The acoustic Courant number of every material of a split is at most 0.8 at every size."""
+    """The acoustic Courant number of every material of a split is at most 0.8 at every
+    size.
+    """
     assert courant(constants("fluid", size))[Material.LIQUID] <= 0.8
     assert max(courant(constants("multimaterial", size)).values()) <= 0.8
 
 
 def assert_sound(run: History) -> None:
-    """Positions lie between the walls, nobody crosses a cell in a substep, energy falls.
+    """Positions lie between the walls, nobody crosses a cell in a substep, energy
+    falls.
 
     Energy never rises above its running minimum by 2 % of what was dissipated.
     """
@@ -145,18 +168,21 @@ def assert_sound(run: History) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("split", "scenario_id"), of_this_turn(EVERY, turns=3))
 def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
-    """A scenario keeps box, CFL bound and falling energy, its motion dies out, its rope stays in one piece.
+    """A scenario keeps box, CFL bound and falling energy, its motion dies out, its rope
+    stays in one piece.
 
-    Every particle of a rope has a neighbour within 2 spacings, and no gap grows by half. The seeds
-    themselves hang together by gaps of 2.0 to 2.4 spacings, the rows of the R2 lattice, so the gap of the
-    spanning tree is compared with its own start.
+    Every particle of a rope has a neighbour within 2 spacings, and no gap grows by
+    half. The seeds themselves hang together by gaps of 2.0 to 2.4 spacings, the rows of
+    the R2 lattice, so the gap of the spanning tree is compared with its own start.
     """
     run = history(split, "full", scenario_id, 600)
     assert_sound(run)
     assert run.kinetic[-1] <= 0.03 * run.kinetic.max()
     rope = run.state.material == Material.ROPE
     if rope.any():
-        neighbour = np.asarray(cKDTree(run.position[rope]).query(run.position[rope], k=2)[0])[:, 1]
+        neighbour = np.asarray(
+            cKDTree(run.position[rope]).query(run.position[rope], k=2)[0]
+        )[:, 1]
         assert neighbour.max() <= 2.0 * spacing(run.state)
         assert run.largest_gap <= 1.5 * longest_edge(run.state.position[rope])
 
@@ -166,15 +192,24 @@ def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
 def test_settled_liquid(split: str, scenario_id: int) -> None:
     """After 1500 frames: rest density, even depth, hydrostatic pressure.
 
-    Density and pressure count below the surface by two cells; the profile is judged in bins of
-    depth, in units of the pressure on the floor.
+    Density and pressure count below the surface by two cells; the profile is judged in
+    bins of depth, in units of the pressure on the floor.
     """
     run = history(split, "full", scenario_id, 1500)
-    p, cell = run.parameters, 1.0 / run.parameters.grid
-    low, columns = p.wall * cell, 16
+    p = run.parameters
+    cell = 1.0 / run.parameters.grid
+    low = p.wall * cell
+    columns = 16
     width = 1.0 - 2.0 * low
-    column = np.clip((run.position[:, 0] - low) / width * columns, 0, columns - 1).astype(int)
-    top = np.array([np.quantile(run.position[column == c, 1], 0.98) for c in range(columns)]) - low
+    column = np.clip(
+        (run.position[:, 0] - low) / width * columns, 0, columns - 1
+    ).astype(int)
+    top = (
+        np.array(
+            [np.quantile(run.position[column == c, 1], 0.98) for c in range(columns)]
+        )
+        - low
+    )
     np.testing.assert_allclose(top, run.state.area / width, rtol=0.25)
     below = low + top[column] - run.position[:, 1]
     deep = below > 2.0 * cell
@@ -193,41 +228,61 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
 @pytest.mark.parametrize("shape", [Rectangle(0.22, 0.22), Disc(0.125)])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
-    """Dropped by 0.45, 40 to 85 % of the snow is compacted and neighbours are torn apart."""
+    """Dropped by 0.45, 40 to 85 % of the snow is compacted and neighbours are torn
+    apart.
+    """
     height = 3 / 64 + 0.45 + shape.reach[1]
-    state = scenario(FULL, Part(Material.SNOW, shape, (0.5, height)), seed=seed, friction=0.3)
+    state = scenario(
+        FULL, Part(Material.SNOW, shape, (0.5, height)), seed=seed, friction=0.3
+    )
     solver = start(FULL, [state])
     solver.advance(150 * FRAME)
     assert 0.40 <= (solver.volume_ratio()[0] < 1.0).mean() <= 0.85
-    pairs = cKDTree(state.position).query_pairs(1.5 * spacing(state), output_type="ndarray")
+    pairs = cKDTree(state.position).query_pairs(
+        1.5 * spacing(state), output_type="ndarray"
+    )
     x = solver.position()[0].astype(np.float64)
-    torn = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) > 3.0 * spacing(state)
+    torn = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) > 3.0 * spacing(
+        state
+    )
     assert torn.mean() >= 0.05
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
-    """Dropped by 0.45, a ball rises to 0.6-0.9 of that and is round again at frame 600."""
-    radius, drop = 0.126, 0.45
-    state = scenario(FULL, Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius)), seed=seed)
-    solver, heights = start(FULL, [state]), []
+    """Dropped by 0.45, a ball rises to 0.6-0.9 of that and is round again at frame
+    600.
+    """
+    radius = 0.126
+    drop = 0.45
+    state = scenario(
+        FULL,
+        Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius)),
+        seed=seed,
+    )
+    solver = start(FULL, [state])
+    heights = []
     for _ in range(120):
         heights.append(float(solver.position()[0, :, 1].mean()))
         solver.advance(FRAME)
-    lowest, rest = int(np.argmin(heights[:60])), heights[0] - drop
+    lowest = int(np.argmin(heights[:60]))
+    rest = heights[0] - drop
     assert 0.6 <= (max(heights[lowest:]) - rest) / drop <= 0.9
     solver.advance(480 * FRAME)
     # root mean square distance after the best rigid motion (Kabsch)
     after = solver.position()[0].astype(np.float64)
-    a, b = state.position - state.position.mean(axis=0), after - after.mean(axis=0)
+    a = state.position - state.position.mean(axis=0)
+    b = after - after.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     assert np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()) <= 0.03 * radius
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("material", "young"), [(Material.ROPE, 100.0), (Material.JELLY, 30.0)])
+@pytest.mark.parametrize(
+    ("material", "young"), [(Material.ROPE, 100.0), (Material.JELLY, 30.0)]
+)
 def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
     """A free bar swings lengthwise at sqrt(E / (rho (1 - nu^2))) / 2L to 2 %."""
     length = 0.6
@@ -235,7 +290,8 @@ def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
     state = scenario(weightless, Part(material, Rectangle(length, 0.05), (0.5, 0.5)))
     mode = np.cos(np.pi * (state.position[:, 0] - 0.5 + 0.5 * length) / length)
     state.velocity[:, 0] = 0.05 * mode
-    solver, amplitude = start(weightless, [state]), []
+    solver = start(weightless, [state])
+    amplitude = []
     for _ in range(1200):
         solver.advance(1)
         amplitude.append(float((solver.velocity()[0, :, 0] * mode).mean()))
@@ -248,7 +304,11 @@ def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("split", "size", "scenario_id"), of_this_turn(SMALL, turns=3, shift=1))
+@pytest.mark.parametrize(
+    ("split", "size", "scenario_id"), of_this_turn(SMALL, turns=3, shift=1)
+)
 def test_small_sizes_are_sound(split: str, size: str, scenario_id: int) -> None:
-    """With the constants of ``full``, mini and tiny keep box, CFL bound and falling energy."""
+    """With the constants of ``full``, mini and tiny keep box, CFL bound and falling
+    energy.
+    """
     assert_sound(history(split, size, scenario_id, 300))

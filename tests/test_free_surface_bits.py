@@ -1,4 +1,6 @@
-"""The free-surface solver's bits: drivers, orders of particles and NumPy agree exactly."""
+"""The free-surface solver's bits: drivers, orders of particles and NumPy agree
+exactly.
+"""
 
 from __future__ import annotations
 
@@ -23,14 +25,18 @@ def falling(material: Material, friction: float = 0.0) -> InitialState:
     """Two bodies that hit opposite corners at once and come apart."""
     low = Part(material, SQUARE, (0.2, 0.18), (-1.5, -1.5))
     high = Part(material, Disc(0.1), (0.8, 0.8), (2.0, 1.0))
-    return scenario(CONSTANTS, low, high, seed=int(material), friction=friction, spin=4.0)
+    return scenario(
+        CONSTANTS, low, high, seed=int(material), friction=friction, spin=4.0
+    )
 
 
 def cornered(gap: float, high: bool) -> InitialState:
     """One resting square of liquid that keeps a gap from two walls [cells]."""
     near = (CONSTANTS.wall + gap) / CONSTANTS.grid + 0.1
     centre = 1.0 - near if high else near
-    return scenario(CONSTANTS, Part(Material.LIQUID, SQUARE, (centre, centre)), spin=4.0)
+    return scenario(
+        CONSTANTS, Part(Material.LIQUID, SQUARE, (centre, centre)), spin=4.0
+    )
 
 
 MIXED = scenario(
@@ -50,14 +56,20 @@ CASES = [pytest.param(state, id=name) for name, state in NAMED.items()]
 def arrays_of(reference: FreeSurfaceReference) -> list[NDArray[np.float32]]:
     """Return the arrays of the state in the order of a snapshot."""
     shape = (CONSTANTS.particles, 2, 2)
-    matrices = (np.stack(rows, axis=1).reshape(shape) for rows in (reference.affine, reference.deformation))
+    matrices = (
+        np.stack(rows, axis=1).reshape(shape)
+        for rows in (reference.affine, reference.deformation)
+    )
     return [reference.position, reference.velocity, *matrices, reference.ratio]
 
 
 @pytest.mark.parametrize("state", CASES)
 def test_numpy_gives_the_same_bits(state: InitialState) -> None:
-    """An independent float32 implementation agrees in every bit over 400 substeps, walls included."""
-    solver, reference = start(CONSTANTS, [state]), FreeSurfaceReference(CONSTANTS, state)
+    """An independent float32 implementation agrees in every bit over 400 substeps,
+    walls included.
+    """
+    solver = start(CONSTANTS, [state])
+    reference = FreeSurfaceReference(CONSTANTS, state)
     for substeps in (1, 9, 90, 300):
         solver.advance(substeps)
         reference.advance(substeps)
@@ -68,23 +80,35 @@ def test_numpy_gives_the_same_bits(state: InitialState) -> None:
 
 @pytest.mark.parametrize("material", Material)
 def test_scenarios_of_these_tests_reach_walls(material: Material) -> None:
-    """The comparisons cover mirrored nodes: at least three walls are hit within 400 substeps."""
-    solver, near = start(CONSTANTS, [falling(material)]), (CONSTANTS.wall + 1.5) / CONSTANTS.grid
+    """The comparisons cover mirrored nodes: at least three walls are hit within 400
+    substeps.
+    """
+    solver = start(CONSTANTS, [falling(material)])
+    near = (CONSTANTS.wall + 1.5) / CONSTANTS.grid
     touched = np.zeros(4, bool)
     for _ in range(40):
         solver.advance(10)
         position = solver.position()[0]
-        touched |= np.concatenate([position.min(axis=0), 1.0 - position.max(axis=0)]) < near
+        touched |= (
+            np.concatenate([position.min(axis=0), 1.0 - position.max(axis=0)]) < near
+        )
     assert touched.sum() >= 3
 
 
 @pytest.mark.parametrize(
     "threads",
-    [1, pytest.param(2, marks=pytest.mark.skipif(available_cores() < 2, reason="one processor"))],
+    [
+        1,
+        pytest.param(
+            2, marks=pytest.mark.skipif(available_cores() < 2, reason="one processor")
+        ),
+    ],
 )
 @pytest.mark.parametrize("state", CASES)
 def test_parallel_driver_gives_the_same_bits(state: InitialState, threads: int) -> None:
-    """Atomic adds from any number of threads, over the whole grid, change no bit in 400 substeps."""
+    """Atomic adds from any number of threads, over the whole grid, change no bit in 400
+    substeps.
+    """
     serial = run(CONSTANTS, [state], 400)
     parallel = run(CONSTANTS, [state], 400, device=Device.PARALLEL, threads=threads)
     np.testing.assert_equal(parallel, serial)
@@ -95,20 +119,26 @@ def test_parallel_driver_gives_the_same_bits(state: InitialState, threads: int) 
 def test_rows_beyond_a_wall_are_never_stale(gap: float, high: bool) -> None:
     """Nodes that walls mirror are cleared even if no particle touches them.
 
-    The serial driver visits only nodes near particles. Here a first scenario fills the rows
-    beyond two walls; the second lies near these walls without touching those rows.
+    The serial driver visits only nodes near particles. Here a first scenario fills the
+    rows beyond two walls; the second lies near these walls without touching those rows.
     """
-    parallel = run(CONSTANTS, [cornered(gap, high)], 20, device=Device.PARALLEL, threads=1)
+    parallel = run(
+        CONSTANTS, [cornered(gap, high)], 20, device=Device.PARALLEL, threads=1
+    )
     run(CONSTANTS, [cornered(0.05, high)], 5)
     np.testing.assert_equal(run(CONSTANTS, [cornered(gap, high)], 20), parallel)
 
 
 def test_batched_scenarios_do_not_touch_each_other() -> None:
-    """Scenarios of other materials, areas and frictions in one batch equal each one alone."""
+    """Scenarios of other materials, areas and frictions in one batch equal each one
+    alone.
+    """
     states = [falling(Material.LIQUID), falling(Material.SNOW, friction=0.3), MIXED]
     together = run(CONSTANTS, states, 200, device=Device.PARALLEL)
     for index, state in enumerate(states):
-        np.testing.assert_equal([own[index : index + 1] for own in together], run(CONSTANTS, [state], 200))
+        np.testing.assert_equal(
+            [own[index : index + 1] for own in together], run(CONSTANTS, [state], 200)
+        )
 
 
 @pytest.mark.parametrize("state", CASES)
@@ -116,20 +146,27 @@ def test_order_of_particles_does_not_matter(state: InitialState) -> None:
     """Permuted particles give permuted results, bit for bit, over 400 substeps."""
     order = np.random.default_rng(4).permutation(CONSTANTS.particles)
     names = ("position", "velocity", "affine", "material")
-    permuted = dataclasses.replace(state, **{name: getattr(state, name)[order] for name in names})
+    permuted = dataclasses.replace(
+        state, **{name: getattr(state, name)[order] for name in names}
+    )
     straight = [own[:, order] for own in run(CONSTANTS, [state], 400)]
     np.testing.assert_equal(run(CONSTANTS, [permuted], 400), straight)
 
 
 def test_pauses_do_not_matter() -> None:
     """Reading out between substeps changes nothing: 7 + 93 substeps are 100."""
-    np.testing.assert_equal(run(CONSTANTS, [MIXED], 7, 0, 93), run(CONSTANTS, [MIXED], 100))
+    np.testing.assert_equal(
+        run(CONSTANTS, [MIXED], 7, 0, 93), run(CONSTANTS, [MIXED], 100)
+    )
 
 
 def test_a_solver_forgets_its_last_scenario() -> None:
-    """Loading again starts from the new state only: no field carries over, NumPy says."""
+    """Loading again starts from the new state only: no field carries over, NumPy
+    says.
+    """
     run(CONSTANTS, [falling(Material.LIQUID)], 300)
-    again, reference = start(CONSTANTS, [MIXED]), FreeSurfaceReference(CONSTANTS, MIXED)
+    again = start(CONSTANTS, [MIXED])
+    reference = FreeSurfaceReference(CONSTANTS, MIXED)
     again.advance(100)
     reference.advance(100)
     np.testing.assert_equal([own[0] for own in snapshot(again)], arrays_of(reference))

@@ -1,4 +1,6 @@
-"""Generation: what is written, what is resumed, and that workers and devices leave no trace."""
+"""Generation: what is written, what is resumed, and that workers and devices leave no
+trace.
+"""
 
 from __future__ import annotations
 
@@ -44,11 +46,15 @@ def manifest_of(root: Path, split: str = SPLIT) -> Manifest:
 
 def contents(root: Path) -> dict[str, bytes]:
     """Return name and bytes of every scenario file."""
-    return {path.name: path.read_bytes() for path in sorted(folder_of(root).glob("*/*.nc"))}
+    return {
+        path.name: path.read_bytes() for path in sorted(folder_of(root).glob("*/*.nc"))
+    }
 
 
 def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
-    """Five files, whose data set hash follows by h5py and hashlib from the rules of the design."""
+    """Five files, whose data set hash follows by h5py and hashlib from the rules of the
+    design.
+    """
     subsets = {}
     for subset in ("train", "valid", "test"):
         paths = sorted((generated.folder / subset).glob("*.nc"))
@@ -59,19 +65,38 @@ def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
     assert generated.simulated == (0, 1, 2, 3, 4)
     assert (generated.kept, generated.missing, generated.complete) == ((), (), True)
     assert "nothing to compare with" in generated.verdict
-    # Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no temporary file.
+    # Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no
+    # temporary file.
     files = [path for path in generated.folder.rglob("*") if path.is_file()]
     names = {str(path.relative_to(generated.folder)) for path in files}
-    scenarios = {"train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc", "test/0004.nc"}
-    cards = {"manifest.json", "README.md", "croissant.json", "pictures/frame.png", "pictures/scenarios.png"}
+    scenarios = {
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    }
+    cards = {
+        "manifest.json",
+        "README.md",
+        "croissant.json",
+        "pictures/frame.png",
+        "pictures/scenarios.png",
+    }
     assert names == scenarios | cards | {".lock", ".verified.json"}
 
 
-def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeasured: Registry) -> None:
-    """Frame 0 is the initial state drawn from the stated seed; parameters are those of the registry."""
+def test_a_file_holds_what_its_scenario_says(
+    generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """Frame 0 is the initial state drawn from the stated seed; parameters are those of
+    the registry.
+    """
     size = unmeasured.size(SPLIT, SIZE)
     with read_scenario(generated.folder / "test" / "0003.nc") as file:
-        header, first, material = file.header, file.read("position", 0), file.read("material")
+        header = file.header
+        first = file.read("position", 0)
+        material = file.read("material")
         velocity = file.read("velocity", 0)
     state = draw(size, 3)
     np.testing.assert_array_equal(first, state.position.astype(np.float32))
@@ -85,20 +110,34 @@ def test_a_file_holds_what_its_scenario_says(generated: GenerationResult, unmeas
     assert header.parameters["modulus"] == size.value("modulus")
 
 
-def test_cavity_files_hold_the_walls_of_every_frame(tiny_split: Callable[..., GenerationResult]) -> None:
-    """Row f of ``wall_velocity`` is what the program says of frame f, counted from where recording starts."""
+def test_cavity_files_hold_the_walls_of_every_frame(
+    tiny_split: Callable[..., GenerationResult],
+) -> None:
+    """Row f of ``wall_velocity`` is what the program says of frame f, counted from
+    where recording starts.
+    """
     state = draw(load().size("cavity", "tiny"), 3)
     with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
-        walls, start = file.read("wall_velocity"), file.header.parameters["start_frame"]
+        walls = file.read("wall_velocity")
+        start = file.header.parameters["start_frame"]
         assert "active_frames" not in file.header.parameters
     assert start == state.start_frame
     np.testing.assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
-    assert len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0)) > 13
+    assert (
+        len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0))
+        > 13
+    )
 
 
 def test_active_frames_end_when_little_energy_is_left() -> None:
-    """Two frames given, six to predict: the last above 1 % counts, later peaks beyond the horizon do not."""
-    task = load().size("fluid", "tiny").task.model_copy(update={"input_frames": 2, "horizon": 6})
+    """Two frames given, six to predict: the last above 1 % counts, later peaks beyond
+    the horizon do not.
+    """
+    task = (
+        load()
+        .size("fluid", "tiny")
+        .task.model_copy(update={"input_frames": 2, "horizon": 6})
+    )
     assert active_frames([1.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05, 0.02, 90.0], task) == 6
     assert active_frames([1.0, 2.0, 1.0, 0.5, 0.0199, 0.1, 0.0199, 0.0, 0.5], task) == 4
     assert active_frames([1.0, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], task) == 0
@@ -108,7 +147,9 @@ def test_active_frames_end_when_little_energy_is_left() -> None:
 def test_active_frames_stand_in_the_file_and_its_hash(
     split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
-    """They follow from the stored velocities; another number is another content hash."""
+    """They follow from the stored velocities; another number is another content
+    hash.
+    """
     shutil.copytree(tiny_split(split).folder / "test", tmp_path / "test")
     task = load().size(split, "tiny").task
     for path in sorted((tmp_path / "test").glob("*.nc")):
@@ -116,7 +157,10 @@ def test_active_frames_stand_in_the_file_and_its_hash(
             energy = (file.read("velocity").astype(np.float64) ** 2).sum(axis=(1, 2))
             stated = file.header.parameters["active_frames"]
         span = energy[: task.input_frames + task.horizon]
-        assert stated == np.flatnonzero(span >= 0.01 * span.max())[-1] + 1 - task.input_frames
+        assert (
+            stated
+            == np.flatnonzero(span >= 0.01 * span.max())[-1] + 1 - task.input_frames
+        )
         check_scenario(path)
         with h5py.File(path, "r+") as raw:
             raw.attrs.modify("active_frames", stated + 1)
@@ -127,19 +171,26 @@ def test_active_frames_stand_in_the_file_and_its_hash(
 def test_facts_of_the_manifest_follow_from_the_files(
     generated: GenerationResult, unmeasured: Registry
 ) -> None:
-    """Energies are sums over the stored velocities; speed, CFL number and J stay in their bounds.
+    """Energies are sums over the stored velocities; speed, CFL number and J stay in
+    their bounds.
 
-    A twin's RMSE is known for each predicted frame; after one frame it is still near 2^-20.
+    A twin's RMSE is known for each predicted frame; after one frame it is still near
+    2^-20.
     """
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
     for entry in manifest_of(generated.root).files:
         with read_scenario(generated.folder / entry.path) as file:
-            velocity, mass = file.read("velocity").astype(np.float64), float(file.read("particle_mass"))
+            velocity = file.read("velocity").astype(np.float64)
+            mass = float(file.read("particle_mass"))
         energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
-        facts, last = entry.facts, energy[-1]
+        facts = entry.facts
+        last = energy[-1]
         known = {"first": energy[0], "last": last, "mean": energy.mean()}
         known = {f"kinetic_energy_{name}": value for name, value in known.items()}
-        for name, value in {**known, "energy_last_over_max": last / energy.max()}.items():
+        for name, value in {
+            **known,
+            "energy_last_over_max": last / energy.max(),
+        }.items():
             assert facts[name] == pytest.approx(value, rel=1e-12), name
         assert facts["max_speed"] >= np.abs(velocity).max()
         assert 0.0 < facts["cfl"] < 1.0
@@ -150,7 +201,9 @@ def test_facts_of_the_manifest_follow_from_the_files(
 
 
 def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
-    """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario is drawn."""
+    """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario
+    is drawn.
+    """
     size = unmeasured.size(SPLIT, SIZE)
     signs = nudge(size, 3) * 2**20
     assert set(np.unique(signs)) == {-1.0, 1.0}
@@ -163,9 +216,12 @@ def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
 def test_resuming_makes_what_is_missing_or_wrong(
     copied: Callable[[], Path], unmeasured: Registry, generated: GenerationResult
 ) -> None:
-    """A removed and a damaged scenario are made anew by one worker; then all bytes are as before."""
+    """A removed and a damaged scenario are made anew by one worker; then all bytes are
+    as before.
+    """
     root = copied()
-    before, folder = contents(root), folder_of(root)
+    before = contents(root)
+    folder = folder_of(root)
     (folder / "test" / "0003.nc").unlink()
     damaged = folder / "train" / "0001.nc"
     os.truncate(damaged, damaged.stat().st_size - 1000)
@@ -178,9 +234,15 @@ def test_resuming_makes_what_is_missing_or_wrong(
     assert not leftover.exists()
 
 
-def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
-    """One subset first leaves complete: false and no data set hash; the rest gives the whole hash."""
-    part = generate(SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured)
+def test_parts_complete_each_other(
+    tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """One subset first leaves complete: false and no data set hash; the rest gives the
+    whole hash.
+    """
+    part = generate(
+        SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured
+    )
     assert (part.simulated, part.missing) == ((3, 4), (0, 1, 2))
     assert (part.complete, part.dataset_sha256) == (False, None)
     manifest = manifest_of(tmp_path)
@@ -192,14 +254,29 @@ def test_parts_complete_each_other(tmp_path: Path, unmeasured: Registry, generat
 
 @pytest.mark.usefixtures("as_shipped")
 def test_force_simulates_what_is_there(
-    copied: Callable[[], Path], unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    copied: Callable[[], Path],
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With force a good scenario is written again, with the same bytes; compiled kernels are kept."""
-    root, kernels = copied(), tmp_path / "kernels"
+    """With force a good scenario is written again, with the same bytes; compiled
+    kernels are kept.
+    """
+    root = copied()
+    kernels = tmp_path / "kernels"
     monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(kernels))
-    before, path = contents(root), folder_of(root) / "valid" / "0002.nc"
+    before = contents(root)
+    path = folder_of(root) / "valid" / "0002.nc"
     stamp = path.stat().st_mtime_ns
-    result = generate(SPLIT, SIZE, scenarios="2", root=root, workers=1, force=True, registry=unmeasured)
+    result = generate(
+        SPLIT,
+        SIZE,
+        scenarios="2",
+        root=root,
+        workers=1,
+        force=True,
+        registry=unmeasured,
+    )
     assert result.simulated == (2,)
     assert path.stat().st_mtime_ns > stamp
     assert contents(root) == before
@@ -209,17 +286,30 @@ def test_force_simulates_what_is_there(
 def test_files_of_other_parameters_are_made_anew(
     copied: Callable[[], Path], unmeasured_path: Path, tmp_path: Path
 ) -> None:
-    """Whoever changes a parameter of an unreleased split does not keep files of the old one."""
-    text, old = unmeasured_path.read_text(), "velocity_relaxation: {value: 0.002"
+    """Whoever changes a parameter of an unreleased split does not keep files of the old
+    one.
+    """
+    text = unmeasured_path.read_text()
+    old = "velocity_relaxation: {value: 0.002"
     assert old in text
-    (tmp_path / "own.yaml").write_text(text.replace(old, "velocity_relaxation: {value: 0.003"))
-    result = generate(SPLIT, SIZE, root=copied(), dry_run=True, registry=load(tmp_path / "own.yaml"))
+    (tmp_path / "own.yaml").write_text(
+        text.replace(old, "velocity_relaxation: {value: 0.003")
+    )
+    result = generate(
+        SPLIT, SIZE, root=copied(), dry_run=True, registry=load(tmp_path / "own.yaml")
+    )
     assert (result.simulated, result.kept) == ((0, 1, 2, 3, 4), ())
 
 
-def test_a_dry_run_touches_nothing(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
-    """It tells bytes (an upper bound, not by much), time and free disk, and makes no folder."""
-    result = generate(SPLIT, SIZE, root=tmp_path / "new", dry_run=True, registry=unmeasured)
+def test_a_dry_run_touches_nothing(
+    tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """It tells bytes (an upper bound, not by much), time and free disk, and makes no
+    folder.
+    """
+    result = generate(
+        SPLIT, SIZE, root=tmp_path / "new", dry_run=True, registry=unmeasured
+    )
     real = sum(len(data) for data in contents(generated.root).values())
     assert real < result.bytes_needed < 2 * real
     assert result.bytes_free > result.bytes_needed
@@ -231,11 +321,20 @@ def test_a_dry_run_touches_nothing(tmp_path: Path, unmeasured: Registry, generat
 def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> None:
     """Substeps of the scenario and of its twin are counted, none twice."""
     news: list[Progress] = []
-    generate(SPLIT, SIZE, scenarios="3", root=tmp_path, progress=news.append, registry=unmeasured)
+    generate(
+        SPLIT,
+        SIZE,
+        scenarios="3",
+        root=tmp_path,
+        progress=news.append,
+        registry=unmeasured,
+    )
     size = unmeasured.size(SPLIT, SIZE)
     simulating = [state for state in news if state.stage == "simulating"]
     assert simulating[0].total == 2 * substeps_of(size, 3) == 2 * 25 * 12
-    assert [state.done for state in simulating] == sorted(state.done for state in simulating)
+    assert [state.done for state in simulating] == sorted(
+        state.done for state in simulating
+    )
     assert simulating[-1].done == simulating[-1].total
     assert simulating[-1].scenarios_done == 1
 
@@ -243,12 +342,20 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
 def test_batches_start_each_scenario_at_its_own_frame(
     tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
-    """Three cavities with programs and starts of their own: one batch and single runs, equal hashes."""
+    """Three cavities with programs and starts of their own: one batch and single runs,
+    equal hashes.
+    """
     size = load().size("cavity", "tiny")
     assert len({draw(size, i).start_frame for i in range(3)}) == 3
-    batch = generate("cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2")
-    manifests = [manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)]
-    single, together = ([e.content_sha256 for e in m.files if e.scenario < 3] for m in manifests)
+    batch = generate(
+        "cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2"
+    )
+    manifests = [
+        manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)
+    ]
+    single, together = (
+        [e.content_sha256 for e in m.files if e.scenario < 3] for m in manifests
+    )
     assert single == together
     assert len(single) == 3
 
@@ -258,7 +365,9 @@ def test_batches_start_each_scenario_at_its_own_frame(
 def test_parallel_driver_gives_the_same_data_set(
     split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
 ) -> None:
-    """The GPU's kernels with all scenarios in one batch agree to the bit with the serial kernel."""
+    """The GPU's kernels with all scenarios in one batch agree to the bit with the
+    serial kernel.
+    """
     together = generate(split, "tiny", root=tmp_path, device="parallel").dataset_sha256
     assert together == tiny_split(split).dataset_sha256 is not None
 
@@ -277,32 +386,45 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
 
 
 def test_estimates_add_up(unmeasured: Registry) -> None:
-    """Bytes follow from frames and particles; time from substeps, never below the longest scenario's."""
+    """Bytes follow from frames and particles; time from substeps, never below the
+    longest scenario's.
+    """
     size = unmeasured.size("fluid", "tiny")
     expected = estimate(size, (0, 1))
     assert expected.substeps == (31 * 5, 31 * 5)
     assert expected.frames == 64
     assert expected.bytes == 2 * (32 * 256 * 16 + 65536)
-    one, two = (expected.seconds(workers) - SECONDS_TO_START for workers in (1, 2))  # all compile
+    one, two = (
+        expected.seconds(workers) - SECONDS_TO_START for workers in (1, 2)
+    )  # all compile
     assert one == pytest.approx(2 * two)
     assert estimate(size, ()).seconds(1) == 0.0
     assert expected.seconds(9) == expected.seconds(2)
 
 
 def test_a_few_drawn_scenarios_stand_for_all(unmeasured: Registry) -> None:
-    """Exact where none begins late; a cavity begins 60 to 120 frames before frame 0, so that it is near."""
-    fluid, cavity = unmeasured.size("fluid", "tiny"), unmeasured.size("cavity", "mini")
+    """Exact where none begins late; a cavity begins 60 to 120 frames before frame 0, so
+    that it is near.
+    """
+    fluid = unmeasured.size("fluid", "tiny")
+    cavity = unmeasured.size("cavity", "mini")
     assert estimate(fluid, fluid.scenarios, drawn=1) == estimate(fluid, fluid.scenarios)
     found, exact = (estimate(cavity, cavity.scenarios, drawn=n) for n in (2, None))
     assert found.core_seconds == pytest.approx(exact.core_seconds, rel=0.25)
-    assert (found.scenarios, found.bytes, found.frames) == (exact.scenarios, exact.bytes, exact.frames)
+    assert (found.scenarios, found.bytes, found.frames) == (
+        exact.scenarios,
+        exact.bytes,
+        exact.frames,
+    )
 
 
 @pytest.mark.parametrize("dry_run", [True, False])
 def test_a_root_that_is_a_file_is_refused_dry_or_not(
     dry_run: bool, tmp_path: Path, unmeasured: Registry
 ) -> None:
-    """A dry run does not promise what the real one cannot do: the same error, the same exit code."""
+    """A dry run does not promise what the real one cannot do: the same error, the same
+    exit code.
+    """
     (tmp_path / "file").write_text("mine")
     for root in (tmp_path / "file", tmp_path / "file" / "data"):
         with pytest.raises(WorkFailedError, match="is a file") as caught:
@@ -313,11 +435,15 @@ def test_a_root_that_is_a_file_is_refused_dry_or_not(
 def test_a_registry_of_ones_own_is_all_that_counts(
     tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A split that only the given registry knows is generated, drawn and described with its own title."""
+    """A split that only the given registry knows is generated, drawn and described with
+    its own title.
+    """
     monkeypatch.setattr(cards, "_draw", DRAW)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
-    result = generate("own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own)
+    result = generate(
+        "own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own
+    )
     assert "# Noise of our own" in (result.folder / "README.md").read_text()
     assert all((result.folder / name).stat().st_size > 1000 for name in cards.PICTURES)
 
@@ -338,11 +464,27 @@ print(peak, sorted(heavy))
 """
 
 
-@pytest.mark.parametrize(("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54), ("cavity", 50)])
-def test_a_worker_stays_small(split: str, scenario: int, unmeasured_path: Path, tmp_path: Path) -> None:
-    """Simulating and writing three frames of the full size takes at most 400 MB and no heavy library."""
-    command = [sys.executable, "-c", WORKER, str(unmeasured_path), split, str(scenario), str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+@pytest.mark.parametrize(
+    ("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54), ("cavity", 50)]
+)
+def test_a_worker_stays_small(
+    split: str, scenario: int, unmeasured_path: Path, tmp_path: Path
+) -> None:
+    """Simulating and writing three frames of the full size takes at most 400 MB and no
+    heavy library.
+    """
+    command = [
+        sys.executable,
+        "-c",
+        WORKER,
+        str(unmeasured_path),
+        split,
+        str(scenario),
+        str(tmp_path),
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=True
+    )
     kilobytes, heavy = done.stdout.splitlines()[-1].split(" ", 1)
     assert int(kilobytes) <= 400_000
     assert heavy == "[]"

@@ -1,4 +1,6 @@
-"""Generation when something goes wrong: bad input, full disks, kills, Ctrl-C, blow-ups."""
+"""Generation when something goes wrong: bad input, full disks, kills, Ctrl-C,
+blow-ups.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,11 @@ from lagbench.make.generate import GenerationResult, generate
 
 def files(root: Path) -> list[str]:
     """Return the names of all regular files below a folder, locks left out."""
-    return sorted(p.name for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock"))
+    return sorted(
+        p.name
+        for p in root.rglob("*")
+        if p.is_file() and not p.name.startswith(".lock")
+    )
 
 
 def partial_files(root: Path) -> list[Path]:
@@ -64,10 +70,18 @@ def manifest_of(root: Path) -> Manifest:
         *(({"workers": count}, "without a worker") for count in (0, -1)),
     ],
 )
-def test_bad_input(options: dict[str, Any], message: str, tmp_path: Path, unmeasured: Registry) -> None:
-    """Wrong names, ids and numbers are usage errors that say what is known, before anything is written."""
+def test_bad_input(
+    options: dict[str, Any], message: str, tmp_path: Path, unmeasured: Registry
+) -> None:
+    """Wrong names, ids and numbers are usage errors that say what is known, before
+    anything is written.
+    """
     with pytest.raises(UsageError, match=re.escape(message)) as caught:
-        generate(**{"split": SPLIT, "size": SIZE, **options}, root=tmp_path / "new", registry=unmeasured)
+        generate(
+            **{"split": SPLIT, "size": SIZE, **options},
+            root=tmp_path / "new",
+            registry=unmeasured,
+        )
     assert caught.value.exit_code == 2
     assert not (tmp_path / "new").exists()
 
@@ -78,15 +92,22 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=320k", "none", str(disk)]
-    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode:
+    if (
+        shutil.which("mount") is None
+        or subprocess.run(mount, capture_output=True, check=False).returncode
+    ):
         pytest.skip("a tmpfs cannot be mounted here: it takes root rights")
     yield disk
     subprocess.run(["umount", str(disk)], check=True)
 
 
-def test_a_disk_too_small_is_refused_at_once(small_disk: Path, unmeasured: Registry) -> None:
+def test_a_disk_too_small_is_refused_at_once(
+    small_disk: Path, unmeasured: Registry
+) -> None:
     """The message tells bytes needed and free; nothing is written."""
-    with pytest.raises(WorkFailedError, match=r"(?s)not enough disk space.*bytes free") as caught:
+    with pytest.raises(
+        WorkFailedError, match=r"(?s)not enough disk space.*bytes free"
+    ) as caught:
         generate(SPLIT, SIZE, root=small_disk, registry=unmeasured)
     assert caught.value.exit_code == 5
     assert files(small_disk) == []
@@ -95,7 +116,9 @@ def test_a_disk_too_small_is_refused_at_once(small_disk: Path, unmeasured: Regis
 def test_a_disk_that_fills_up_leaves_whole_files_only(
     small_disk: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Somebody else takes the space in the midst: what was finished stays, the rest leaves no trace."""
+    """Somebody else takes the space in the midst: what was finished stays, the rest
+    leaves no trace.
+    """
     monkeypatch.setattr("lagbench.make.generate.check_disk", lambda root, needed: None)
     with pytest.raises(WorkFailedError, match="free disk space") as caught:
         generate(SPLIT, SIZE, root=small_disk, workers=1, registry=unmeasured)
@@ -103,14 +126,22 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(
     assert partial_files(small_disk) == []
     manifest = manifest_of(small_disk)
     assert not manifest.complete
-    assert scenario_files(small_disk) == [Path(entry.path).name for entry in manifest.files]
+    assert scenario_files(small_disk) == [
+        Path(entry.path).name for entry in manifest.files
+    ]
 
 
-def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Registry) -> None:
-    """/dev/full answers every write with ENOSPC; the error carries the path and the remedy."""
+def test_a_worker_on_a_full_disk_names_the_file(
+    tmp_path: Path, unmeasured: Registry
+) -> None:
+    """/dev/full answers every write with ENOSPC; the error carries the path and the
+    remedy.
+    """
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
-    job = SimulationJob(size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path)
+    job = SimulationJob(
+        size=unmeasured.size(SPLIT, SIZE), scenarios=(2,), root=tmp_path
+    )
     folder = tmp_path / SPLIT / SIZE / "v2" / "valid"
     folder.mkdir(parents=True)
     temporary_name(folder / "0002.nc").symlink_to("/dev/full")
@@ -120,16 +151,25 @@ def test_a_worker_on_a_full_disk_names_the_file(tmp_path: Path, unmeasured: Regi
     assert files(tmp_path) == []
 
 
-def test_two_generations_at_once(tmp_path: Path, unmeasured: Registry, generated: GenerationResult) -> None:
+def test_two_generations_at_once(
+    tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
     """The second waits, is told for whom, and then finds everything there."""
     told: list[str] = []
-    options: dict[str, Any] = {"root": tmp_path, "workers": 1, "registry": unmeasured, "on_wait": told.append}
+    options: dict[str, Any] = {
+        "root": tmp_path,
+        "workers": 1,
+        "registry": unmeasured,
+        "on_wait": told.append,
+    }
     with ThreadPoolExecutor() as threads:
         with dataset_lock(tmp_path, SPLIT, SIZE, 2):
             second = threads.submit(generate, SPLIT, SIZE, **options)
             while not told:
                 time.sleep(0.01)
-            shutil.copytree(generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True)
+            shutil.copytree(
+                generated.folder, tmp_path / SPLIT / SIZE / "v2", dirs_exist_ok=True
+            )
         result = second.result(timeout=60)
     assert f"process {os.getpid()} on" in told[0]
     assert result.simulated == ()
@@ -152,9 +192,20 @@ generate.write_manifest = write_first
 """
 
 
-def start(root: Path, registry: Path, *options: str, program: str = CALL) -> subprocess.Popen[str]:
+def start(
+    root: Path, registry: Path, *options: str, program: str = CALL
+) -> subprocess.Popen[str]:
     """Start a generation as a process group of its own, as a shell does."""
-    command = ["generate", "--split", SPLIT, "--size", SIZE, "--root", str(root), *options]
+    command = [
+        "generate",
+        "--split",
+        SPLIT,
+        "--size",
+        SIZE,
+        "--root",
+        str(root),
+        *options,
+    ]
     return subprocess.Popen(
         [sys.executable, "-c", program, *command],
         env={**os.environ, "LAGBENCH_REGISTRY": str(registry)},
@@ -183,19 +234,36 @@ def children(process: int) -> list[int]:
 def test_kernels_that_cannot_be_kept_stop_nothing(
     tmp_path: Path, unmeasured_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Where Taichi's cache cannot be made, as in a read-only home, the data are made in silence."""
+    """Where Taichi's cache cannot be made, as in a read-only home, the data are made in
+    silence.
+    """
     (tmp_path / "file").touch()
     monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(tmp_path / "file" / "cache"))
-    process = start(tmp_path / "data", unmeasured_path, "--scenarios", "2", "--workers", "1", "--quiet")
+    process = start(
+        tmp_path / "data",
+        unmeasured_path,
+        "--scenarios",
+        "2",
+        "--workers",
+        "1",
+        "--quiet",
+    )
     _, errors = process.communicate(timeout=120)
     assert (process.returncode, errors) == (0, "")
 
 
 def test_control_c_is_resumable(
-    tmp_path: Path, unmeasured_path: Path, unmeasured: Registry, generated: GenerationResult
+    tmp_path: Path,
+    unmeasured_path: Path,
+    unmeasured: Registry,
+    generated: GenerationResult,
 ) -> None:
-    """SIGINT to the whole group after the first file: exit 130, whole files and a manifest that says so."""
-    with start(tmp_path, unmeasured_path, "--workers", "1", program=INTERRUPTED) as process:
+    """SIGINT to the whole group after the first file: exit 130, whole files and a
+    manifest that says so.
+    """
+    with start(
+        tmp_path, unmeasured_path, "--workers", "1", program=INTERRUPTED
+    ) as process:
         _, errors = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted" in errors
@@ -209,9 +277,14 @@ def test_control_c_is_resumable(
 
 
 def test_a_killed_worker_is_replaced(
-    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult, unmeasured: Registry
+    tmp_path: Path,
+    unmeasured_path: Path,
+    generated: GenerationResult,
+    unmeasured: Registry,
 ) -> None:
-    """SIGKILL of a worker costs time, nothing else: exit 0 and the same data set hash."""
+    """SIGKILL of a worker costs time, nothing else: exit 0 and the same data set
+    hash.
+    """
     with start(tmp_path, unmeasured_path, "--workers", "2") as process:
         wait_for(lambda: partial_files(tmp_path), process)
         os.kill(children(process.pid)[0], signal.SIGKILL)
@@ -223,11 +296,19 @@ def test_a_killed_worker_is_replaced(
 
 
 def test_a_killed_parent_is_resumed(
-    tmp_path: Path, unmeasured_path: Path, generated: GenerationResult, unmeasured: Registry
+    tmp_path: Path,
+    unmeasured_path: Path,
+    generated: GenerationResult,
+    unmeasured: Registry,
 ) -> None:
-    """SIGKILL of the parent ends its workers; the second call keeps what is whole and completes it."""
+    """SIGKILL of the parent ends its workers; the second call keeps what is whole and
+    completes it.
+    """
     with start(tmp_path, unmeasured_path, "--workers", "2") as process:
-        wait_for(lambda: len(scenario_files(tmp_path)) >= 1 and partial_files(tmp_path), process)
+        wait_for(
+            lambda: len(scenario_files(tmp_path)) >= 1 and partial_files(tmp_path),
+            process,
+        )
         workers = children(process.pid)
         process.kill()
         process.wait()
@@ -239,16 +320,24 @@ def test_a_killed_parent_is_resumed(
     assert result.kept != ()
     assert result.dataset_sha256 == generated.dataset_sha256
     assert partial_files(tmp_path) == []
-    found, whole = (read_manifest(root, SPLIT, SIZE, 2) for root in (tmp_path, generated.root))
+    found, whole = (
+        read_manifest(root, SPLIT, SIZE, 2) for root in (tmp_path, generated.root)
+    )
     assert found is not None
     assert whole is not None
     assert found.files == whole.files  # with what each simulation went through
 
 
-def test_a_draw_out_of_range_names_its_scenario(tmp_path: Path, unmeasured_path: Path) -> None:
+def test_a_draw_out_of_range_names_its_scenario(
+    tmp_path: Path, unmeasured_path: Path
+) -> None:
     """A scale that no float32 grain can hold stops before any worker starts."""
     own = tmp_path / "own.yaml"
-    own.write_text(unmeasured_path.read_text().replace("velocity_scale: 0.0052", "velocity_scale: 90.0052"))
+    own.write_text(
+        unmeasured_path.read_text().replace(
+            "velocity_scale: 0.0052", "velocity_scale: 90.0052"
+        )
+    )
     with pytest.raises(WorkFailedError, match="exact float32") as caught:
         generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 2"

@@ -1,4 +1,6 @@
-"""Scenarios whose frames are large: chunks of particles, and memory that does not grow with frames."""
+"""Scenarios whose frames are large: chunks of particles, and memory that does not grow
+with frames.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,12 @@ def chunks(path: Path) -> Any:
 
 
 def test_a_large_frame_has_chunks_of_particles(tmp_path: Path) -> None:
-    """At most 131,072 particles a chunk; the content hash, by h5py and hashlib too, knows nothing of it."""
-    path, stored = write_scenario(tmp_path, make_key(), frames=2, particles=(1 << 17) + 1000)
+    """At most 131,072 particles a chunk; the content hash, by h5py and hashlib too,
+    knows nothing of it.
+    """
+    path, stored = write_scenario(
+        tmp_path, make_key(), frames=2, particles=(1 << 17) + 1000
+    )
     assert chunks(path) == [1, 131072, 2]
     assert stored == content_hash(path) == check_scenario(path)
     with read_scenario(path) as file:
@@ -36,7 +42,9 @@ def test_a_large_frame_has_chunks_of_particles(tmp_path: Path) -> None:
         np.testing.assert_array_equal(last[-3:], file["position"][1, -3:])
 
 
-def test_chunks_do_not_enter_the_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_chunks_do_not_enter_the_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The same values in other chunks: another file of the same content hash."""
     key = make_key()
     whole, first = write_scenario(tmp_path / "whole", key, particles=100)
@@ -66,32 +74,47 @@ print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1
 
 
 def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
-    """Writing, hashing and the statistics of 30 frames take what 6 take, to less than two frames."""
+    """Writing, hashing and the statistics of 30 frames take what 6 take, to less than
+    two frames.
+    """
     peaks = []
     for frames in (6, 30):
-        words = ["-c", PEAK, str(Path(__file__).parent), str(tmp_path / str(frames)), str(frames)]
-        done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=True)
+        words = [
+            "-c",
+            PEAK,
+            str(Path(__file__).parent),
+            str(tmp_path / str(frames)),
+            str(frames),
+        ]
+        done = subprocess.run(
+            [sys.executable, *words], capture_output=True, text=True, check=True
+        )
         peaks.append(1024 * int(done.stdout))
     frame = 100_000 * 4 * 4  # position and velocity, two float32 each
     assert abs(peaks[1] - peaks[0]) < 2 * frame
 
 
 def test_many_particles_are_drawn_by_some(tmp_path: Path) -> None:
-    """150,000 particles make 50,000 dots of three times the area; a few make one each."""
+    """150,000 particles make 50,000 dots of three times the area; a few make one
+    each.
+    """
     from lagbench.draw.panels import Panel, draw
     from lagbench.draw.recording import open_recording
     from lagbench.draw.style import figure
 
     drawn = {}
     for particles in (1500, 150_000):
-        path, _ = write_scenario(tmp_path / str(particles), make_key(), frames=2, particles=particles)
+        path, _ = write_scenario(
+            tmp_path / str(particles), make_key(), frames=2, particles=particles
+        )
         with open_recording(path) as recording, figure(2.0, 2.0) as page:
             axes = page.add_axes((0, 0, 1, 1))
             draw(axes, Panel.SPEED, recording.scene(1), limit=1.0, detail=0.0)
             dots = axes.collections[0]
             drawn[particles] = len(dots.get_offsets()), float(dots.get_sizes()[0])
     assert [count for count, _ in drawn.values()] == [1500, 50_000]
-    # an area is that of a particle: a hundredth for a hundred times as many, times three
+    # an area is that of a particle: a hundredth for a hundred times as many, times
+    # three
     assert drawn[150_000][1] == pytest.approx(drawn[1500][1] * 3 / 100)
 
 
@@ -101,8 +124,12 @@ def note(path: Path, report: Report) -> tuple[str, bool]:
     return path.name, "pytest" in sys.modules
 
 
-def test_reading_much_is_shared_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files of more than a gigabyte are read by worker processes, few bytes here; the order stays."""
+def test_reading_much_is_shared_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Files of more than a gigabyte are read by worker processes, few bytes here; the
+    order stays.
+    """
     paths = {f"scenario {k}": tmp_path / f"{k}.nc" for k in range(3)}
     for path in paths.values():
         path.write_bytes(bytes(8))

@@ -30,21 +30,37 @@ LAYERS = (
     ("board",),
     ("cli", "__main__"),
 )
-"""The folders of the package, lowest first: each may import its own layer's and those before it."""
+"""The folders of the package, lowest first: each may import its own layer's and those
+before it.
+"""
 
 NEVER = {
     "baselines": {"generators", "make"},
     "generators": {"metrics", "draw"},
     "metrics": {"draw", "generators"},
 }
-"""What stays apart although a layer would allow it: models learn from files, the solver knows no score."""
+"""What stays apart although a layer would allow it: models learn from files, the solver
+knows no score.
+"""
 
 DRAWN = {"matplotlib", "PIL", "xarray", "taichi", "torch"}
-HEAVY = {"taichi", "torch", "matplotlib", "xarray", "pandas", "scipy", "dask", "netCDF4", "numpy"}
+HEAVY = {
+    "taichi",
+    "torch",
+    "matplotlib",
+    "xarray",
+    "pandas",
+    "scipy",
+    "dask",
+    "netCDF4",
+    "numpy",
+}
 
 
 def imports(name: str, path: Path) -> Iterator[str]:
-    """Yield the dotted names that a module imports, those for type checkers left out."""
+    """Yield the dotted names that a module imports, those for type checkers left
+    out.
+    """
     pending: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while pending:
         node = pending.pop()
@@ -54,16 +70,21 @@ def imports(name: str, path: Path) -> Iterator[str]:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            here = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+            here = (
+                name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+            )
             above = here[: len(here) - node.level + 1] if node.level else []
             base = ".".join([*above, *([node.module] if node.module else [])])
             yield from (f"{base}.{alias.name}" for alias in node.names)
         pending += ast.iter_child_nodes(node)
 
 
-@functools.cache  # parsed by the test that asks first, not by every process that collects tests
+# parsed by the test that asks first, not by every process that collects tests
+@functools.cache
 def edges() -> dict[str, set[str]]:
-    """Return which module of ours imports which; nobody imports generators or baselines by the bare name."""
+    """Return which module of ours imports which; nobody imports generators or baselines
+    by the bare name.
+    """
     graph = {}
     # Path.rglob does not follow the links that hold generators and baselines.
     for folder in (PACKAGE, PACKAGE / "generators", PACKAGE / "baselines"):
@@ -79,16 +100,22 @@ def edges() -> dict[str, set[str]]:
             target = target.rpartition(".")[0]
         return target
 
-    return {name: {module(target) for target in targets} - {"", name} for name, targets in graph.items()}
+    return {
+        name: {module(target) for target in targets} - {"", name}
+        for name, targets in graph.items()
+    }
 
 
 def test_imports_stay_below() -> None:
-    """A module imports from its own layer and those below, and never from what stays apart.
+    """A module imports from its own layer and those below, and never from what stays
+    apart.
 
     Relative imports across packages, and those in functions, are seen.
     """
     assert "lagbench.errors" in edges()["lagbench.data.registry"]
-    assert {"lagbench.data.writer", "lagbench.generators.batch"} <= edges()["lagbench.generators.simulate"]
+    assert {"lagbench.data.writer", "lagbench.generators.batch"} <= edges()[
+        "lagbench.generators.simulate"
+    ]
     assert "lagbench.make.generate" in edges()["lagbench.cli.data"]
     floor = {folder: number for number, layer in enumerate(LAYERS) for folder in layer}
     wrong = []
@@ -112,14 +139,26 @@ def test_no_import_cycle() -> None:
 
 
 def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
-    """A folder named lagbench beside a script, the clone, does not hide the installed package."""
-    (tmp_path / "lagbench" / "docs").mkdir(parents=True)  # the clone: no package by itself
+    """A folder named lagbench beside a script, the clone, does not hide the installed
+    package.
+    """
+    (tmp_path / "lagbench" / "docs").mkdir(
+        parents=True
+    )  # the clone: no package by itself
     script = tmp_path / "script.py"
-    script.write_text("import lagbench; print(lagbench.list_splits()[0])", encoding="utf-8")
-    # With and without -e an install comes to a path entry after the script's own folder.
+    script.write_text(
+        "import lagbench; print(lagbench.list_splits()[0])", encoding="utf-8"
+    )
+    # With and without -e an install comes to a path entry after the script's own
+    # folder.
     where = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
     done = subprocess.run(
-        [sys.executable, str(script)], env=where, capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, str(script)],
+        env=where,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
     )
     assert done.stdout.strip() == "cavity"
 
@@ -131,23 +170,45 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
         ("--help; generate --help; --version; cite cavity", HEAVY),
         ("import lagbench; lagbench.generate; lagbench.windows", HEAVY - {"numpy"}),
         ("list; info cavity; generate fluid --size tiny --dry-run", HEAVY - {"numpy"}),
-        ("import lagbench.data.writer", {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"}),
-        ("import lagbench.metrics", {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"}),
+        (
+            "import lagbench.data.writer",
+            {"xarray", "pandas", "h5py", "pydantic", "scipy", "dask"},
+        ),
+        (
+            "import lagbench.metrics",
+            {"torch", "taichi", "xarray", "scipy", "netCDF4", "ot"},
+        ),
         ("import lagbench.report.report", {"matplotlib", "PIL", "taichi", "torch"}),
-        ("import lagbench.draw.plot, lagbench.draw.animate, lagbench.make.cards", DRAWN),
+        (
+            "import lagbench.draw.plot, lagbench.draw.animate, lagbench.make.cards",
+            DRAWN,
+        ),
     ],
 )
 def test_light_things_stay_light(code: str, forbidden: set[str]) -> None:
-    """Importing and asking for help load no numerical library, planning NumPy only, and so on.
+    """Importing and asking for help load no numerical library, planning NumPy only, and
+    so on.
 
     Code that does not import is commands, run one after the other.
     """
     if not code.startswith("import"):
         calls = [
-            f"assert CliRunner().invoke(app, {line.split()}).exit_code == 0" for line in code.split("; ")
+            f"assert CliRunner().invoke(app, {line.split()}).exit_code == 0"
+            for line in code.split("; ")
         ]
-        code = "\n".join(["from typer.testing import CliRunner", "from lagbench.__main__ import app", *calls])
+        code = "\n".join(
+            [
+                "from typer.testing import CliRunner",
+                "from lagbench.__main__ import app",
+                *calls,
+            ]
+        )
     command = [sys.executable, "-c", code + "\nimport sys\nprint(*sys.modules)"]
-    empty = {**os.environ, "LAGBENCH_ROOT": str(PACKAGE / "none")}  # files that are there would be read
-    done = subprocess.run(command, env=empty, capture_output=True, text=True, check=True)
+    empty = {
+        **os.environ,
+        "LAGBENCH_ROOT": str(PACKAGE / "none"),
+    }  # files that are there would be read
+    done = subprocess.run(
+        command, env=empty, capture_output=True, text=True, check=True
+    )
     assert not set(done.stdout.splitlines()[-1].split()) & forbidden

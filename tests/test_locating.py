@@ -1,4 +1,6 @@
-"""Roots; splits by name and by path: what a user names is found, what a file names is not a path."""
+"""Roots; splits by name and by path: what a user names is found, what a file names is
+not a path.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,12 @@ from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.verify import verify
 
 
-def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Option, LAGBENCH_ROOT unless empty, user data folder; a root is made absolute, ~ is the home folder."""
+def test_root_given_then_environment_then_platform(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Option, LAGBENCH_ROOT unless empty, user data folder; a root is made absolute, ~
+    is the home folder.
+    """
     monkeypatch.setenv("LAGBENCH_ROOT", str(tmp_path / "b"))
     assert resolve_root(tmp_path / "a") == tmp_path / "a"
     assert resolve_root() == tmp_path / "b"
@@ -34,11 +40,25 @@ def test_root_given_then_environment_then_platform(monkeypatch: pytest.MonkeyPat
     monkeypatch.chdir(tmp_path)
     assert resolve_root("data") == tmp_path / "data"
     assert resolve_root("~/data") == Path.home() / "data"
-    assert scenario_path(Path("r"), make_key(7)).as_posix() == "r/cavity/tiny/v2/test/0007.nc"
+    assert (
+        scenario_path(Path("r"), make_key(7)).as_posix()
+        == "r/cavity/tiny/v2/test/0007.nc"
+    )
 
 
 @pytest.mark.parametrize(
-    "root", ["x" * 300, "a/" * 3000, "nul\0", "", " ", "s3://", "s3:", "file:///", "~nobodyx/y"]
+    "root",
+    [
+        "x" * 300,
+        "a/" * 3000,
+        "nul\0",
+        "",
+        " ",
+        "s3://",
+        "s3:",
+        "file:///",
+        "~nobodyx/y",
+    ],
 )
 def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None:
     """Too long, a NUL, nothing, a scheme alone, the home of nobody: exit code 2."""
@@ -47,7 +67,9 @@ def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None
     assert "--root" in str(caught.value.where)
 
 
-def test_an_empty_option_is_not_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_empty_option_is_not_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A path made of nothing is ".", so the command line looks before."""
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(app, ["list", "--root", ""])
@@ -60,7 +82,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     """A local split named own."""
     folder = tmp_path_factory.mktemp("made")
     np.save(folder / "runs.npy", np.stack(straight_runs(3)))
-    return adopt(folder / "runs.npy", output=folder / "own", radius=0.1, frame_interval=0.1)
+    return adopt(
+        folder / "runs.npy", output=folder / "own", radius=0.1, frame_interval=0.1
+    )
 
 
 @pytest.fixture
@@ -70,10 +94,17 @@ def own(made: LocalSplit, tmp_path: Path) -> Path:
     return tmp_path / "root" / "own"
 
 
-def test_all_ways_to_name_it(own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is in no other root."""
+def test_all_ways_to_name_it(
+    own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is
+    in no other root.
+    """
     monkeypatch.chdir(own.parent)
-    by_path = [(name, None) for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")]
+    by_path = [
+        (name, None)
+        for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")
+    ]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
         found = home(split, root=root)
         assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())
@@ -91,29 +122,45 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
     (tmp_path / "cavity").mkdir()
     (tmp_path / "cavity" / "split.yaml").write_text("format: 1")
     found = locate("cavity", "tiny", root=tmp_path)
-    assert (found.size.generator, found.root) == ("lagbench.generators.cavity", tmp_path)
+    assert (found.size.generator, found.root) == (
+        "lagbench.generators.cavity",
+        tmp_path,
+    )
     with pytest.raises(UsageError, match="taken by another split"):
         locate(str(tmp_path / "cavity"), "tiny")
 
 
 def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
-    """One size there: that one. None or several: an error that names them. What is to be made: mini."""
+    """One size there: that one. None or several: an error that names them. What is to
+    be made: mini.
+    """
     with pytest.raises(UsageError) as none:
         lagbench.open_split("cavity", root=tmp_path)
     assert none.value.where == "--size"
     for size in ("tiny", "full"):
-        folder = dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major) / "test"
+        folder = (
+            dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major)
+            / "test"
+        )
         folder.mkdir(parents=True)
         (folder / "0000.nc").touch()
         if size == "tiny":
             assert locate("cavity", root=tmp_path).size.name == "tiny"
-    for opened in (lagbench.open_split, lagbench.windows, lagbench.load_manifest, verify):
+    for opened in (
+        lagbench.open_split,
+        lagbench.windows,
+        lagbench.load_manifest,
+        verify,
+    ):
         with pytest.raises(UsageError) as several:
             opened("cavity", root=tmp_path)
         assert (several.value.where, several.value.fix) == ("--size", "--size full")
     assert locate_new("cavity", root=tmp_path).size.name == "mini"
     # Where a split has no mini, its only size is the default.
-    assert locate_new("own", root=own.parent).size.name == locate("own", root=own.parent).size.name
+    assert (
+        locate_new("own", root=own.parent).size.name
+        == locate("own", root=own.parent).size.name
+    )
 
 
 def test_unknown_names_list_local_ones(own: Path) -> None:
@@ -126,8 +173,12 @@ def test_unknown_names_list_local_ones(own: Path) -> None:
         locate(str(own), "tiny")
 
 
-def test_a_folder_may_be_moved_but_not_renamed(own: Path, made: LocalSplit, tmp_path: Path) -> None:
-    """The name is part of every hash, so the folder must keep it; where it lies is part of nothing."""
+def test_a_folder_may_be_moved_but_not_renamed(
+    own: Path, made: LocalSplit, tmp_path: Path
+) -> None:
+    """The name is part of every hash, so the folder must keep it; where it lies is part
+    of nothing.
+    """
     moved = Path(shutil.move(own, tmp_path / "own"))
     assert lagbench.verify(str(moved)).dataset_sha256 == made.dataset_sha256
     with pytest.raises(UnreadableFileError, match="not named like its split"):
@@ -135,9 +186,13 @@ def test_a_folder_may_be_moved_but_not_renamed(own: Path, made: LocalSplit, tmp_
 
 
 def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> None:
-    """It is told only when it is asked for; a generator in it, which would be imported, is refused."""
+    """It is told only when it is asked for; a generator in it, which would be imported,
+    is refused.
+    """
     path = own / "split.yaml"
-    path.write_text(path.read_text().replace("generator: none", "generator: antigravity"))
+    path.write_text(
+        path.read_text().replace("generator: none", "generator: antigravity")
+    )
     with pytest.raises(UnreadableFileError, match="cannot name a generator"):
         locate(str(own))
     path.write_text("splits: [")
@@ -146,7 +201,9 @@ def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> No
         locate("own", root=own.parent)
 
 
-@pytest.mark.parametrize("name", ["../own", "/etc", "own/", ".", "..", "", "Own", "a b", "a" * 65, "own\0"])
+@pytest.mark.parametrize(
+    "name", ["../own", "/etc", "own/", ".", "..", "", "Own", "a b", "a" * 65, "own\0"]
+)
 def test_paths_are_no_names(name: str) -> None:
     """Whatever could leave the root folder cannot be the name of a split."""
     assert not is_name(name)
@@ -154,7 +211,9 @@ def test_paths_are_no_names(name: str) -> None:
 
 @pytest.mark.parametrize("path", ["relative", "absolute"])
 def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> None:
-    """A stranger's file whose split is the path of a local split is for no known split."""
+    """A stranger's file whose split is the path of a local split is for no known
+    split.
+    """
     target = tmp_path / "predictions.nc"
     lagbench.template(str(own), output=target)
     assert lagbench.validate(target, root=own.parent, isolated=False).valid

@@ -31,24 +31,34 @@ with dataset_lock(Path(sys.argv[1]), "cavity", "tiny", 1):
 def other(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """Another process that holds the lock until a line reaches its input."""
     with subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLD, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     ) as process:
         assert process.stdout.readline() == "held\n"
         yield process
         process.kill()
 
 
-def test_a_second_writer_is_told_who_holds_the_lock(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+def test_a_second_writer_is_told_who_holds_the_lock(
+    tmp_path: Path, other: subprocess.Popen[str]
+) -> None:
     """With timeout 0 the error names process, host and time at once, exit code 5.
 
     Another size or MAJOR version of the split can be written meanwhile.
     """
     start = time.monotonic()
-    with pytest.raises(WorkFailedError) as caught, dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):
+    with (
+        pytest.raises(WorkFailedError) as caught,
+        dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0),
+    ):
         pass
     assert time.monotonic() - start < 5
     assert caught.value.exit_code == 5
-    holder = rf"process {other.pid} on {re.escape(os.uname().nodename)}, since 20..-..-..T"
+    holder = (
+        rf"process {other.pid} on {re.escape(os.uname().nodename)}, since 20..-..-..T"
+    )
     assert re.search(holder, str(caught.value))
     with (
         dataset_lock(tmp_path, "cavity", "mini", 1, timeout=0),
@@ -58,7 +68,9 @@ def test_a_second_writer_is_told_who_holds_the_lock(tmp_path: Path, other: subpr
 
 
 def test_a_second_writer_waits(tmp_path: Path, other: subprocess.Popen[str]) -> None:
-    """Without a timeout it says whom it waits for and goes on when the first one ends."""
+    """Without a timeout it says whom it waits for and goes on when the first one
+    ends.
+    """
     told: list[str] = []
 
     def release(holder: str) -> None:
@@ -73,7 +85,9 @@ def test_a_second_writer_waits(tmp_path: Path, other: subprocess.Popen[str]) -> 
     assert f"process {other.pid}" in told[0]
 
 
-def test_a_killed_writer_blocks_nobody(tmp_path: Path, other: subprocess.Popen[str]) -> None:
+def test_a_killed_writer_blocks_nobody(
+    tmp_path: Path, other: subprocess.Popen[str]
+) -> None:
     """After kill -9 the holder file is stale, and the lock is free all the same."""
     other.send_signal(signal.SIGKILL)
     other.wait()
@@ -101,7 +115,13 @@ def test_a_damaged_holder_file_is_no_obstacle(tmp_path: Path) -> None:
     """The holder file is information only: rubbish in it reads as nobody."""
     folder = dataset_folder(tmp_path, "cavity", "tiny", 1)
     folder.mkdir(parents=True)
-    for text in ("", "[1]", '{"pid": 1}', '{"pid": 1, "host": "a", "since": "b", "more": 2}', "\x00"):
+    for text in (
+        "",
+        "[1]",
+        '{"pid": 1}',
+        '{"pid": 1, "host": "a", "since": "b", "more": 2}',
+        "\x00",
+    ):
         (folder / ".lock.holder.json").write_text(text)
         assert read_holder(folder) is None
     with dataset_lock(tmp_path, "cavity", "tiny", 1, timeout=0):

@@ -59,7 +59,9 @@ def trajectories() -> tuple[Floats, Floats]:
 def pairs() -> list[FramePair]:
     """Return their frame pairs."""
     truth, prediction = trajectories()
-    return pairs_of(scenario_of(truth, material=MATERIAL, materials=KINDS), truth, prediction)
+    return pairs_of(
+        scenario_of(truth, material=MATERIAL, materials=KINDS), truth, prediction
+    )
 
 
 def tallied(*pieces: FramePair) -> Tally:
@@ -70,7 +72,9 @@ def tallied(*pieces: FramePair) -> Tally:
 def same_bits(one: Tally, two: Tally) -> bool:
     """Tell whether two tallies hold the same bytes."""
     fields = ("total", "weight", "undefined")
-    return all(getattr(one, name).tobytes() == getattr(two, name).tobytes() for name in fields)
+    return all(
+        getattr(one, name).tobytes() == getattr(two, name).tobytes() for name in fields
+    )
 
 
 def of_pearson(*values: float) -> Tally:
@@ -80,10 +84,17 @@ def of_pearson(*values: float) -> Tally:
 
 
 @given(st.lists(st.integers(0, 6), max_size=4), st.randoms(use_true_random=False))
-def test_chunks_in_any_order_give_the_same_bits(cuts: list[int], random: object) -> None:
-    """Frames cut anywhere, measured apart and added in any order, add up to the same bytes."""
+def test_chunks_in_any_order_give_the_same_bits(
+    cuts: list[int], random: object
+) -> None:
+    """Frames cut anywhere, measured apart and added in any order, add up to the same
+    bytes.
+    """
     edges = [0, *sorted(cuts), 6]
-    chunks = [tally(pairs()[a:b], ALL, SETTING.predicted_frames) for a, b in itertools.pairwise(edges)]
+    chunks = [
+        tally(pairs()[a:b], ALL, SETTING.predicted_frames)
+        for a, b in itertools.pairwise(edges)
+    ]
     random.shuffle(chunks)  # type: ignore[attr-defined]
     assert same_bits(functools.reduce(Tally.__add__, chunks), tallied())
 
@@ -91,7 +102,9 @@ def test_chunks_in_any_order_give_the_same_bits(cuts: list[int], random: object)
 @settings(max_examples=15)
 @given(st.randoms(use_true_random=False))
 def test_particle_order_changes_nothing(random: object) -> None:
-    """Truth and prediction permuted alike have the same scores, but for the rounding of sums."""
+    """Truth and prediction permuted alike have the same scores, but for the rounding of
+    sums.
+    """
     order = list(range(400))
     random.shuffle(order)  # type: ignore[attr-defined]
     truth, prediction = (x[:, order] for x in trajectories())
@@ -101,25 +114,40 @@ def test_particle_order_changes_nothing(random: object) -> None:
 
 
 def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
-    """The truth's fields serve several predictions; from frame 5 on, given frame 4, values are the same."""
+    """The truth's fields serve several predictions; from frame 5 on, given frame 4,
+    values are the same.
+    """
     truth, prediction = trajectories()
     scenario = scenario_of(truth, material=MATERIAL, materials=KINDS)
     true = list(snapshots(scenario, truth[2:]))
     for positions in (prediction, truth):
-        sides = zip(SETTING.predicted_frames, true, snapshots(scenario, positions[2:]), strict=True)
+        sides = zip(
+            SETTING.predicted_frames,
+            true,
+            snapshots(scenario, positions[2:]),
+            strict=True,
+        )
         shared = [FramePair(scenario, f, t, p) for f, t, p in sides]
-        assert same_bits(tallied(*shared), tallied(*pairs_of(scenario, truth, positions)))
-    late = (next(iter(snapshots(scenario, x[5:], previous=x[4]))) for x in (truth, prediction))
+        assert same_bits(
+            tallied(*shared), tallied(*pairs_of(scenario, truth, positions))
+        )
+    late = (
+        next(iter(snapshots(scenario, x[5:], previous=x[4])))
+        for x in (truth, prediction)
+    )
     assert measure(FramePair(scenario, 5, *late), ALL) == measure(pairs()[3], ALL)
 
 
 def test_undefined_frames_are_left_out_and_counted() -> None:
-    """Correlations 1, NaN, 0.6: mean 0.8 of two, one undefined; stable for one defined frame.
+    """Correlations 1, NaN, 0.6: mean 0.8 of two, one undefined; stable for one defined
+    frame.
 
     One good frame, then 89 at rest without a correlation: one stable frame, not 90.
     """
     names = ("vorticity_pearson", "stable_frames")
-    found, stable = (score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names)
+    found, stable = (
+        score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names
+    )
     assert (found.mean, found.undefined) == (pytest.approx(0.8), (1,))
     assert math.isnan(found.at(3)[0])
     assert stable.mean == 1.0
@@ -132,7 +160,8 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
     [
         # scenario 4 has no correlation: the mean is that of scenario 2, in id order
         ({4: (math.nan, math.nan), 2: (0.5, 0.7)}, 0.6, (0, 2)),
-        # scenario means 0.6 and 1.0 of two and of one defined frame: 0.8, not (0.5 + 0.7 + 1.0) / 3
+        # scenario means 0.6 and 1.0 of two and of one defined frame: 0.8, not (0.5 +
+        # 0.7 + 1.0) / 3
         ({0: (0.5, 0.7), 1: (math.nan, 1.0)}, 0.8, (0, 1)),
         ({0: (0.5, 0.7), 1: (0.8, math.nan), 2: (math.nan, math.nan)}, 0.7, (0, 1, 2)),
     ],
@@ -140,8 +169,12 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
 def test_means_over_frames_come_before_those_over_scenarios(
     values: dict[int, tuple[float, float]], mean: float, undefined: tuple[int, ...]
 ) -> None:
-    """Undefined scenarios are left out; the interval is the bootstrap of the scenarios' values."""
-    found = score(METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in values.items()})
+    """Undefined scenarios are left out; the interval is the bootstrap of the scenarios'
+    values.
+    """
+    found = score(
+        METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in values.items()}
+    )
     assert (found.scenarios, found.undefined) == (tuple(sorted(values)), undefined)
     assert found.mean == pytest.approx(mean)
     np.testing.assert_equal(found.interval, bootstrap_interval(found.values))
@@ -153,14 +186,22 @@ def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None
     rng = np.random.Generator(np.random.PCG64(5))
     values = 10.0 ** rng.uniform(-8, 8, (5, 1201))
     values[0, :holes] = math.nan
-    found = score(METRICS["vorticity_pearson"], {i: of_pearson(*row) for i, row in enumerate(values)})
+    found = score(
+        METRICS["vorticity_pearson"],
+        {i: of_pearson(*row) for i, row in enumerate(values)},
+    )
     expected = [np.mean(row[~np.isnan(row)].copy()) for row in values]
     np.testing.assert_array_equal(found.values, expected)
 
 
 def test_a_horizon_beyond_the_series_is_undefined() -> None:
-    """The mean of the first five of three frames does not exist; of the first two it does."""
-    found = [first(np.arange(3.0)) for first in (FirstFrames(5), FirstFrames(2), FirstFrames(2, last))]
+    """The mean of the first five of three frames does not exist; of the first two it
+    does.
+    """
+    found = [
+        first(np.arange(3.0))
+        for first in (FirstFrames(5), FirstFrames(2), FirstFrames(2, last))
+    ]
     np.testing.assert_array_equal(found, [math.nan, 0.5, 1.0])
 
 
@@ -169,7 +210,8 @@ def test_tallies_add() -> None:
 
     Other frames or statistics are refused, and so is a value without a place.
     """
-    twice, once = tallied() + tallied(), tallied()
+    twice = tallied() + tallied()
+    once = tallied()
     for name in twice.names:
         np.testing.assert_array_equal(twice.series(name), once.series(name))
     with pytest.raises(UsageError):
@@ -180,8 +222,12 @@ def test_tallies_add() -> None:
 
 NAMES = sorted(METRICS)
 MEASURED = select(known=METRICS)  # Sinkhorn, optional and slow, has tests of its own
-LENGTHS = re.compile(r"(1|%|nat|frame|(mass )?length(\^2)?(/frame(\^2)?)?|1/frame(\^2)?)")
-SOURCES = re.compile(r"Eqs?\. \d|Figs?\. \d|section \d|design section|design 2, section|LagrangeBench")
+LENGTHS = re.compile(
+    r"(1|%|nat|frame|(mass )?length(\^2)?(/frame(\^2)?)?|1/frame(\^2)?)"
+)
+SOURCES = re.compile(
+    r"Eqs?\. \d|Figs?\. \d|section \d|design section|design 2, section|LagrangeBench"
+)
 STATES = ("liquid", "jelly", "snow", "rope")
 
 
@@ -192,19 +238,33 @@ def scores(size: float) -> dict[str, Score]:
     scattered = np.random.default_rng(7).standard_normal(truth.shape[1:])
     step = truth[1:] - truth[:-1]
     wrong = 0.4 * step + 0.0001 * scattered + [2e-4, 1e-4] + 0.01 * (truth[:-1] - 0.4)
-    error = np.concatenate([np.zeros((2, *truth.shape[1:])), np.cumsum(wrong[1:], axis=0)])
+    error = np.concatenate(
+        [np.zeros((2, *truth.shape[1:])), np.cumsum(wrong[1:], axis=0)]
+    )
     found: dict[str, Score] = {}
     for placement in Placement:  # no one box is full and has a surface
-        task = {"materials": STATES, "horizon": 52, "grid": Grid(20, placement), "radius": 0.04}
+        task = {
+            "materials": STATES,
+            "horizon": 52,
+            "grid": Grid(20, placement),
+            "radius": 0.04,
+        }
         scenario = scenario_of(truth, material=np.repeat(range(4), 400), **task)
         pairs = pairs_of(scenario, truth, truth + size * error)
-        found = aggregate(MEASURED, {0: tally(pairs, MEASURED, scenario.setting.predicted_frames)}) | found
+        found = (
+            aggregate(
+                MEASURED, {0: tally(pairs, MEASURED, scenario.setting.predicted_frames)}
+            )
+            | found
+        )
     return found
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_metric_is_told(name: str) -> None:
-    """Name, family, unit, direction and source are well formed; the summary is one line without a stop."""
+    """Name, family, unit, direction and source are well formed; the summary is one line
+    without a stop.
+    """
     metric = METRICS[name]
     assert metric.name == name
     assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name)
@@ -216,13 +276,19 @@ def test_every_metric_is_told(name: str) -> None:
     assert (metric.direction is Direction.NONE) <= (metric.perfect is None)
 
 
-@pytest.mark.parametrize("name", [m.name for m in MEASURED if m.direction is not Direction.NONE])
-def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(name: str) -> None:
-    """The truth as its own prediction gets exactly the perfect value: 0 or 1, and no frame undefined.
+@pytest.mark.parametrize(
+    "name", [m.name for m in MEASURED if m.direction is not Direction.NONE]
+)
+def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(
+    name: str,
+) -> None:
+    """The truth as its own prediction gets exactly the perfect value: 0 or 1, and no
+    frame undefined.
 
     The loss never falls while the error grows tenfold and more, and rises over all.
     """
-    metric, found = METRICS[name], scores(0.0)[name]
+    metric = METRICS[name]
+    found = scores(0.0)[name]
     expected = metric.perfect if name != "stable_frames" else 52.0
     assert (found.mean, found.undefined) == (expected, (0,))
     losses = [metric.loss(scores(size)[name].mean) for size in (0.0, 0.1, 0.5, 2.5)]
@@ -231,25 +297,62 @@ def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(name
 
 
 def test_the_tables_of_the_design_are_complete() -> None:
-    """Everything that design section 8 lists has an entry, and the rollout of these tests has them all."""
+    """Everything that design section 8 lists has an entry, and the rollout of these
+    tests has them all.
+    """
     assert set(scores(0.1)) == {m.name for m in MEASURED}
     assert not any(math.isnan(found.mean) for found in scores(0.1).values())
     mse = scores(0.1)["vorticity_mse"]
     assert (mse.per_frame.shape, mse.frames) == ((1, 52), tuple(range(2, 54)))
     quantities = ("position", "velocity", "vorticity")
     expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
-    expected |= {f"vorticity_{name}" for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")}
-    expected |= {"energy_ratio", "energy_retention", "energy_error", "momentum_error", "divergence_rms"}
-    expected |= {"angular_momentum_error", "density_rmse", "sliced_w2", "sinkhorn_pot", "attribute_mse"}
+    expected |= {
+        f"vorticity_{name}"
+        for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")
+    }
+    expected |= {
+        "energy_ratio",
+        "energy_retention",
+        "energy_error",
+        "momentum_error",
+        "divergence_rms",
+    }
+    expected |= {
+        "angular_momentum_error",
+        "density_rmse",
+        "sliced_w2",
+        "sinkhorn_pot",
+        "attribute_mse",
+    }
     expected |= {"mse_avg", "mse_end", "stable_frames", "shape_error", "connectivity"}
     expected |= {f"mse_avg_{h}" for h in (1, 5, 10, 20, 50)}
     assert expected <= set(METRICS)
-    residual = {n.removeprefix("vorticity_residual_") for n in METRICS if n.startswith("vorticity_residual_")}
-    assert residual == {"mean", "std", "max", "slope", "p05", "p25", "p50", "p75", "p95"}
-    # Expected gaps are no scores: the rollout of the tallies has no rope, and no horizon of ten frames.
+    residual = {
+        n.removeprefix("vorticity_residual_")
+        for n in METRICS
+        if n.startswith("vorticity_residual_")
+    }
+    assert residual == {
+        "mean",
+        "std",
+        "max",
+        "slope",
+        "p05",
+        "p25",
+        "p50",
+        "p75",
+        "p95",
+    }
+    # Expected gaps are no scores: the rollout of the tallies has no rope, and no
+    # horizon of ten frames.
     found = aggregate(ALL, {0: tallied()})
     assert {"position_mse_jelly", "shape_error_jelly", "mse_avg_5"} <= set(found)
-    assert not {"position_mse_rope", "shape_error_rope", "position_mse_snow", "mse_avg_10"} & set(found)
+    assert not {
+        "position_mse_rope",
+        "shape_error_rope",
+        "position_mse_snow",
+        "mse_avg_10",
+    } & set(found)
 
 
 OTHERS = Metric(
@@ -274,12 +377,19 @@ def with_entry_point(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     monkeypatch.setattr(table_module, "installed", lambda group: [point])
 
 
-def test_our_metrics_are_registered_as_those_of_others_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each family stands in the entry-point group, and loading it gives the same objects.
+def test_our_metrics_are_registered_as_those_of_others_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each family stands in the entry-point group, and loading it gives the same
+    objects.
 
     A single metric of another package behind an entry point is scored like ours.
     """
-    points = [p for p in entry_points(group="lagbench.metrics") if p.value.startswith("lagbench.")]
+    points = [
+        p
+        for p in entry_points(group="lagbench.metrics")
+        if p.value.startswith("lagbench.")
+    ]
     assert {p.name: p.load() for p in points} == dict(FAMILIES)
     assert {name: available()[name] for name in METRICS} == dict(METRICS)
     with_entry_point(monkeypatch, f"{__name__}:OTHERS")
@@ -289,11 +399,17 @@ def test_our_metrics_are_registered_as_those_of_others_are(monkeypatch: pytest.M
     assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
 
 
-@pytest.mark.parametrize("name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS", "leaving:METRICS"])
-def test_a_bad_entry_point_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str) -> None:
-    """A taken name, no metric, or one of statistics that nothing measures: refused, and said where it is.
+@pytest.mark.parametrize(
+    "name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS", "leaving:METRICS"]
+)
+def test_a_bad_entry_point_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    """A taken name, no metric, or one of statistics that nothing measures: refused, and
+    said where it is.
 
-    A module that would end the program, with exit code 0 and nothing done, is told likewise.
+    A module that would end the program, with exit code 0 and nothing done, is told
+    likewise.
     """
     (tmp_path / "leaving.py").write_text("raise SystemExit")
     monkeypatch.syspath_prepend(tmp_path)
@@ -310,7 +426,13 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     Neither a statistic nor a source of one, or a target without a value, is a mistake.
     """
     found = {m.name for m in select(["vorticity_rmse", "energy_ratio"])}
-    assert found == {"vorticity_mse", "vorticity_rmse", "energy_predicted", "energy_true", "energy_ratio"}
+    assert found == {
+        "vorticity_mse",
+        "vorticity_rmse",
+        "energy_predicted",
+        "energy_true",
+        "energy_ratio",
+    }
     with pytest.raises(UsageError, match="did you mean 'vorticity_rmse'"):
         select(["vorticity_rmsee"])
     for changes in (
@@ -322,7 +444,9 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
     ):
         with pytest.raises(UsageError):
             replace(OTHERS, **changes)
-    assert replace(OTHERS, direction="higher").direction is Direction.HIGHER  # as a package may write it
+    assert (
+        replace(OTHERS, direction="higher").direction is Direction.HIGHER
+    )  # as a package may write it
 
 
 class Refusing:
@@ -333,19 +457,33 @@ class Refusing:
         raise RuntimeError
 
 
-NO_NUMBERS = [None, "much", "1.5", np.zeros(3), 1j, np.complex128(3), 10**400, Refusing()]
+NO_NUMBERS = [
+    None,
+    "much",
+    "1.5",
+    np.zeros(3),
+    1j,
+    np.complex128(3),
+    10**400,
+    Refusing(),
+]
 STRANGE: list[tuple[str, Any]] = [
     *(("statistic", lambda pair, value=value: value) for value in NO_NUMBERS),
     ("statistic", lambda pair: sys.exit(0)),  # as one that parses arguments would
-    *(("defined", lambda pair, told=told: told) for told in (None, "no", np.array([True, False]))),
+    *(
+        ("defined", lambda pair, told=told: told)
+        for told in (None, "no", np.array([True, False]))
+    ),
 ]
 
 
 @pytest.mark.parametrize(("what", "function"), STRANGE)
 def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> None:
-    """A metric of another package that gives something else is named, and where it comes from, with any note.
+    """A metric of another package that gives something else is named, and where it
+    comes from, with any note.
 
-    Whether it is defined must be true or false: a forgotten return would leave out every frame.
+    Whether it is defined must be true or false: a forgotten return would leave out
+    every frame.
     """
     bad = replace(OTHERS, **{what: function})
     with pytest.raises(WorkFailedError) as caught:
@@ -362,12 +500,16 @@ def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
     with pytest.raises(WorkFailedError, match="enstrophy_error"):
         replace(OTHERS, statistic=bare).measure(pairs()[0])
-    assert math.isnan(replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0]))
+    assert math.isnan(
+        replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0])
+    )
 
 
 @pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
 @pytest.mark.parametrize("left", [SystemExit(0), KeyError("mine")])
-def test_all_that_a_metric_does_is_told_with_its_name(what: str, left: BaseException) -> None:
+def test_all_that_a_metric_does_is_told_with_its_name(
+    what: str, left: BaseException
+) -> None:
     """Not its statistic alone; nothing of it ends the program."""
 
     def fail(*_: object) -> Any:
@@ -382,7 +524,9 @@ def test_all_that_a_metric_does_is_told_with_its_name(what: str, left: BaseExcep
 
 @pytest.mark.parametrize("what", ["statistic", "defined"])
 def test_what_a_metric_raises_keeps_what_it_came_from(what: str) -> None:
-    """The error itself goes on, with metric and frame; a package's author sees the first error too."""
+    """The error itself goes on, with metric and frame; a package's author sees the
+    first error too.
+    """
 
     def fail(_: FramePair) -> float:
         try:

@@ -13,7 +13,14 @@ from simple_models import OPERATORS, graph
 from torch import Tensor, nn
 
 from lagbench.baselines import network as layers
-from lagbench.baselines.network import EdgeMLP, EncodeProcessDecode, LayerNorm, Linear, ProcessorLayer, linear
+from lagbench.baselines.network import (
+    EdgeMLP,
+    EncodeProcessDecode,
+    LayerNorm,
+    Linear,
+    ProcessorLayer,
+    linear,
+)
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.baselines.operators.supergat import SuperGAT
@@ -25,7 +32,12 @@ EVERY = pytest.mark.parametrize("operator", OPERATORS)
 def network(operator: type[Operator], **options: Any) -> EncodeProcessDecode:
     """Return a small network with weights of seed 0."""
     torch.manual_seed(0)
-    sizes = {"node_features": 7, "edge_features": 3, "latent": 16, "layers": 3} | options
+    sizes = {
+        "node_features": 7,
+        "edge_features": 3,
+        "latent": 16,
+        "layers": 3,
+    } | options
     return EncodeProcessDecode(operator, **sizes)
 
 
@@ -33,14 +45,19 @@ def plain(split: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor) -> Ten
     """Return the MLP of the concatenation [edge, receiver, sender]."""
     sender, receiver = edge_index
     whole = torch.cat([edge, node[receiver], node[sender]], dim=1)
-    update: Tensor = split.rest(nn.functional.linear(whole, split.first.weight, split.first.bias))
+    update: Tensor = split.rest(
+        nn.functional.linear(whole, split.first.weight, split.first.bias)
+    )
     return update
 
 
 def test_split_first_layer() -> None:
     """Per-node products give the MLP of the concatenation to 6e-7 in float32."""
     torch.manual_seed(0)
-    layer, (node, edge_index, edge) = EdgeMLP(128, 128), graph(200, 1600, node=128, edge=128)
+    layer, (node, edge_index, edge) = (
+        EdgeMLP(128, 128),
+        graph(200, 1600, node=128, edge=128),
+    )
     split = layer(edge, node, edge_index)
     expected = plain(layer.double(), edge.double(), node.double(), edge_index)
     assert ((split - expected).abs().max() / expected.abs().max()).item() < 6e-7
@@ -48,51 +65,73 @@ def test_split_first_layer() -> None:
 
 @pytest.mark.parametrize("mixed", [False, True])
 def test_recomputed_hidden_layers(monkeypatch: pytest.MonkeyPatch, mixed: bool) -> None:
-    """Hidden layers that are computed again give the values and gradients of those that are kept."""
+    """Hidden layers that are computed again give the values and gradients of those that
+    are kept.
+    """
     torch.manual_seed(0)
-    layer, inputs = EdgeMLP(16, 12), graph(300, 20_000, node=16, edge=16)
+    layer = EdgeMLP(16, 12)
+    inputs = graph(300, 20_000, node=16, edge=16)
     results = []
     for limit in (1e12, 0.0):
         monkeypatch.setattr(layers, "LARGEST_KEPT", limit)
-        node, edge = (part.clone().requires_grad_() for part in (inputs.node, inputs.edge))
+        node, edge = (
+            part.clone().requires_grad_() for part in (inputs.node, inputs.edge)
+        )
         with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
             update = layer(edge, node, inputs.edge_index)
         wanted = [node, edge, *layer.parameters()]
         results.append([update, *torch.autograd.grad(update.square().sum(), wanted)])
     for kept, again in zip(*results, strict=True):
-        assert ((kept - again).abs().max() / kept.abs().max()).item() < (2e-2 if mixed else 1e-5)
+        assert ((kept - again).abs().max() / kept.abs().max()).item() < (
+            2e-2 if mixed else 1e-5
+        )
 
 
 @pytest.mark.parametrize("limit", [1e12, 0.0])
-def test_gradients_of_the_edge_update(monkeypatch: pytest.MonkeyPatch, limit: float) -> None:
+def test_gradients_of_the_edge_update(
+    monkeypatch: pytest.MonkeyPatch, limit: float
+) -> None:
     """Gradients are finite differences' in float64, hidden layers kept or not."""
     monkeypatch.setattr(layers, "LARGEST_KEPT", limit)
     torch.manual_seed(0)
-    layer, inputs = EdgeMLP(4, 3).double(), graph(5, 9, node=4, edge=4)
-    node, edge = inputs.node.double().requires_grad_(), inputs.edge.double().requires_grad_()
+    layer = EdgeMLP(4, 3).double()
+    inputs = graph(5, 9, node=4, edge=4)
+    node = inputs.node.double().requires_grad_()
+    edge = inputs.edge.double().requires_grad_()
     tensors = (edge, node, *layer.parameters())
     torch.autograd.gradcheck(lambda e, n, *_: layer(e, n, inputs.edge_index), tensors)
 
 
 @pytest.mark.parametrize("rows", [0, 1, 257])
 def test_linear(rows: int) -> None:
-    """The product by oneDNN and its gradients are NumPy's, for views of wider matrices too."""
+    """The product by oneDNN and its gradients are NumPy's, for views of wider matrices
+    too.
+    """
     torch.manual_seed(0)
-    wide, weight, bias = torch.randn(rows, 40), torch.randn(24, 90), torch.randn(24)
-    x, part = wide[:, :30].detach(), weight[:, 30:60].detach()
+    wide = torch.randn(rows, 40)
+    weight = torch.randn(24, 90)
+    bias = torch.randn(24)
+    x = wide[:, :30].detach()
+    part = weight[:, 30:60].detach()
     for tensor in (x, part, bias):
         tensor.requires_grad_()
-    y, sign = linear(x, part, bias), torch.randn(rows, 24)
+    y = linear(x, part, bias)
+    sign = torch.randn(rows, 24)
     (y * sign).sum().backward()
     a, w, s = (tensor.detach().double().numpy() for tensor in (x, part, sign))
-    np.testing.assert_allclose(y.detach(), a @ w.T + bias.detach().numpy(), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(
+        y.detach(), a @ w.T + bias.detach().numpy(), rtol=1e-4, atol=1e-4
+    )
     for tensor, expected in ((x, s @ w), (part, s.T @ a), (bias, s.sum(axis=0))):
         np.testing.assert_allclose(tensor.grad, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_linear_elsewhere() -> None:
-    """What oneDNN does not take (float64, bfloat16, other shapes) goes to torch: the same numbers."""
-    layer, x = Linear(5, 4), torch.randn(2, 3, 5)
+    """What oneDNN does not take (float64, bfloat16, other shapes) goes to torch: the
+    same numbers.
+    """
+    layer = Linear(5, 4)
+    x = torch.randn(2, 3, 5)
     expected = nn.functional.linear(x, layer.weight, layer.bias)
     assert torch.equal(layer(x), expected)
     assert layer.double()(x.double()).dtype == torch.float64
@@ -101,16 +140,23 @@ def test_linear_elsewhere() -> None:
 
 
 def test_layer_norm_learns_in_bfloat16() -> None:
-    """In bfloat16 all gradients are those of float64 to two digits: sums over 5,000 rows do not stall."""
+    """In bfloat16 all gradients are those of float64 to two digits: sums over 5,000
+    rows do not stall.
+    """
     torch.manual_seed(0)
-    x, slope = torch.randn(5000, 16) * 3 + 1, torch.randn(5000, 16) * 0.1 + 1
+    x = torch.randn(5000, 16) * 3 + 1
+    slope = torch.randn(5000, 16) * 0.1 + 1
     rounded = x.bfloat16().requires_grad_()
     with torch.autocast("cpu", torch.bfloat16):
         layer = LayerNorm(16)
         layer(rounded).backward(slope.bfloat16())
-    precise, exact = nn.LayerNorm(16).double(), x.double().requires_grad_()
+    precise = nn.LayerNorm(16).double()
+    exact = x.double().requires_grad_()
     precise(exact).backward(slope.double())
-    pairs = [(rounded, exact), *zip(layer.parameters(), precise.parameters(), strict=True)]
+    pairs = [
+        (rounded, exact),
+        *zip(layer.parameters(), precise.parameters(), strict=True),
+    ]
     for ours, theirs in pairs:
         assert float((ours.grad - theirs.grad).norm() / theirs.grad.norm()) < 0.03
 
@@ -118,12 +164,17 @@ def test_layer_norm_learns_in_bfloat16() -> None:
 def test_layer_by_hand() -> None:
     """A layer is the interaction network of its docstring, written out node by node."""
     torch.manual_seed(0)
-    layer, inputs = ProcessorLayer(GNS, latent=8, hidden=6).double(), graph(6, 12, node=8, edge=8)
-    node, edge = inputs.node.double(), inputs.edge.double()
+    layer = ProcessorLayer(GNS, latent=8, hidden=6).double()
+    inputs = graph(6, 12, node=8, edge=8)
+    node = inputs.node.double()
+    edge = inputs.edge.double()
     nodes, edges, _ = layer(node, inputs.edge_index, edge)
     message = plain(layer.message, edge, node, inputs.edge_index)
     for i in range(6):
-        total = sum((message[k] for k in range(12) if inputs.edge_index[1, k] == i), torch.zeros(8))
+        total = sum(
+            (message[k] for k in range(12) if inputs.edge_index[1, k] == i),
+            torch.zeros(8),
+        )
         expected = node[i] + layer.update(torch.cat([node[i], total]))
         torch.testing.assert_close(nodes[i], expected, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(edges, edge + message, rtol=1e-10, atol=1e-10)
@@ -131,8 +182,11 @@ def test_layer_by_hand() -> None:
 
 @EVERY
 def test_edge_latents_update(operator: type[Operator]) -> None:
-    """Every layer adds something else to the edges; ten layers are not a factor of 1024."""
-    model, inputs = network(operator, layers=10), graph(30, 150, node=7, edge=3)
+    """Every layer adds something else to the edges; ten layers are not a factor of
+    1024.
+    """
+    model = network(operator, layers=10)
+    inputs = graph(30, 150, node=7, edge=3)
     seen: list[Tensor] = []
     for layer in model.processor:
         layer.register_forward_hook(lambda _, given, __: seen.append(given[2].detach()))
@@ -147,20 +201,28 @@ def test_edge_latents_update(operator: type[Operator]) -> None:
 
 def test_parameters() -> None:
     """With latent 128 and 10 layers, GNS has 1.6 M parameters."""
-    count = sum(p.numel() for p in network(GNS, node_features=30, latent=128, layers=10).parameters())
-    square, norm = 128 * 128 + 128, 2 * 128
+    count = sum(
+        p.numel()
+        for p in network(GNS, node_features=30, latent=128, layers=10).parameters()
+    )
+    square = 128 * 128 + 128
+    norm = 2 * 128
     encoders = (31 * 128 + 2 * square + norm) + (4 * 128 + 2 * square + norm)
     layer = (385 * 128 + 2 * square + norm) + (257 * 128 + 2 * square + norm)
     assert count == encoders + 10 * layer + 2 * square + 129 * 2 == 1_591_682
 
 
 @EVERY
-def test_only_the_operator_differs_and_no_weight_is_idle(operator: type[Operator]) -> None:
-    """Names and shapes beside it are those of GNS; gradients reach all parameters, as DDP wants it.
+def test_only_the_operator_differs_and_no_weight_is_idle(
+    operator: type[Operator],
+) -> None:
+    """Names and shapes beside it are those of GNS; gradients reach all parameters, as
+    DDP wants it.
 
     A key's bias shifts all logits alike and has none to speak of.
     """
-    model, inputs = network(operator), graph(30, 150, node=7, edge=3)
+    model = network(operator)
+    inputs = graph(30, 150, node=7, edge=3)
     ours, gns = (
         {n: p.shape for n, p in one.named_parameters() if ".operator." not in n}
         for one in (model, network(GNS))
@@ -177,8 +239,10 @@ def test_only_the_operator_differs_and_no_weight_is_idle(operator: type[Operator
 def test_windows_side_by_side(operator: type[Operator]) -> None:
     """Two graphs in one call have the predictions of two calls."""
     model = network(operator).eval()
-    one, two = graph(12, 40, node=7, edge=3, seed=1), graph(9, 24, node=7, edge=3, seed=2)
-    node, edge = torch.cat([one.node, two.node]), torch.cat([one.edge, two.edge])
+    one = graph(12, 40, node=7, edge=3, seed=1)
+    two = graph(9, 24, node=7, edge=3, seed=2)
+    node = torch.cat([one.node, two.node])
+    edge = torch.cat([one.edge, two.edge])
     both, _ = model(node, torch.cat([one.edge_index, two.edge_index + 12], dim=1), edge)
     apart = torch.cat([model(*one)[0], model(*two)[0]])
     torch.testing.assert_close(both, apart, rtol=1e-5, atol=1e-5)
@@ -186,15 +250,20 @@ def test_windows_side_by_side(operator: type[Operator]) -> None:
 
 @EVERY
 def test_mixed_precision(operator: type[Operator]) -> None:
-    """Under bfloat16 the prediction is float32 and near the exact one; every weight still learns."""
-    model, inputs = network(operator, latent=32), graph(60, 400, node=7, edge=3)
+    """Under bfloat16 the prediction is float32 and near the exact one; every weight
+    still learns.
+    """
+    model = network(operator, latent=32)
+    inputs = graph(60, 400, node=7, edge=3)
     exact, _ = model(*inputs)
     with torch.autocast("cpu", torch.bfloat16):
         prediction, losses = model(*inputs)
     assert prediction.dtype == torch.float32
     assert ((prediction - exact).norm() / exact.norm()).item() < 0.05
     (prediction.square().sum() + sum(losses.values())).backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+    assert all(
+        p.grad is not None and p.grad.isfinite().all() for p in model.parameters()
+    )
 
 
 class Total(Operator):
@@ -208,7 +277,12 @@ class Total(Operator):
         self.linear = nn.Linear(inputs, latent)
 
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers and a loss of its own."""
         heard = node.index_add(0, edge_index[1], node[edge_index[0]])
@@ -226,8 +300,12 @@ class Total(Operator):
         lambda heard: (heard, {"size": heard}),
     ],
 )
-def test_an_operator_that_returns_something_else(answer: Callable[[Tensor], Any]) -> None:
-    """No pair, another number of rows or columns, no losses of one number: its class is named."""
+def test_an_operator_that_returns_something_else(
+    answer: Callable[[Tensor], Any],
+) -> None:
+    """No pair, another number of rows or columns, no losses of one number: its class is
+    named.
+    """
 
     class Odd(Total):
         def forward(self, *given: Tensor, **options: Any) -> Any:
@@ -240,7 +318,8 @@ def test_an_operator_that_returns_something_else(answer: Callable[[Tensor], Any]
 
 def test_operator_of_others() -> None:
     """An operator in one class works; its loss comes out as the mean over layers."""
-    model, inputs = network(Total), graph(12, 40, node=7, edge=3)
+    model = network(Total)
+    inputs = graph(12, 40, node=7, edge=3)
     sizes: list[Tensor] = []
     for layer in model.processor:
         layer.register_forward_hook(lambda _, __, out: sizes.append(out[2]["size"]))
@@ -253,13 +332,20 @@ def test_operator_of_others() -> None:
 @pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch, while it traces
 @pytest.mark.parametrize("operator", [GNS, SuperGAT])
 def test_compiled_layers(operator: type[Operator]) -> None:
-    """Compiled layers give the values and gradients of the plain ones, for any number of edges."""
-    plain_one, compiled = network(operator), network(operator)
+    """Compiled layers give the values and gradients of the plain ones, for any number
+    of edges.
+    """
+    plain_one = network(operator)
+    compiled = network(operator)
     compiled.compile_layers()
     for edges in (500, 731):
         results = []
         for model in (plain_one, compiled):
-            output, losses = model(*graph(60, edges, node=7, edge=3), torch.Generator().manual_seed(0))
+            output, losses = model(
+                *graph(60, edges, node=7, edge=3), torch.Generator().manual_seed(0)
+            )
             total = output.square().sum() + sum(losses.values())
-            results.append([output, *torch.autograd.grad(total, list(model.parameters()))])
+            results.append(
+                [output, *torch.autograd.grad(total, list(model.parameters()))]
+            )
         torch.testing.assert_close(results[1], results[0], rtol=1e-4, atol=1e-5)

@@ -24,12 +24,23 @@ from lagbench.baselines.start import Start
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
 
-SMALL: dict[str, object] = {"cells": 10, "width": 8, "velocities": 2, "bundle": 2, "calls": 2}
+SMALL: dict[str, object] = {
+    "cells": 10,
+    "width": 8,
+    "velocities": 2,
+    "bundle": 2,
+    "calls": 2,
+}
 SMALL |= {"noise_std": 0.0, "materials": [0, 1, 2, 3]}
 PROJECTED: dict[str, object] = {"shape": [4, 8], "density": [8]}
 
 
-def surrogate(*, awake: float = 0.0, changes: Mapping[str, object] | None = None, **options: object) -> Any:
+def surrogate(
+    *,
+    awake: float = 0.0,
+    changes: Mapping[str, object] | None = None,
+    **options: object,
+) -> Any:
     """Return a small model; `awake` is the deviation of its last layer's weights."""
     torch.manual_seed(0)
     model = NeuralMPM.build(SMALL | options, facts(**(changes or {})))
@@ -45,17 +56,27 @@ def liquid(*windows: np.ndarray[Any, np.dtype[np.float64]]) -> Batch:
     return given
 
 
-def drift(speed: tuple[float, float], frames: int, seed: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return a cloud in the middle of the box that moves as one, shape [frame, particle, 2]."""
-    return jittered(seed, low=0.35, high=0.65) + np.arange(frames)[:, None, None] * np.array(speed)
+def drift(
+    speed: tuple[float, float], frames: int, seed: int = 0
+) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """Return a cloud in the middle of the box that moves as one, shape [frame,
+    particle, 2].
+    """
+    return jittered(seed, low=0.35, high=0.65) + np.arange(frames)[
+        :, None, None
+    ] * np.array(speed)
 
 
 def test_untrained_models_keep_every_velocity() -> None:
-    """Without smoothing particles move on straight, and with it a uniform flow keeps its kinetic energy."""
+    """Without smoothing particles move on straight, and with it a uniform flow keeps
+    its kinetic energy.
+    """
     velocity = np.random.default_rng(0).normal(0.0, 2e-3, (256, 2))
     window = jittered(0, low=0.3, high=0.7) + np.arange(3)[:, None, None] * velocity
     found = rolled(surrogate(smoothing=0.0), batch(window), 20).diff(dim=1)
-    expected = torch.from_numpy(window[1] - window[0])[:, None].expand(-1, 19, -1).float()
+    expected = (
+        torch.from_numpy(window[1] - window[0])[:, None].expand(-1, 19, -1).float()
+    )
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
     moved = rolled(surrogate(smoothing=0.2), batch(drift((4e-3, -2e-3), 3)), 40)
     energy = moved.diff(dim=1).double().square().sum(dim=2).mean(dim=0)
@@ -73,7 +94,9 @@ def test_smoothing_damps_what_the_grid_does_not_see() -> None:
 
 @pytest.mark.parametrize("conserve", [False, True])
 def test_particles_stay_inside_the_walls(conserve: bool) -> None:
-    """Whatever the network says, positions stay in the box and velocities true to them."""
+    """Whatever the network says, positions stay in the box and velocities true to
+    them.
+    """
     model = surrogate(awake=30.0, conserve=conserve)
     given = batch(swirl(0, 3), swirl(1, 3))
     found = rolled(model, given, 12)
@@ -81,51 +104,75 @@ def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     assert bool(((found >= low) & (found <= high)).all())
     assert bool(((found == low) | (found == high)).any())  # some were stopped
     _, frames = model.call(model.start(given))
-    torch.testing.assert_close(frames[1][0] - frames[0][0], frames[1][1], rtol=0, atol=2e-7)
+    torch.testing.assert_close(
+        frames[1][0] - frames[0][0], frames[1][1], rtol=0, atol=2e-7
+    )
 
 
 @pytest.mark.parametrize("conserve", [False, True])
 def test_windows_side_by_side_do_not_see_each_other(conserve: bool) -> None:
-    """Two windows in one batch roll out as they do alone, walls and context included."""
+    """Two windows in one batch roll out as they do alone, walls and context
+    included.
+    """
     model = surrogate(awake=0.1, context=3, wall_velocity=True, conserve=conserve)
     windows = [batch(swirl(seed, 3), walls=True) for seed in (0, 1)]
     both = rolled(model, batch(swirl(0, 3), swirl(1, 3), walls=True), 5)
-    torch.testing.assert_close(both, torch.cat([rolled(model, w, 5) for w in windows]), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        both, torch.cat([rolled(model, w, 5) for w in windows]), rtol=0, atol=1e-6
+    )
 
 
 def test_training_unrolls_the_rollout() -> None:
-    """The loss over two calls is the mean error of the rollout's velocities, over the deviation.
+    """The loss over two calls is the mean error of the rollout's velocities, over the
+    deviation.
 
-    With a generator after none or one call without gradients: of the rollout's next frames.
+    With a generator after none or one call without gradients: of the rollout's next
+    frames.
     """
     window = batch(swirl(0, 9))
     model = surrogate(awake=0.1, pushforward=1)
-    path = torch.cat([window.position[:, 2:3], rolled(model, window.part(slice(3)), 6)], dim=1)
-    error = (path.diff(dim=1) - window.position[:, 2:].diff(dim=1)).square() / ((2e-4**2 + 1e-4**2) / 2)
+    path = torch.cat(
+        [window.position[:, 2:3], rolled(model, window.part(slice(3)), 6)], dim=1
+    )
+    error = (path.diff(dim=1) - window.position[:, 2:].diff(dim=1)).square() / (
+        (2e-4**2 + 1e-4**2) / 2
+    )
     expected = [float(error[:, start : start + 4].mean()) for start in (0, 2)]
     with torch.no_grad():
         assert float(model(window)["velocity"]) == pytest.approx(expected[0], rel=1e-3)
-        found = {float(model(window, torch.Generator().manual_seed(seed))["velocity"]) for seed in range(12)}
+        found = {
+            float(model(window, torch.Generator().manual_seed(seed))["velocity"])
+            for seed in range(12)
+        }
     assert sorted(found) == pytest.approx(sorted(expected), rel=1e-3)
 
 
 @pytest.mark.parametrize("after", [2.2e-3, 6e-3])
 def test_the_way_back_is_asked_for(after: float) -> None:
-    """An untrained model goes on as before, the truth faster: how far it is behind counts, to a bound."""
-    given, frames = 2e-3, np.arange(1.0, 5.0)
+    """An untrained model goes on as before, the truth faster: how far it is behind
+    counts, to a bound.
+    """
+    given = 2e-3
+    frames = np.arange(1.0, 5.0)
     travelled = np.concatenate([given * np.arange(3.0), 2 * given + after * frames])
-    window = batch(jittered(0, low=0.3, high=0.6) + travelled[:, None, None] * np.array([1.0, 0.0]))
+    window = batch(
+        jittered(0, low=0.3, high=0.6) + travelled[:, None, None] * np.array([1.0, 0.0])
+    )
     model = surrogate(smoothing=0.0, recovery=4.0)
     behind = (after - given) * np.arange(4.0)
     wanted = after + np.minimum(behind / 4.0, 3.0 * model.change)
-    expected = ((wanted - given) ** 2 / 2).mean() / model.change**2  # nothing moves along y
+    expected = (
+        (wanted - given) ** 2 / 2
+    ).mean() / model.change**2  # nothing moves along y
     with torch.no_grad():
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("projected", [{}, PROJECTED])
 def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> None:
-    """Whatever stresses are said: two materials push each other apart, and their mean goes on and falls."""
+    """Whatever stresses are said: two materials push each other apart, and their mean
+    goes on and falls.
+    """
     model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True, **projected)
     nn.init.constant_(model.fall, -0.05)
     if model.projection is not None:
@@ -136,24 +183,34 @@ def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> 
     found = rolled(model, given, 4).diff(dim=1).double()
     fall = -0.05 * 10.0 * model.change
     mean = found.mean(dim=0).numpy()
-    np.testing.assert_allclose(mean, [(2e-3, -1e-3 + fall * k) for k in (2, 3, 4)], rtol=0, atol=2e-7)
+    np.testing.assert_allclose(
+        mean, [(2e-3, -1e-3 + fall * k) for k in (2, 3, 4)], rtol=0, atol=2e-7
+    )
     apart = found[::2].mean(dim=0) - found[1::2].mean(dim=0)
     assert float(apart.abs().max()) > 1e-5
 
 
 def test_thin_matter_bears_less() -> None:
-    """Under one pressure a lattice bursts at its rim; with a quarter of the particles far less."""
+    """Under one pressure a lattice bursts at its rim; with a quarter of the particles
+    far less.
+    """
 
     def bursting(spacing: float) -> float:
         model = surrogate(conserve=True, materials=[0], bundle=1, smoothing=0.0)
         nn.init.constant_(model.network.end.bias[:3:2], 1.0)
         axis = np.arange(0.3 + spacing / 2, 0.7, spacing)
-        given = liquid(np.repeat(np.stack(np.meshgrid(axis, axis), axis=-1).reshape(1, -1, 2), 3, axis=0))
+        given = liquid(
+            np.repeat(
+                np.stack(np.meshgrid(axis, axis), axis=-1).reshape(1, -1, 2), 3, axis=0
+            )
+        )
         with torch.no_grad():
             _, ((_, velocity),) = model.call(model.start(given))
         return float(velocity.norm(dim=1).max())
 
-    dense, full, thin, thinner = (bursting(spacing) for spacing in (0.0125, 0.025, 0.05, 0.1))
+    dense, full, thin, thinner = (
+        bursting(spacing) for spacing in (0.0125, 0.025, 0.05, 0.1)
+    )
     assert full == pytest.approx(dense, rel=0.2)
     assert thin < full / 5
     assert thinner < thin / 10
@@ -169,12 +226,23 @@ def test_walls_push_where_they_are() -> None:
         assert bool(moved.abs().max() > 1e-5) is pushed
 
 
-@pytest.mark.parametrize("changes", [{}, {"conserve": True}, {"conserve": True} | PROJECTED])
+@pytest.mark.parametrize(
+    "changes", [{}, {"conserve": True}, {"conserve": True} | PROJECTED]
+)
 @pytest.mark.parametrize("number", range(8))
-def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, changes: dict[str, object]) -> None:
-    """Strain, walls that move and context included, the rollout of an image is the image of the rollout."""
+def test_the_mean_over_images_has_the_symmetry_of_the_box(
+    number: int, changes: dict[str, object]
+) -> None:
+    """Strain, walls that move and context included, the rollout of an image is the
+    image of the rollout.
+    """
     matrix = images(Symmetry.SQUARE)[number]
-    options = {"strain": True, "wall_velocity": True, "context": 3, "symmetry": "square"} | changes
+    options = {
+        "strain": True,
+        "wall_velocity": True,
+        "context": 3,
+        "symmetry": "square",
+    } | changes
     given = batch(swirl(0, 3), walls=True)
     sheared = torch.tensor([[0.9, 0.15], [0.0, 1.05]])
     given = replace(given, origin=(given.position[:, 0] - 0.5) @ sheared + 0.5)
@@ -184,7 +252,10 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, changes: 
         nn.init.normal_(model.context.numbers[-1].weight, std=3.0)
         if model.projection is not None:
             nn.init.constant_(model.projection.limit, -2.0)  # all is too dense
-        here, there = (rolled(model, one, 4) for one in (given, image(given, matrix[None], facts().bounds)))
+        here, there = (
+            rolled(model, one, 4)
+            for one in (given, image(given, matrix[None], facts().bounds))
+        )
         return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())
 
     assert apart(average=True) < 2e-6
@@ -192,8 +263,11 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(number: int, changes: 
 
 
 def test_the_mean_over_images_in_half_precision() -> None:
-    """Under autocast the rollout is near that in full precision; without images there is no mean."""
-    model, given = surrogate(awake=0.1, symmetry="square", average=True), batch(swirl(0, 3))
+    """Under autocast the rollout is near that in full precision; without images there
+    is no mean.
+    """
+    model = surrogate(awake=0.1, symmetry="square", average=True)
+    given = batch(swirl(0, 3))
     with torch.autocast("cpu", torch.bfloat16):
         rounded = rolled(model, given, 4)
     torch.testing.assert_close(rounded, rolled(model, given, 4), rtol=0, atol=1e-4)
@@ -202,14 +276,18 @@ def test_the_mean_over_images_in_half_precision() -> None:
 
 
 def test_materials_in_one_place_come_to_one_velocity() -> None:
-    """Two clouds that lie in each other and part are held together by a grid that they share."""
+    """Two clouds that lie in each other and part are held together by a grid that they
+    share.
+    """
     rng = np.random.default_rng(0)
     side = np.where(np.arange(256) % 2, 1.0, -1.0)[:, None] * np.array([1e-3, 0.0])
     given = batch(rng.uniform(0.3, 0.7, (256, 2)) + np.arange(3)[:, None, None] * side)
     given = replace(given, material=torch.arange(256) % 2)
 
     def gap(**options: object) -> float:
-        found = rolled(surrogate(smoothing=0.5, **options), given, 6).diff(dim=1).double()
+        found = (
+            rolled(surrogate(smoothing=0.5, **options), given, 6).diff(dim=1).double()
+        )
         assert float(found.mean(dim=0).abs().max()) < 2e-4
         return float(found[1::2, -1, 0].mean() - found[::2, -1, 0].mean())
 
@@ -220,11 +298,13 @@ def test_materials_in_one_place_come_to_one_velocity() -> None:
 def test_materials_matter() -> None:
     """Who is jelly and who is snow matters; a material that was not named is refused.
 
-    A strained first frame matters where a body is solid; liquid has no shape to come back to.
+    A strained first frame matters where a body is solid; liquid has no shape to come
+    back to.
     """
     given = batch(swirl(0, 3))
     other = replace(given, material=(given.material + 1) % 4)
-    plain, model = surrogate(awake=0.1), surrogate(awake=0.1, strain=True)
+    plain = surrogate(awake=0.1)
+    model = surrogate(awake=0.1, strain=True)
     assert not torch.equal(rolled(plain, given, 2), rolled(plain, other, 2))
     with pytest.raises(DataError):
         surrogate(materials=[0, 2]).start(given)
@@ -236,9 +316,13 @@ def test_materials_matter() -> None:
 
 
 def test_bodies_come_back_to_the_shape_of_the_first_frame() -> None:
-    """Jelly that is pulled apart in later frames is drawn together again; without the option it is not."""
+    """Jelly that is pulled apart in later frames is drawn together again; without the
+    option it is not.
+    """
     rng = np.random.default_rng(0)
-    window = jittered(0, low=0.4, high=0.6) + 0.02 * np.arange(3)[:, None, None] * rng.normal(0, 1, (256, 2))
+    window = jittered(0, low=0.4, high=0.6) + 0.02 * np.arange(3)[
+        :, None, None
+    ] * rng.normal(0, 1, (256, 2))
     first = torch.from_numpy(jittered(0, low=0.4, high=0.6)).float()
     given = batch(window)
     given = replace(given, material=torch.ones(256).long(), frame=given.frame + 7)
@@ -246,7 +330,11 @@ def test_bodies_come_back_to_the_shape_of_the_first_frame() -> None:
     def off(**options: object) -> float:
         model = surrogate(smoothing=0.0, **options)
         told = replace(given, origin=first if model.origin else None)
-        return float((torch.pdist(rolled(model, told, 6)[:, -1]) - torch.pdist(first)).abs().mean())
+        return float(
+            (torch.pdist(rolled(model, told, 6)[:, -1]) - torch.pdist(first))
+            .abs()
+            .mean()
+        )
 
     assert off(shape=[4, 8]) < 0.1 * off()
 
@@ -254,7 +342,9 @@ def test_bodies_come_back_to_the_shape_of_the_first_frame() -> None:
 def test_clouds_that_meet_are_not_pressed_into_each_other() -> None:
     """Two that fly into each other end less dense where that is asked for."""
     side = np.where(np.arange(512) < 256, 1.0, -1.0)[:, None] * np.array([8e-3, 0.0])
-    clouds = np.concatenate([jittered(0, low=0.25, high=0.45), jittered(1, low=0.55, high=0.75)])
+    clouds = np.concatenate(
+        [jittered(0, low=0.25, high=0.45), jittered(1, low=0.55, high=0.75)]
+    )
     clouds[:, 1] += np.where(np.arange(512) < 256, 0.15, -0.15)
     given = batch(clouds + np.arange(3)[:, None, None] * side)
 
@@ -266,11 +356,14 @@ def test_clouds_that_meet_are_not_pressed_into_each_other() -> None:
 
 
 class Drag(nn.Module):
-    """Stands for the U-Net: every frame's acceleration is -rate times the velocity on the grid."""
+    """Stands for the U-Net: every frame's acceleration is -rate times the velocity on
+    the grid.
+    """
 
     def __init__(self, rate: float, bundle: int) -> None:
         super().__init__()
-        self.rate, self.bundle = rate, bundle
+        self.rate = rate
+        self.bundle = bundle
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the accelerations of one material."""
@@ -278,18 +371,28 @@ class Drag(nn.Module):
 
 
 def test_a_known_network_has_a_known_rollout() -> None:
-    """Drag takes the share r of the velocity before a bundle in each of its frames: a closed form."""
+    """Drag takes the share r of the velocity before a bundle in each of its frames: a
+    closed form.
+    """
     model = surrogate(materials=[0], smoothing=0.0)
     rate = 0.1
     model.network = Drag(rate * model.speed / model.change, 2)
     given = liquid(drift((4e-3, -2e-3), 3))
-    found = rolled(model, given, 4).double().mean(dim=0) - given.position[:, -1].double().mean(dim=0)
-    shares = np.array([1 - rate, 1 - 2 * rate, (1 - 2 * rate) * (1 - rate), (1 - 2 * rate) ** 2])
-    np.testing.assert_allclose(found.numpy(), shares.cumsum()[:, None] * [4e-3, -2e-3], rtol=1e-3)
+    found = rolled(model, given, 4).double().mean(dim=0) - given.position[
+        :, -1
+    ].double().mean(dim=0)
+    shares = np.array(
+        [1 - rate, 1 - 2 * rate, (1 - 2 * rate) * (1 - rate), (1 - 2 * rate) ** 2]
+    )
+    np.testing.assert_allclose(
+        found.numpy(), shares.cumsum()[:, None] * [4e-3, -2e-3], rtol=1e-3
+    )
 
 
 def test_images_roll_out_as_images() -> None:
-    """All eight images of the box, with a network that knows no direction: transfers and walls know none."""
+    """All eight images of the box, with a network that knows no direction: transfers
+    and walls know none.
+    """
     model = surrogate(materials=[0], smoothing=0.2)
     model.network = Drag(-0.5 * model.speed / model.change, 2)
     given = liquid(swirl(0, 3, (0.2, 0.2)))
@@ -300,7 +403,9 @@ def test_images_roll_out_as_images() -> None:
 
 
 def test_each_frame_is_driven_by_its_own_walls() -> None:
-    """The first bundle sees the walls of its two frames and none after them; the second sees its own."""
+    """The first bundle sees the walls of its two frames and none after them; the second
+    sees its own.
+    """
     model = surrogate(awake=0.1, wall_velocity=True)
     whole = batch(swirl(0, 9), walls=True)
 
@@ -315,14 +420,20 @@ def test_each_frame_is_driven_by_its_own_walls() -> None:
     assert torch.equal(second[:, :2], still[:, :2])
     assert not torch.equal(second[:, 2], still[:, 2])
     assert torch.equal(later, still)
-    # a batch that knows nothing of later frames is rolled out as if its last walls stayed
+    # a batch that knows nothing of later frames is rolled out as if its last walls
+    # stayed
     short = replace(whole.part(slice(3)), wall_velocity=whole.wall_velocity[:, :3])
     assert torch.equal(rolled(model, whole.part(slice(3)), 6), rolled(model, short, 6))
 
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("materials", []), ("materials", [1, 1]), ("materials", [4]), ("wall_velocity", True)],
+    [
+        ("materials", []),
+        ("materials", [1, 1]),
+        ("materials", [4]),
+        ("wall_velocity", True),
+    ],
 )
 def test_options_that_do_not_fit_are_refused(option: str, value: object) -> None:
     """Materials that do not exist, and walls of a split where none moves."""
@@ -333,7 +444,9 @@ def test_options_that_do_not_fit_are_refused(option: str, value: object) -> None
 
 @pytest.mark.parametrize("cells", [18, 20, 22, 30, 38, 42])
 def test_walls_are_felt_alike_on_all_sides(cells: int) -> None:
-    """As many rows of nodes beside each wall; with an odd number walls lay on nodes: refused."""
+    """As many rows of nodes beside each wall; with an odd number walls lay on nodes:
+    refused.
+    """
     held = surrogate(cells=cells).grid
     beside = [int(side.count_nonzero()) for side in held.beside_walls()]
     assert len(set(beside)) == 1
@@ -342,10 +455,13 @@ def test_walls_are_felt_alike_on_all_sides(cells: int) -> None:
 
 
 def test_learns_a_swirl() -> None:
-    """Particles turn ever slower: soon the rollout errs a third of what constant velocity does."""
+    """Particles turn ever slower: soon the rollout errs a third of what constant
+    velocity does.
+    """
     model = surrogate(materials=[0], width=16, symmetry="square", noise_std=1e-5)
     flows = [swirl(seed, 24, (0.06, 0.01)) for seed in range(4)]
-    generator, optimiser = torch.Generator().manual_seed(0), torch.optim.Adam(model.parameters(), lr=3e-3)
+    generator = torch.Generator().manual_seed(0)
+    optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
     rng = np.random.default_rng(0)
 
     def error() -> float:
@@ -367,15 +483,23 @@ def test_learns_a_swirl() -> None:
 @pytest.mark.parametrize("size", ["tiny", "mini", "full"])
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
 def test_recipes_fit_every_split(split: str, size: str) -> None:
-    """Walls drive the cavity alone, gravity allows the mirror alone, materials are those of the split."""
+    """Walls drive the cavity alone, gravity allows the mirror alone, materials are
+    those of the split.
+    """
     described = load().size(split, size)
     recipe = recipe_for(find("neuralmpm"), split, size)
-    model = NeuralMPM.build(recipe.model, facts(moving_walls=split == "cavity", bounds=described.bounds))
+    model = NeuralMPM.build(
+        recipe.model, facts(moving_walls=split == "cavity", bounds=described.bounds)
+    )
     gravity = described.parameters.get("gravity")
     assert recipe.model["wall_velocity"] is (split == "cavity")
-    assert recipe.model["symmetry"] == ("mirror" if gravity and gravity.value else "square")
+    assert recipe.model["symmetry"] == (
+        "mirror" if gravity and gravity.value else "square"
+    )
     assert len(recipe.model["materials"]) == (4 if split == "multimaterial" else 1)
-    assert 2 * sum(p.numel() for p in model.parameters()) <= 4e6  # bytes of its weights in bfloat16
+    assert (
+        2 * sum(p.numel() for p in model.parameters()) <= 4e6
+    )  # bytes of its weights in bfloat16
 
 
 def both(*cells: int) -> dict[str, object]:
@@ -389,21 +513,37 @@ def both(*cells: int) -> dict[str, object]:
         *(({}, both(4, 8), 0), (both(4), both(4, 8), 1)),
         *(({kind: [4]}, both(4, 8), 1) for kind in ("shape", "density")),
         *(({kind: [4]}, {kind: [4, 8]}, 1) for kind in ("shape", "density")),
-        *((both(4), both(8), 0), (both(4, 8), both(4, 16), 1), (both(4, 8), both(4), 1)),
+        *(
+            (both(4), both(8), 0),
+            (both(4, 8), both(4, 16), 1),
+            (both(4, 8), both(4), 1),
+        ),
         *((both(4, 8), both(8, 4), 0), (both(4, 8), {}, 0)),
     ],
 )
 def test_of_other_grids_those_go_on_that_stand_first_in_both(
     earlier: dict[str, object], later: dict[str, object], same: int
 ) -> None:
-    """Their weights are kept; others start as in a new model, and those that are left out are dropped."""
-    before, new = surrogate(awake=0.1, **earlier), surrogate(**later)
+    """Their weights are kept; others start as in a new model, and those that are left
+    out are dropped.
+    """
+    before = surrogate(awake=0.1, **earlier)
+    new = surrogate(**later)
     with torch.no_grad():
         for weight in before.parameters():
             weight.add_(0.01)
-    held, own = rounded_weights(before), {name: value.clone() for name, value in new.state_dict().items()}
-    options = before.options.model_dump(mode="json", exclude=set(before.options.in_training))
-    start = Start(path=Path("earlier.pt"), facts=before.facts, weights=held, options=options, record={})
+    held = rounded_weights(before)
+    own = {name: value.clone() for name, value in new.state_dict().items()}
+    options = before.options.model_dump(
+        mode="json", exclude=set(before.options.in_training)
+    )
+    start = Start(
+        path=Path("earlier.pt"),
+        facts=before.facts,
+        weights=held,
+        options=options,
+        record={},
+    )
     start.fill(new)
     found = new.state_dict()
     assert found.keys() == own.keys()

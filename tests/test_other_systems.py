@@ -1,4 +1,6 @@
-"""What works where modules and functions of Linux are missing, as on Windows and macOS: all but solving."""
+"""What works where modules and functions of Linux are missing, as on Windows and macOS:
+all but solving.
+"""
 
 from __future__ import annotations
 
@@ -49,12 +51,16 @@ Run = Callable[..., None]
 
 @pytest.fixture
 def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult) -> Run:
-    """A function that runs commands in an interpreter, with children, that lacks what others lack."""
+    """A function that runs commands in an interpreter, with children, that lacks what
+    others lack.
+    """
     (tmp_path / "less").mkdir()
     (tmp_path / "less" / "sitecustomize.py").write_text(LESS)
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(tmp_path / "less"), str(Path(lagbench.__file__).parents[1])]),
+        "PYTHONPATH": os.pathsep.join(
+            [str(tmp_path / "less"), str(Path(lagbench.__file__).parents[1])]
+        ),
         "LAGBENCH_REGISTRY": str(unmeasured_path),
         "LAGBENCH_ROOT": str(generated.root),
         "CUDA_VISIBLE_DEVICES": "",
@@ -76,10 +82,19 @@ def commands(tmp_path: Path, unmeasured_path: Path, generated: GenerationResult)
 
 
 @pytest.mark.usefixtures("as_shipped")
-def test_validating_and_scoring(commands: Run, bench: ScoreBench, tmp_path: Path) -> None:
-    """Scores are those of this system to the last digit, though files are read in children too."""
+def test_validating_and_scoring(
+    commands: Run, bench: ScoreBench, tmp_path: Path
+) -> None:
+    """Scores are those of this system to the last digit, though files are read in
+    children too.
+    """
     bench.submit(tmp_path / "predictions.nc", straight)
-    commands("list", "info curl-noise", "validate predictions.nc", "score predictions.nc -o less-scores")
+    commands(
+        "list",
+        "info curl-noise",
+        "validate predictions.nc",
+        "score predictions.nc -o less-scores",
+    )
     bench.score(tmp_path / "predictions.nc")
     paths = tmp_path / "less-scores/scores.json", tmp_path / "scores.json"
     found, expected = (json.loads(path.read_bytes()) for path in paths)
@@ -90,7 +105,8 @@ def test_validating_and_scoring(commands: Run, bench: ScoreBench, tmp_path: Path
 def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
     """A training of two steps, its rollouts and their score."""
     commands(
-        "train --baseline mlp --split curl-noise --size tiny --set training.steps=2 -o run",
+        "train --baseline mlp --split curl-noise --size tiny --set "
+        "training.steps=2 -o run",
         "predict run/weights.pt --no-bench",
         "score predictions.nc",
     )
@@ -98,10 +114,14 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
 
 
 def test_systems_without_some_limits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where there are no limits none is asked for; macOS refuses that of the address space."""
+    """Where there are no limits none is asked for; macOS refuses that of the address
+    space.
+    """
     wanted: list[int] = []
     monkeypatch.setattr(machine.sys, "platform", "darwin")
-    monkeypatch.setattr(machine.resource, "setrlimit", lambda what, _: wanted.append(what))
+    monkeypatch.setattr(
+        machine.resource, "setrlimit", lambda what, _: wanted.append(what)
+    )
     machine.limit_process(memory=1, seconds=1)
     assert wanted == [machine.resource.RLIMIT_CORE, machine.resource.RLIMIT_CPU]
     monkeypatch.setattr(machine, "LIMITS", False)
@@ -110,7 +130,9 @@ def test_systems_without_some_limits(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """There a process that reads where it may not ends with the code 0xC0000005, not with a signal."""
+    """There a process that reads where it may not ends with the code 0xC0000005, not
+    with a signal.
+    """
     ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
     monkeypatch.setattr(machine.subprocess, "run", lambda *_, **__: ended)
     found = machine.in_child("any.function", [0, 0], seconds=1.0, wall=1.0)

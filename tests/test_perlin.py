@@ -11,18 +11,22 @@ from numpy.typing import NDArray
 
 from lagbench.generators import curl_noise, draws, noise
 
-LOW, HIGH = 0.0375, 0.9625
+LOW = 0.0375
+HIGH = 0.9625
 NUMBERS = st.floats(-2, 2, allow_subnormal=False)
 
 
 def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
     """Return reproducible points of a square."""
-    return low + (high - low) * np.random.Generator(np.random.PCG64(5)).random((count, 2))
+    return low + (high - low) * np.random.Generator(np.random.PCG64(5)).random(
+        (count, 2)
+    )
 
 
 def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
     """Perlin noise as thesis Eqs. 5.40 and 5.41 spell it, one point at a time."""
-    i, j = min(int(x), len(lattice) - 2), min(int(y), len(lattice) - 2)
+    i = min(int(x), len(lattice) - 2)
+    j = min(int(y), len(lattice) - 2)
 
     def dot(k: int, m: int) -> float:
         slope = lattice[i + k, j + m]
@@ -34,11 +38,14 @@ def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
     def lerp(t: float, a: float, b: float) -> float:
         return a + t * (b - a)
 
-    u, w = fade(x - i), fade(y - j)
+    u = fade(x - i)
+    w = fade(y - j)
     return lerp(u, lerp(w, dot(0, 0), dot(0, 1)), lerp(w, dot(1, 0), dot(1, 1)))
 
 
-def psi_by_hand(position: NDArray[np.float64], lattice: NDArray[np.float64], scale: float) -> float:
+def psi_by_hand(
+    position: NDArray[np.float64], lattice: NDArray[np.float64], scale: float
+) -> float:
     """The windowed stream function at one point, from its definition."""
     frequency = len(lattice) - 1
     x, y = (position - LOW) / (HIGH - LOW)
@@ -61,12 +68,15 @@ def stream(position: NDArray[np.float64], lattice: NDArray[np.float64]) -> noise
 
 
 @given(st.lists(NUMBERS, min_size=1, max_size=6), NUMBERS, NUMBERS)
-def test_jets_differentiate_polynomials(coefficients: list[float], x: float, y: float) -> None:
+def test_jets_differentiate_polynomials(
+    coefficients: list[float], x: float, y: float
+) -> None:
     """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
     jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
     p = (jet_x * jet_y).polynomial(*coefficients)
     exact = Polynomial(coefficients)
-    first, second = exact.deriv(1)(x * y), exact.deriv(2)(x * y)
+    first = exact.deriv(1)(x * y)
+    second = exact.deriv(2)(x * y)
     expected = [exact(x * y), y * first, x * first]
     expected += [y * y * second, first + x * y * second, x * x * second]
     found = [term[0] for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy)]
@@ -79,7 +89,9 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     node = np.array([(i, j) for i in range(4) for j in range(4)], dtype=np.float64)
     found = noise.noise(*noise.coordinates(node), lattice)
     np.testing.assert_allclose(found.value, 0.0, atol=1e-15)
-    np.testing.assert_allclose(np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14)
+    np.testing.assert_allclose(
+        np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14
+    )
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
     np.testing.assert_allclose(np.hypot(*large.T), 1.0, rtol=3e-16)
     assert len(np.unique(large, axis=0)) == 14 * 14
@@ -94,7 +106,9 @@ def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
 
 
 def test_ramp_joins_one_with_two_derivatives() -> None:
-    """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1 on."""
+    """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1
+    on.
+    """
     t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
     found = noise.ramp(noise.coordinates(t)[0])
     np.testing.assert_allclose(found.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
@@ -103,30 +117,43 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
 
 
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
-def test_flow_is_the_rotated_gradient_by_numerical_differentiation(frequency: int) -> None:
+def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
+    frequency: int,
+) -> None:
     """Velocity: u = dpsi/dy and v = -dpsi/dx of the formula, differenced over 2e-6."""
-    lattice, step = lattice_of(frequency), 1e-6
+    lattice = lattice_of(frequency)
+    step = 1e-6
     position = points(60, LOW + 0.001, HIGH - 0.001)
     psi = stream(position, lattice)
     for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
         above, below = (
-            np.array([psi_by_hand(p + sign * offset, lattice, 0.01) for p in position]) for sign in (1, -1)
+            np.array([psi_by_hand(p + sign * offset, lattice, 0.01) for p in position])
+            for sign in (1, -1)
         )
-        np.testing.assert_allclose(term, (above - below) / (2 * step), atol=2e-9 * frequency)
+        np.testing.assert_allclose(
+            term, (above - below) / (2 * step), atol=2e-9 * frequency
+        )
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
 def test_hessian_by_numerical_differentiation(frequency: int) -> None:
     """The second derivatives are the differences of the first."""
-    lattice, step = lattice_of(frequency), 1e-6
+    lattice = lattice_of(frequency)
+    step = 1e-6
     position = points(200, LOW + 0.001, HIGH - 0.001)
     here = stream(position, lattice)
     for (along_x, along_y), offset in zip(
         ((here.xx, here.xy), (here.xy, here.yy)), np.eye(2) * step, strict=True
     ):
-        after, before = stream(position + offset, lattice), stream(position - offset, lattice)
-        for exact, difference in ((along_x, after.x - before.x), (along_y, after.y - before.y)):
-            np.testing.assert_allclose(exact, difference / (2 * step), atol=2e-5 * frequency**2)
+        after = stream(position + offset, lattice)
+        before = stream(position - offset, lattice)
+        for exact, difference in (
+            (along_x, after.x - before.x),
+            (along_y, after.y - before.y),
+        ):
+            np.testing.assert_allclose(
+                exact, difference / (2 * step), atol=2e-5 * frequency**2
+            )
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
@@ -136,7 +163,8 @@ def test_no_flow_crosses_the_walls(frequency: int) -> None:
     lattice = lattice_of(frequency)
     for wall in (LOW, HIGH):
         upright = np.stack([np.full(101, wall), along], -1)
-        side, floor = stream(upright, lattice), stream(upright[:, ::-1], lattice)
+        side = stream(upright, lattice)
+        floor = stream(upright[:, ::-1], lattice)
         assert not side.y.any()
         assert not floor.x.any()
         assert np.abs(side.x).max() > 1e-4

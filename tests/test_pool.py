@@ -39,8 +39,13 @@ def failure(name: str, function: Callable[..., object]) -> LagbenchError:
 
 
 def test_results_come_back_costliest_first() -> None:
-    """One worker takes the tasks by falling cost and returns every result and report."""
-    tasks = [Task(name=f"{n}", function=pool_tasks.square, arguments=(n,), cost=float(n)) for n in (2, 5, 3)]
+    """One worker takes the tasks by falling cost and returns every result and
+    report.
+    """
+    tasks = [
+        Task(name=f"{n}", function=pool_tasks.square, arguments=(n,), cost=float(n))
+        for n in (2, 5, 3)
+    ]
     with Pool(1) as pool:
         for task in tasks:
             pool.submit(task)
@@ -53,7 +58,9 @@ def test_results_come_back_costliest_first() -> None:
 
 
 def test_tasks_may_be_added_while_others_run() -> None:
-    """A task submitted from within the loop runs in the same loop, in a worker that is there."""
+    """A task submitted from within the loop runs in the same loop, in a worker that is
+    there.
+    """
     with Pool(2) as pool:
         pool.submit(Task(name="a", function=pool_tasks.square, arguments=(2,)))
         results = []
@@ -61,17 +68,28 @@ def test_tasks_may_be_added_while_others_run() -> None:
             if event.kind == "done":
                 results.append(event.value)
                 if event.value == 4:
-                    pool.submit(Task(name="b", function=pool_tasks.square, arguments=(7,)))
+                    pool.submit(
+                        Task(name="b", function=pool_tasks.square, arguments=(7,))
+                    )
         assert results == [4, 49]
         assert len(pool.process_ids()) == 1
 
 
 def test_a_killed_worker_costs_one_attempt(tmp_path: Path) -> None:
-    """The task of a worker killed by SIGKILL runs again in a fresh one; lost units are told."""
+    """The task of a worker killed by SIGKILL runs again in a fresh one; lost units are
+    told.
+    """
     with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.die_once, arguments=(tmp_path / "seen",)))
+        pool.submit(
+            Task(name="a", function=pool_tasks.die_once, arguments=(tmp_path / "seen",))
+        )
         events = [(event.kind, event.value) for event in pool.events()]
-    assert events == [("progress", 5), ("lost", 5), ("progress", 5), ("done", "survived")]
+    assert events == [
+        ("progress", 5),
+        ("lost", 5),
+        ("progress", 5),
+        ("done", "survived"),
+    ]
 
 
 def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
@@ -85,7 +103,9 @@ def test_a_task_that_always_kills_its_worker_is_given_up() -> None:
 
 
 def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:
-    """A task that loses one worker each time it is submitted is never given up; nothing adds up."""
+    """A task that loses one worker each time it is submitted is never given up; nothing
+    adds up.
+    """
     marker = tmp_path / "seen"
     task = Task(name="a", function=pool_tasks.die_once, arguments=(marker,))
     with Pool(1) as pool:
@@ -96,7 +116,9 @@ def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:
 
 
 def test_fewer_than_one_worker_is_refused() -> None:
-    """Zero or less is a usage error, not a pool that never works; None means one per core."""
+    """Zero or less is a usage error, not a pool that never works; None means one per
+    core.
+    """
     for wanted in (0, -1):
         with pytest.raises(UsageError, match="without a worker"):
             worker_count(wanted)
@@ -119,7 +141,8 @@ def test_errors_of_ours_arrive_whole() -> None:
 def test_other_errors_bring_their_traceback(package: Callable[..., Path]) -> None:
     """Whatever else a task raises names the line that raised it.
 
-    Where the line belongs to a package that adds a split, it is the package that is told of.
+    Where the line belongs to a package that adds a split, it is the package that is
+    told of.
     """
     error = failure("a", pool_tasks.crash)
     assert (type(error), error.what) == (WorkFailedError, "a worker crashed")
@@ -146,7 +169,13 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
 def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
     """Compiled kernels are kept as a worker ends, so one without work is not killed."""
     with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.leave_a_note, arguments=(tmp_path / "note",)))
+        pool.submit(
+            Task(
+                name="a",
+                function=pool_tasks.leave_a_note,
+                arguments=(tmp_path / "note",),
+            )
+        )
         list(pool.events())
         process = pool.process_ids()[0]
     assert (tmp_path / "note").read_text() == "left in peace"
@@ -166,9 +195,18 @@ with Pool(1) as pool:
 
 
 def test_workers_die_with_their_parent(tmp_path: Path) -> None:
-    """A worker whose parent is killed by SIGKILL ends by itself, even in the midst of a task."""
+    """A worker whose parent is killed by SIGKILL ends by itself, even in the midst of a
+    task.
+    """
     marker = tmp_path / "pid"
-    command = [sys.executable, "-c", SCRIPT, HERE, "sleep_long", f"Path({str(marker)!r})"]
+    command = [
+        sys.executable,
+        "-c",
+        SCRIPT,
+        HERE,
+        "sleep_long",
+        f"Path({str(marker)!r})",
+    ]
     with subprocess.Popen(command) as parent:
         wait_until(lambda: marker.exists() and marker.read_text() != "")
         worker = int(marker.read_text())
@@ -181,5 +219,7 @@ def test_workers_die_with_their_parent(tmp_path: Path) -> None:
 def test_the_calling_script_is_not_imported_again() -> None:
     """A script from standard input without a main guard may use a pool."""
     command = [sys.executable, "-", HERE, "square", "6"]
-    done = subprocess.run(command, input=SCRIPT, capture_output=True, text=True, timeout=60, check=True)
+    done = subprocess.run(
+        command, input=SCRIPT, capture_output=True, text=True, timeout=60, check=True
+    )
     assert done.stdout == "[1, 36]\n"

@@ -1,4 +1,6 @@
-"""Predictions: rollouts that are known in closed form, frozen ones, what a file says; threads."""
+"""Predictions: rollouts that are known in closed form, frozen ones, what a file says;
+threads.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,12 @@ from lagbench.baselines.graph import radius_graph
 from lagbench.baselines.job import MOST_RECORD, OVER
 from lagbench.baselines.machine import threads_used
 from lagbench.baselines.neuralmpm import NeuralMPM
-from lagbench.baselines.predict import PredictionResult, UnfinishedWarning, check_replaceable, predict
+from lagbench.baselines.predict import (
+    PredictionResult,
+    UnfinishedWarning,
+    check_replaceable,
+    predict,
+)
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import as_published, roll_out, single
 from lagbench.data.registry import Registry
@@ -45,7 +52,9 @@ UNFINISHED = {"state": "running", "step": 9, "steps": 70, "recipe": RECIPE}
 
 
 class Scaled(Drift):
-    """A Drift that may be run at any size, and keeps the facts that it was last told."""
+    """A Drift that may be run at any size, and keeps the facts that it was last
+    told.
+    """
 
     any_size = True
     told: Facts
@@ -70,12 +79,17 @@ class Several(Drift):
 
 @pytest.fixture
 def run(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Predict:
     """Predict with an untrained simple model on one thread."""
     install(monkeypatch, drift=Drift, bursting=Bursting, scaled=Scaled)
 
-    def call(baseline: str = "drift", start: float = 1.0, **options: Any) -> PredictionResult:
+    def call(
+        baseline: str = "drift", start: float = 1.0, **options: Any
+    ) -> PredictionResult:
         root = options.pop("root", generated.root)
         here = facts_of("curl-noise", "tiny", root=root, registry=unmeasured)
         facts = options.pop("facts", here)
@@ -89,7 +103,14 @@ def run(
         )
         save(tmp_path / "weights.pt", stored)
         output = tmp_path / options.pop("name", "predictions.nc")
-        return predict(tmp_path / "weights.pt", output, root=root, threads=1, registry=unmeasured, **options)
+        return predict(
+            tmp_path / "weights.pt",
+            output,
+            root=root,
+            threads=1,
+            registry=unmeasured,
+            **options,
+        )
 
     return call
 
@@ -108,7 +129,10 @@ def said(path: Path) -> dict[str, Any]:
 
 def truth(folder: Path) -> dict[int, np.ndarray]:
     """Return the positions of the test scenarios by id."""
-    return {int(file.stem): written(file).astype(float) for file in sorted(folder.glob("test/*.nc"))}
+    return {
+        int(file.stem): written(file).astype(float)
+        for file in sorted(folder.glob("test/*.nc"))
+    }
 
 
 def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> None:
@@ -116,7 +140,8 @@ def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> No
     result = run(start=0.5)
     shares = 1 - 0.5 ** np.arange(1, 21)
     for row, position in enumerate(truth(generated.folder).values()):
-        last, velocity = position[5], position[5] - position[4]
+        last = position[5]
+        velocity = position[5] - position[4]
         expected = last + shares[:, None, None] * velocity
         assert np.abs(written(result.path)[row] - expected).max() < 1e-6
 
@@ -124,8 +149,12 @@ def test_a_drift_in_closed_form(run: Predict, generated: GenerationResult) -> No
 def test_the_file_is_valid_and_says_what_made_it(
     run: Predict, generated: GenerationResult, unmeasured: Registry
 ) -> None:
-    """The file passes every check, and holds cost, device, seed, parameters and training."""
-    result = run(method="my drift", training={"best_step": 4})  # of a state that is not the best
+    """The file passes every check, and holds cost, device, seed, parameters and
+    training.
+    """
+    result = run(
+        method="my drift", training={"best_step": 4}
+    )  # of a state that is not the best
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
     found = said(result.path)
@@ -144,30 +173,44 @@ def test_batches_do_not_matter(run: Predict) -> None:
     assert np.array_equal(written(alone.path), written(together.path))
 
 
-def test_a_rollout_is_frozen_where_it_diverges(run: Predict, generated: GenerationResult) -> None:
+def test_a_rollout_is_frozen_where_it_diverges(
+    run: Predict, generated: GenerationResult
+) -> None:
     """From frame 6 + 4 on, positions are those of frame 9, and the file says so."""
     result = run(model={"explode_at": 5})
-    position, given = written(result.path), truth(generated.folder)
+    position = written(result.path)
+    given = truth(generated.folder)
     assert result.diverged == dict.fromkeys(given, 10)
     assert written(result.path, "diverged_at").tolist() == [10, 10]
     assert np.isfinite(position).all()
     assert (position[:, 4:] == position[:, 3:4]).all()
     assert (position[:, 3] != position[:, 2]).any()
-    never = run(model={"explode_at": 1}, name="never.nc")  # stays at the last given frame
+    never = run(
+        model={"explode_at": 1}, name="never.nc"
+    )  # stays at the last given frame
     for row, position in enumerate(given.values()):
         assert (written(never.path)[row] == position[5].astype(np.float32)).all()
     assert set(never.diverged.values()) == {6}
 
 
 def test_the_search_that_is_timed_is_the_models(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where matter has collapsed, only the neighbours that the model hears are searched."""
+    """Where matter has collapsed, only the neighbours that the model hears are
+    searched.
+    """
     facts = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
     options = {"latent": 4, "layers": 1, "neighbours": 3}
     model = find("gns").model.build(options, facts)
     stored = Checkpoint(
-        baseline="gns", options=options, facts=facts, weights=model.state_dict(), training={"recipe": RECIPE}
+        baseline="gns",
+        options=options,
+        facts=facts,
+        weights=model.state_dict(),
+        training={"recipe": RECIPE},
     )
     save(tmp_path / "weights.pt", stored)
     asked = []
@@ -177,7 +220,13 @@ def test_the_search_that_is_timed_is_the_models(
         return radius_graph(*given, most=most)
 
     monkeypatch.setattr(prediction, "radius_graph", search)
-    predict(tmp_path / "weights.pt", tmp_path / "p.nc", root=generated.root, threads=1, registry=unmeasured)
+    predict(
+        tmp_path / "weights.pt",
+        tmp_path / "p.nc",
+        root=generated.root,
+        threads=1,
+        registry=unmeasured,
+    )
     assert set(asked) == {3}
 
 
@@ -185,10 +234,14 @@ def test_the_search_that_is_timed_is_the_models(
 def test_frozen_frames_are_not_timed(
     run: Predict, monkeypatch: pytest.MonkeyPatch, batch: int, seconds: float
 ) -> None:
-    """With a second per step, 4 of 20 frames before a burst cost 4 s, side by side 4 s in vain before."""
+    """With a second per step, 4 of 20 frames before a burst cost 4 s, side by side 4 s
+    in vain before.
+    """
     slow = Mock(side_effect=Drift.advance)
     monkeypatch.setattr(Drift, "advance", lambda self, state: slow(self, state))
-    monkeypatch.setattr(prediction, "time", SimpleNamespace(process_time=lambda: float(slow.call_count)))
+    monkeypatch.setattr(
+        prediction, "time", SimpleNamespace(process_time=lambda: float(slow.call_count))
+    )
     result = run(model={"explode_at": 4}, batch=batch)
     assert list(result.diverged.values()) == [9, 9]
     assert result.seconds_per_frame == seconds
@@ -196,8 +249,12 @@ def test_frozen_frames_are_not_timed(
 
 
 def windows(firsts: list[float]) -> Batch:
-    """Return windows of three particles and two frames; the first particle stands where told."""
-    position = torch.rand((len(firsts) * 3, 2, 2), generator=torch.Generator().manual_seed(0))
+    """Return windows of three particles and two frames; the first particle stands where
+    told.
+    """
+    position = torch.rand(
+        (len(firsts) * 3, 2, 2), generator=torch.Generator().manual_seed(0)
+    )
     position[::3, :, 0] = torch.tensor(firsts)[:, None]
     return Batch(
         position=position,
@@ -211,7 +268,8 @@ def windows(firsts: list[float]) -> Batch:
 
 def test_a_diverging_scenario_leaves_others_alone() -> None:
     """Beside one that diverges, a scenario is predicted as it is alone."""
-    model, batch = Bursting.build({"start": 1.0}, FACTS), windows([0.9, 0.1])
+    model = Bursting.build({"start": 1.0}, FACTS)
+    batch = windows([0.9, 0.1])
     good, bad = roll_out(model, batch, 8)
     assert (good.scenario, good.diverged_at) == (10, None)
     # Frames 4 and 5 are given, 6 to 8 finite.
@@ -232,10 +290,16 @@ class Wrong(Drift):
         return self.answer(state, position)
 
 
-def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the scorer would refuse is frozen within ten boxes, as what ceases to be finite is."""
+def test_a_rollout_is_frozen_before_it_is_too_far(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What the scorer would refuse is frozen within ten boxes, as what ceases to be
+    finite is.
+    """
 
-    def fleeing(state: State, position: Tensor) -> Any:  # a box farther to the right in every frame
+    def fleeing(
+        state: State, position: Tensor
+    ) -> Any:  # a box farther to the right in every frame
         return state, position + torch.tensor([float(state[2] - 1), 0.0])
 
     monkeypatch.setattr(Wrong, "answer", staticmethod(fleeing))
@@ -255,8 +319,12 @@ def test_a_rollout_is_frozen_before_it_is_too_far(monkeypatch: pytest.MonkeyPatc
         lambda state, position: position,
     ],
 )
-def test_what_is_no_frame_is_not_broadcast(answer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One particle, a mean, parts exchanged, an array or positions alone: told with the class."""
+def test_what_is_no_frame_is_not_broadcast(
+    answer: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One particle, a mean, parts exchanged, an array or positions alone: told with the
+    class.
+    """
     monkeypatch.setattr(Wrong, "answer", staticmethod(answer))
     with torch.no_grad(), pytest.raises(UsageError) as caught:
         roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.2, 0.9]), 3)
@@ -264,7 +332,9 @@ def test_what_is_no_frame_is_not_broadcast(answer: Any, monkeypatch: pytest.Monk
 
 
 def test_rollouts_keep_mode_and_weights() -> None:
-    """In training it is in training afterwards; rounded to bfloat16 for a while it has all its bits again."""
+    """In training it is in training afterwards; rounded to bfloat16 for a while it has
+    all its bits again.
+    """
     drift = Drift.build({}, FACTS).train()
     roll_out(drift, windows([0.9]), 1)
     assert drift.training
@@ -273,10 +343,14 @@ def test_rollouts_keep_mode_and_weights() -> None:
     with as_published(model):
         assert torch.equal(model.weight, before["weight"].bfloat16().float())
         assert not torch.equal(model.weight, before["weight"])
-    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(
+        torch.equal(value, before[name]) for name, value in model.state_dict().items()
+    )
 
 
-def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]) -> None:
+def test_only_the_given_frames_are_read(
+    run: Predict, copied: Callable[[], Path]
+) -> None:
     """With all later frames of test overwritten the predictions are the same."""
     root = copied()
     whole = run(name="a.nc", root=root)
@@ -289,7 +363,9 @@ def test_only_the_given_frames_are_read(run: Predict, copied: Callable[[], Path]
 
 
 def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> None:
-    """Missing data, a missing checkpoint and a missing device have errors of their own."""
+    """Missing data, a missing checkpoint and a missing device have errors of their
+    own.
+    """
     made = run().path
     with pytest.raises(DataError, match="lagbench generate"):
         predict(tmp_path / "weights.pt", made, root=tmp_path / "nowhere")
@@ -302,40 +378,62 @@ def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> 
 def test_another_size_than_that_of_the_training(
     run: Predict, generated: GenerationResult, unmeasured: Registry
 ) -> None:
-    """Four times as many particles are half as far apart; figures there, statistics of the training."""
+    """Four times as many particles are half as far apart; figures there, statistics of
+    the training.
+    """
     here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
     ones = dict.fromkeys(here.statistics, (1.0, 1.0))
-    trained = replace(here, size="mini", dataset_sha256="0" * 64, radius=0.5, horizon=3, statistics=ones)
+    trained = replace(
+        here,
+        size="mini",
+        dataset_sha256="0" * 64,
+        radius=0.5,
+        horizon=3,
+        statistics=ones,
+    )
     trained = replace(trained, particles=4 * here.particles)
     valid = {"metric": "vorticity_nrmse", "best": 0.2, "validations": [[9, 0.2]]}
     budget = {"cpu_hours": 0.1, "steps": 9, **valid}
-    result = run("scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget})
+    result = run(
+        "scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget}
+    )
     assert (result.size, result.trained_size) == ("tiny", "mini")
     assert Scaled.told == replace(here, radius=1.0, statistics=ones)
-    assert np.array_equal(written(result.path), written(run(start=0.5, name="own.nc").path))
+    assert np.array_equal(
+        written(result.path), written(run(start=0.5, name="own.nc").path)
+    )
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
     assert json.loads(said(result.path)["budget"]) == {"cpu_hours": 0.1, "steps": 9}
     assert said(result.path)["training"].startswith("curl-noise mini train")
     other = replace(trained, frame_interval=2.0 * here.frame_interval)
-    wrong = (("drift", trained, "tiny"), ("scaled", other, "tiny"), ("scaled", trained, "small"))
+    wrong = (
+        ("drift", trained, "tiny"),
+        ("scaled", other, "tiny"),
+        ("scaled", trained, "small"),
+    )
     for name, facts, size in wrong:
         with pytest.raises(UsageError):
             run(name, size=size, facts=facts)
     with pytest.raises(DataError):
         run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
     run("scaled", facts=replace(here, radius=0.5))
-    assert Scaled.told.radius == 0.5  # hashes do not hold it: at its own size that of the training counts
+    assert (
+        Scaled.told.radius == 0.5
+    )  # hashes do not hold it: at its own size that of the training counts
 
 
 def test_a_model_is_changed_where_that_needs_no_weights(
     run: Predict, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An option of the model is as if it had been trained with, and the file says so; others are refused.
+    """An option of the model is as if it had been trained with, and the file says so;
+    others are refused.
 
     By which ``--set`` the training's recipe became another is told apart from that.
     """
-    recipe = recipe_for(find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]).as_json()
+    recipe = recipe_for(
+        find("gns"), "curl-noise", "tiny", settings=["training.steps=77"]
+    ).as_json()
     result = run(training={"recipe": recipe}, settings=["model.explode_at=3"])
     trained = run(model={"explode_at": 3}, name="trained.nc")
     assert np.array_equal(written(result.path), written(trained.path), equal_nan=True)
@@ -350,44 +448,83 @@ def test_a_model_is_changed_where_that_needs_no_weights(
             run("several", settings=[setting])
 
 
-def test_no_image_falls_sideways(tiny_split: Callable[..., GenerationResult], tmp_path: Path) -> None:
-    """Where gravity points down, images of the square are refused at prediction as in training."""
+def test_no_image_falls_sideways(
+    tiny_split: Callable[..., GenerationResult], tmp_path: Path
+) -> None:
+    """Where gravity points down, images of the square are refused at prediction as in
+    training.
+    """
     root = tiny_split("fluid").root
-    model = NeuralMPM.build({"symmetry": "mirror"}, facts_of("fluid", "tiny", root=root))
+    model = NeuralMPM.build(
+        {"symmetry": "mirror"}, facts_of("fluid", "tiny", root=root)
+    )
     options = model.options.model_dump(mode="json")
     stored = Checkpoint(
-        baseline="neuralmpm", options=options, facts=model.facts, weights=model.state_dict(), training={}
+        baseline="neuralmpm",
+        options=options,
+        facts=model.facts,
+        weights=model.state_dict(),
+        training={},
     )
     save(tmp_path / "weights.pt", stored)
     with pytest.raises(UsageError, match="gravity"):
-        predict(tmp_path / "weights.pt", tmp_path / "p.nc", root=root, settings=["model.symmetry=square"])
+        predict(
+            tmp_path / "weights.pt",
+            tmp_path / "p.nc",
+            root=root,
+            settings=["model.symmetry=square"],
+        )
     assert not (tmp_path / "p.nc").exists()
 
 
 def test_models_of_any_size_have_the_same_weights_at_each() -> None:
-    """No parameter of theirs depends on the number of particles; MLPs and the like are not among them."""
-    kinds = [f"{name}_{of}" for name in ("position", "velocity", "acceleration") for of in ("mean", "std")]
+    """No parameter of theirs depends on the number of particles; MLPs and the like are
+    not among them.
+    """
+    kinds = [
+        f"{name}_{of}"
+        for name in ("position", "velocity", "acceleration")
+        for of in ("mean", "std")
+    ]
     small = replace(FACTS, statistics=dict.fromkeys(kinds, (0.5, 0.5)))
     large = replace(small, size="full", particles=12, radius=0.05)
-    models = {name: entry.model for name, entry in every_entry().items() if entry.model.any_size}
-    assert {"neuralmpm", "gns", "supergat"} <= set(models) <= set(every_entry()) - {"mlp", "lstm", "var"}
+    models = {
+        name: entry.model
+        for name, entry in every_entry().items()
+        if entry.model.any_size
+    }
+    assert (
+        {"neuralmpm", "gns", "supergat"}
+        <= set(models)
+        <= set(every_entry()) - {"mlp", "lstm", "var"}
+    )
     for model in models.values():
         shapes = [
-            {name: value.shape for name, value in model.build({}, facts).state_dict().items()}
+            {
+                name: value.shape
+                for name, value in model.build({}, facts).state_dict().items()
+            }
             for facts in (small, large)
         ]
         assert shapes[0] == shapes[1], model.method
 
 
 @pytest.mark.parametrize(
-    "name", ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"]
+    "name",
+    ["weights.pt", "training.nc", ".", "predictions.json", "taken.nc", "scenario.nc"],
 )
 def test_nothing_else_is_replaced(
-    run: Predict, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult
+    run: Predict,
+    tmp_path: Path,
+    name: str,
+    monkeypatch: pytest.MonkeyPatch,
+    generated: GenerationResult,
 ) -> None:
-    """Not the weights, nor the record of their training, whose name that of the cost would be; no folder.
+    """Not the weights, nor the record of their training, whose name that of the cost
+    would be; no folder.
 
-    No scenario, which is a file of the same format. Predictions and their cost have two names.
+    No scenario, which is a file of the same format. Predictions and their cost have two
+    names.
     """
     scenario = next(generated.folder.glob("test/*.nc")).read_bytes()
     (tmp_path / "scenario.nc").write_bytes(scenario)
@@ -405,21 +542,31 @@ def test_nothing_else_is_replaced(
         check_replaceable(Path())
     run(name="predictions.nc")
     run(name="predictions.nc")
-    (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')  # as scores have it too
+    (tmp_path / "predictions.json").write_text(
+        '{"seconds_per_frame": 1.0}'
+    )  # as scores have it too
     with pytest.raises(UsageError):
         run(name="predictions.nc")
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     """When memory is full, the message says what to lower, and no file appears."""
-    monkeypatch.setattr(Drift, "advance", Mock(side_effect=torch.OutOfMemoryError("no memory left")))
+    monkeypatch.setattr(
+        Drift, "advance", Mock(side_effect=torch.OutOfMemoryError("no memory left"))
+    )
     with pytest.raises(WorkFailedError, match="lower --batch"):
         run(name="none.nc")
 
 
-@pytest.mark.parametrize("state", ["running", "interrupted", "failed", "finished", "stopped early"])
-def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: str) -> None:
-    """The record beside the weights says how far it came: those of the best step say 'running' for good."""
+@pytest.mark.parametrize(
+    "state", ["running", "interrupted", "failed", "finished", "stopped early"]
+)
+def test_weights_of_an_unfinished_training(
+    run: Predict, tmp_path: Path, state: str
+) -> None:
+    """The record beside the weights says how far it came: those of the best step say
+    'running' for good.
+    """
     (tmp_path / "training.json").write_text(json.dumps({**UNFINISHED, "state": state}))
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -446,7 +593,9 @@ def test_weights_of_an_unfinished_training(run: Predict, tmp_path: Path, state: 
 def test_what_is_no_record_of_these_weights_is_passed_over(
     run: Predict, tmp_path: Path, record: bytes | str | None
 ) -> None:
-    """Weights alone, damaged records, those of other weights: predictions come without a warning."""
+    """Weights alone, damaged records, those of other weights: predictions come without
+    a warning.
+    """
     if isinstance(record, bytes):
         (tmp_path / "training.json").write_bytes(record)
     elif record:
@@ -471,9 +620,15 @@ CORES = len(os.sched_getaffinity(0))
     ],
 )
 def test_threads_are_those_asked_for(
-    monkeypatch: pytest.MonkeyPatch, count: int | None, environment: str, processes: int, expected: int
+    monkeypatch: pytest.MonkeyPatch,
+    count: int | None,
+    environment: str,
+    processes: int,
+    expected: int,
 ) -> None:
-    """The option wins over OMP_NUM_THREADS, that over a share of the cores; afterwards all is as before."""
+    """The option wins over OMP_NUM_THREADS, that over a share of the cores; afterwards
+    all is as before.
+    """
     monkeypatch.setenv("OMP_NUM_THREADS", environment)
     before = torch.get_num_threads()
     with threads_used(count, processes=processes):

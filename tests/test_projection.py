@@ -1,4 +1,6 @@
-"""Projections: shapes against SciPy's rotations, densities against lattices, momentum kept by both."""
+"""Projections: shapes against SciPy's rotations, densities against lattices, momentum
+kept by both.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def crowd(position: Tensor) -> Density:
 
 def turn(position: Tensor, angle: float) -> Tensor:
     """Return positions turned about the middle of the box."""
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     return (position - 0.5) @ torch.tensor([[cosine, sine], [-sine, cosine]]) + 0.5
 
 
@@ -69,16 +72,23 @@ def test_clusters_turn_as_scipy_says() -> None:
 
 
 def test_shape_matching_keeps_both_momenta_and_restores_the_shape() -> None:
-    """Whatever a body is pressed to, its centre and its spin stay, and every step is nearer to its shape."""
+    """Whatever a body is pressed to, its centre and its spin stay, and every step is
+    nearer to its shape.
+    """
     rng = np.random.default_rng(1)
-    first, found = body(0), shape(body(0))
+    first = body(0)
+    found = shape(body(0))
     now = turn(first, 0.3) + torch.from_numpy(rng.normal(0.0, 0.02, first.shape))
     there = found.matched(now)
     pushed = there - now
-    torch.testing.assert_close(pushed.sum(dim=0), torch.zeros(2).double(), rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        pushed.sum(dim=0), torch.zeros(2).double(), rtol=0, atol=1e-9
+    )
     spin = (now[:, 0] * pushed[:, 1] - now[:, 1] * pushed[:, 0]).sum()
     assert abs(float(spin)) < 1e-9 < float(pushed.abs().sum())
-    before, after = ((torch.pdist(one) - torch.pdist(first)).square().mean() for one in (now, there))
+    before, after = (
+        (torch.pdist(one) - torch.pdist(first)).square().mean() for one in (now, there)
+    )
     assert float(after) < 0.1 * float(before)
 
 
@@ -95,29 +105,43 @@ def test_a_lone_particle_has_finite_gradients() -> None:
 @pytest.mark.parametrize("sides", [(0.875, 0.875), (0.875, 0.31)])
 @pytest.mark.parametrize("cells", [6, 7])
 def test_a_full_box_is_evenly_dense(cells: int, sides: tuple[float, float]) -> None:
-    """Beside walls too, where splines lie partly outside, and where cells do not fill the box."""
+    """Beside walls too, where splines lie partly outside, and where cells do not fill
+    the box.
+    """
     bounds = tuple((0.0625, 0.0625 + side) for side in sides)
-    axes = [low + (high - low) * (torch.arange(150).double() + 0.5) / 150 for low, high in bounds]
-    lattice, one = torch.cartesian_prod(*axes), torch.zeros(150**2, dtype=torch.int64)
+    axes = [
+        low + (high - low) * (torch.arange(150).double() + 0.5) / 150
+        for low, high in bounds
+    ]
+    lattice = torch.cartesian_prod(*axes)
+    one = torch.zeros(150**2, dtype=torch.int64)
     grid = ParticleGrid(bounds, cells).double()
     found = Density.of(grid, lattice, one, 1)
     rho, mass = found.relative(grid.stencil(lattice, one))
     torch.testing.assert_close(rho, torch.ones_like(rho), rtol=4e-3, atol=0)
     assert float(mass.sum()) == pytest.approx(150**2)
-    assert float(found.most) == pytest.approx((150 * grid.spacing) ** 2 / (sides[0] * sides[1]), rel=4e-3)
+    assert float(found.most) == pytest.approx(
+        (150 * grid.spacing) ** 2 / (sides[0] * sides[1]), rel=4e-3
+    )
 
 
 @pytest.mark.parametrize("shift", [(-0.22, -0.22), (-0.22, 0.0), (0.0, -0.22)])
 def test_what_is_pressed_together_comes_apart(shift: tuple[float, float]) -> None:
-    """At rest nothing moves, by a bit; two bodies in one place part, and their centre stays."""
+    """At rest nothing moves, by a bit; two bodies in one place part, and their centre
+    stays.
+    """
     first = torch.cat([body(0, 0.3, 0.45), body(1, 0.3, 0.45) - torch.tensor(shift)])
-    found, limit = crowd(first), torch.ones(len(first)).double()
+    found = crowd(first)
+    limit = torch.ones(len(first)).double()
     assert torch.equal(found.eased(first, torch.tensor(1.0), limit), first)
     now = first.clone()
     now[256:] += torch.tensor(shift)
-    there, most = now, []
+    there = now
+    most = []
     for _ in range(12):
-        most.append(float(found.relative(found.grid.stencil(there, found.sample))[0].max()))
+        most.append(
+            float(found.relative(found.grid.stencil(there, found.sample))[0].max())
+        )
         there = found.eased(there, torch.tensor(1.0), limit)
     torch.testing.assert_close(there.mean(dim=0), now.mean(dim=0), rtol=0, atol=1e-9)
     assert most[0] > 1.6
@@ -125,8 +149,11 @@ def test_what_is_pressed_together_comes_apart(shift: tuple[float, float]) -> Non
 
 
 def test_a_heap_is_not_thrown_apart() -> None:
-    """A body in a twenty-fifth of its place: what is pushed goes a cell or two, however dense it is."""
-    found, heap = crowd(body(0)), 0.5 + 0.2 * (body(1) - 0.5)
+    """A body in a twenty-fifth of its place: what is pushed goes a cell or two, however
+    dense it is.
+    """
+    found = crowd(body(0))
+    heap = 0.5 + 0.2 * (body(1) - 0.5)
     moved = found.eased(heap, torch.tensor(1.0), torch.ones(256).double()) - heap
     assert 1.0 < float(moved.norm(dim=1).max()) / found.grid.spacing < 2.5
 
@@ -144,8 +171,11 @@ def test_nothing_spins_by_rounding() -> None:
 def test_shares_and_limits_are_those_of_their_material() -> None:
     """Jelly and rope go their own share of the way; each material has its own limit."""
     first = torch.cat([body(0), body(1)]).float()
-    now = first + 0.02 * torch.randn(first.shape, generator=torch.Generator().manual_seed(0))
-    material, sample = torch.tensor([1, 3]).repeat(256), torch.zeros(512).long()
+    now = first + 0.02 * torch.randn(
+        first.shape, generator=torch.Generator().manual_seed(0)
+    )
+    material = torch.tensor([1, 3]).repeat(256)
+    sample = torch.zeros(512).long()
     model = Projection(BOUNDS, shape=(8,), density=())
     shares = torch.tensor([0.25, 0.75])
     with torch.no_grad():
@@ -153,40 +183,59 @@ def test_shares_and_limits_are_those_of_their_material() -> None:
     found = model(model.start(first, material, sample, 1), now)
     for kind, share in ((1, 0.25), (3, 0.75)):
         own = material == kind
-        there = Shape.of(ParticleGrid(BOUNDS, 8), first[own], sample[own], 1).matched(now[own])
-        torch.testing.assert_close(found[own], now[own] + share * (there - now[own]), rtol=0, atol=1e-6)
-    model, pressed = Projection(BOUNDS, shape=(), density=(8,)), 0.9 * (first - 0.5) + 0.5
+        there = Shape.of(ParticleGrid(BOUNDS, 8), first[own], sample[own], 1).matched(
+            now[own]
+        )
+        torch.testing.assert_close(
+            found[own], now[own] + share * (there - now[own]), rtol=0, atol=1e-6
+        )
+    model = Projection(BOUNDS, shape=(), density=(8,))
+    pressed = 0.9 * (first - 0.5) + 0.5
     with torch.no_grad():
         model.limit[1] = 1.0
     drawn = model.start(first, material, sample, 1)
     limit = torch.where(material == 1, 1.2, 1.0)
     expected = drawn.densities[0].eased(pressed, torch.tensor(1.0), limit)
     torch.testing.assert_close(model(drawn, pressed), expected, rtol=0, atol=1e-7)
-    assert not torch.allclose(expected, drawn.densities[0].eased(pressed, torch.tensor(1.0), 0 * limit + 1))
+    assert not torch.allclose(
+        expected, drawn.densities[0].eased(pressed, torch.tensor(1.0), 0 * limit + 1)
+    )
 
 
 def test_liquids_and_other_windows_are_none_of_a_shape() -> None:
     """Only jelly and rope come back; windows side by side have what each has alone."""
     first = torch.cat([body(0), body(1, 0.4, 0.6)]).float()
-    now = 0.9 * (first - 0.5) + 0.5 + 0.01 * torch.randn(512, 2, generator=torch.Generator().manual_seed(0))
+    now = (
+        0.9 * (first - 0.5)
+        + 0.5
+        + 0.01 * torch.randn(512, 2, generator=torch.Generator().manual_seed(0))
+    )
     sample = torch.arange(2).repeat_interleave(256)
     model = Projection(BOUNDS, shape=(4, 8), density=(8,))
     material = torch.tensor([0, 1, 2, 3]).repeat(128)
     together = model(model.start(first, material, sample, 2), now)
     for window in range(2):
         own = sample == window
-        alone = model(model.start(first[own], material[own], torch.zeros(256).long(), 1), now[own])
+        alone = model(
+            model.start(first[own], material[own], torch.zeros(256).long(), 1), now[own]
+        )
         torch.testing.assert_close(together[own], alone, rtol=0, atol=1e-6)
     still = Projection(BOUNDS, shape=(4, 8), density=())
-    moved = (still(still.start(first, material, sample, 2), now) - now).abs().amax(dim=1) > 0.0
+    moved = (still(still.start(first, material, sample, 2), now) - now).abs().amax(
+        dim=1
+    ) > 0.0
     assert torch.equal(moved, (material == 1) | (material == 3))
 
 
 def test_every_weight_has_a_gradient() -> None:
-    """Where nothing is elastic or dense too, as training on several devices asks for."""
+    """Where nothing is elastic or dense too, as training on several devices asks
+    for.
+    """
     first = body(0).float()
     for material in (0, 1):
         model = Projection(BOUNDS, shape=(4, 8), density=(8,))
-        drawn = model.start(first, torch.full((256,), material), torch.zeros(256).long(), 1)
+        drawn = model.start(
+            first, torch.full((256,), material), torch.zeros(256).long(), 1
+        )
         model(drawn, first + 0.3).sum().backward()
         assert all(each.grad is not None for each in model.parameters())

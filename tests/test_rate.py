@@ -1,4 +1,6 @@
-"""What this machine's generations measured decides estimates of time, and nothing else does."""
+"""What this machine's generations measured decides estimates of time, and nothing else
+does.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,9 @@ def pace(slowness: float) -> Pace:
 
 
 def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
-    """Whoever took 300 s for three times the work takes 100 s: 2 * 155 * 256 particle substeps, 64 frames."""
+    """Whoever took 300 s for three times the work takes 100 s: 2 * 155 * 256 particle
+    substeps, 64 frames.
+    """
     size = unmeasured.size("fluid", "tiny")
     assert not estimate(size, (0, 1)).measured
     noted(cache, free_surface={"256": [300.0, 3 * 2 * 155 * 256, 3 * 64]})
@@ -58,22 +62,31 @@ def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
 
 
 def test_twins_of_test_scenarios_are_counted() -> None:
-    """What generating simulates: every substep of scenarios and of twins, which end with the horizon."""
+    """What generating simulates: every substep of scenarios and of twins, which end
+    with the horizon.
+    """
     size = load().size("cavity", "mini")
     test = size.subsets["test"]
     twins = [twin_substeps(size, i) for i in test]
     alone = [substeps_of(size, i) for i in test]
     assert sum(twins) < sum(alone)
-    frames = sum(map(size.frame_count, test)) + len(test) * (size.task.input_frames + size.task.horizon)
+    frames = sum(map(size.frame_count, test)) + len(test) * (
+        size.task.input_frames + size.task.horizon
+    )
     expected = reference_seconds((sum(alone) + sum(twins)) * size.particles, frames)
     assert estimate(size, test).core_seconds == pytest.approx(expected)
 
 
-def test_the_nearest_number_of_particles_stands_in(cache: Path, unmeasured: Registry) -> None:
-    """By ratio, of the same kind of solver alone; another machine's rates count for nothing."""
+def test_the_nearest_number_of_particles_stands_in(
+    cache: Path, unmeasured: Registry
+) -> None:
+    """By ratio, of the same kind of solver alone; another machine's rates count for
+    nothing.
+    """
     size = unmeasured.size("fluid", "tiny")
     assert size.particles == 256
-    slow, slower = [2 * PLAIN, *WORK], [3 * PLAIN, *WORK]
+    slow = [2 * PLAIN, *WORK]
+    slower = [3 * PLAIN, *WORK]
     noted(cache, free_surface={"100": slow, "600": slower}, closed_box={"256": slow})
     assert measured_ratio(size) == pytest.approx(3.0)
     noted(cache, closed_box={"256": slow})
@@ -104,8 +117,12 @@ DAMAGED: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGED)
-def test_damaged_rates_are_passed_over(damage: str, cache: Path, unmeasured: Registry) -> None:
-    """A file that is no rate, or that no machine could have, leaves the estimate; the next note mends it."""
+def test_damaged_rates_are_passed_over(
+    damage: str, cache: Path, unmeasured: Registry
+) -> None:
+    """A file that is no rate, or that no machine could have, leaves the estimate; the
+    next note mends it.
+    """
     size = unmeasured.size("fluid", "tiny")
     expected = estimate(size, (0,))
     cache.mkdir()
@@ -118,7 +135,9 @@ def test_damaged_rates_are_passed_over(damage: str, cache: Path, unmeasured: Reg
 
 
 def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
-    """What counts is the sum of seconds over the sum of work; the file stays small whatever is simulated."""
+    """What counts is the sum of seconds over the sum of work; the file stays small
+    whatever is simulated.
+    """
     size = unmeasured.size("fluid", "tiny")
     paces = [pace(1.0), pace(3.0)]
     note_pace(size, paces)
@@ -127,13 +146,17 @@ def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
     note_pace(size, paces)
     held = json.loads((cache / "rates.json").read_text())
     assert len(held["free_surface"]) <= 32
-    assert held["free_surface"]["256"] == pytest.approx([4 * PLAIN, 2 * WORK[0], 2 * WORK[1]])
+    assert held["free_surface"]["256"] == pytest.approx(
+        [4 * PLAIN, 2 * WORK[0], 2 * WORK[1]]
+    )
     note_pace(size, [])
     assert json.loads((cache / "rates.json").read_text()) == held
 
 
 def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) -> None:
-    """The time from the second frame on, when everything is compiled, to the end of the file."""
+    """The time from the second frame on, when everything is compiled, to the end of the
+    file.
+    """
     size = unmeasured.size(SPLIT, SIZE)
     job = SimulationJob(size=size, scenarios=(0,), root=tmp_path)
     times = itertools.accumulate(itertools.count(10, 10))
@@ -145,7 +168,9 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
 
 
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
-    """Before the first one tables say that times are estimated, after it that they are measured here."""
+    """Before the first one tables say that times are estimated, after it that they are
+    measured here.
+    """
     root = ("--root", tmp_path)
     plan = ("generate", SPLIT, "--size", SIZE, *root, "--scenarios", "1", "--dry-run")
     assert "measured after the first generate" in run(*plan).stdout
@@ -160,20 +185,32 @@ def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
     assert "measured after the first generate" not in run(*plan).stdout
     listed = json.loads(run("list", *root, "--json").stdout)["sizes"]
     assert {one["split"] for one in listed if one["measured"]} == {"cavity", SPLIT}
-    assert json.loads(run("info", SPLIT, *root, "--json").stdout)["sizes"][SIZE]["overview"]["measured"]
+    assert json.loads(run("info", SPLIT, *root, "--json").stdout)["sizes"][SIZE][
+        "overview"
+    ]["measured"]
     tiny = next(one for one in listed if (one["split"], one["size"]) == (SPLIT, SIZE))
     assert int(particles) == tiny["particles"]
     assert seconds > 0.0
     assert particle_substeps == frames * 12 * 506
 
 
-def test_a_cache_that_cannot_be_written_is_no_loss(cache: Path, tmp_path: Path, unmeasured: Registry) -> None:
-    """The data set is made all the same, and another device's rate is not taken for this one's."""
+def test_a_cache_that_cannot_be_written_is_no_loss(
+    cache: Path, tmp_path: Path, unmeasured: Registry
+) -> None:
+    """The data set is made all the same, and another device's rate is not taken for
+    this one's.
+    """
     cache.write_text("a file")
-    result = generate(SPLIT, SIZE, scenarios="0", root=tmp_path / "root", registry=unmeasured)
+    result = generate(
+        SPLIT, SIZE, scenarios="0", root=tmp_path / "root", registry=unmeasured
+    )
     assert result.simulated == (0,)
     cache.unlink()
     noted(cache, closed_box=GOOD)
-    options: dict[str, Any] = {"root": tmp_path / "new", "registry": unmeasured, "dry_run": True}
+    options: dict[str, Any] = {
+        "root": tmp_path / "new",
+        "registry": unmeasured,
+        "dry_run": True,
+    }
     assert generate(SPLIT, SIZE, **options).measured
     assert not generate(SPLIT, SIZE, device="cuda", **options).measured

@@ -1,4 +1,6 @@
-"""Data made here have the hashes of datasets.yaml: the promise of docs/determinism.md."""
+"""Data made here have the hashes of datasets.yaml: the promise of
+docs/determinism.md.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +17,9 @@ SPLITS = tuple(load().splits)
 
 
 @pytest.mark.parametrize("split", SPLITS)
-def test_tiny_is_made_to_the_bit(split: str, tiny_split: Callable[..., GenerationResult]) -> None:
+def test_tiny_is_made_to_the_bit(
+    split: str, tiny_split: Callable[..., GenerationResult]
+) -> None:
     """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
     size = load().size(split, "tiny")
     measured = size.measured

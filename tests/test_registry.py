@@ -1,4 +1,6 @@
-"""The registry: the numbers of design and thesis; mistakes, limits and packages of others that are named."""
+"""The registry: the numbers of design and thesis; mistakes, limits and packages of
+others that are named.
+"""
 
 from __future__ import annotations
 
@@ -39,8 +41,12 @@ SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
         ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
     ],
 )
-def test_full_sizes_are_those_of_the_design(split: str, interval: float, expected: tuple[int, ...]) -> None:
-    """Particles, grid and substeps of section 3; frames over train, valid and test; subsets of version 2."""
+def test_full_sizes_are_those_of_the_design(
+    split: str, interval: float, expected: tuple[int, ...]
+) -> None:
+    """Particles, grid and substeps of section 3; frames over train, valid and test;
+    subsets of version 2.
+    """
     full = load().size(split, "full")
     official = [full.subsets[name] for name in ("train", "valid", "test")]
     frames = sum(full.frame_count(i) for ids in official for i in ids)
@@ -51,7 +57,9 @@ def test_full_sizes_are_those_of_the_design(split: str, interval: float, expecte
 
 
 def test_special_ids_of_the_design() -> None:
-    """Subsets are runs of ids; extra and the frames of fluid 0 and 26 are as section 3 names them."""
+    """Subsets are runs of ids; extra and the frames of fluid 0 and 26 are as section 3
+    names them.
+    """
     fluid, pairs, cavity, noise = (load().size(split, "full") for split in SPLITS)
     assert fluid.subsets["test"] == tuple(range(36, 52))
     assert fluid.subsets["valid"] == tuple(range(28, 36))
@@ -65,26 +73,42 @@ def test_special_ids_of_the_design() -> None:
 @pytest.mark.parametrize("size", ["full", "mini", "tiny"])
 @pytest.mark.parametrize("split", SPLITS)
 def test_every_size_is_consistent(split: str, size: str) -> None:
-    """Frames cover the task, frames of interest are predicted ones, bounds lie in the unit box."""
+    """Frames cover the task, frames of interest are predicted ones, bounds lie in the
+    unit box.
+    """
     entry = load().size(split, size)
     task = entry.task
     last = task.input_frames + task.horizon - 1
     assert all(entry.frame_count(i) > last for i in entry.subsets["test"])
     assert all(task.input_frames <= frame <= last for frame in task.frames_of_interest)
     assert all(0.0 < low < high < 1.0 for low, high in entry.bounds)
-    assert all(low + high == pytest.approx(1.0, abs=1e-12) for low, high in entry.bounds)
+    assert all(
+        low + high == pytest.approx(1.0, abs=1e-12) for low, high in entry.bounds
+    )
     assert set(entry.subsets) <= set(SUBSETS)
-    assert entry.scenarios == tuple(sorted({i for ids in entry.subsets.values() for i in ids}))
-    assert all(p.unit and p.description and p.value is not None for p in entry.parameters.values())
+    assert entry.scenarios == tuple(
+        sorted({i for ids in entry.subsets.values() for i in ids})
+    )
+    assert all(
+        p.unit and p.description and p.value is not None
+        for p in entry.parameters.values()
+    )
 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_mini_and_tiny_are_small_relatives(split: str) -> None:
-    """As many particles per cell, the same frame interval, substeps as cells; tiny for tests."""
+    """As many particles per cell, the same frame interval, substeps as cells; tiny for
+    tests.
+    """
     full, mini, tiny = (load().size(split, size) for size in ("full", "mini", "tiny"))
-    inside = [(size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)]
+    inside = [
+        (size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)
+    ]
     if split in ("cavity", "curl-noise"):
-        per_cell = [size.particles / cells**2 for size, cells in zip((full, mini), inside, strict=True)]
+        per_cell = [
+            size.particles / cells**2
+            for size, cells in zip((full, mini), inside, strict=True)
+        ]
         assert per_cell[1] == pytest.approx(per_cell[0], rel=0.06)
     else:
         assert mini.particles == full.particles / 4
@@ -139,8 +163,11 @@ def test_unknown_names_offer_the_nearest() -> None:
         load().size("multimaterial", "full").subset_of(87)
 
 
-def test_a_registry_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """LAGBENCH_REGISTRY replaces ours; a change of the file is seen in the same process.
+def test_a_registry_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LAGBENCH_REGISTRY replaces ours; a change of the file is seen in the same
+    process.
 
     YAML reads hexadecimals of any length, which Python does not print.
     """
@@ -161,7 +188,10 @@ def renamed(split: str, old: str, new: str) -> Change:
 
     def change(splits: dict[str, Any]) -> None:
         entry = splits[split]
-        for mapping in (entry["parameters"], *(s["parameters"] for s in entry["sizes"].values())):
+        for mapping in (
+            entry["parameters"],
+            *(s["parameters"] for s in entry["sizes"].values()),
+        ):
             if old in mapping:
                 mapping[new] = mapping.pop(old)
 
@@ -197,26 +227,63 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
             ),
             ("cavity.sizes", "../x", "match pattern"),
         ),
-        (tiny(substeps_per_frame="many"), ("tiny.parameters.substeps_per_frame", ">= 1", "'many'")),
-        (tiny(substeps_per_frame=2.5), ("tiny.parameters.substeps_per_frame", "an integer", "2.5")),
-        (tiny(substeps_per_frame=0), ("tiny.parameters.substeps_per_frame", ">= 1", "0")),
-        (tiny(particles=True), ("tiny.parameters.particles", "an integer, >= 1", "True")),
-        (tiny(particles=99999999999), ("tiny.parameters.particles", "<= 10000000", "99999999999")),
+        (
+            tiny(substeps_per_frame="many"),
+            ("tiny.parameters.substeps_per_frame", ">= 1", "'many'"),
+        ),
+        (
+            tiny(substeps_per_frame=2.5),
+            ("tiny.parameters.substeps_per_frame", "an integer", "2.5"),
+        ),
+        (
+            tiny(substeps_per_frame=0),
+            ("tiny.parameters.substeps_per_frame", ">= 1", "0"),
+        ),
+        (
+            tiny(particles=True),
+            ("tiny.parameters.particles", "an integer, >= 1", "True"),
+        ),
+        (
+            tiny(particles=99999999999),
+            ("tiny.parameters.particles", "<= 10000000", "99999999999"),
+        ),
         (tiny(grid=10**6), ("tiny.parameters.grid", "<= 4096", "1000000")),
-        (always("frame_rate", value=0), ("parameters.frame_rate.value", "a finite number, > 0", "got 0")),
-        (always("gravity", value=math.nan), ("parameters.gravity.value", "a finite number", "nan")),
-        (always("gravity", value=math.inf), ("parameters.gravity.value", "a finite number", "inf")),
-        (within("fluid", "sizes", "tiny", frames=0), ("sizes.tiny.frames", "an integer, >= 1", "got 0")),
+        (
+            always("frame_rate", value=0),
+            ("parameters.frame_rate.value", "a finite number, > 0", "got 0"),
+        ),
+        (
+            always("gravity", value=math.nan),
+            ("parameters.gravity.value", "a finite number", "nan"),
+        ),
+        (
+            always("gravity", value=math.inf),
+            ("parameters.gravity.value", "a finite number", "inf"),
+        ),
+        (
+            within("fluid", "sizes", "tiny", frames=0),
+            ("sizes.tiny.frames", "an integer, >= 1", "got 0"),
+        ),
         (
             within("fluid", "sizes", "tiny", frames={31: "0-3", 32: "4"}),
             ("sizes.tiny.frames", "horizon = 32 for test scenario 3", "got 31"),
         ),
-        (renamed("fluid", "particles", "particels"), ("'particles'", "did you mean 'particels'?")),
-        (renamed("cavity", "density", "denstiy"), ("'density'", "did you mean 'denstiy'?", "needs")),
+        (
+            renamed("fluid", "particles", "particels"),
+            ("'particles'", "did you mean 'particels'?"),
+        ),
+        (
+            renamed("cavity", "density", "denstiy"),
+            ("'density'", "did you mean 'denstiy'?", "needs"),
+        ),
     ],
 )
-def test_mistakes_are_named_on_load(change: Change, parts: tuple[str, ...], tmp_path: Path) -> None:
-    """An unknown key or a value that cannot be: file, key, what is expected, what was got."""
+def test_mistakes_are_named_on_load(
+    change: Change, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """An unknown key or a value that cannot be: file, key, what is expected, what was
+    got.
+    """
     path = edited(tmp_path, change)
     refused(path, parts, lambda: load(path))
 
@@ -224,29 +291,60 @@ def test_mistakes_are_named_on_load(change: Change, parts: tuple[str, ...], tmp_
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        (renamed("fluid", "gravity", "gravty"), ("parameter gravity", "did you mean 'gravty'?")),
-        (always("gravity", value="down"), ("parameter gravity", "a finite number", "'down'")),
-        (always("liquid_modulus", value=-1.0), ("parameter liquid_modulus", "a finite number, > 0", "-1.0")),
-        (always("jacobian_relaxation", value=2), ("parameter jacobian_relaxation", ">= 0 and <= 1", "2")),
+        (
+            renamed("fluid", "gravity", "gravty"),
+            ("parameter gravity", "did you mean 'gravty'?"),
+        ),
+        (
+            always("gravity", value="down"),
+            ("parameter gravity", "a finite number", "'down'"),
+        ),
+        (
+            always("liquid_modulus", value=-1.0),
+            ("parameter liquid_modulus", "a finite number, > 0", "-1.0"),
+        ),
+        (
+            always("jacobian_relaxation", value=2),
+            ("parameter jacobian_relaxation", ">= 0 and <= 1", "2"),
+        ),
         (tiny(wall=16), ("parameter wall", "an integer, >= 0 and <= 14", "16")),
-        (always("area_min", value="big"), ("size tiny", "generators.fluid can use", "area_min = 'big'")),
-        (renamed("fluid", "area_max", "aera_max"), ("size tiny", "did you mean 'aera_max'?", "'area_max'")),
+        (
+            always("area_min", value="big"),
+            ("size tiny", "generators.fluid can use", "area_min = 'big'"),
+        ),
+        (
+            renamed("fluid", "area_max", "aera_max"),
+            ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
+        ),
     ],
 )
 def test_a_solver_that_cannot_be_fed_is_refused_before_work(
     change: Change, parts: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """By ``generate``, dry or not, and by ``verify --regenerate``; nothing is written."""
-    path, root = edited(tmp_path, change), tmp_path / "data"
+    """By ``generate``, dry or not, and by ``verify --regenerate``; nothing is
+    written.
+    """
+    path = edited(tmp_path, change)
+    root = tmp_path / "data"
     options = {"root": root, "registry": load(path), "workers": 1}
     for dry_run in (True, False):
-        refused(path, parts, lambda dry_run=dry_run: generate("fluid", "tiny", dry_run=dry_run, **options))
-    assert [p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")] == []
+        refused(
+            path,
+            parts,
+            lambda dry_run=dry_run: generate(
+                "fluid", "tiny", dry_run=dry_run, **options
+            ),
+        )
+    assert [
+        p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")
+    ] == []
     refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
 
 
 def test_our_own_values_hold_with_room() -> None:
-    """Every number of ours lies within its limit, at every size, or the limits are wrong."""
+    """Every number of ours lies within its limit, at every size, or the limits are
+    wrong.
+    """
     for split, entry in load().splits.items():
         for name in entry.sizes:
             size = load().size(split, name)
@@ -257,7 +355,9 @@ def test_our_own_values_hold_with_room() -> None:
 
 @given(st.one_of(st.integers(), st.floats(), st.booleans(), st.text()))
 def test_limits_agree_with_their_words(value: object) -> None:
-    """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the type."""
+    """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the
+    type.
+    """
     whole = Limit(low=-2, high=5, whole=True, open_high=True)
     assert whole.holds(value) == (type(value) is int and value in range(-2, 5))
     real = Limit(low=0.0, open_low=True)
@@ -271,7 +371,9 @@ Plug = Callable[..., Registry]
 
 @pytest.fixture
 def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
-    """A function that loads our registry with other packages' modules, given as name=source."""
+    """A function that loads our registry with other packages' modules, given as
+    name=source.
+    """
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
 
@@ -279,7 +381,9 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
         points = [EntryPoint("cavity", "lagbench.generators.cavity", registry.GROUP)]
         for name, source in sources.items():
             (tmp_path / f"{name}_split.py").write_text(source)
-            points += 2 * [EntryPoint(name, f"{name}_split", registry.GROUP)]  # found on two paths
+            points += 2 * [
+                EntryPoint(name, f"{name}_split", registry.GROUP)
+            ]  # found on two paths
         monkeypatch.setattr(registry, "installed", lambda group: points)
         registry._load.cache_clear()
         return load()
@@ -290,19 +394,30 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
 
 @pytest.fixture
 def theirs(tmp_path: Path) -> str:
-    """A datasets.yaml of a split of one's own that also rewrites the cavity and its hash."""
+    """A datasets.yaml of a split of one's own that also rewrites the cavity and its
+    hash.
+    """
     data = read_yaml(default_path())
     splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
     splits["cavity"]["title"] = "Hijacked"
-    nothing = {"subset_sha256": {}, "scenario_sha256": {}, "statistics": {}, "twin_floor": []}
+    nothing = {
+        "subset_sha256": {},
+        "scenario_sha256": {},
+        "statistics": {},
+        "twin_floor": [],
+    }
     measured = {"cavity": {"tiny": {"dataset_sha256": "0" * 64, **nothing}}}
     path = tmp_path / "theirs.yaml"
-    path.write_text(yaml.safe_dump({"format": 1, "splits": splits, "measured": measured}))
+    path.write_text(
+        yaml.safe_dump({"format": 1, "splits": splits, "measured": measured})
+    )
     return str(path)
 
 
 def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -> None:
-    """Only the split that an entry point names is taken: our split and its hash stay ours."""
+    """Only the split that an entry point names is taken: our split and its hash stay
+    ours.
+    """
     before = load(default_path())
     found = plugged(sloshing=f"REGISTRY = {theirs!r}")
     assert set(found.splits) == {*before.splits, "sloshing"}
@@ -315,7 +430,11 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
     ("name", "source", "reason"),
     [
         ("careless", "", "REGISTRY"),
-        ("broken", "import no_such_module_at_all", "ModuleNotFoundError.*no_such_module_at_all"),
+        (
+            "broken",
+            "import no_such_module_at_all",
+            "ModuleNotFoundError.*no_such_module_at_all",
+        ),
         ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "/nowhere/datasets.yaml"),
         ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
         ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
@@ -324,21 +443,29 @@ def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -
 def test_a_broken_package_is_left_out(
     name: str, source: str, reason: str, plugged: Plug, theirs: str
 ) -> None:
-    """A package that cannot be imported or read costs one warning that names it, and none of our splits."""
-    with pytest.warns(registry.PluginWarning, match=f"(?s)package {name}_split .*{reason}") as told:
+    """A package that cannot be imported or read costs one warning that names it, and
+    none of our splits.
+    """
+    with pytest.warns(
+        registry.PluginWarning, match=f"(?s)package {name}_split .*{reason}"
+    ) as told:
         found = plugged(**{name: source.format(theirs=theirs)})
     assert len(told) == 1
     assert found.splits == load(default_path()).splits
 
 
 def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package installed after the first look is found, and one that was uninstalled is not."""
+    """A package installed after the first look is found, and one that was uninstalled
+    is not.
+    """
     monkeypatch.syspath_prepend(tmp_path)
     os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
     assert registry.installed("some.group") == ()
     folder = tmp_path / "wave_splits-1.0.dist-info"
     folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n")
+    (folder / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
+    )
     (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
     assert [point.name for point in registry.installed("some.group")] == ["waves"]
     shutil.rmtree(folder)
@@ -347,14 +474,22 @@ def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
-    """An installed package whose module is gone: the command works, one line on stderr names the package."""
+    """An installed package whose module is gone: the command works, one line on stderr
+    names the package.
+    """
     folder = tmp_path / "wave_splits-1.0.dist-info"
     folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n")
-    (folder / "entry_points.txt").write_text(f"[{registry.GROUP}]\nwaves = wave_splits.gone\n")
+    (folder / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
+    )
+    (folder / "entry_points.txt").write_text(
+        f"[{registry.GROUP}]\nwaves = wave_splits.gone\n"
+    )
     code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from lagbench.__main__ import app; app()"
     command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False
+    )
     assert done.returncode == 0, done.stderr
     assert '"split": "cavity"' in done.stdout
     assert done.stderr.startswith("warning: package wave-splits adds no split 'waves'")
@@ -362,17 +497,24 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("split", "expected"), [("cavity", (0.002191, 0.002195)), ("curl-noise", (1.600e-03, 1.600e-03))]
+    ("split", "expected"),
+    [("cavity", (0.002191, 0.002195)), ("curl-noise", (1.600e-03, 1.600e-03))],
 )
-def test_statistics_of_train_are_those_of_the_thesis(split: str, expected: tuple[float, float]) -> None:
-    """Standard deviations of per-frame velocities within 5 % of Tables 5.1 and 5.3, by component.
+def test_statistics_of_train_are_those_of_the_thesis(
+    split: str, expected: tuple[float, float]
+) -> None:
+    """Standard deviations of per-frame velocities within 5 % of Tables 5.1 and 5.3, by
+    component.
 
-    Positions of curl noise spread as in Table 5.1 (0.272): a uniform box of this width gives it within 2 %.
+    Positions of curl noise spread as in Table 5.1 (0.272): a uniform box of this width
+    gives it within 2 %.
     """
     size = load().size(split, "full")
     assert size.measured.statistics["velocity_std"] == pytest.approx(expected, rel=0.05)
     if split == "curl-noise":
         (low, high), _ = size.bounds
         uniform = (high - low) / 12**0.5
-        assert size.measured.statistics["position_std"] == pytest.approx((uniform, uniform), rel=1e-3)
+        assert size.measured.statistics["position_std"] == pytest.approx(
+            (uniform, uniform), rel=1e-3
+        )
         assert uniform == pytest.approx(0.272, rel=0.02)

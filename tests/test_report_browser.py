@@ -1,4 +1,6 @@
-"""The report in a real browser: nothing asked for, nothing complained of, nothing cut off."""
+"""The report in a real browser: nothing asked for, nothing complained of, nothing cut
+off.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from browser import CHROMIUM, Browser
 from made_up import page_of
 from PIL import Image
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here: apt-get install chromium")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
+)
 
 
 @pytest.fixture(scope="module", params=["cavity", "multimaterial"])
@@ -22,12 +26,18 @@ def report(request: pytest.FixtureRequest, home: Path) -> Path:
 
 @pytest.mark.parametrize("width", [1280, 390, 320])
 @pytest.mark.parametrize("dark", [False, True])
-def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark: bool) -> None:
-    """Focus shows; no message, no request but the page itself, no sideways scrolling, its scheme as asked."""
+def test_page_opens_in_silence(
+    running: Browser, report: Path, width: int, dark: bool
+) -> None:
+    """Focus shows; no message, no request but the page itself, no sideways scrolling,
+    its scheme as asked.
+    """
     page = running.open(report, width=width, dark=dark)
     assert page.value("document.documentElement.scrollWidth") <= width
     assert page.value("document.images.length") > 5
-    assert page.value("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    assert page.value(
+        "[...document.images].every(i => i.complete && i.naturalWidth > 0)"
+    )
     assert page.value("document.scripts.length") == 0
     with Image.open(io.BytesIO(page.screenshot())) as picture:
         brightness = float(np.median(np.asarray(picture.convert("L")))) / 255.0
@@ -40,12 +50,16 @@ def test_page_opens_in_silence(running: Browser, report: Path, width: int, dark:
 
 
 @pytest.mark.parametrize("width", [1280, 390])
-def test_texts_of_charts_lie_within_them(running: Browser, report: Path, width: int) -> None:
+def test_texts_of_charts_lie_within_them(
+    running: Browser, report: Path, width: int
+) -> None:
     """No label is cut off at the edge of the window, none is smaller than 7 pixels."""
     page = running.open(report, width=width)
     boxes = page.value(
-        "[...document.querySelectorAll('.chart text')].map(t => { const b = t.getBoundingClientRect();"
-        " return [b.left, b.right, parseFloat(getComputedStyle(t).fontSize) * t.getCTM().a]; })"
+        "[...document.querySelectorAll('.chart text')].map(t => { const b = "
+        "t.getBoundingClientRect();"
+        " return [b.left, b.right, parseFloat(getComputedStyle(t).fontSize) * "
+        "t.getCTM().a]; })"
     )
     assert len(boxes) > 50
     left, right, size = np.array(boxes).T
@@ -54,15 +68,19 @@ def test_texts_of_charts_lie_within_them(running: Browser, report: Path, width: 
     assert size.min() >= 7.0
 
 
-def test_heads_break_at_no_letter_and_the_page_prints(running: Browser, report: Path) -> None:
-    """A name without a space or hyphen is on one line of its head, as every floor's is; a PDF has pages."""
+def test_heads_break_at_no_letter_and_the_page_prints(
+    running: Browser, report: Path
+) -> None:
+    """A name without a space or hyphen is on one line of its head, as every floor's is;
+    a PDF has pages.
+    """
     page = running.open(report, width=1280)
-    heads = (
-        "[...document.querySelectorAll('thead th, tbody th')].flatMap(th => [...th.querySelectorAll('span')])"
-    )
+    heads = "[...document.querySelectorAll('thead th, tbody th')].flatMap(th => [...th.querySelectorAll('span')])"
     broken = page.value(
-        f"{heads}.filter(s => !s.matches('.metric, .metric *, .sub') && s.getClientRects().length > 1)"
-        ".filter(s => s.matches('.muted') || !/[ -]/.test(s.textContent)).map(s => s.textContent)"
+        f"{heads}.filter(s => !s.matches('.metric, .metric *, .sub') && "
+        f"s.getClientRects().length > 1)"
+        ".filter(s => s.matches('.muted') || !/[ -]/.test(s.textContent)).map(s => "
+        "s.textContent)"
     )
     assert broken == []
     pdf = page.pdf()

@@ -1,4 +1,6 @@
-"""Claims from scores, the thesis's numbers, and the small mathematics of reproduction."""
+"""Claims from scores, the thesis's numbers, and the small mathematics of
+reproduction.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,11 @@ from lagbench.baselines.reproduce.claims import (
 from lagbench.baselines.reproduce.drawing import SMOOTHED, loss_over_steps, smoothed
 from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.baselines.reproduce.results import agreement
-from lagbench.baselines.reproduce.tables import cubic_errors, cubic_vorticity, rollout_table
+from lagbench.baselines.reproduce.tables import (
+    cubic_errors,
+    cubic_vorticity,
+    rollout_table,
+)
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS, Score
 from lagbench.scoring.score_file import read_statistics
@@ -39,7 +45,9 @@ def six(**better: list[float]) -> Evidence:
 
 
 def test_a_comparison_can_be_counted_by_hand() -> None:
-    """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes first."""
+    """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes
+    first.
+    """
     evidence = known({"gns": [0.1] * 8, "gat": [0.2] * 8})
     (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
     assert (row.means, row.won, row.seeds) == (pytest.approx((0.1, 0.2)), 8, (1, 1))
@@ -47,23 +55,35 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     assert row.verdict is Verdict.BETTER
     (turned,) = compared(evidence, "gat", ["gns"], ["position_rmse"])
     assert (turned.verdict, turned.won, turned.p) == (Verdict.WORSE, 0, row.p)
-    # Directions come from the metrics table; at a frame the values of that frame are compared.
+    # Directions come from the metrics table; at a frame the values of that frame are
+    # compared.
     evidence = known({"gns": [0.9] * 8, "gat": [0.5] * 8})
     (row,) = compared(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
     assert (row.verdict, row.won, row.frame) == (Verdict.BETTER, 8, 54)
 
 
 def test_nothing_is_claimed_of_what_cannot_be_told() -> None:
-    """Mixed signs leave a question open; fewer than six scenarios give no p-value at all."""
-    (mixed,) = compared(known({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8}), "gns", ["gat"], ["position_rmse"])
+    """Mixed signs leave a question open; fewer than six scenarios give no p-value at
+    all.
+    """
+    (mixed,) = compared(
+        known({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8}),
+        "gns",
+        ["gat"],
+        ["position_rmse"],
+    )
     assert mixed.verdict is Verdict.OPEN
-    (few,) = compared(known({"gns": [0.1] * 5, "gat": [0.9] * 5}), "gns", ["gat"], ["position_rmse"])
+    (few,) = compared(
+        known({"gns": [0.1] * 5, "gat": [0.9] * 5}), "gns", ["gat"], ["position_rmse"]
+    )
     assert few.verdict is Verdict.FEW
     assert math.isnan(few.p)
 
 
 def test_first_place_takes_all_rivals() -> None:
-    """Better than all five after correction (5 x 2 / 2^8 < 5 %): yes; a tie or a loss: counted."""
+    """Better than all five after correction (5 x 2 / 2^8 < 5 %): yes; a tie or a loss:
+    counted.
+    """
     rows = claim_rows(FIRST, six(supergat=[0.1] * 8))
     assert {row.second for row in rows} == set(FIRST.rivals)
     assert {row.p for row in rows} == {5 * 2 / 2**8}
@@ -71,18 +91,31 @@ def test_first_place_takes_all_rivals() -> None:
     tied = claim_rows(FIRST, six(supergat=[0.1] * 8, gns=[0.05, 0.16] * 4))
     assert {row.second for row in tied if row.verdict is Verdict.OPEN} == {"gns"}
     assert answer(tied) not in ("yes", "no")
-    assert all(row.verdict is Verdict.WORSE for row in claim_rows(FIRST, six(supergat=[0.9] * 8)))
+    assert all(
+        row.verdict is Verdict.WORSE
+        for row in claim_rows(FIRST, six(supergat=[0.9] * 8))
+    )
 
 
-@pytest.mark.parametrize(("without", "expected"), [(0.9, "yes"), (0.1, "no"), (0.5, "open")])
-def test_a_loss_is_judged_by_the_model_without_it(without: float, expected: str) -> None:
-    """The claim on the vorticity loss compares GNS with its ablation, by the ranking metric first."""
+@pytest.mark.parametrize(
+    ("without", "expected"), [(0.9, "yes"), (0.1, "no"), (0.5, "open")]
+)
+def test_a_loss_is_judged_by_the_model_without_it(
+    without: float, expected: str
+) -> None:
+    """The claim on the vorticity loss compares GNS with its ablation, by the ranking
+    metric first.
+    """
     (claim,) = (claim for claim in CLAIMS if claim.rivals == ("gns-novorticity",))
     evidence = known({"gns": [0.5] * 8, "gns-novorticity": [without] * 8})
     rows = claim_rows(claim, evidence)
     assert answer(rows) == expected
     assert rows[0].metric == evidence.ranking
-    assert {row.metric for row in rows} == {evidence.ranking, *claim.metrics, *claim.at_key_frame}
+    assert {row.metric for row in rows} == {
+        evidence.ranking,
+        *claim.metrics,
+        *claim.at_key_frame,
+    }
 
 
 def test_seeds_that_only_one_has_do_not_count() -> None:
@@ -99,7 +132,9 @@ def test_seeds_that_only_one_has_do_not_count() -> None:
 
 
 def test_models_stand_beside_the_best_floor() -> None:
-    """The floor of least error is the one that counts; skill is 1 - score / its score."""
+    """The floor of least error is the one that counts; skill is 1 - score / its
+    score.
+    """
     scores = {"gns": 0.1, "gat": 0.9, "persistence": 0.5, "constant-velocity": 2.0}
     evidence = known({name: [score] * 8 for name, score in scores.items()})
     assert evidence.best_floor == "persistence"
@@ -107,17 +142,25 @@ def test_models_stand_beside_the_best_floor() -> None:
     assert evidence.skill("gat") == pytest.approx(-0.8)
     assert evidence.skill("persistence") == 0.0
     rows = claim_rows(Claim(question="", first=""), evidence)
-    assert {row.second: row.verdict for row in rows} == {"gns": Verdict.WORSE, "gat": Verdict.BETTER}
+    assert {row.second: row.verdict for row in rows} == {
+        "gns": Verdict.WORSE,
+        "gat": Verdict.BETTER,
+    }
     del evidence.methods["gns"]
     ahead = floors_ahead([evidence])
     assert evidence.ranking in {row[1] for row in ahead.rows}
     assert {row[2] for row in ahead.rows} <= set(evidence.floors)
-    assert floors_ahead([known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]).rows == ()
+    assert (
+        floors_ahead([known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]).rows
+        == ()
+    )
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])
 def test_every_claim_asks_what_can_be_answered(claim: Claim) -> None:
-    """Its metrics are of the table; where nobody has an entry there are no rows, and no answer."""
+    """Its metrics are of the table; where nobody has an entry there are no rows, and no
+    answer.
+    """
     assert {*claim.metrics, *claim.at_key_frame} <= METRICS.keys()
     for models in ({}, {"gns-short": [0.5] * 8}):
         rows = claim_rows(claim, known(models))
@@ -125,10 +168,14 @@ def test_every_claim_asks_what_can_be_answered(claim: Claim) -> None:
 
 
 def test_seeds_become_a_mean_per_scenario() -> None:
-    """The score of two seeds is their mean per scenario; the spread is the sample deviation of means."""
+    """The score of two seeds is their mean per scenario; the spread is the sample
+    deviation of means.
+    """
     method = a_method("gns", [1.0, 3.0], [3.0, 5.0])
     assert method.scores["position_rmse"].values.tolist() == [2.0, 4.0]
-    assert method.spread("position_rmse") == pytest.approx(math.sqrt(2.0))  # of means 2 and 4
+    assert method.spread("position_rmse") == pytest.approx(
+        math.sqrt(2.0)
+    )  # of means 2 and 4
     assert method.at("position_rmse", 54, 1) == 4.0
     assert math.isnan(method.at("no_metric", 54))
     assert math.isnan(a_method("gns", [1.0]).spread("position_rmse"))
@@ -145,7 +192,9 @@ def test_orders_agree_as_scipy_says() -> None:
 
 
 def test_printed_parameters_follow_from_the_widths() -> None:
-    """Every printed parameter count of Tables 4.2 to 4.5 is that of dense layers 10,000 -> ... -> 10,000."""
+    """Every printed parameter count of Tables 4.2 to 4.5 is that of dense layers 10,000
+    -> ... -> 10,000.
+    """
     for study in thesis.STUDIES:
         widths = (10_000, *study.widths, 10_000)
         assert study.parameters == sum(a * b + b for a, b in pairwise(widths)), study
@@ -154,13 +203,22 @@ def test_printed_parameters_follow_from_the_widths() -> None:
 
 
 def test_printed_errors_agree_with_each_other() -> None:
-    """In Table 5.4 RMSE is the root of MSE, MAE the smaller; Table 4.7 swaps columns of 4.8."""
+    """In Table 5.4 RMSE is the root of MSE, MAE the smaller; Table 4.7 swaps columns of
+    4.8.
+    """
     for row in thesis.TABLE_5_4.values():
         assert row["rmse"] == pytest.approx(math.sqrt(row["mse"]), rel=4e-3)
         assert row["mae"] < row["rmse"]
-    (printed,) = (row for row in thesis.TABLE_4_8["fluid"] if row.scenario == thesis.TABLE_4_7.scenario)
+    (printed,) = (
+        row
+        for row in thesis.TABLE_4_8["fluid"]
+        if row.scenario == thesis.TABLE_4_7.scenario
+    )
     for i in (thesis.FRAME_MODELS.index(name) for name in ("mlp", "lstm-mlp")):
-        assert (printed.average[i], printed.end[i]) == (thesis.TABLE_4_7.end[i], thesis.TABLE_4_7.average[i])
+        assert (printed.average[i], printed.end[i]) == (
+            thesis.TABLE_4_7.end[i],
+            thesis.TABLE_4_7.average[i],
+        )
 
 
 def test_scenes_stand_for_their_own_kind() -> None:
@@ -179,7 +237,9 @@ def test_scenes_stand_for_their_own_kind() -> None:
 
 
 @pytest.mark.parametrize(("spin", "strain"), [(0.3, 0.0), (-0.2, 0.5)])
-def test_interpolation_finds_the_vorticity_of_a_linear_flow(spin: float, strain: float) -> None:
+def test_interpolation_finds_the_vorticity_of_a_linear_flow(
+    spin: float, strain: float
+) -> None:
     """U = (s x - w y, w x - s y) has vorticity 2 w everywhere inside the hull."""
     position = np.random.default_rng(1).random((200, 2))
     x, y = position.T
@@ -189,9 +249,17 @@ def test_interpolation_finds_the_vorticity_of_a_linear_flow(spin: float, strain:
 
 
 def test_errors_of_interpolated_fields() -> None:
-    """A field against itself is perfect; against twice itself the hand-worked values hold."""
+    """A field against itself is perfect; against twice itself the hand-worked values
+    hold.
+    """
     truth = np.array([[1.0, -2.0], [3.0, np.nan]])
-    perfect = {"mae": 0.0, "mse": 0.0, "rmse": 0.0, "kl": 0.0, "pearson": pytest.approx(1.0)}
+    perfect = {
+        "mae": 0.0,
+        "mse": 0.0,
+        "rmse": 0.0,
+        "kl": 0.0,
+        "pearson": pytest.approx(1.0),
+    }
     assert cubic_errors(truth, truth) == perfect
     twice = cubic_errors(truth, 2 * truth)
     # residuals 1, 2, 3; magnitudes in the same proportion, so that KL is 0
@@ -203,7 +271,9 @@ def test_errors_of_interpolated_fields() -> None:
 
 def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
     """What was logged comes back in the order of steps; no log gives no curve."""
-    writer = pytest.importorskip("torch.utils.tensorboard").SummaryWriter(str(tmp_path / "tensorboard"))
+    writer = pytest.importorskip("torch.utils.tensorboard").SummaryWriter(
+        str(tmp_path / "tensorboard")
+    )
     for step in (10, 20, 30):
         writer.add_scalar("loss/total", 1.0 / step, step)
     writer.close()
@@ -215,10 +285,14 @@ def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
 
 
 def test_smoothing_is_a_centred_mean() -> None:
-    """Each value is the mean of as many before it as after, fewer at both ends; lines stay lines."""
+    """Each value is the mean of as many before it as after, fewer at both ends; lines
+    stay lines.
+    """
     values = np.random.default_rng(2).random(60)
     reach = [min(SMOOTHED // 2, i, 59 - i) for i in range(60)]
-    assert smoothed(values) == pytest.approx([values[i - k : i + k + 1].mean() for i, k in enumerate(reach)])
+    assert smoothed(values) == pytest.approx(
+        [values[i - k : i + k + 1].mean() for i, k in enumerate(reach)]
+    )
     assert smoothed(np.arange(60.0)) == pytest.approx(np.arange(60.0))
 
 
@@ -226,8 +300,12 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
     evidence = Evidence(Sources(board=None), "fluid", "full")
     ids = tuple(sorted(evidence.size.subsets["test"]))
-    values, none = np.arange(len(ids), dtype=float), np.empty((len(ids), 0))
-    scores = {m: Score(METRICS[m], ids, (), none, values, (0,) * len(ids)) for m in ("mse_avg", "mse_end")}
+    values = np.arange(len(ids), dtype=float)
+    none = np.empty((len(ids), 0))
+    scores = {
+        m: Score(METRICS[m], ids, (), none, values, (0,) * len(ids))
+        for m in ("mse_avg", "mse_end")
+    }
     seed = Seeded(seed=0, scores=scores, record={}, path=Path())
     evidence.methods["mlp"] = Method(name="mlp", seeds=(seed,))
     table = rollout_table(evidence, thesis.TABLE_4_8["fluid"])
@@ -239,7 +317,9 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
 
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
 def test_skill_is_the_score_files(split: str) -> None:
-    """The skill of results is the one that each committed score file holds the floor of."""
+    """The skill of results is the one that each committed score file holds the floor
+    of.
+    """
     board = Path(__file__).parents[1] / "leaderboard"
     evidence = Evidence(Sources(board=board), split, "mini")
     assert evidence.models

@@ -1,4 +1,6 @@
-"""Runs that are reproduced: those of another recipe or other data, and models without the recipe."""
+"""Runs that are reproduced: those of another recipe or other data, and models without
+the recipe.
+"""
 
 from __future__ import annotations
 
@@ -34,11 +36,20 @@ FILES = ("weights.pt", "training.json", "predictions.nc", "scores.nc")
 
 
 @pytest.fixture
-def reproduce(generated: GenerationResult, unmeasured: Registry, tmp_path: Path) -> Reproduce:
+def reproduce(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path
+) -> Reproduce:
     """Call the command on tiny curl-noise data."""
 
     def call(*words: str) -> int:
-        places = ["--size", "tiny", "--root", str(generated.root), "--runs", str(tmp_path / "runs")]
+        places = [
+            "--size",
+            "tiny",
+            "--root",
+            str(generated.root),
+            "--runs",
+            str(tmp_path / "runs"),
+        ]
         small = ["--device", "cpu", "--threads", "1", "--set", "model.layers=1"]
         return command.main([*places, *small, *words], registry=unmeasured)
 
@@ -59,7 +70,9 @@ def label(file: Path, **labels: str) -> None:
 def test_what_is_there_is_what_was_asked_for(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A run with another recipe or on other data ends the command; scores of other data are made again."""
+    """A run with another recipe or on other data ends the command; scores of other data
+    are made again.
+    """
     folder = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0"
     steps = "--set", "training.steps=1"
     assert reproduce(*ONLY, *steps) == 0
@@ -69,7 +82,9 @@ def test_what_is_there_is_what_was_asked_for(
     assert reproduce(*ONLY, "--set", "training.steps=2") == 2
     told = capsys.readouterr()
     assert str(folder) in told.err
-    assert "supergat: no run" in told.out.lower(), "nothing of a run that was refused is drawn"
+    assert "supergat: no run" in told.out.lower(), (
+        "nothing of a run that was refused is drawn"
+    )
 
     label(folder / "scores.nc", dataset_sha256="f" * 64)
     assert reproduce(*ONLY, *steps) == 0
@@ -82,26 +97,46 @@ def test_what_is_there_is_what_was_asked_for(
     assert "supergat-0: to predict and score" in capsys.readouterr().out
     assert reproduce(*ONLY, *steps) == 0
     again = stamps(folder)
-    assert {name for name in FILES if again[name] != first[name]} == {"predictions.nc", "scores.nc"}
+    assert {name for name in FILES if again[name] != first[name]} == {
+        "predictions.nc",
+        "scores.nc",
+    }
 
     record = folder / "training.json"
-    record.write_text(json.dumps({**json.loads(record.read_text()), "dataset_sha256": "e" * 64}))
+    record.write_text(
+        json.dumps({**json.loads(record.read_text()), "dataset_sha256": "e" * 64})
+    )
     assert reproduce(*ONLY, *steps) == 4
 
 
 def test_studies_are_what_was_asked_for(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Errors of an MLP with another recipe are not taken for those that were asked for.
 
-    What a row came to lies in one file, which suffices for its table, unless it is of other data.
+    What a row came to lies in one file, which suffices for its table, unless it is of
+    other data.
     """
     monkeypatch.setitem(TABLES, "table_4_2", ("4.2", SPLIT))
     for module in (runs, tables):
         monkeypatch.setattr(module, "study_rows", lambda _: STUDIES[:1])
-    places = {"root": generated.root, "runs": tmp_path / "runs", "output": tmp_path / "out"}
+    places = {
+        "root": generated.root,
+        "runs": tmp_path / "runs",
+        "output": tmp_path / "out",
+    }
     small = ("training.steps=1", "model.widths=[4]")
-    plan = Plan(size="tiny", settings=small, device="cpu", threads=1, registry=unmeasured, **places)
+    plan = Plan(
+        size="tiny",
+        settings=small,
+        device="cpu",
+        threads=1,
+        registry=unmeasured,
+        **places,
+    )
     runs.make_studies(plan, "table_4_2")
     home = plan.home(SPLIT)
     first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
@@ -114,17 +149,24 @@ def test_studies_are_what_was_asked_for(
     (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
     assert f"{held['valid']:.3g}" in row
     assert known_studies([home], "f" * 64) == {}
-    stale, later = {**held, "training": {"dataset_sha256": "f" * 64}}, {**held, "train": 9.0}
+    stale = {**held, "training": {"dataset_sha256": "f" * 64}}
+    later = {**held, "train": 9.0}
     for other, expected in ((stale, held), (later, later)):
         (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
-        assert known_studies([home, tmp_path], plan.hash(SPLIT)) == {"mlp-4-2-1": expected}
+        assert known_studies([home, tmp_path], plan.hash(SPLIT)) == {
+            "mlp-4-2-1": expected
+        }
     with pytest.raises(UsageError):
-        runs.make_studies(replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2")
+        runs.make_studies(
+            replace(plan, settings=("training.steps=2", *small[1:])), "table_4_2"
+        )
 
 
 @pytest.fixture
 def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Graph networks have a short recipe for tiny, MLPs have none; both are meant for curl-noise."""
+    """Graph networks have a short recipe for tiny, MLPs have none; both are meant for
+    curl-noise.
+    """
     folder = tmp_path / "recipes"
     folder.mkdir()
     for name, recipe in (("gns", "tiny-short"), ("mlp", "tiny")):
@@ -138,12 +180,17 @@ def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_models_without_the_recipe_are_left_out(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With ``--recipe short`` a model that has none is named on stderr, and all others are made."""
+    """With ``--recipe short`` a model that has none is named on stderr, and all others
+    are made.
+    """
     words = (*ONLY, "--split", SPLIT, "--recipe", "short", "--set", "model.latent=8")
     home = tmp_path / "runs" / SPLIT / "tiny-short"
     assert reproduce(*words, "--dry-run") == 0
     told = capsys.readouterr()
-    assert told.out == "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
+    assert (
+        told.out
+        == "curl-noise tiny supergat-0: to train, curl-noise/tiny-short: 1 steps\n"
+    )
     assert "curl-noise tiny mlp: left out, mlp has no recipe 'short'" in told.err
     assert not home.exists()
 
@@ -165,9 +212,20 @@ def test_a_recipe_that_no_model_has_is_a_mistake(
     assert "left out" not in told
 
 
-def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """For full, list and dry run name what is made, with the short recipes and with the thesis's own."""
-    places = ("--size", "full", "--root", str(tmp_path), "--runs", str(tmp_path / "runs"))
+def test_the_way_to_full_is_told_without_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """For full, list and dry run name what is made, with the short recipes and with the
+    thesis's own.
+    """
+    places = (
+        "--size",
+        "full",
+        "--root",
+        str(tmp_path),
+        "--runs",
+        str(tmp_path / "runs"),
+    )
     assert command.main([*places, "--recipe", "short", "--list"]) == 0
     assert "table_5_4" in capsys.readouterr().out
     assert command.main([*places, "--recipe", "short", "--dry-run"]) == 0
@@ -175,7 +233,10 @@ def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.Cap
     assert "cavity full gns-0: to train, cavity/full-short: 14,000 steps" in told.out
     assert "fluid full mlp-0: to train, fluid/full-short: 1,500 steps" in told.out
     assert "studies of table_4_2: left out" in told.err
-    assert command.main([*places, "--recipe", "short", "--dry-run", "--split", "cavity"]) == 0
+    assert (
+        command.main([*places, "--recipe", "short", "--dry-run", "--split", "cavity"])
+        == 0
+    )
     told = capsys.readouterr()
     assert "cavity full mlp-0: to train, cavity/full-short: 1,000 steps" in told.out
     assert "cavity full var: left out" in told.err
@@ -191,11 +252,17 @@ def test_the_way_to_full_is_told_without_data(tmp_path: Path, capsys: pytest.Cap
 def test_committed_weights_are_shown_without_training(
     reproduce: Reproduce, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Their predictions are made on the spot, once, and are those of the run that the weights come from."""
-    made, weights = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0", tmp_path / "weights" / SPLIT / "tiny"
+    """Their predictions are made on the spot, once, and are those of the run that the
+    weights come from.
+    """
+    made = tmp_path / "runs" / SPLIT / "tiny" / "supergat-0"
+    weights = tmp_path / "weights" / SPLIT / "tiny"
     assert reproduce(*ONLY, "--set", "training.steps=1") == 0
     weights.mkdir(parents=True)
-    for source, target in (("weights.pt", "supergat_3.pt"), ("training.json", "supergat_3.json")):
+    for source, target in (
+        ("weights.pt", "supergat_3.pt"),
+        ("training.json", "supergat_3.json"),
+    ):
         (made / source).rename(weights / target)
     expected = read_statistics(made / "scores.nc").predictions_sha256
     shutil.rmtree(tmp_path / "runs")
@@ -213,12 +280,18 @@ def test_committed_weights_are_shown_without_training(
     assert list((tmp_path / "runs" / "reproduce" / "tiny").glob("fig_5_22*.png"))
 
 
-def test_unusable_committed_weights_leave_nothing(reproduce: Reproduce, tmp_path: Path) -> None:
-    """No weights leave a figure that says so; damaged ones end with exit code 3, and no run appears."""
+def test_unusable_committed_weights_leave_nothing(
+    reproduce: Reproduce, tmp_path: Path
+) -> None:
+    """No weights leave a figure that says so; damaged ones end with exit code 3, and no
+    run appears.
+    """
     assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "none")) == 0
     assert [path.name for path in (tmp_path / "runs").iterdir()] == ["reproduce"]
     weights = tmp_path / "weights" / SPLIT / "tiny" / "supergat_0.pt"
     weights.parent.mkdir(parents=True)
     weights.write_bytes(b"no weights")
-    assert reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3
+    assert (
+        reproduce(*ONLY, "--no-training", "--weights", str(tmp_path / "weights")) == 3
+    )
     assert not list((tmp_path / "runs" / SPLIT).rglob("*.*"))

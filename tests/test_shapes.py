@@ -1,4 +1,6 @@
-"""Shapes and their particles: areas by counting, distances by hand, spread by k-d tree."""
+"""Shapes and their particles: areas by counting, distances by hand, spread by k-d
+tree.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +33,20 @@ def source(scenario: int = 0) -> np.random.Generator:
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
-    """The points inside a fine grid give the area to 0.5 % and the bounding box to a cell.
+    """The points inside a fine grid give the area to 0.5 % and the bounding box to a
+    cell.
 
     Outside, the distance is that to the nearest of them.
     """
-    shape, side = SHAPES[name], 0.6 * ((2 * np.arange(1501) + 1) / 1501 - 1)
+    shape = SHAPES[name]
+    side = 0.6 * ((2 * np.arange(1501) + 1) / 1501 - 1)
     grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     inside = grid[shape.distance(grid) <= 0.0]
     assert len(inside) * (1.2 / 1501) ** 2 == pytest.approx(shape.area, rel=5e-3)
     np.testing.assert_allclose(inside.max(axis=0), shape.reach, atol=1.2 / 1501)
-    np.testing.assert_allclose(inside.min(axis=0), np.negative(shape.reach), atol=1.2 / 1501)
+    np.testing.assert_allclose(
+        inside.min(axis=0), np.negative(shape.reach), atol=1.2 / 1501
+    )
     probes = np.random.Generator(np.random.PCG64(1)).random((300, 2)) * 1.6 - 0.8
     found = shape.distance(probes)
     nearest = neighbours(probes[found > 0.0], 1, among=inside)[0][:, 0]
@@ -48,7 +54,9 @@ def test_area_reach_and_distance_agree_with_counting(name: str) -> None:
 
 
 def test_shapes_by_hand() -> None:
-    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner (3-4-5); one blob."""
+    """A 4 x 2 rectangle: 1 deep at the middle, 1 beyond an edge, 5 from a corner
+    (3-4-5); one blob.
+    """
     rectangle = shapes.Rectangle(4.0, 2.0)
     at = np.array([[0.0, 0.0], [3.0, 0.5], [5.0, 5.0], [1.5, 0.0]])
     assert rectangle.distance(at).tolist() == [-1.0, 1.0, 5.0, -0.5]
@@ -73,7 +81,9 @@ def test_seeds_lie_evenly_inside(name: str, count: int) -> None:
 
 
 def test_seeds_have_the_centre_and_spread_of_the_body() -> None:
-    """Second moments of a 0.65 x 0.05 bar along (0.6, 0.8): length^2/12 and width^2/12."""
+    """Second moments of a 0.65 x 0.05 bar along (0.6, 0.8): length^2/12 and
+    width^2/12.
+    """
     position = shapes.seeds(source(), shapes.body_at(SHAPES["rope"], 0.5, 0.5), 2500)
     moments, axes = np.linalg.eigh(np.cov(position.T, bias=True))
     assert moments == pytest.approx([0.05**2 / 12, 0.65**2 / 12], rel=0.03)
@@ -90,12 +100,16 @@ def test_place_keeps_within_its_region(scenario: int, name: str) -> None:
     """The bounding box lies in the region whatever was drawn."""
     region = ((0.05, 0.95), (0.1, 0.8))
     body = shapes.place(source(scenario), SHAPES[name], region)
-    for centre, reach, (low, high) in zip(body.centre, body.shape.reach, region, strict=True):
+    for centre, reach, (low, high) in zip(
+        body.centre, body.shape.reach, region, strict=True
+    ):
         assert low - 2.0**-20 <= centre - reach
         assert centre + reach <= high + 2.0**-20
 
 
 def test_place_refuses_a_body_that_does_not_fit() -> None:
     """The error says how wide the body is and what to change."""
-    with pytest.raises(WorkFailedError, match=r"(?s)up to 0\.2000.*0\.3000.*areas or lengths"):
+    with pytest.raises(
+        WorkFailedError, match=r"(?s)up to 0\.2000.*0\.3000.*areas or lengths"
+    ):
         shapes.place(source(), SHAPES["rectangle"], ((0.1, 0.3), (0.0, 1.0)))

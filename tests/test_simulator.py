@@ -8,7 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from simple_models import RADIUS, SMALL, batch, facts, jittered, network, oracle, rolled, swirl
+from simple_models import (
+    RADIUS,
+    SMALL,
+    batch,
+    facts,
+    jittered,
+    network,
+    oracle,
+    rolled,
+    swirl,
+)
 
 from lagbench.baselines.augmentation import image
 from lagbench.baselines.operators.gns import GNS
@@ -18,54 +28,68 @@ from lagbench.errors import UsageError
 
 @pytest.mark.parametrize("target", ["acceleration", "velocity"])
 def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
-    """Fed the true accelerations or velocities, 90 frames end within float32 rounding of the truth."""
+    """Fed the true accelerations or velocities, 90 frames end within float32 rounding
+    of the truth.
+    """
     truth = batch(swirl(0, 96))
     exact = torch.from_numpy(swirl(0, 96)).transpose(0, 1)
     found = rolled(oracle(exact, target), truth.part(slice(6)), 90)
     moved = float((truth.position[:, 95] - truth.position[:, 5]).norm(dim=1).max())
     assert moved > 0.2
-    # The given velocities are differences of float32 positions: 6e-8 a frame if nothing mends it.
+    # The given velocities are differences of float32 positions: 6e-8 a frame if nothing
+    # mends it.
     allowed = 90 * 6e-8 if target == "acceleration" else 1e-6
     assert float((found - truth.position[:, 6:]).abs().max()) < allowed
 
 
 def test_untrained_models_keep_velocities_or_stand_still() -> None:
-    """Target acceleration gives constant velocity; target velocity the train mean, here 0."""
+    """Target acceleration gives constant velocity; target velocity the train mean, here
+    0.
+    """
     given = batch(swirl(0, 6))
     steps = torch.arange(1.0, 4.0)[:, None]
     last = given.position[:, -1] - given.position[:, -2]
     straight = given.position[:, -1:] + steps * last[:, None]
-    torch.testing.assert_close(rolled(network(), given, 3), straight, rtol=0.0, atol=3e-7)
+    torch.testing.assert_close(
+        rolled(network(), given, 3), straight, rtol=0.0, atol=3e-7
+    )
     still = given.position[:, -1:].expand(-1, 3, -1)
     assert torch.equal(rolled(network(target="velocity"), given, 3), still)
 
 
 @pytest.mark.parametrize("target", ["acceleration", "velocity"])
 def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
-    """All particles moved by one vector: so is what follows (the shift is exact in binary)."""
+    """All particles moved by one vector: so is what follows (the shift is exact in
+    binary).
+    """
     rng = np.random.default_rng(0)
     start = np.round(jittered(0, 8, 0.3, 0.5) * 2**16) / 2**16
     drift = np.round(rng.normal(0.0, 1e-3, (6, *start.shape)) * 2**16) / 2**16
     frames = start + drift.cumsum(axis=0)
     shift = np.array([0.25, 0.125])
     model = network(awake=True, target=target)
-    here, there = (rolled(model, batch(window), 4) for window in (frames, frames + shift))
+    here, there = (
+        rolled(model, batch(window), 4) for window in (frames, frames + shift)
+    )
     assert float((here[:, 0] - batch(frames).position[:, -1]).abs().max()) > 1e-4
-    torch.testing.assert_close(there, here + torch.from_numpy(shift).float(), rtol=0.0, atol=2e-6)
+    torch.testing.assert_close(
+        there, here + torch.from_numpy(shift).float(), rtol=0.0, atol=2e-6
+    )
 
 
 def mirrored(model: Any, axis: int) -> Any:
     """Return the model whose weights see the world mirrored along an axis.
 
-    Every input that changes sign has its column negated, the two walls across have their
-    columns swapped, and the output along the axis is negated.
+    Every input that changes sign has its column negated, the two walls across have
+    their columns swapped, and the output along the axis is negated.
     """
     twin = network(awake=True, target=model.options.target.value, wall_velocity=True)
     twin.load_state_dict(model.state_dict())
     with torch.no_grad():
         first = twin.network.node_encoder[0].weight
         first[:, axis:10:2] *= -1.0
-        low, high = 10 + 2 * axis, 11 + 2 * axis
+        low = 10 + 2 * axis
+        high = 11 + 2 * axis
         first[:, [low, high]] = first[:, [high, low]]
         walls = first[:, 30:].reshape(-1, 4, 2)
         walls[..., axis] *= -1.0
@@ -82,7 +106,10 @@ def mirrored(model: Any, axis: int) -> Any:
 def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     """Walls, their motion and the weights mirrored: the rollout is the mirror image."""
     rng = np.random.default_rng(0)
-    windows = [jittered(seed) + rng.normal(0.0, 2e-3, (6, 256, 2)).cumsum(axis=0) for seed in (0, 1)]
+    windows = [
+        jittered(seed) + rng.normal(0.0, 2e-3, (6, 256, 2)).cumsum(axis=0)
+        for seed in (0, 1)
+    ]
     given = batch(*windows, walls=True)
     given.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
@@ -90,7 +117,8 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     turned = image(given, matrix, facts().bounds)
     model = network(awake=True, target=target, wall_velocity=True)
     here, there, plain = (
-        rolled(m, w, 3) for m, w in ((model, given), (mirrored(model, axis), turned), (model, turned))
+        rolled(m, w, 3)
+        for m, w in ((model, given), (mirrored(model, axis), turned), (model, turned))
     )
     for found in (there, plain):
         found[..., axis] = 1.0 - found[..., axis]
@@ -100,13 +128,18 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:
     """Two windows in one batch roll out as they do alone."""
-    model, windows = network(awake=True), [swirl(seed, 6) for seed in (0, 1)]
+    model = network(awake=True)
+    windows = [swirl(seed, 6) for seed in (0, 1)]
     alone = torch.cat([rolled(model, batch(window), 3) for window in windows])
-    torch.testing.assert_close(rolled(model, batch(*windows), 3), alone, rtol=0.0, atol=1e-6)
+    torch.testing.assert_close(
+        rolled(model, batch(*windows), 3), alone, rtol=0.0, atol=1e-6
+    )
 
 
 def test_two_frames_are_enough_to_start_from() -> None:
-    """The first velocity repeats before what is given; more than six frames count by their last six."""
+    """The first velocity repeats before what is given; more than six frames count by
+    their last six.
+    """
     given = batch(swirl(0, 8))
     model = network()
     short = model.start(given.part(slice(2)))
@@ -116,35 +149,48 @@ def test_two_frames_are_enough_to_start_from() -> None:
     middle = model.start(given.part(slice(4)))
     assert torch.equal(middle.velocity[:, :3], first[:, None].expand(-1, 3, -1))
     assert torch.equal(middle.velocity[:, 2:], given.position[:, :4].diff(dim=1))
-    long, six = model.start(given), model.start(given.part(slice(2, 8)))
+    long = model.start(given)
+    six = model.start(given.part(slice(2, 8)))
     assert torch.equal(long.velocity, six.velocity)
     assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
     with pytest.raises(UsageError, match="2 or more"):
         model.start(given.part(slice(1)))
     model = network(awake=True, velocities=1)  # sees two frames and starts from two
     assert (model.history, model.features.count) == (2, 22)
-    assert torch.equal(rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2))
+    assert torch.equal(
+        rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2)
+    )
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
-    """The oldest velocity leaves, the new one comes last: the start of the window one frame on."""
-    given, model = batch(swirl(0, 7)), network()
+    """The oldest velocity leaves, the new one comes last: the start of the window one
+    frame on.
+    """
+    given = batch(swirl(0, 7))
+    model = network()
     following = model.start(given.part(slice(1, 7)))
-    moved = model.start(given.part(slice(6))).moved(following.position, following.velocity[:, -1])
+    moved = model.start(given.part(slice(6))).moved(
+        following.position, following.velocity[:, -1]
+    )
     for field in fields(State):
-        one, other = getattr(moved, field.name), getattr(following, field.name)
+        one = getattr(moved, field.name)
+        other = getattr(following, field.name)
         assert one is other is None or torch.equal(one, other)
 
 
 def test_walls_move_per_frame() -> None:
-    """Wall velocities per second become per frame (half a second here), each particle its window's.
+    """Wall velocities per second become per frame (half a second here), each particle
+    its window's.
 
-    A predicted frame moves with its own wall velocity; after the last known one that stays.
+    A predicted frame moves with its own wall velocity; after the last known one that
+    stays.
     """
     given = batch(swirl(0, 6), swirl(1, 6), walls=True)
     given.wall_velocity[1] *= 3.0
     state = network(wall_velocity=True).start(given)
-    torch.testing.assert_close(state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200)
+    torch.testing.assert_close(
+        state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200
+    )
     torch.testing.assert_close(state.wall_velocity[1], 3.0 * state.wall_velocity[0])
     assert network().start(given).wall_velocity is None
     with pytest.raises(UsageError) as caught:
@@ -161,10 +207,17 @@ def test_walls_move_per_frame() -> None:
 
 
 def test_particles_stay_in_the_box_unless_told_otherwise() -> None:
-    """A particle that flies out stops at the wall and its velocity says so; without clamp it flies on."""
-    flight = batch(np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)]))
-    assert float(rolled(network(clamp=False), flight, 3)[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
-    kept, places = network(), []
+    """A particle that flies out stops at the wall and its velocity says so; without
+    clamp it flies on.
+    """
+    flight = batch(
+        np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)])
+    )
+    assert float(rolled(network(clamp=False), flight, 3)[0, -1, 0]) == pytest.approx(
+        0.942, abs=1e-6
+    )
+    kept = network()
+    places = []
     state = kept.start(flight)
     for _ in range(3):
         with torch.no_grad():
@@ -189,9 +242,12 @@ def test_no_rollout_leaves_the_box(target: str) -> None:
 class Watched(GraphNetwork):
     """A graph network that keeps what it is shown, and says nothing."""
 
-    operator, method = GNS, "watched"
+    operator = GNS
+    method = "watched"
 
-    def predict(self, state: State, *_: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def predict(
+        self, state: State, *_: object
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Keep the state."""
         self.seen = [*getattr(self, "seen", []), state]
         return torch.zeros_like(state.position), {}
@@ -208,16 +264,23 @@ def test_noise_stays_in_the_box() -> None:
 
 def test_a_wall_passes_gradients_on() -> None:
     """A prediction that a wall stops learns to stop before it, where the truth does."""
-    arriving = np.array([[[0.9275 + 0.002 * f, 0.5]] for f in range(6)] + [[[0.936, 0.5]]])
+    arriving = np.array(
+        [[[0.9275 + 0.002 * f, 0.5]] for f in range(6)] + [[[0.936, 0.5]]]
+    )
     model = network()
-    (slope,) = torch.autograd.grad(model(batch(arriving))["acceleration"], model.network.decoder[-1].bias)
+    (slope,) = torch.autograd.grad(
+        model(batch(arriving))["acceleration"], model.network.decoder[-1].bias
+    )
     assert float(rolled(model, batch(arriving[:6]), 1)[0, 0, 0]) == 0.9375
-    # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are multiplied by.
+    # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are
+    # multiplied by.
     assert float(slope[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
 
 
 def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
-    """Another wall velocity in the coming frame changes the step near walls, in an older frame nothing."""
+    """Another wall velocity in the coming frame changes the step near walls, in an
+    older frame nothing.
+    """
     window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
     model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
     found = []
@@ -226,7 +289,9 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
         if frame is not None:
             walls[:, frame] *= -3.0
         with torch.no_grad():
-            state, _ = model.step(model.start(replace(window, wall_velocity=walls).part(slice(6))))
+            state, _ = model.step(
+                model.start(replace(window, wall_velocity=walls).part(slice(6)))
+            )
         found.append(state.position)
     assert torch.equal(found[0], found[1])
     changed = (found[0] - found[2]).abs().amax(dim=1) > 0
@@ -234,20 +299,28 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
     place = window.position[:, 5]
     near = torch.minimum(place - low, high - place).amin(dim=1)
     assert bool(changed[near < 0.9 * RADIUS].all())
-    assert not bool(changed[near > 2.0 * RADIUS].any())  # one layer: a neighbour's wall at most
+    assert not bool(
+        changed[near > 2.0 * RADIUS].any()
+    )  # one layer: a neighbour's wall at most
 
 
 def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
-    """A forgetful window starts as from its last few frames do; every number comes up, but all of them."""
+    """A forgetful window starts as from its last few frames do; every number comes up,
+    but all of them.
+    """
     window = batch(*(swirl(seed, 7) for seed in range(24)))
     model = Watched.build(SMALL | {"forgetful": 1.0}, facts())
     model(window, torch.Generator().manual_seed(0))
-    starts = [model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)]
+    starts = [
+        model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)
+    ]
     numbers = set()
     for sample in range(24):
         mine = window.sample == sample
         (number,) = (
-            i for i, start in enumerate(starts) if torch.equal(model.seen[0].velocity[mine], start[mine])
+            i
+            for i, start in enumerate(starts)
+            if torch.equal(model.seen[0].velocity[mine], start[mine])
         )
         numbers.add(number)
     assert numbers == set(range(4))
@@ -256,7 +329,9 @@ def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
 
 
 def test_half_precision_moves_particles_in_full() -> None:
-    """Under bf16 autocast positions stay float32; a step and the loss differ by bf16's rounding only."""
+    """Under bf16 autocast positions stay float32; a step and the loss differ by bf16's
+    rounding only.
+    """
     given = batch(swirl(0, 6))
     model = network(awake=True)
     exact = rolled(model, given, 1)
@@ -265,7 +340,8 @@ def test_half_precision_moves_particles_in_full() -> None:
     assert half.dtype == torch.float32
     change = (exact[:, 0] - given.position[:, -1]).abs().max()
     assert 0.0 < float((half - exact).abs().max()) < 0.02 * float(change)
-    window, disturbed = batch(swirl(0, 7)), network(awake=True, noise_std=1e-3, symmetry="square")
+    window = batch(swirl(0, 7))
+    disturbed = network(awake=True, noise_std=1e-3, symmetry="square")
     with torch.no_grad():
         full = disturbed(window, torch.Generator().manual_seed(0))
         with torch.autocast("cpu", torch.bfloat16):
@@ -277,8 +353,11 @@ def test_half_precision_moves_particles_in_full() -> None:
 
 def test_scales_are_no_weights() -> None:
     """Weights stored in half precision bring back a model with the scales in full."""
-    model, twin = network(awake=True), network()
-    twin.load_state_dict({name: value.bfloat16() for name, value in model.state_dict().items()})
+    model = network(awake=True)
+    twin = network()
+    twin.load_state_dict(
+        {name: value.bfloat16() for name, value in model.state_dict().items()}
+    )
     for scale in ("position", "velocity", "acceleration"):
         assert torch.equal(getattr(twin, scale).std, getattr(model, scale).std)
     assert float(twin.velocity.std[0]) == pytest.approx(0.004, rel=1e-7)

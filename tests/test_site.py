@@ -1,4 +1,6 @@
-"""The documentation site: built without a warning, whole, and without a request to the network."""
+"""The documentation site: built without a warning, whole, and without a request to the
+network.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,13 @@ import pytest
 import lagbench
 
 CLONE = Path(__file__).parent.parent
-LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
+LOADED = {
+    "script": "src",
+    "img": "src",
+    "link": "href",
+    "iframe": "src",
+    "source": "src",
+}
 """What a browser fetches by itself, and the attribute that says where from."""
 
 pytestmark = pytest.mark.slow
@@ -28,9 +36,15 @@ class Fetched(HTMLParser):
         self.addresses: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Keep the address of an element that loads; `canonical` and the like are only names."""
+        """Keep the address of an element that loads; `canonical` and the like are only
+        names.
+        """
         held = dict(attrs)
-        names_only = tag == "link" and held.get("rel") not in {"stylesheet", "icon", "preload"}
+        names_only = tag == "link" and held.get("rel") not in {
+            "stylesheet",
+            "icon",
+            "preload",
+        }
         if tag in LOADED and not names_only and (address := held.get(LOADED[tag])):
             self.addresses.append(address)
 
@@ -40,9 +54,20 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The site, built as CI does: warnings are errors."""
     pytest.importorskip("mkdocs")
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        str(folder),
+    ]
     where = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=CLONE, env=where, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=CLONE, env=where, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -58,17 +83,28 @@ def test_nothing_comes_from_the_network(site: Path) -> None:
         for address in reader.addresses:
             assert not re.match(r"(\w+:)?//", address), f"{page.name}: {address}"
             base = site if address.startswith("/") else page.parent
-            assert (base / address.lstrip("/").partition("?")[0]).is_file(), f"{page.name}: {address}"
+            assert (base / address.lstrip("/").partition("?")[0]).is_file(), (
+                f"{page.name}: {address}"
+            )
     sheets = "".join(sheet.read_text() for sheet in site.rglob("*.css"))
     assert not re.search(r"url\([\"']?(https?:)?//|@import", sheets)
 
 
 def test_the_public_names_are_described(site: Path) -> None:
-    """Every name of `lagbench.__all__` and of `lagbench.torch` that pages use has an entry with its text."""
+    """Every name of `lagbench.__all__` and of `lagbench.torch` that pages use has an
+    entry with its text.
+    """
     text = (site / "api.html").read_text()
     functions = set(lagbench.__all__) - {"__version__", "submission"}
     names = {f"lagbench.{name}" for name in functions} | {"lagbench.submission.write"}
-    classes = ("WindowDataset", "WindowSampler", "collate", "Batch", "roll_out", "predict")
+    classes = (
+        "WindowDataset",
+        "WindowSampler",
+        "collate",
+        "Batch",
+        "roll_out",
+        "predict",
+    )
     names |= {f"lagbench.torch.{name}" for name in classes}
     names |= {"lagbench.baselines.particle_grid.ParticleGrid"}
     for name in names:

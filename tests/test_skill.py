@@ -1,4 +1,6 @@
-"""Skill against hand-worked ratios, and shipped scores of floors against measured ones."""
+"""Skill against hand-worked ratios, and shipped scores of floors against measured
+ones.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,22 @@ from lagbench.metrics import METRICS, Score
 from lagbench.scoring import floors as floors_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import SUBMISSION, ScoreCard, best_floor, skill
-from lagbench.scoring.floors import differences, kept_in, measurable, measure, measured_again, measured_sizes
+from lagbench.scoring.floors import (
+    differences,
+    kept_in,
+    measurable,
+    measure,
+    measured_again,
+    measured_sizes,
+)
 from lagbench.scoring.record import record
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.tables import card_tables
 
 
-def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) -> Score:
+def scored(
+    values: list[float], metric: str = "vorticity_rmse", first: int = 0
+) -> Score:
     """Return a score with these values over scenarios."""
     ids = tuple(range(first, first + len(values)))
     empty = np.empty((len(values), 0))
@@ -37,28 +48,45 @@ def scored(values: list[float], metric: str = "vorticity_rmse", first: int = 0) 
 
 
 def test_skill_is_one_minus_the_ratio_of_means() -> None:
-    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice the floor's -1.
+    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice
+    the floor's -1.
 
-    The coarse solver knows the equations: however good, skill is measured against what does not; nor are
-    strangers. A scenario that is undefined on one side is left out on both.
+    The coarse solver knows the equations: however good, skill is measured against what
+    does not; nor are strangers. A scenario that is undefined on one side is left out on
+    both.
     """
     floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
     found = [skill([scored(v)], floors) for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])]
-    assert [(one.floor, one.value) for one in found] == [("frozen-field", v) for v in (0.75, 1.0, -1.0)]
-    floors = {"analog": scored([2.0]), "coarse-solver": scored([0.1]), "stranger": scored([0.1])}
-    assert best_floor({name: floors[name] for name in COUNTING.intersection(floors)}) == "analog"
+    assert [(one.floor, one.value) for one in found] == [
+        ("frozen-field", v) for v in (0.75, 1.0, -1.0)
+    ]
+    floors = {
+        "analog": scored([2.0]),
+        "coarse-solver": scored([0.1]),
+        "stranger": scored([0.1]),
+    }
+    assert (
+        best_floor({name: floors[name] for name in COUNTING.intersection(floors)})
+        == "analog"
+    )
     gappy = skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
     np.testing.assert_equal((gappy.value, gappy.interval), (0.75, (math.nan, math.nan)))
 
 
 def test_what_skill_and_its_interval_need() -> None:
-    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which more is better.
+    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which
+    more is better.
 
     A ratio that is 1/2 in every scenario is certain; three scenarios have no interval.
     """
-    ours, pearson = scored([1.0, 1.0]), scored([0.5, 0.5], "vorticity_pearson")
+    ours = scored([1.0, 1.0])
+    pearson = scored([0.5, 0.5], "vorticity_pearson")
     assert skill([ours], {}) is None
-    for floor in (scored([math.nan] * 2), scored([0.0, 0.0]), scored([1.0, 1.0], first=7)):
+    for floor in (
+        scored([math.nan] * 2),
+        scored([0.0, 0.0]),
+        scored([1.0, 1.0], first=7),
+    ):
         assert skill([ours], {"analog": floor}) is None
     assert skill([pearson], {"analog": pearson}) is None
     base = [1.0, 2.0, 5.0, 3.0]
@@ -69,7 +97,9 @@ def test_what_skill_and_its_interval_need() -> None:
 
 
 def test_the_interval_is_that_of_resampled_ratios() -> None:
-    """Scenarios drawn together, 20 of them: SciPy's percentiles of the ratio, Student's widening aside."""
+    """Scenarios drawn together, 20 of them: SciPy's percentiles of the ratio, Student's
+    widening aside.
+    """
     rng = np.random.default_rng(3)
     base = rng.gamma(9.0, size=20)
     ours = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
@@ -80,15 +110,23 @@ def test_the_interval_is_that_of_resampled_ratios() -> None:
 
     options = {"paired": True, "method": "percentile", "rng": np.random.default_rng(1)}
     theirs = scipy.stats.bootstrap((ours, base), ratio, **options).confidence_interval
-    stretch = math.sqrt(20 / 19) * scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
+    stretch = (
+        math.sqrt(20 / 19) * scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
+    )
     expected = [found.value + stretch * (bound - found.value) for bound in theirs]
-    assert found.interval == pytest.approx(expected, abs=0.1 * (expected[1] - expected[0]))
+    assert found.interval == pytest.approx(
+        expected, abs=0.1 * (expected[1] - expected[0])
+    )
 
 
 def test_the_interval_of_skill_stays_below_one() -> None:
-    """No ratio of means is negative, whatever of six scenarios is drawn; a perfect one is certain."""
+    """No ratio of means is negative, whatever of six scenarios is drawn; a perfect one
+    is certain.
+    """
     base = [1.0, 1.1, 0.9, 1.2, 0.8, 1.0]
-    wild = skill([scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])], {"analog": scored(base)})
+    wild = skill(
+        [scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])], {"analog": scored(base)}
+    )
     assert wild.interval[0] < wild.value < wild.interval[1] < 1.0
     perfect = skill([scored([0.0] * 6)], {"analog": scored(base)})
     assert (perfect.value, perfect.interval) == (1.0, (1.0, 1.0))
@@ -97,13 +135,18 @@ def test_the_interval_of_skill_stays_below_one() -> None:
 
 
 def test_seeds_widen_the_interval_of_skill() -> None:
-    """Where scenarios agree and seeds do not, the interval is that of the seeds: Student's, two degrees."""
-    base, share = np.full(12, 4.0), np.array([0.4, 0.5, 0.9])
+    """Where scenarios agree and seeds do not, the interval is that of the seeds:
+    Student's, two degrees.
+    """
+    base = np.full(12, 4.0)
+    share = np.array([0.4, 0.5, 0.9])
     seeds = [scored((part * base).tolist()) for part in share]
     found = skill(seeds, {"analog": scored(base.tolist())})
     assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
     reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
-    reaches = [math.log((1.0 - bound) / (1.0 - found.value)) for bound in found.interval]
+    reaches = [
+        math.log((1.0 - bound) / (1.0 - found.value)) for bound in found.interval
+    ]
     assert reaches[0] - reaches[1] == pytest.approx(2 * reach / 0.6, rel=0.15)
     alone = skill(seeds[:1], {"analog": scored(base.tolist())})
     assert alone.interval == pytest.approx((0.6, 0.6))
@@ -126,11 +169,16 @@ def recorded(size: Size, sha256: str = "a" * 64) -> Size:
 def test_shipped_scores_are_the_measured_ones(
     bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Written and read again they are equal to five digits, curves to three; another data set has none."""
+    """Written and read again they are equal to five digits, curves to three; another
+    data set has none.
+    """
     found = measured_floors
     assert list(found) == [floor.name for floor in floors_of(bench.size)]
-    size, frames = recorded(bench.size), (15, 25)
-    path = write_shipped(size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path)
+    size = recorded(bench.size)
+    frames = (15, 25)
+    path = write_shipped(
+        size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path
+    )
     held = shipped(size, tmp_path)
     assert differences(held, found) == {}
     for name, floor in found.items():
@@ -138,12 +186,18 @@ def test_shipped_scores_are_the_measured_ones(
             told = held[name].scores[metric]
             assert told.undefined == score.undefined
             if score.metric.per_frame:
-                at = [np.nanmean(s.at(25)) if np.isfinite(s.at(25)).any() else 0.0 for s in (told, score)]
+                at = [
+                    np.nanmean(s.at(25)) if np.isfinite(s.at(25)).any() else 0.0
+                    for s in (told, score)
+                ]
                 assert at[0] == pytest.approx(at[1], rel=1e-3)
-    before, after = found["frozen-field"], held["frozen-field"]
+    before = found["frozen-field"]
+    after = held["frozen-field"]
     last = before.scores["vorticity_pearson"].per_frame[:, -1]
     np.testing.assert_allclose(after.correlation, last, rtol=1e-3)
-    curves = [side.scores["position_rmse"].per_frame.mean(axis=0) for side in (after, before)]
+    curves = [
+        side.scores["position_rmse"].per_frame.mean(axis=0) for side in (after, before)
+    ]
     np.testing.assert_allclose(*curves, rtol=6e-3)
     assert path == shipped_path(size, tmp_path)
     assert shipped(recorded(bench.size, "b" * 64), tmp_path) is None
@@ -153,40 +207,66 @@ def test_shipped_scores_are_the_measured_ones(
 def test_one_floor_measured_anew_leaves_the_others(
     bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Its scores change; order, the others, its cost and the solver's stay, which one run has measured."""
-    size, known = recorded(bench.size), {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
+    """Its scores change; order, the others, its cost and the solver's stay, which one
+    run has measured.
+    """
+    size = recorded(bench.size)
+    known = {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
     path = write_shipped(size, measured_floors, **known)
     write_solver_seconds(size, 0.5, tmp_path)
     before = json.loads(path.read_text())
-    other = replace(measured_floors["persistence"], name="analog", seconds_per_frame=9.0)
+    other = replace(
+        measured_floors["persistence"], name="analog", seconds_per_frame=9.0
+    )
     write_shipped(size, {"analog": other}, partial=True, **known)
     after = json.loads(path.read_text())
     assert list(after["floors"]) == list(before["floors"])
-    assert after["floors"]["analog"].pop("values") == before["floors"]["persistence"]["values"]
-    assert after["floors"]["analog"]["seconds_per_frame"] == before["floors"]["analog"]["seconds_per_frame"]
+    assert (
+        after["floors"]["analog"].pop("values")
+        == before["floors"]["persistence"]["values"]
+    )
+    assert (
+        after["floors"]["analog"]["seconds_per_frame"]
+        == before["floors"]["analog"]["seconds_per_frame"]
+    )
     for held in (before, after):
         del held["floors"]["analog"]
     assert after == before
     write_shipped(size, {"analog": other}, **known)
     assert list(json.loads(path.read_text())["floors"]) == ["analog"]
     with pytest.raises(DataError):
-        write_shipped(recorded(bench.size, "b" * 64), {"analog": other}, partial=True, **known)
+        write_shipped(
+            recorded(bench.size, "b" * 64), {"analog": other}, partial=True, **known
+        )
 
 
-def test_a_floor_that_a_data_set_lacks_is_not_measured(bench: ScoreBench, tmp_path: Path) -> None:
+def test_a_floor_that_a_data_set_lacks_is_not_measured(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
     """A coarse solver at tiny: nothing is written."""
     with pytest.raises(UsageError):
-        record(recorded(bench.size), bench.root, folder=tmp_path, floors=["coarse-solver"])
+        record(
+            recorded(bench.size), bench.root, folder=tmp_path, floors=["coarse-solver"]
+        )
     assert not list(tmp_path.iterdir())
 
 
 def test_a_forged_shipped_score_is_found(
-    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: ScoreBench,
+    measured_floors: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One value changed by 1 % differs from what is measured again; so does a floor that is left out."""
-    found = {name: measured_floors[name] for name in ("persistence", "constant-velocity")}
+    """One value changed by 1 % differs from what is measured again; so does a floor
+    that is left out.
+    """
+    found = {
+        name: measured_floors[name] for name in ("persistence", "constant-velocity")
+    }
     size = recorded(bench.size)
-    path = write_shipped(size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path)
+    path = write_shipped(
+        size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path
+    )
     said = json.loads(path.read_text())
     said["floors"]["persistence"]["values"]["position_rmse"][1] *= 1.01
     del said["floors"]["constant-velocity"]
@@ -195,21 +275,33 @@ def test_a_forged_shipped_score_is_found(
     assert unlike["persistence"] == ("position_rmse",)
     assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
 
-    assert [size.name for size in measured_sizes(bench.root, registry=bench.registry)] == [bench.size.name]
+    assert [
+        size.name for size in measured_sizes(bench.root, registry=bench.registry)
+    ] == [bench.size.name]
     held = dict(measured_floors)
     monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
     assert measured_again(bench.size, bench.root) == (tuple(held), {})
     monkeypatch.setattr(floors_of_scoring, "measure", lambda *_, **__: measured_floors)
     still = held["persistence"]
     score = still.scores["position_rmse"]
-    forged = {**still.scores, "position_rmse": replace(score, values=1.01 * score.values)}
+    forged = {
+        **still.scores,
+        "position_rmse": replace(score, values=1.01 * score.values),
+    }
     held["persistence"] = replace(still, scores=forged)
-    assert measured_again(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
+    assert measured_again(bench.size, bench.root)[1] == {
+        "persistence": ("position_rmse",)
+    }
 
 
-def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[[], Path]) -> None:
-    """What is kept is taken as it is: a file altered on purpose shows in the second run."""
-    size, root = recorded(bench.size), copied()
+def test_an_interrupted_measurement_goes_on(
+    bench: ScoreBench, copied: Callable[[], Path]
+) -> None:
+    """What is kept is taken as it is: a file altered on purpose shows in the second
+    run.
+    """
+    size = recorded(bench.size)
+    root = copied()
     first = measure(size, root, floors=["persistence"], resume=True)
     kept = sorted(kept_in(size, root).glob("*.npz"))
     assert len(kept) == len(size.subsets["test"])
@@ -218,15 +310,22 @@ def test_an_interrupted_measurement_goes_on(bench: ScoreBench, copied: Callable[
     np.savez(kept[0], **{**values, "total": 4.0 * values["total"]})
     again = measure(size, root, floors=["persistence"], resume=True)
     fresh = measure(size, root, floors=["persistence"])
-    one, two, three = (m["persistence"].scores["position_mse"].values for m in (first, again, fresh))
+    one, two, three = (
+        m["persistence"].scores["position_mse"].values for m in (first, again, fresh)
+    )
     np.testing.assert_allclose(two[0], 4.0 * one[0])
     np.testing.assert_array_equal(one, three)
 
 
 def test_scoring_takes_what_is_shipped(
-    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bench: ScoreBench,
+    measured_floors: dict[str, Any],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With shipped scores nothing but the submission is measured, and the card says the same."""
+    """With shipped scores nothing but the submission is measured, and the card says the
+    same.
+    """
     path = bench.submit(tmp_path / "predictions.nc", straight)
     measured = bench.evaluate(path)
     monkeypatch.setattr(scoring, "shipped", lambda size: measured_floors)
@@ -237,7 +336,9 @@ def test_scoring_takes_what_is_shipped(
 
 
 def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
-    """The truth has skill 1; persistence has none above 0; first row and JSON say the same."""
+    """The truth has skill 1; persistence has none above 0; first row and JSON say the
+    same.
+    """
     perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
     standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
     assert perfect.skill.value == 1.0

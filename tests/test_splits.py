@@ -21,19 +21,38 @@ from lagbench.generators.split import ClosedBoxParameters
 
 GENERATORS = Path(draws.__file__).parent
 KINDS = list(zip(SPLITS, ("wall", "frequency", "family", "pair"), strict=True))
-DRAWN = ("draws", "noise", "shapes", "constants", "cavity", "curl_noise", "fluid", "multimaterial")
+DRAWN = (
+    "draws",
+    "noise",
+    "shapes",
+    "constants",
+    "cavity",
+    "curl_noise",
+    "fluid",
+    "multimaterial",
+)
 
 
 @pytest.mark.parametrize(("split", "size"), EVERY)
 def test_arrays_are_exact_and_inside(split: str, size: str) -> None:
-    """Shapes and types hold, all numbers are multiples of 2^-20, particles are in the box."""
+    """Shapes and types hold, all numbers are multiples of 2^-20, particles are in the
+    box.
+    """
     entry = registry.load().size(split, size)
     (low, high), _ = entry.bounds
     for state in all_of(split, size)[:12]:
         assert state.position.shape == state.velocity.shape == (entry.particles, 2)
         assert state.affine.shape == (entry.particles, 2, 2)
-        assert (state.material.shape, state.material.dtype) == ((entry.particles,), np.int8)
-        for values in (state.position, state.velocity, state.affine, state.wall_velocity):
+        assert (state.material.shape, state.material.dtype) == (
+            (entry.particles,),
+            np.int8,
+        )
+        for values in (
+            state.position,
+            state.velocity,
+            state.affine,
+            state.wall_velocity,
+        ):
             assert values.dtype == np.float64
             assert (values.astype(np.float32) == values).all()
             assert (values * 2**20 == np.rint(values * 2**20)).all()
@@ -54,19 +73,25 @@ def test_scenarios_differ_and_repeat(split: str) -> None:
 @pytest.mark.parametrize("size", ["full", "mini"])
 @pytest.mark.parametrize(("split", "kind"), KINDS)
 def test_kinds_are_spread_evenly_over_test(split: str, kind: str, size: str) -> None:
-    """Every kind of scenario occurs in test, none more than once more often than another."""
+    """Every kind of scenario occurs in test, none more than once more often than
+    another.
+    """
     entry = registry.load().size(split, size)
     count = 20 if split == "cavity" else 16
     assert (len(entry.subsets["test"]), len(entry.subsets["valid"])) == (count, 8)
     everywhere = {state.parameters[kind] for state in all_of(split, size)}
-    found = Counter(state_of(split, size, i).parameters[kind] for i in entry.subsets["test"])
+    found = Counter(
+        state_of(split, size, i).parameters[kind] for i in entry.subsets["test"]
+    )
     assert found.keys() == everywhere
     assert max(found.values()) - min(found.values()) <= 1
 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_boxes_of_all_sizes_are_one(split: str) -> None:
-    """Walls lie at 1/16 in the cavity and 1/32 on the free surface, whatever the grid, and bounds say so."""
+    """Walls lie at 1/16 in the cavity and 1/32 on the free surface, whatever the grid,
+    and bounds say so.
+    """
     place = {"cavity": 1 / 16, "fluid": 1 / 32, "multimaterial": 1 / 32}.get(split)
     for name in SIZES:
         entry = registry.load().size(split, name)
@@ -84,7 +109,9 @@ def test_solver_constants_come_from_the_registry(split: str, size: str) -> None:
     for field in dataclasses.fields(constants):
         if field.name in entry.parameters:
             assert getattr(constants, field.name) == entry.value(field.name)
-    assert constants.dt == pytest.approx(entry.frame_interval / entry.substeps_per_frame)
+    assert constants.dt == pytest.approx(
+        entry.frame_interval / entry.substeps_per_frame
+    )
     if isinstance(constants, ClosedBoxParameters):
         assert constants.no_slip == (split == "cavity")
 
@@ -99,13 +126,17 @@ def test_bits_do_not_depend_on_vector_instructions() -> None:
     plain = {**os.environ, "NPY_DISABLE_CPU_FEATURES": " ".join(found)}
     command = [sys.executable, "-W", "ignore", "-c", script, str(Path(__file__).parent)]
     assert found, "this machine has no vector instructions to do without"
-    result = subprocess.run(command, env=plain, capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        command, env=plain, capture_output=True, text=True, check=True
+    )
     assert result.stdout.split() == [digest(state_of(s, z, 3)) for s, z in EVERY]
 
 
 @pytest.mark.parametrize("module", DRAWN)
 def test_sources_use_no_operation_that_rounds_by_library(module: str) -> None:
-    """No libm function, power, matrix product or pairwise sum in what draws the data."""
+    """No libm function, power, matrix product or pairwise sum in what draws the
+    data.
+    """
     unsafe = {
         "sin", "cos", "tan", "arctan2", "atan2", "hypot", "exp", "log", "log2", "log10", "pow", "power",
         "cbrt", "dot", "matmul", "einsum", "inner", "tensordot", "linalg", "sum", "mean", "std", "var",

@@ -19,7 +19,9 @@ from lagbench.generators.cavity import is_classic
 
 
 def test_cavity_scenarios_draw_what_the_design_says() -> None:
-    """Ranges of speed, Reynolds number and start hold; a program covers all frames; fluid rests first."""
+    """Ranges of speed, Reynolds number and start hold; a program covers all frames;
+    fluid rests first.
+    """
     size = registry.load().size("cavity", "full")
     fastest = size.value("speed_max")
     states = all_of("cavity")
@@ -27,50 +29,78 @@ def test_cavity_scenarios_draw_what_the_design_says() -> None:
         drawn = state.parameters
         assert 20.0 <= float(drawn["reynolds"]) <= 400.0
         # Re = (U / 2) L / nu with L = 0.875 and mu = rho nu with rho = 1e-4.
-        assert 0.5 * fastest * 0.875 / state.viscosity == pytest.approx(drawn["reynolds"])
+        assert 0.5 * fastest * 0.875 / state.viscosity == pytest.approx(
+            drawn["reynolds"]
+        )
         assert drawn["dynamic_viscosity"] == pytest.approx(1e-4 * state.viscosity)
         assert state.area == 0.875**2
         assert not state.velocity.any()
         assert 60 <= state.start_frame <= 120
-        assert state.wall_velocity.shape == (state.start_frame + size.frame_count(scenario), 4, 2)
+        assert state.wall_velocity.shape == (
+            state.start_frame + size.frame_count(scenario),
+            4,
+            2,
+        )
         assert np.abs(state.wall_velocity).max() <= fastest
     assert len({state.start_frame for state in states}) > 30
     assert len({drawn.parameters["reynolds"] for drawn in states}) == len(states)
-    speeds = np.abs(np.concatenate([s.wall_velocity[s.wall_velocity != 0.0] for s in states]))
+    speeds = np.abs(
+        np.concatenate([s.wall_velocity[s.wall_velocity != 0.0] for s in states])
+    )
     assert speeds.max() > 0.98 * fastest
 
 
 def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> None:
-    """The named walls move, the others rest; those that move together face each other."""
+    """The named walls move, the others rest; those that move together face each
+    other.
+    """
     for state in all_of("cavity"):
-        moving = {wall for wall, v in zip(WALLS, state.wall_velocity.swapaxes(0, 1), strict=True) if v.any()}
+        moving = {
+            wall
+            for wall, v in zip(WALLS, state.wall_velocity.swapaxes(0, 1), strict=True)
+            if v.any()
+        }
         assert moving == set(str(state.parameters["wall"]).split("+"))
         assert moving <= {"left", "right"} or moving <= {"bottom", "top"}
         assert not state.wall_velocity[:, (0, 1, 2, 3), (0, 0, 1, 1)].any()
         if moving == {"bottom", "top"}:  # each has a program of its own
-            assert not np.array_equal(state.wall_velocity[:, 2, 0], state.wall_velocity[:, 3, 0])
+            assert not np.array_equal(
+                state.wall_velocity[:, 2, 0], state.wall_velocity[:, 3, 0]
+            )
 
 
 def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
-    """With knots every 25 frames, SciPy's spline that is flat in each is the program; signs alternate."""
-    size = changed(registry.load().size("cavity", "mini"), knot_gap_min=25, knot_gap_max=25)
+    """With knots every 25 frames, SciPy's spline that is flat in each is the program;
+    signs alternate.
+    """
+    size = changed(
+        registry.load().size("cavity", "mini"), knot_gap_min=25, knot_gap_max=25
+    )
     for scenario in (0, 3, 4):
         state = draw(size, scenario)
         for speed in (s for s in state.wall_velocity.reshape(-1, 8).T if s.any()):
             knots = np.arange(0, len(speed), 25)
             spline = CubicHermiteSpline(knots, speed[knots], np.zeros(len(knots)))
             frames = np.arange(knots[-1])
-            np.testing.assert_allclose(speed[: knots[-1]], spline(frames), atol=2.0**-20)
+            np.testing.assert_allclose(
+                speed[: knots[-1]], spline(frames), atol=2.0**-20
+            )
             assert (np.sign(speed[knots][1:]) == -np.sign(speed[knots][:-1])).all()
             assert len(np.unique(speed[knots])) == len(knots)
 
 
 @pytest.mark.parametrize(("size", "expected"), [("full", 9), ("mini", 6)])
 def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
-    """There the lid rests, then keeps a speed, at the latest in the last given frame; train has all walls."""
+    """There the lid rests, then keeps a speed, at the latest in the last given frame;
+    train has all walls.
+    """
     tier = registry.load().size("cavity", size)
     states = dict(zip(tier.scenarios, all_of("cavity", size), strict=True))
-    classic = {i: state for i, state in states.items() if state.parameters["motion"] == "constant"}
+    classic = {
+        i: state
+        for i, state in states.items()
+        if state.parameters["motion"] == "constant"
+    }
     assert len(classic) == expected
     assert {i for i in states if is_classic(i)} == classic.keys()
     for state in classic.values():
@@ -80,9 +110,15 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
             start = starts[wall]
             assert state.start_frame - 15 <= start <= state.start_frame + 5
             assert (speed[start:, wall] == speed[-1, wall]).all()
-            assert 0.5 * tier.value("speed_max") <= speed[-1, wall] <= tier.value("speed_max")
+            assert (
+                0.5 * tier.value("speed_max")
+                <= speed[-1, wall]
+                <= tier.value("speed_max")
+            )
     if size == "full":
-        train = Counter(state.parameters["wall"] for i, state in classic.items() if i < 48)
+        train = Counter(
+            state.parameters["wall"] for i, state in classic.items() if i < 48
+        )
         assert sorted(train.values()) == [1] * 6
 
 
@@ -92,7 +128,9 @@ def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
     rng = draws.generator("cavity", "test", 1, scenario)
     position = draws.fill(rng, count, low=0.0625, high=0.9375, jitter=0.25)
     columns = math.isqrt(count)
-    held = Counter(np.floor((position[:, 0] - 0.0625) / 0.875 * columns).astype(int).tolist())
+    held = Counter(
+        np.floor((position[:, 0] - 0.0625) / 0.875 * columns).astype(int).tolist()
+    )
     assert len(held) == columns
     assert max(held.values()) - min(held.values()) <= 1
     # Neighbours in a column are at least 3/4 of the closest row spacing apart.
@@ -101,28 +139,45 @@ def test_lattice_fills_the_box_evenly(count: int, scenario: int) -> None:
 
 
 def test_curl_noise_frequencies_follow_the_thesis() -> None:
-    """Eq. 5.55 with 4 to 13 at full; mini holds those that its grid resolves, tiny two."""
+    """Eq. 5.55 with 4 to 13 at full; mini holds those that its grid resolves, tiny
+    two.
+    """
     for size, count, least in (("full", 10, 4), ("mini", 3, 2), ("tiny", 2, 1)):
         found = [state.parameters["frequency"] for state in all_of("curl-noise", size)]
-        assert found == [i % count + least for i in registry.load().size("curl-noise", size).scenarios]
-    # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has one scale.
+        assert found == [
+            i % count + least
+            for i in registry.load().size("curl-noise", size).scenarios
+        ]
+    # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
+    # one scale.
     drawn = [state.parameters for state in all_of("curl-noise", "mini")]
     for frequency in (2, 3, 4):
-        own = [float(one["initial_vorticity_rms"]) for one in drawn if one["frequency"] == frequency]
+        own = [
+            float(one["initial_vorticity_rms"])
+            for one in drawn
+            if one["frequency"] == frequency
+        ]
         assert 0.08 < 0.1 * np.mean(own) < 0.12
     assert {state.parameters["scale"] for state in all_of("curl-noise")} == {0.0052}
 
 
 def test_curl_noise_affine_predicts_the_neighbours_velocity() -> None:
-    """v(x_q) = v_p + C (x_q - x_p) with C midway: 2 % of the change is left; C has no trace, to the bit."""
+    """v(x_q) = v_p + C (x_q - x_p) with C midway: 2 % of the change is left; C has no
+    trace, to the bit.
+    """
     for state in all_of("curl-noise")[:10]:
         assert (state.affine[:, 0, 0] + state.affine[:, 1, 1] == 0.0).all()
         assert np.abs(state.affine).max() > 0.1
     state = state_of("curl-noise", "full", 0)
-    distance, (_, nearest) = neighbours(state.position, 2)[0], neighbours(state.position, 2)[1].T
+    distance, (_, nearest) = (
+        neighbours(state.position, 2)[0],
+        neighbours(state.position, 2)[1].T,
+    )
     middle = 0.5 * (state.affine + state.affine[nearest])
     change = state.velocity[nearest] - state.velocity
-    left = change - np.einsum("pij,pj->pi", middle, state.position[nearest] - state.position)
+    left = change - np.einsum(
+        "pij,pj->pi", middle, state.position[nearest] - state.position
+    )
     assert distance.max() < 0.02
     assert np.sqrt(np.mean(left**2)) < 0.02 * np.sqrt(np.mean(change**2))
 
@@ -132,7 +187,9 @@ def test_curl_noise_energy_grows_with_frequency() -> None:
     states = all_of("curl-noise")
     energy = np.array([float(s.parameters["initial_kinetic_energy"]) for s in states])
     for state, recorded in zip(states[:10], energy, strict=False):
-        assert recorded == pytest.approx(0.5 * np.mean(np.sum(state.velocity**2, axis=1)), rel=1e-12)
+        assert recorded == pytest.approx(
+            0.5 * np.mean(np.sum(state.velocity**2, axis=1)), rel=1e-12
+        )
     mean = energy[:70].reshape(7, 10).mean(axis=0)
     assert (np.diff(mean) > 0).all()
     slope = np.polyfit(np.log(np.arange(4, 14)), np.log(mean), 1)[0]
@@ -140,14 +197,20 @@ def test_curl_noise_energy_grows_with_frequency() -> None:
 
 
 def test_curl_noise_divergence_is_the_grids_share_alone() -> None:
-    """Second-order differences: cells a third as wide show a ninth of the divergence."""
+    """Second-order differences: cells a third as wide show a ninth of the
+    divergence.
+    """
     size = registry.load().size("curl-noise", "full")
     coarse = draw(size, 0).parameters
     # (4 + 1/2) / 120 = (1 + 1/2) / 40: the same walls with cells a third as wide.
     fine = draw(changed(size, grid=120, wall=4), 0).parameters
-    ratio = float(coarse["initial_divergence_rms"]) / float(fine["initial_divergence_rms"])
+    ratio = float(coarse["initial_divergence_rms"]) / float(
+        fine["initial_divergence_rms"]
+    )
     assert ratio == pytest.approx(9.0, rel=0.15)
-    assert float(coarse["initial_divergence_rms"]) < 0.03 * float(coarse["initial_vorticity_rms"])
+    assert float(coarse["initial_divergence_rms"]) < 0.03 * float(
+        coarse["initial_vorticity_rms"]
+    )
 
 
 def test_curl_noise_refuses_a_lattice_of_another_count() -> None:

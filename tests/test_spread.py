@@ -1,4 +1,6 @@
-"""Jobs here, in processes and on a real Dask cluster: the same results, workers killed or not."""
+"""Jobs here, in processes and on a real Dask cluster: the same results, workers killed
+or not.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ from typing import Any
 import pytest
 from cluster_bench import local_cluster, scheduler_process
 from score_bench import ScoreBench, bench_of, straight
-from spread_jobs import Deadly, double, sit_after_dying_once, take_worker_along, time_out
+from spread_jobs import (
+    Deadly,
+    double,
+    sit_after_dying_once,
+    take_worker_along,
+    time_out,
+)
 
 from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
@@ -22,7 +30,9 @@ from lagbench.scoring.scenario import ScenarioJob, ScenarioScores
 from lagbench.work import run
 from lagbench.work.pool import Report
 
-distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+distributed = pytest.importorskip(
+    "distributed", reason="the extra 'cluster' is not installed"
+)
 
 
 @pytest.fixture(scope="module")
@@ -62,9 +72,18 @@ JOBS = {f"job {i}": i for i in range(6)}
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order(workers: int) -> None:
-    """Results stand in the order of the jobs although later ones end first; every unit is counted."""
+    """Results stand in the order of the jobs although later ones end first; every unit
+    is counted.
+    """
     units: list[int] = []
-    assert run.run_all(double, JOBS, workers=workers, report=units.append) == [0, 2, 4, 6, 8, 10]
+    assert run.run_all(double, JOBS, workers=workers, report=units.append) == [
+        0,
+        2,
+        4,
+        6,
+        8,
+        10,
+    ]
     assert sum(units) == 6
 
 
@@ -72,16 +91,23 @@ def test_results_come_in_order(workers: int) -> None:
 def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     bench: ScoreBench, cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """scores.json and scores.nc from two cluster workers, one killed in the middle, equal those from here."""
+    """scores.json and scores.nc from two cluster workers, one killed in the middle,
+    equal those from here.
+    """
     source = bench.submit(tmp_path / "predictions.nc", straight)
     here = bench.score(source, output_dir=tmp_path / "here")
     address = cluster.scheduler_address
     there = bench.score(source, output_dir=tmp_path / "there", scheduler=address)
     marker = tmp_path / "killed"
 
-    def killing(function: Any, jobs: dict[str, ScenarioJob], **options: Any) -> list[ScenarioScores]:
+    def killing(
+        function: Any, jobs: dict[str, ScenarioJob], **options: Any
+    ) -> list[ScenarioScores]:
         first = next(iter(jobs))
-        held = {name: Deadly(job, marker if name == first else None) for name, job in jobs.items()}
+        held = {
+            name: Deadly(job, marker if name == first else None)
+            for name, job in jobs.items()
+        }
         return run.run_all(sit_after_dying_once, held, **options)
 
     monkeypatch.setattr(score, "run_all", killing)
@@ -93,7 +119,9 @@ def test_cluster_gives_the_same_bytes_though_a_worker_is_killed(
 
 
 def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> None:
-    """A scheduler that dies in the middle ends as failed work that says so, without Dask's traces."""
+    """A scheduler that dies in the middle ends as failed work that says so, without
+    Dask's traces.
+    """
     with pytest.raises(WorkFailedError, match="the Dask cluster is lost"):
         run.run_all(take_worker_along, {"job 0": 0}, scheduler=losable)
     captured = capfd.readouterr()
@@ -104,15 +132,21 @@ def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
     """Nothing of Dask's is printed either when the process ends."""
     there = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, "-c", LOSER, losable]
-    ended = subprocess.run(command, env=there, capture_output=True, text=True, check=True)
+    ended = subprocess.run(
+        command, env=there, capture_output=True, text=True, check=True
+    )
     assert (ended.stdout, ended.stderr) == ("the Dask cluster is lost\n", "")
 
 
 @pytest.mark.slow
 def test_a_job_that_kills_every_worker(cluster: Any) -> None:
-    """A job that no worker survives ends as failed work that names it, not as a hang."""
+    """A job that no worker survives ends as failed work that names it, not as a
+    hang.
+    """
     with pytest.raises(WorkFailedError, match="job 0"):
-        run.run_all(take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address)
+        run.run_all(
+            take_worker_along, {"job 0": 0}, scheduler=cluster.scheduler_address
+        )
 
 
 def test_a_killed_process_changes_nothing(
@@ -121,7 +155,8 @@ def test_a_killed_process_changes_nothing(
     """Two worker processes, one killed in the middle: the same bytes as from one."""
     source = bench.submit(tmp_path / "predictions.nc", straight)
     here = bench.score(source, output_dir=tmp_path / "here", workers=1)
-    marker, counted = tmp_path / "killed", []
+    marker = tmp_path / "killed"
+    counted = []
 
     def killing(
         function: Any, jobs: dict[str, ScenarioJob], *, report: Report, **options: Any

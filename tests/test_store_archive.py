@@ -1,4 +1,6 @@
-"""Archives of data sets: the same bytes each time, read from a store, and nothing in them is trusted."""
+"""Archives of data sets: the same bytes each time, read from a store, and nothing in
+them is trusted.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def packed(original: LocalSplit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The archive of a data set."""
-    return archive.write_archive(str(original.folder), output=tmp_path_factory.mktemp("packed"))
+    return archive.write_archive(
+        str(original.folder), output=tmp_path_factory.mktemp("packed")
+    )
 
 
 @pytest.fixture
@@ -61,7 +65,9 @@ def is_right(root: Path) -> bool:
 
 def left(root: Path) -> set[str]:
     """Return the paths of all scenario files and temporary files below a folder."""
-    files = (path for path in root.rglob("*") if path.name.endswith((".nc", ".partial")))
+    files = (
+        path for path in root.rglob("*") if path.name.endswith((".nc", ".partial"))
+    )
     return {path.relative_to(root).as_posix() for path in files}
 
 
@@ -82,7 +88,9 @@ def rewritten(path: Path, change: Callable[[Members], Members]) -> None:
 def test_the_same_files_give_the_same_bytes(
     generated: GenerationResult, copied: Callable[[], Path], tmp_path: Path
 ) -> None:
-    """Times and modes of files do not matter; the name is that of the content, members are sorted."""
+    """Times and modes of files do not matter; the name is that of the content, members
+    are sorted.
+    """
     root = copied()
     for path in (root / DATA).rglob("*.nc"):
         path.chmod(0o600)
@@ -91,18 +99,29 @@ def test_the_same_files_give_the_same_bytes(
     again = archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
     assert again.read_bytes() == first.read_bytes()
     assert generated.dataset_sha256 is not None
-    assert again.name == first.name == f"{SPLIT}-{SIZE}-{generated.dataset_sha256[:16]}.tar"
+    assert (
+        again.name
+        == first.name
+        == f"{SPLIT}-{SIZE}-{generated.dataset_sha256[:16]}.tar"
+    )
     with tarfile.open(first) as tar:
         names = tar.getnames()
         assert names == ["manifest.json", *sorted(names[1:])]
-        assert {(m.uid, m.gid, m.uname, m.mtime, m.mode) for m in tar} == {(0, 0, "", 0, 0o644)}
+        assert {(m.uid, m.gid, m.uname, m.mtime, m.mode) for m in tar} == {
+            (0, 0, "", 0, 0o644)
+        }
         tar.extractall(tmp_path / "out", filter="data")
-    out, there = tmp_path / "out", generated.root / DATA
-    assert all((out / name).read_bytes() == (there / name).read_bytes() for name in names)
+    out = tmp_path / "out"
+    there = generated.root / DATA
+    assert all(
+        (out / name).read_bytes() == (there / name).read_bytes() for name in names
+    )
 
 
 @pytest.mark.parametrize("harm", ["missing", "flipped"])
-def test_only_right_data_are_packed(copied: Callable[[], Path], tmp_path: Path, harm: str) -> None:
+def test_only_right_data_are_packed(
+    copied: Callable[[], Path], tmp_path: Path, harm: str
+) -> None:
     """What is missing or damaged is said; there is no archive."""
     root = copied()
     victim = root / DATA / "train/0001.nc"
@@ -119,8 +138,18 @@ def test_only_right_data_are_packed(copied: Callable[[], Path], tmp_path: Path, 
 def test_releases_have_one_address(
     generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command's archive there comes without ``--from``; the data set is that of datasets.yaml."""
-    arguments = ["--root", str(generated.root), "--output", str(tmp_path / "out"), "--size", SIZE, "--split"]
+    """The command's archive there comes without ``--from``; the data set is that of
+    datasets.yaml.
+    """
+    arguments = [
+        "--root",
+        str(generated.root),
+        "--output",
+        str(tmp_path / "out"),
+        "--size",
+        SIZE,
+        "--split",
+    ]
     assert archive.main([*arguments, SPLIT]) == 0
     assert archive.main([*arguments, "nowhere"]) == 2
     with serving(tmp_path / "out") as running:
@@ -136,8 +165,12 @@ def test_releases_have_one_address(
     assert here == there
 
 
-def test_nobody_is_asked(server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Local splits are nobody's business; a placeholder is no address, and the error says what is missing."""
+def test_nobody_is_asked(
+    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Local splits are nobody's business; a placeholder is no address, and the error
+    says what is missing.
+    """
     with monkeypatch.context() as patch:
         patch.setattr(archive, "open_object", None)
         with pytest.raises(UsageError) as caught:
@@ -150,8 +183,12 @@ def test_nobody_is_asked(server: Mirror, here: Path, monkeypatch: pytest.MonkeyP
     assert server.asked == []
 
 
-def test_a_manifest_comes_before_an_archive(original: LocalSplit, server: Mirror, here: Path) -> None:
-    """A store that has files is not asked for an archive, which is read through fsspec as well."""
+def test_a_manifest_comes_before_an_archive(
+    original: LocalSplit, server: Mirror, here: Path
+) -> None:
+    """A store that has files is not asked for an archive, which is read through fsspec
+    as well.
+    """
     assert fetched(server.folder.as_uri(), here).complete
     assert is_right(here)
     shutil.rmtree(here / "own/full/v1")
@@ -161,8 +198,12 @@ def test_a_manifest_comes_before_an_archive(original: LocalSplit, server: Mirror
 
 
 @pytest.mark.parametrize("fault", ["", "no ranges"])
-def test_only_what_is_missing_is_asked_for(server: Mirror, here: Path, fault: str) -> None:
-    """Members that are here or not wanted are passed over; where there are no ranges, read and dropped."""
+def test_only_what_is_missing_is_asked_for(
+    server: Mirror, here: Path, fault: str
+) -> None:
+    """Members that are here or not wanted are passed over; where there are no ranges,
+    read and dropped.
+    """
     first = fetched(server.url, here, subset="train")
     if fault:
         server.faults = {".tar": fault}
@@ -175,7 +216,9 @@ def test_only_what_is_missing_is_asked_for(server: Mirror, here: Path, fault: st
 
 @pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once", "wrong range"])
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
-    """Broken connections are taken up by range, or from the start where the server knows no ranges."""
+    """Broken connections are taken up by range, or from the start where the server
+    knows no ranges.
+    """
     server.faults = {".tar": fault}
     assert fetched(server.url, here).complete
     ranges = [wanted for path, wanted in server.asked if path.endswith(".tar")]
@@ -187,18 +230,30 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        *((fault, objects.TruncatedError) for fault in ("chopped", "ends early", "announces more")),
+        *(
+            (fault, objects.TruncatedError)
+            for fault in ("chopped", "ends early", "announces more")
+        ),
         ("drops always", LagbenchError),
-        *((fault, objects.NotDataError) for fault in ("page", "hidden page", "endless")),
+        *(
+            (fault, objects.NotDataError)
+            for fault in ("page", "hidden page", "endless")
+        ),
         ("busy", objects.StoreUnreachableError),
     ],
 )
-def test_a_lying_server(server: Mirror, here: Path, fault: str, error: type[LagbenchError]) -> None:
-    """The address is named; files that were right stay, and the next command completes them."""
+def test_a_lying_server(
+    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+) -> None:
+    """The address is named; files that were right stay, and the next command completes
+    them.
+    """
     server.faults = {".tar": fault}
     with pytest.raises(error) as caught:
         fetched(server.url, here)
-    assert caught.value.where == f"{server.url}/{next(server.folder.glob('*.tar')).name}"
+    assert (
+        caught.value.where == f"{server.url}/{next(server.folder.glob('*.tar')).name}"
+    )
     if issubclass(error, DataError):
         assert not [name for name in left(here) if "partial" in name]
     server.faults = {}
@@ -209,38 +264,72 @@ def test_a_lying_server(server: Mirror, here: Path, fault: str, error: type[Lagb
 def foreign(name: str, kind: bytes = tarfile.REGTYPE) -> tuple[tarfile.TarInfo, bytes]:
     """Return a member that should not be there."""
     member = tarfile.TarInfo(name)
-    member.type, member.linkname = kind, "/etc/passwd" if kind == tarfile.SYMTYPE else ""
+    member.type = kind
+    member.linkname = "/etc/passwd" if kind == tarfile.SYMTYPE else ""
     return member, b"" if kind == tarfile.SYMTYPE else b"\x89HDF\r\n\x1a\n" * 100
 
 
 def garbled(members: Members) -> Members:
     """Change a byte of the second scenario."""
     member, data = members[2]
-    return [*members[:2], (member, data[:-500] + bytes([data[-500] ^ 1]) + data[-499:]), *members[3:]]
+    return [
+        *members[:2],
+        (member, data[:-500] + bytes([data[-500] ^ 1]) + data[-499:]),
+        *members[3:],
+    ]
 
 
 def other(members: Members) -> Members:
     """Give all scenarios another content hash."""
     (head, text), *rest = members
     manifest = Manifest.model_validate_json(text)
-    files = [entry.model_copy(update={"content_sha256": "0" * 64}) for entry in manifest.files]
-    return [(head, manifest.model_copy(update={"files": tuple(files)}).model_dump_json().encode()), *rest]
+    files = [
+        entry.model_copy(update={"content_sha256": "0" * 64})
+        for entry in manifest.files
+    ]
+    return [
+        (
+            head,
+            manifest.model_copy(update={"files": tuple(files)})
+            .model_dump_json()
+            .encode(),
+        ),
+        *rest,
+    ]
 
 
 LIES: dict[str, tuple[Callable[[Members], Members], type[LagbenchError]]] = {
     "foreign first": (lambda m: [foreign("a.nc"), *m], objects.NotDataError),
-    "foreign between": (lambda m: [*m[:2], foreign("../evil.nc"), *m[2:]], objects.WrongContentError),
-    "foreign last": (lambda m: [*m, foreign("train/0099.nc")], objects.WrongContentError),
-    "absolute": (lambda m: [*m[:2], foreign("/tmp/evil.nc"), *m[2:]], objects.WrongContentError),
-    "link": (lambda m: [m[0], foreign(m[1][0].name, tarfile.SYMTYPE), *m[1:]], objects.WrongContentError),
+    "foreign between": (
+        lambda m: [*m[:2], foreign("../evil.nc"), *m[2:]],
+        objects.WrongContentError,
+    ),
+    "foreign last": (
+        lambda m: [*m, foreign("train/0099.nc")],
+        objects.WrongContentError,
+    ),
+    "absolute": (
+        lambda m: [*m[:2], foreign("/tmp/evil.nc"), *m[2:]],
+        objects.WrongContentError,
+    ),
+    "link": (
+        lambda m: [m[0], foreign(m[1][0].name, tarfile.SYMTYPE), *m[1:]],
+        objects.WrongContentError,
+    ),
     "another order": (lambda m: [m[0], *reversed(m[1:])], objects.WrongContentError),
     "one missing": (lambda m: m[:-1], objects.NotDataError),
     "wrong bytes": (garbled, objects.WrongContentError),
-    "longer": (lambda m: [m[0], (m[1][0], m[1][1] + bytes(9)), *m[2:]], objects.WrongLengthError),
+    "longer": (
+        lambda m: [m[0], (m[1][0], m[1][1] + bytes(9)), *m[2:]],
+        objects.WrongLengthError,
+    ),
     "another data set": (other, objects.WrongContentError),
     "no manifest": (lambda m: [(m[0][0], b"{}"), *m[1:]], objects.NotDataError),
     "other hashes": (
-        lambda m: [(m[0][0], m[0][1].replace(b'"content_sha256": "', b'"content_sha256": "0')), *m[1:]],
+        lambda m: [
+            (m[0][0], m[0][1].replace(b'"content_sha256": "', b'"content_sha256": "0')),
+            *m[1:],
+        ],
         objects.NotDataError,
     ),
 }
@@ -248,7 +337,9 @@ LIES: dict[str, tuple[Callable[[Members], Members], type[LagbenchError]]] = {
 
 @pytest.mark.parametrize("lie", LIES)
 def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -> None:
-    """Each has its error; only right files of the data set are left, and none elsewhere."""
+    """Each has its error; only right files of the data set are left, and none
+    elsewhere.
+    """
     change, error = LIES[lie]
     target = server.folder / packed.name
     rewritten(target, change)
@@ -258,7 +349,9 @@ def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -
     assert str(caught.value.where).startswith(f"{server.url}/{packed.name}")
     with tarfile.open(packed) as tar:
         assert left(here) <= {f"own/full/v1/{name}" for name in tar.getnames()}
-    assert not (left(here) and lie == "another data set")  # it is refused before any file is taken
+    assert not (
+        left(here) and lie == "another data set"
+    )  # it is refused before any file is taken
     assert not list(here.rglob("evil.nc"))
     shutil.copy(packed, target)
     fetched(server.url, here)

@@ -1,4 +1,6 @@
-"""Downloads from stores that work, break, and lie: right files, or an error by name and nothing else."""
+"""Downloads from stores that work, break, and lie: right files, or an error by name and
+nothing else.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from lagbench.exchange.local_split import LocalSplit
 from lagbench.make.generate import GenerationResult
 from lagbench.store import fetch, objects
 
-FIRST, LIST = "train/0000.nc", "manifest.json"
+FIRST = "train/0000.nc"
+LIST = "manifest.json"
 
 
 @pytest.fixture(autouse=True)
@@ -32,11 +35,15 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(params=("http", "file", "s3"))
 def store(
-    request: pytest.FixtureRequest, original: LocalSplit, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest,
+    original: LocalSplit,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Store]:
     """A store of each kind that holds it."""
     place = request.getfixturevalue("s3") if request.param == "s3" else request.param
-    with holding(place, tmp_path_factory.mktemp("store"), original.folder.parent) as held:
+    with holding(
+        place, tmp_path_factory.mktemp("store"), original.folder.parent
+    ) as held:
         yield held
 
 
@@ -50,13 +57,16 @@ def server(original: LocalSplit) -> Iterator[Mirror]:
 def left(root: Path) -> set[str]:
     """Return the names of all files below a root folder but description and locks."""
     found = {path.name for path in root.rglob("*") if path.is_file()}
-    return {name for name in found if name != "split.yaml" and not name.startswith(".lock")}
+    return {
+        name for name in found if name != "split.yaml" and not name.startswith(".lock")
+    }
 
 
 def test_all_files_come_and_are_right(
     store: Store, here: Path, original: LocalSplit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The data set is complete, has its hash, and equals the original; nothing temporary is left.
+    """The data set is complete, has its hash, and equals the original; nothing
+    temporary is left.
 
     A second download reads bytes, not values.
     """
@@ -67,7 +77,10 @@ def test_all_files_come_and_are_right(
     assert result.bytes == sum(path.stat().st_size for path in here.rglob("*.nc"))
     assert left(here) == {*(f"000{i}.nc" for i in range(4)), LIST, ".verified.json"}
     assert lagbench.verify("own", root=here, complete=True).warnings == ()
-    with lagbench.open_split("own", root=here) as one, lagbench.open_split(str(original.folder)) as two:
+    with (
+        lagbench.open_split("own", root=here) as one,
+        lagbench.open_split(str(original.folder)) as two,
+    ):
         np.testing.assert_array_equal(one["position"].values, two["position"].values)
     monkeypatch.setattr("lagbench.make.inventory.check_scenario", None)
     assert download("own", root=here, mirror=store.url).kept == (0, 1, 2, 3)
@@ -84,7 +97,9 @@ def test_what_is_there_is_kept(store: Store, here: Path) -> None:
         assert store.server.count("0001.nc") == 1
 
 
-def test_half_a_file_is_completed(store: Store, here: Path, original: LocalSplit) -> None:
+def test_half_a_file_is_completed(
+    store: Store, here: Path, original: LocalSplit
+) -> None:
     """What an interrupted call left under its temporary name is not asked for again."""
     whole = (original.folder / "full/v1" / FIRST).read_bytes()
     half = fetch.partial_name(here / "own/full/v1" / FIRST)
@@ -93,7 +108,10 @@ def test_half_a_file_is_completed(store: Store, here: Path, original: LocalSplit
     result = download("own", root=here, mirror=store.url, scenarios="0")
     assert result.bytes == len(whole) - len(whole) // 3
     if store.server:
-        assert (f"/own/full/v1/{FIRST}", f"bytes={len(whole) // 3}-") in store.server.asked
+        assert (
+            f"/own/full/v1/{FIRST}",
+            f"bytes={len(whole) // 3}-",
+        ) in store.server.asked
     assert (here / "own/full/v1" / FIRST).read_bytes() == whole
 
 
@@ -108,9 +126,15 @@ def test_half_a_file_is_completed(store: Store, here: Path, original: LocalSplit
     ],
 )
 def test_wrong_objects_are_refused(
-    store: Store, here: Path, original: LocalSplit, change: str, error: type[LagbenchError]
+    store: Store,
+    here: Path,
+    original: LocalSplit,
+    change: str,
+    error: type[LagbenchError],
 ) -> None:
-    """The error is a DataError that names the address; no file of it is left, other files come."""
+    """The error is a DataError that names the address; no file of it is left, other
+    files come.
+    """
     name = f"own/full/v1/{FIRST}"
     good = store.read(name)
     changed = {
@@ -133,23 +157,43 @@ def test_wrong_objects_are_refused(
 
 
 def test_another_data_set_is_told_at_once(store: Store, here: Path) -> None:
-    """A store whose manifest has other content hashes, or is none, is refused before files are asked for."""
-    np.save(here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9)))
-    other = adopt(here / "runs.npy", output=here / "other" / "own", radius=0.1, frame_interval=0.1)
+    """A store whose manifest has other content hashes, or is none, is refused before
+    files are asked for.
+    """
+    np.save(
+        here / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400, seed=9))
+    )
+    other = adopt(
+        here / "runs.npy", output=here / "other" / "own", radius=0.1, frame_interval=0.1
+    )
     of_another = (other.folder / "full/v1/manifest.json").read_bytes()
-    for text, error in ((of_another, objects.WrongContentError), (b'{"format": 1}', objects.NotDataError)):
+    for text, error in (
+        (of_another, objects.WrongContentError),
+        (b'{"format": 1}', objects.NotDataError),
+    ):
         store.put("own/full/v1/manifest.json", text)
         with pytest.raises(error) as caught:
             download("own", root=here, mirror=store.url)
-        assert str(caught.value.where).startswith(f"{store.url}/own/full/v1/manifest.json")
+        assert str(caught.value.where).startswith(
+            f"{store.url}/own/full/v1/manifest.json"
+        )
         assert left(here / "own") == set()
 
 
 @pytest.mark.parametrize(
-    "fault", ["drops", "no ranges", "busy once", "wrong range", "announces a number without end"]
+    "fault",
+    [
+        "drops",
+        "no ranges",
+        "busy once",
+        "wrong range",
+        "announces a number without end",
+    ],
 )
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
-    """Broken connections are taken up by range, or from the start where the server knows no ranges."""
+    """Broken connections are taken up by range, or from the start where the server
+    knows no ranges.
+    """
     server.faults = {FIRST: fault}
     assert download("own", root=here, mirror=server.url).complete
     ranges = [wanted for path, wanted in server.asked if path.endswith(FIRST)]
@@ -161,9 +205,18 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
 @pytest.mark.parametrize(
     ("faults", "error"),
     [
-        *(({FIRST: fault}, objects.NotDataError) for fault in ("page", "hidden page", "nowhere")),
-        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("announces more", "announces less")),
-        *(({FIRST: fault}, objects.WrongLengthError) for fault in ("chopped", "endless")),
+        *(
+            ({FIRST: fault}, objects.NotDataError)
+            for fault in ("page", "hidden page", "nowhere")
+        ),
+        *(
+            ({FIRST: fault}, objects.WrongLengthError)
+            for fault in ("announces more", "announces less")
+        ),
+        *(
+            ({FIRST: fault}, objects.WrongLengthError)
+            for fault in ("chopped", "endless")
+        ),
         ({FIRST: "ends early"}, objects.TruncatedError),
         ({FIRST: "flipped"}, objects.WrongContentError),
         # where the store has no manifest lengths are not known, but content is
@@ -178,7 +231,9 @@ def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> N
 def test_each_lie_has_its_error_and_leaves_nothing(
     server: Mirror, here: Path, faults: dict[str, str], error: type[LagbenchError]
 ) -> None:
-    """No file of that name, no temporary one; the message names the address; other files stay right."""
+    """No file of that name, no temporary one; the message names the address; other
+    files stay right.
+    """
     server.faults = faults
     with pytest.raises(error) as caught:
         download("own", root=here, mirror=server.url, connections=1)
@@ -190,9 +245,15 @@ def test_each_lie_has_its_error_and_leaves_nothing(
     assert download("own", root=here, mirror=server.url).complete
 
 
-@pytest.mark.parametrize(("fault", "useful"), [("drops always", 0), ("drops and starts over", 1)])
-def test_a_line_that_stays_broken(server: Mirror, here: Path, fault: str, useful: int) -> None:
-    """A connection that brings it no further five times is given up, with an error that names the address."""
+@pytest.mark.parametrize(
+    ("fault", "useful"), [("drops always", 0), ("drops and starts over", 1)]
+)
+def test_a_line_that_stays_broken(
+    server: Mirror, here: Path, fault: str, useful: int
+) -> None:
+    """A connection that brings it no further five times is given up, with an error that
+    names the address.
+    """
     server.faults = {FIRST: fault}
     with pytest.raises((objects.ConnectionLostError, objects.TruncatedError)) as caught:
         download("own", root=here, mirror=server.url, scenarios="0")
@@ -200,20 +261,28 @@ def test_a_line_that_stays_broken(server: Mirror, here: Path, fault: str, useful
     assert server.count(FIRST) == fetch.ATTEMPTS + useful
 
 
-@pytest.mark.parametrize(("name", "fault"), [(LIST, "slow"), (FIRST, "slow"), (FIRST, "drops")])
+@pytest.mark.parametrize(
+    ("name", "fault"), [(LIST, "slow"), (FIRST, "slow"), (FIRST, "drops")]
+)
 def test_an_interrupted_download_goes_on(
     server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch, name: str, fault: str
 ) -> None:
-    """What came before the connection was lost, or given up, is not asked for again by the next command.
+    """What came before the connection was lost, or given up, is not asked for again by
+    the next command.
 
     A hundred bytes a second are below the least rate.
     """
     monkeypatch.setattr(fetch, "PATIENCE", 0.3)
     monkeypatch.setattr(fetch, "MOST_ATTEMPTS", 1)
     server.faults = {name: fault}
-    with pytest.raises(objects.TooSlowError if fault == "slow" else objects.ConnectionLostError) as caught:
+    with pytest.raises(
+        objects.TooSlowError if fault == "slow" else objects.ConnectionLostError
+    ) as caught:
         download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
-    assert (caught.value.exit_code, caught.value.where) == (5, f"{server.url}/own/full/v1/{name}")
+    assert (caught.value.exit_code, caught.value.where) == (
+        5,
+        f"{server.url}/own/full/v1/{name}",
+    )
     assert not (here / "own/full/v1" / FIRST).exists()
     server.faults = {}
     result = download("own", root=here, mirror=server.url, scenarios="0")
@@ -229,13 +298,18 @@ def test_an_interrupted_download_goes_on(
     [
         ("gone", objects.NotInStoreError),
         # a redirection elsewhere leads to no file of this machine
-        *((fault, objects.StoreUnreachableError) for fault in ("busy", "forbidden", "elsewhere")),
+        *(
+            (fault, objects.StoreUnreachableError)
+            for fault in ("busy", "forbidden", "elsewhere")
+        ),
     ],
 )
 def test_no_generate_stops_where_the_store_does(
     server: Mirror, here: Path, fault: str, error: type[LagbenchError]
 ) -> None:
-    """What the store has not, or does not give, is an error when nothing may be simulated."""
+    """What the store has not, or does not give, is an error when nothing may be
+    simulated.
+    """
     server.faults = {FIRST: fault}
     with pytest.raises(error):
         download("own", root=here, mirror=server.url, or_generate=False)
@@ -243,7 +317,9 @@ def test_no_generate_stops_where_the_store_does(
 
 
 def test_no_store_at_all(here: Path) -> None:
-    """There is nothing to download, and nothing to simulate; a port that nobody listens on is unreachable."""
+    """There is nothing to download, and nothing to simulate; a port that nobody listens
+    on is unreachable.
+    """
     for or_generate in (False, True):
         with pytest.raises(UsageError):
             download("own", root=here, or_generate=or_generate)
@@ -256,7 +332,14 @@ def test_no_store_at_all(here: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["http://[::1", "http://host:abc/data", "http://exa mple/data", "http:///data", "http://a..b/"]
+    "address",
+    [
+        "http://[::1",
+        "http://host:abc/data",
+        "http://exa mple/data",
+        "http:///data",
+        "http://a..b/",
+    ],
 )
 def test_what_is_no_address(here: Path, address: str) -> None:
     """It is told at once, as the user's, and names what was typed."""
@@ -266,24 +349,33 @@ def test_what_is_no_address(here: Path, address: str) -> None:
 
 
 def test_addresses_are_percent_encoded(server: Mirror, here: Path) -> None:
-    """A folder of any name can be asked for; what is encoded already is asked for as it stands."""
+    """A folder of any name can be asked for; what is encoded already is asked for as it
+    stands.
+    """
     for typed, asked in (("\u20ac x", "%E2%82%AC%20x"), ("%E2%82%AC", "%E2%82%AC")):
         with pytest.raises(objects.NotInStoreError):
-            download("own", root=here, mirror=f"{server.url}/{typed}", or_generate=False)
+            download(
+                "own", root=here, mirror=f"{server.url}/{typed}", or_generate=False
+            )
         assert server.asked.pop()[0].startswith(f"/{asked}/own/full/v1/")
 
 
 def test_simulated_splits_come_from_a_store_or_are_simulated(
     generated: GenerationResult, tmp_path: Path
 ) -> None:
-    """Files that a store has not are simulated: the data set is that of datasets.yaml all the same."""
+    """Files that a store has not are simulated: the data set is that of datasets.yaml
+    all the same.
+    """
     told: list[str] = []
     where = {"root": tmp_path, "workers": 1, "announce": told.append}
     with serving(generated.root) as running:
         running.faults = {"0003.nc": "gone"}
         result = download("curl-noise", "tiny", mirror=running.url, **where)
     assert (result.downloaded, result.generated) == ((0, 1, 2, 4), (3,))
-    assert (result.verdict, result.dataset_sha256) == ("equal to datasets.yaml", generated.dataset_sha256)
+    assert (result.verdict, result.dataset_sha256) == (
+        "equal to datasets.yaml",
+        generated.dataset_sha256,
+    )
     (one,) = told
     assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in one
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()

@@ -1,4 +1,6 @@
-"""Reading from a store: only what is needed comes, it is checked, and then all is as in a folder."""
+"""Reading from a store: only what is needed comes, it is checked, and then all is as in
+a folder.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture(params=("http", "file", "s3"))
-def store(request: pytest.FixtureRequest, generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
+def store(
+    request: pytest.FixtureRequest, generated: GenerationResult, tmp_path: Path
+) -> Iterator[Store]:
     """A store of each kind that holds the tiny data set."""
     place = request.getfixturevalue("s3") if request.param == "s3" else request.param
     with holding(place, tmp_path, generated.root) as held:
@@ -49,7 +53,9 @@ def store(request: pytest.FixtureRequest, generated: GenerationResult, tmp_path:
 
 @pytest.fixture
 def folder(generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
-    """A folder by its URL that holds it, for what the kind of a store does not matter to."""
+    """A folder by its URL that holds it, for what the kind of a store does not matter
+    to.
+    """
     with holding("file", tmp_path, generated.root) as held:
         yield held
 
@@ -61,7 +67,9 @@ def url(folder: Store) -> str:
 
 
 @pytest.fixture
-def tiny(unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path) -> Registry:
+def tiny(
+    unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path
+) -> Registry:
     """Our splits without hashes, for functions too that take no registry."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     return unmeasured
@@ -79,8 +87,12 @@ def without(text: bytes, key: str, value: object) -> bytes:
     return json.dumps(held).encode()
 
 
-def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResult, tiny: Registry) -> None:
-    """The arrays are those of the folder; a second look fetches nothing; what the store lacks is named."""
+def test_a_subset_comes_and_nothing_else(
+    store: Store, generated: GenerationResult, tiny: Registry
+) -> None:
+    """The arrays are those of the folder; a second look fetches nothing; what the store
+    lacks is named.
+    """
     with (
         lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
         lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
@@ -91,14 +103,20 @@ def test_a_subset_comes_and_nothing_else(store: Store, generated: GenerationResu
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     assert not store.server or store.server.count("0004.nc") == 1
     with pytest.raises(DataError, match="0-1"):
-        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing")
+        lagbench.open_split(
+            SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing"
+        )
 
 
 def test_scores_are_those_of_the_folder(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """Template, validation and scores need test alone; a floor that reads train is scored where it is."""
-    written = template(SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny).path
+    """Template, validation and scores need test alone; a floor that reads train is
+    scored where it is.
+    """
+    written = template(
+        SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny
+    ).path
     result = lagbench.validate(written, root=url, require_truth=True, registry=tiny)
     assert (result.valid, dict(result.skipped)) == (True, {})
     assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
@@ -113,15 +131,28 @@ def test_scores_are_those_of_the_folder(
 def test_baselines_and_exports_read_from_a_store(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """Facts, training files and the bytes of an export, which needs all subsets, are those of the folder."""
+    """Facts, training files and the bytes of an export, which needs all subsets, are
+    those of the folder.
+    """
     assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
     assert here(url) == ["manifest.json", "train/0000.nc"]
-    found = copy.scenario_files(tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid"))
+    found = copy.scenario_files(
+        tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid")
+    )
     names = ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
     there = [(generated.folder / name).read_bytes() for name in names]
     assert [path.read_bytes() for path in found.values()] == there
     far, near = (
-        files(export(SPLIT, SIZE, format="gns-npz", output=tmp_path / name, root=root, registry=tiny).folder)
+        files(
+            export(
+                SPLIT,
+                SIZE,
+                format="gns-npz",
+                output=tmp_path / name,
+                root=root,
+                registry=tiny,
+            ).folder
+        )
         for name, root in (("far", url), ("near", generated.root))
     )
     assert far == near
@@ -132,13 +163,19 @@ def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
     assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
     assert here(url) == []
-    assert overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
+    assert (
+        overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
+    )
 
 
-def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Registry) -> None:
-    """A damaged file comes again; an object that is gone is named, but over HTTP, which lists nothing.
+def test_verify_mends_the_copy_and_tells_of_the_store(
+    store: Store, tiny: Registry
+) -> None:
+    """A damaged file comes again; an object that is gone is named, but over HTTP, which
+    lists nothing.
 
-    Files that are in the working copy alone make no data set of the store whole, be it one or all.
+    Files that are in the working copy alone make no data set of the store whole, be it
+    one or all.
     """
     verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
     path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
@@ -159,7 +196,9 @@ def test_verify_mends_the_copy_and_tells_of_the_store(store: Store, tiny: Regist
 
 
 def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
-    """The error names the object, and no file of it is left: a bit changed, too short, another scenario."""
+    """The error names the object, and no file of it is left: a bit changed, too short,
+    another scenario.
+    """
     good, other = (folder.read(f"{FOLDER}/test/{name}.nc") for name in ("0003", "0004"))
     for bad in (good[:-9] + bytes([good[-9] ^ 1]) + good[-8:], good[:-1], other):
         folder.put(f"{FOLDER}/test/0003.nc", bad)
@@ -183,7 +222,9 @@ def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
 def test_what_a_manifest_cannot_say_is_refused(
     folder: Store, tmp_path: Path, key: str, value: object, error: type[DataError]
 ) -> None:
-    """Other hashes than those of datasets.yaml, endless files, names that lead elsewhere: nothing comes."""
+    """Other hashes than those of datasets.yaml, endless files, names that lead
+    elsewhere: nothing comes.
+    """
     text = json.loads(folder.read(MANIFEST))
     for part in text["files"] if key in ("content_sha256", "bytes") else [text]:
         part[key] = value
@@ -196,9 +237,14 @@ def test_what_a_manifest_cannot_say_is_refused(
 
 
 def test_who_watches_is_told_how_far_it_is(
-    url: str, tiny: Registry, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    url: str,
+    tiny: Registry,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """On a terminal a line on stderr counts files and bytes; with --quiet it does not."""
+    """On a terminal a line on stderr counts files and bytes; with --quiet it does
+    not.
+    """
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     lagbench.open_split(SPLIT, size=SIZE, root=url).close()
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
@@ -219,8 +265,12 @@ def test_what_only_the_copy_has_stays_known(
     assert (resolve_root(folder.url) / MANIFEST).read_bytes() == full
 
 
-def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A Path takes a slash away and means the same; LAGBENCH_ROOT may be a URL; a stranger's mark is none."""
+def test_urls_and_paths_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A Path takes a slash away and means the same; LAGBENCH_ROOT may be a URL; a
+    stranger's mark is none.
+    """
     copy = resolve_root("s3://bucket/some/where/")
     assert copy == resolve_root(Path("s3://bucket/some/where"))
     assert copy.name.startswith("s3-bucket-some-where-")
@@ -231,13 +281,24 @@ def test_urls_and_paths_are_told_apart(tmp_path: Path, monkeypatch: pytest.Monke
     shutil.copytree(copy, tmp_path / copy.name)
     assert url_of(tmp_path / copy.name) is None
     assert as_url(Path("file:///tmp/x")) == "file:///tmp/x"
-    assert [as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)] == [None] * 5
+    assert [
+        as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)
+    ] == [None] * 5
 
 
-def test_the_command_line_takes_a_url(url: str, run: Callable[..., Result], tmp_path: Path) -> None:
-    """List, template, verify and info work on a store as on a folder; the list says where it is."""
+def test_the_command_line_takes_a_url(
+    url: str, run: Callable[..., Result], tmp_path: Path
+) -> None:
+    """List, template, verify and info work on a store as on a folder; the list says
+    where it is.
+    """
     one = (SPLIT, "--size", SIZE)
-    more = {"list": (), "template": (*one, "--output", tmp_path / "p.nc"), "verify": one, "info": one}
+    more = {
+        "list": (),
+        "template": (*one, "--output", tmp_path / "p.nc"),
+        "verify": one,
+        "info": one,
+    }
     done = {word: run(word, *words, "--root", url) for word, words in more.items()}
     assert [result.exit_code for result in done.values()] == [0, 0, 0, 0]
     assert url in done["list"].output.replace("\n", "")

@@ -1,4 +1,6 @@
-"""What S3 refuses is said in words, to those who write and to those who read; nothing is left half done."""
+"""What S3 refuses is said in words, to those who write and to those who read; nothing
+is left half done.
+"""
 
 from __future__ import annotations
 
@@ -57,8 +59,14 @@ def wrong_credentials(patch: pytest.MonkeyPatch) -> None:
     patch.setenv("AWS_ACCESS_KEY_ID", "wrong")
 
 
-REFUSALS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], type[LagbenchError], str]] = {
-    "none": (lacking_credentials, WorkFailedError, r"NoCredentials(.*\n)*.*AWS_ACCESS_KEY_ID"),
+REFUSALS: dict[
+    str, tuple[Callable[[pytest.MonkeyPatch], None], type[LagbenchError], str]
+] = {
+    "none": (
+        lacking_credentials,
+        WorkFailedError,
+        r"NoCredentials(.*\n)*.*AWS_ACCESS_KEY_ID",
+    ),
     "wrong": (wrong_credentials, WorkFailedError, r"refuses\n(.*\n)*.*PermissionError"),
     "no answer": (
         lambda patch: patch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9"),
@@ -75,7 +83,9 @@ REFUSALS: dict[str, tuple[Callable[[pytest.MonkeyPatch], None], type[LagbenchErr
 
 @pytest.mark.parametrize("why", REFUSALS)
 def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
-    """No or wrong credentials, no answer, no library: what is missing, and where to put it, is said."""
+    """No or wrong credentials, no answer, no library: what is missing, and where to put
+    it, is said.
+    """
     harm, error, words = REFUSALS[why]
     harm(monkeypatch)
     with pytest.raises(error, match=words):
@@ -84,7 +94,9 @@ def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) 
 
 def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
     """The bucket is named; a scheme that fsspec does not know is a usage error."""
-    with pytest.raises(DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"):
+    with pytest.raises(
+        DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"
+    ):
         use("s3://elsewhere/data")
     with pytest.raises(UsageError, match="no such kind of address"):
         use("nonsense://data/x")
@@ -105,6 +117,8 @@ def test_where_nothing_can_be_written_nothing_is_kept(
 def test_the_command_line_says_it_too(s3: str) -> None:
     """A message and the exit code of its kind, no traceback."""
     for name, code in (("s3://elsewhere/data", 4), ("nonsense://data/x", 2)):
-        done = CliRunner().invoke(app, ["generate", SPLIT, "--size", SIZE, "--root", name])
+        done = CliRunner().invoke(
+            app, ["generate", SPLIT, "--size", SIZE, "--root", name]
+        )
         assert (done.exit_code, type(done.exception)) == (code, SystemExit)
         assert "fix: " in done.stderr or "expected: " in done.stderr

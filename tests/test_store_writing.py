@@ -1,4 +1,6 @@
-"""Generation into a store: the same objects, whole, the manifest last; machines that come and go."""
+"""Generation into a store: the same objects, whole, the manifest last; machines that
+come and go.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ Wrote = list[tuple[str, dict[str, bytes]]]
 
 
 @pytest.fixture(params=("file", "s3"))
-def url(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def url(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> str:
     """An empty store of each kind that can be written to, and a machine of its own."""
     machine(monkeypatch, tmp_path / "cache")
     if request.param == "file":
@@ -52,12 +56,16 @@ def full(url: str, generated: GenerationResult) -> str:
 @pytest.fixture
 def run(unmeasured: Registry) -> Run:
     """Generate into a store."""
-    return lambda url, **options: generate(SPLIT, SIZE, root=url, registry=unmeasured, workers=1, **options)
+    return lambda url, **options: generate(
+        SPLIT, SIZE, root=url, registry=unmeasured, workers=1, **options
+    )
 
 
 @pytest.fixture
 def simulated_here(generated: GenerationResult) -> Fill:
-    """Fill the working copy of a store as a simulation would, so that tests need not simulate."""
+    """Fill the working copy of a store as a simulation would, so that tests need not
+    simulate.
+    """
 
     def fill(url: str) -> str:
         shutil.copytree(generated.root, resolve_root(url), dirs_exist_ok=True)
@@ -71,7 +79,9 @@ def wrote(monkeypatch: pytest.MonkeyPatch) -> Wrote:
     """Every object that is put, in order, with all that is in the store then."""
     seen: Wrote = []
 
-    def listened(first: Callable[[Objects, str, Any], None]) -> Callable[[Objects, str, Any], None]:
+    def listened(
+        first: Callable[[Objects, str, Any], None],
+    ) -> Callable[[Objects, str, Any], None]:
         def put(store: Objects, name: str, given: Any) -> None:
             first(store, name, given)
             seen.append((name, objects(store.url)))
@@ -83,9 +93,12 @@ def wrote(monkeypatch: pytest.MonkeyPatch) -> Wrote:
     return seen
 
 
-def fail_after(monkeypatch: pytest.MonkeyPatch, count: int, error: BaseException) -> None:
+def fail_after(
+    monkeypatch: pytest.MonkeyPatch, count: int, error: BaseException
+) -> None:
     """Let a machine end when it has put so many scenarios."""
-    put, left = Objects.put, iter(range(count))
+    put = Objects.put
+    left = iter(range(count))
 
     def failing(store: Objects, name: str, source: Path) -> None:
         if name.endswith(".nc") and next(left, None) is None:
@@ -108,14 +121,18 @@ def test_another_machine_ends_what_one_began(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It simulates only what is missing, and the objects are those of a plain generation, all of them."""
+    """It simulates only what is missing, and the objects are those of a plain
+    generation, all of them.
+    """
     simulated_here(url)
     with monkeypatch.context() as patch:
         fail_after(patch, 4, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
             run(url)
     begun = objects(url)
-    assert sorted(begun) == sorted([MANIFEST, *(f"{FOLDER}/{path}" for path in named(begun[MANIFEST]))])
+    assert sorted(begun) == sorted(
+        [MANIFEST, *(f"{FOLDER}/{path}" for path in named(begun[MANIFEST]))]
+    )
     assert len(begun) == 5
     machine(monkeypatch, tmp_path / "second")
     result = run(url)
@@ -136,13 +153,25 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
 
 
 def test_the_manifest_comes_last(
-    url: str, run: Run, simulated_here: Fill, wrote: Wrote, monkeypatch: pytest.MonkeyPatch
+    url: str,
+    run: Run,
+    simulated_here: Fill,
+    wrote: Wrote,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """At no time does it name an object that is not there; after the cards it is put once more."""
+    """At no time does it name an object that is not there; after the cards it is put
+    once more.
+    """
     monkeypatch.setattr(publication, "EVERY", 0.0)
     run(simulated_here(url))
     names = [name for name, _ in wrote]
-    assert names[:5] == ["train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc", "test/0004.nc"]
+    assert names[:5] == [
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    ]
     assert names[-3:] == ["croissant.json", "README.md", "manifest.json"]
     for _, there in wrote:
         assert {*named(there.get("manifest.json", b'{"files": []}'))} <= there.keys()
@@ -151,7 +180,9 @@ def test_the_manifest_comes_last(
 def test_a_fault_in_the_middle_leaves_whole_objects(
     url: str, run: Run, simulated_here: Fill, generated: GenerationResult, wrote: Wrote
 ) -> None:
-    """The manifest names what had been put; the next call puts the rest and nothing twice."""
+    """The manifest names what had been put; the next call puts the rest and nothing
+    twice.
+    """
     simulated_here(url)
     with pytest.MonkeyPatch.context() as patch:
         fail_after(patch, 2, WorkFailedError("the store does not answer or fails"))
@@ -160,7 +191,11 @@ def test_a_fault_in_the_middle_leaves_whole_objects(
     assert named(objects(url)[MANIFEST]) == ["train/0000.nc", "train/0001.nc"]
     wrote.clear()
     run(url)
-    assert [name for name, _ in wrote][:3] == ["valid/0002.nc", "test/0003.nc", "test/0004.nc"]
+    assert [name for name, _ in wrote][:3] == [
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    ]
     assert objects(url) == files(generated.root)
 
 
@@ -190,7 +225,9 @@ def test_two_writers_do_no_harm(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Two machines write different scenarios at once: the last manifest names what both have put."""
+    """Two machines write different scenarios at once: the last manifest names what both
+    have put.
+    """
     simulated_here(url)
     put_first = Objects.put
 
@@ -210,8 +247,11 @@ def test_two_writers_do_no_harm(
     assert sorted(named(objects(url)[MANIFEST])) == sorted(everything)
     result = run(url)
     assert (result.simulated, result.complete) == ((), True)
-    found, wanted = objects(url), files(generated.root)
-    assert all(found[name] == data for name, data in wanted.items() if name.endswith(".nc"))
+    found = objects(url)
+    wanted = files(generated.root)
+    assert all(
+        found[name] == data for name, data in wanted.items() if name.endswith(".nc")
+    )
 
 
 def leave_only(root: Path, *subsets: str) -> None:
@@ -220,7 +260,9 @@ def leave_only(root: Path, *subsets: str) -> None:
     for entry in manifest["files"]:
         if entry["subset"] not in subsets:
             (root / FOLDER / entry["path"]).unlink()
-    manifest["files"] = [entry for entry in manifest["files"] if entry["subset"] in subsets]
+    manifest["files"] = [
+        entry for entry in manifest["files"] if entry["subset"] in subsets
+    ]
     (root / MANIFEST).write_text(json.dumps(manifest))
 
 
@@ -233,7 +275,9 @@ def test_a_dry_run_only_looks(full: str, run: Run) -> None:
     assert (objects(full), files(result.root)) == (before, {})
 
 
-def test_a_file_that_changed_is_not_put(url: str, run: Run, simulated_here: Fill) -> None:
+def test_a_file_that_changed_is_not_put(
+    url: str, run: Run, simulated_here: Fill
+) -> None:
     """What the manifest says of a file holds for the object, or there is none."""
     simulated_here(url)
     path = resolve_root(url) / FOLDER / "train/0000.nc"
@@ -245,15 +289,27 @@ def test_a_file_that_changed_is_not_put(url: str, run: Run, simulated_here: Fill
 
 
 def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
-    """What a mirror has arrives there with its manifest; a second call fetches nothing."""
+    """What a mirror has arrives there with its manifest; a second call fetches
+    nothing.
+    """
     (resolve_root(url) / "own").mkdir(parents=True)
     shutil.copy(original.folder / "split.yaml", resolve_root(url) / "own")
     result = download("own", root=url, mirror=original.folder.parent.as_uri())
     assert (result.downloaded, result.complete) == ((0, 1, 2, 3), True)
-    there = {name.removeprefix("own/full/v1/"): data for name, data in objects(url).items()}
+    there = {
+        name.removeprefix("own/full/v1/"): data for name, data in objects(url).items()
+    }
     manifest = there.pop("manifest.json")
-    assert named(manifest) == ["train/0000.nc", "train/0001.nc", "valid/0002.nc", "test/0003.nc"]
-    assert there == {name: (original.folder / "full/v1" / name).read_bytes() for name in named(manifest)}
+    assert named(manifest) == [
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+    ]
+    assert there == {
+        name: (original.folder / "full/v1" / name).read_bytes()
+        for name in named(manifest)
+    }
     again = download("own", root=url, mirror="file:///nowhere")
     assert (again.downloaded, again.kept) == ((), (0, 1, 2, 3))
 
@@ -263,7 +319,8 @@ def test_what_was_made_anew_is_not_fetched_back(
 ) -> None:
     """A file of other bytes replaces the object, and no old one comes over it."""
     simulated_here(full)
-    size, root = unmeasured.size(SPLIT, SIZE), resolve_root(full)
+    size = unmeasured.size(SPLIT, SIZE)
+    root = resolve_root(full)
     path = root / FOLDER / "train/0000.nc"
     path.write_bytes(path.read_bytes() + b"\0")
     manifest = read_manifest(root, SPLIT, SIZE, 2)
@@ -271,8 +328,13 @@ def test_what_was_made_anew_is_not_fetched_back(
         assert store is not None
         assert manifest is not None
         first = manifest.files[0]
-        new = first.model_copy(update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)})
-        store.follow(manifest.model_copy(update={"files": (new, *manifest.files[1:])}), at_once=True)
+        new = first.model_copy(
+            update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)}
+        )
+        store.follow(
+            manifest.model_copy(update={"files": (new, *manifest.files[1:])}),
+            at_once=True,
+        )
         store.bring(size.scenarios)
     assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
     assert path.stat().st_size == new.bytes

@@ -1,4 +1,6 @@
-"""Strain since the first frame: affine motion has the strain of its matrix, images have images of it."""
+"""Strain since the first frame: affine motion has the strain of its matrix, images have
+images of it.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +41,9 @@ def cloud(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
         (1, 0.3, 0, 1),
     ],
 )
-def test_affine_motion_has_the_strain_of_its_matrix(gradient: tuple[float, ...]) -> None:
+def test_affine_motion_has_the_strain_of_its_matrix(
+    gradient: tuple[float, ...],
+) -> None:
     """(F F^T - 1) / 2, at the edges of the body too, wherever it went."""
     f = np.reshape(gradient, (2, 2))
     e = 0.5 * (f @ f.T - np.eye(2))
@@ -47,7 +51,9 @@ def test_affine_motion_has_the_strain_of_its_matrix(gradient: tuple[float, ...])
     moved = first @ torch.from_numpy(f).float().T + 0.05
     found = rest(first).strain(moved)
     expected = np.tanh(np.array([e[0, 0], e[0, 1], e[1, 1]]) / UNIT)
-    np.testing.assert_allclose(found.numpy(), np.tile(expected, (len(first), 1)), rtol=0, atol=0.05)
+    np.testing.assert_allclose(
+        found.numpy(), np.tile(expected, (len(first), 1)), rtol=0, atol=0.05
+    )
     np.testing.assert_allclose(found.mean(dim=0).numpy(), expected, rtol=0, atol=0.02)
     with torch.autocast("cpu", torch.bfloat16):  # has the bits that it has in a rollout
         assert torch.equal(rest(first).strain(moved), found)
@@ -56,7 +62,9 @@ def test_affine_motion_has_the_strain_of_its_matrix(gradient: tuple[float, ...])
 def test_bodies_in_layers_of_their_own_fly_apart_unstrained() -> None:
     """Two that lie in each other at first and part: neither is strained."""
     first = cloud(0)
-    apart = first + torch.tensor([[-0.1, 0.0], [0.1, 0.05]])[torch.arange(len(first)) % 2]
+    apart = (
+        first + torch.tensor([[-0.1, 0.0], [0.1, 0.05]])[torch.arange(len(first)) % 2]
+    )
     assert float(rest(first, bodies=2).strain(apart).abs().max()) < 1e-4
     assert float(rest(first).strain(apart).abs().max()) > 0.1
 
@@ -66,8 +74,12 @@ def test_an_image_is_strained_as_an_image() -> None:
     frames = torch.stack([cloud(0), cloud(0) @ torch.tensor([[1.05, 0.1], [0.0, 0.9]])])
     given = replace(batch(frames.numpy()), origin=frames[0])
     mirrored = image(given, torch.tensor([[[-1.0, 0.0], [0.0, 1.0]]]), BOUNDS)
-    here, there = (rest(first_frame(one)).strain(one.position[:, 1]) for one in (given, mirrored))
-    torch.testing.assert_close(there, here * torch.tensor([1.0, -1.0, 1.0]), rtol=0, atol=1e-3)
+    here, there = (
+        rest(first_frame(one)).strain(one.position[:, 1]) for one in (given, mirrored)
+    )
+    torch.testing.assert_close(
+        there, here * torch.tensor([1.0, -1.0, 1.0]), rtol=0, atol=1e-3
+    )
 
 
 def test_the_first_frame_is_known_or_asked_for() -> None:

@@ -1,4 +1,6 @@
-"""The child process: what becomes of a child that waits, crashes, or fails for our own reasons."""
+"""The child process: what becomes of a child that waits, crashes, or fails for our own
+reasons.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ bench = small
 def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A module ``jobs`` that children can import."""
     (tmp_path / "jobs.py").write_text(JOBS)
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}")
+    monkeypatch.setenv(
+        "PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}"
+    )
 
 
 @pytest.mark.usefixtures("jobs")
@@ -60,7 +64,9 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
     """Two answers, then it ends; the last request is never reached."""
-    values, stopped = in_child("jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0)
+    values, stopped = in_child(
+        "jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0
+    )
     assert values == ["", ""]
     assert said in str(stopped)
 
@@ -69,8 +75,8 @@ def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> No
 def test_a_child_that_answers_waits_or_raises() -> None:
     """What JSON can hold goes there and back, in the order of requests.
 
-    One that waits is stopped by the clock, since it computes nothing; an error is exit code 5 with its last
-    line.
+    One that waits is stopped by the clock, since it computes nothing; an error is exit
+    code 5 with its last line.
     """
     asked = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
     assert in_child("jobs.behave", asked, **ROOM) == (asked, None)
@@ -82,15 +88,22 @@ def test_a_child_that_answers_waits_or_raises() -> None:
     assert "ValueError: a bug" in str(caught.value.got)
 
 
-def test_what_stops_the_child_is_a_finding(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_stops_the_child_is_a_finding(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The check is `readable`, the exit code 3, and no other check counts as passed.
 
-    A terabyte that takes no room is not granted a day; waiting is granted far more than computing.
+    A terabyte that takes no room is not granted a day; waiting is granted far more than
+    computing.
     """
     monkeypatch.setattr(validation, "in_child", lambda *_, **__: ([], "a reason"))
     result = bench.validate(bench.valid, isolated=True)
     assert result.errors[0].got == "a reason"
-    assert (result.errors[0].check, result.exit_code, result.passed) == ("readable", 3, ())
+    assert (result.errors[0].check, result.exit_code, result.passed) == (
+        "readable",
+        3,
+        (),
+    )
     assert set(result.skipped) == set(CHECKS) - {"readable"}
     assert validation.WALL_SECONDS >= 100.0 * validation.CPU_SECONDS
     path = bench.copy("sparse.nc")
@@ -120,4 +133,6 @@ def test_the_document_names_every_check() -> None:
     text = (Path(__file__).parents[1] / "docs" / "predictions.md").read_text()
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| `")]
     severities = {"error", "warning", "error, warning"}
-    assert [row[1].strip(" `") for row in rows if row[2].strip() in severities] == list(CHECKS)
+    assert [row[1].strip(" `") for row in rows if row[2].strip() in severities] == list(
+        CHECKS
+    )

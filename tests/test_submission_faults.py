@@ -1,4 +1,6 @@
-"""Every faulty file is named by its check; none raises, none needs much memory or time."""
+"""Every faulty file is named by its check; none raises, none needs much memory or
+time.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ MEBIBYTES = 1000.0
 def most() -> float:
     """Memory that no child may exceed [MiB].
 
-    Linux counts what this process held when it started a child as the child's: in a large test run
-    the bound is what this process holds, in a run of this file alone it is MEBIBYTES.
+    Linux counts what this process held when it started a child as the child's: in a
+    large test run the bound is what this process holds, in a run of this file alone it
+    is MEBIBYTES.
     """
     return max(MEBIBYTES, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 + 1)
 
@@ -35,7 +38,9 @@ bench = small
 
 @pytest.fixture
 def peaks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Peak resident memory of every child that ends during a test [MiB], those of other tests left out."""
+    """Peak resident memory of every child that ends during a test [MiB], those of other
+    tests left out.
+    """
     found: list[float] = []
 
     def waitpid(pid: int, options: int) -> tuple[int, int]:
@@ -49,13 +54,21 @@ def peaks(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 def assert_complete(result: ValidationResult) -> None:
-    """Every check has found something, passed, or says why it was not made; exit code and errors agree."""
+    """Every check has found something, passed, or says why it was not made; exit code
+    and errors agree.
+    """
     found = {finding.check for finding in result.findings}
     assert found | set(result.passed) | set(result.skipped) == set(CHECKS)
     assert result.exit_code in (0, 1, 3, 4)
     assert (result.exit_code == 0) == result.valid
     for finding in result.findings:
-        parts = (finding.what, finding.where, finding.expected, finding.got, finding.fix)
+        parts = (
+            finding.what,
+            finding.where,
+            finding.expected,
+            finding.got,
+            finding.fix,
+        )
         assert all(part and part.isprintable() for part in parts), finding
 
 
@@ -73,8 +86,12 @@ def test_there_are_enough_faults_and_a_valid_file_has_none(bench: Bench) -> None
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_faulty_file_fails_its_check(bench: Bench, peaks: list[float], name: str) -> None:
-    """The right check, exit code and hint; in this process but for files that would stop it."""
+def test_a_faulty_file_fails_its_check(
+    bench: Bench, peaks: list[float], name: str
+) -> None:
+    """The right check, exit code and hint; in this process but for files that would
+    stop it.
+    """
     fault = FAULTS[name]
     path = fault.make(bench)
     started = cpu_seconds()
@@ -88,7 +105,9 @@ def test_a_faulty_file_fails_its_check(bench: Bench, peaks: list[float], name: s
     assert_complete(result)
 
 
-@pytest.mark.parametrize("name", ["truncated_half", "stale_hash", "one_nan", "external_link", "fifo"])
+@pytest.mark.parametrize(
+    "name", ["truncated_half", "stale_hash", "one_nan", "external_link", "fifo"]
+)
 def test_the_child_process_says_the_same(bench: Bench, name: str) -> None:
     """What the child finds is what this process finds."""
     path = FAULTS[name].make(bench)
@@ -97,15 +116,20 @@ def test_the_child_process_says_the_same(bench: Bench, name: str) -> None:
 
 MUTATIONS = st.lists(
     st.tuples(
-        st.floats(0, 1, exclude_max=True), st.sampled_from([0, 1, 8, 127, 128, 255]) | st.integers(0, 255)
+        st.floats(0, 1, exclude_max=True),
+        st.sampled_from([0, 1, 8, 127, 128, 255]) | st.integers(0, 255),
     ),
     min_size=1,
     max_size=8,
 )
 
 
-def check_mutation(bench: Bench, peaks: list[float], changes: list[tuple[float, int]], keep: float) -> None:
-    """A valid file with bytes changed and its end cut off passes or fails named checks, in bounds."""
+def check_mutation(
+    bench: Bench, peaks: list[float], changes: list[tuple[float, int]], keep: float
+) -> None:
+    """A valid file with bytes changed and its end cut off passes or fails named checks,
+    in bounds.
+    """
     data = np.frombuffer(bench.valid.read_bytes(), np.uint8).copy()
     for place, value in changes:
         data[int(place * len(data))] = value
@@ -121,16 +145,22 @@ def check_mutation(bench: Bench, peaks: list[float], changes: list[tuple[float, 
 
 BYTES = given(changes=MUTATIONS, keep=st.just(1.0) | st.floats(0, 1))
 RELAXED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
-FEW = settings(max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED)
+FEW = settings(
+    max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED
+)
 MANY = settings(FEW, max_examples=200)
 test_changed_bytes_never_escape_the_checks = FEW(BYTES(check_mutation))
-test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(MANY(BYTES(check_mutation)))
+test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(
+    MANY(BYTES(check_mutation))
+)
 
 
 @pytest.mark.slow
 def test_the_script_makes_and_recognises_all_of_them(tmp_path: Path) -> None:
     """Every fault in a child process, within time and memory: exit code 0."""
     script = Path(__file__).parent / "bad_submissions.py"
-    done = subprocess.run([sys.executable, script, tmp_path], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, script, tmp_path], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert " 0 not recognised" in done.stdout

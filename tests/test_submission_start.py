@@ -1,4 +1,6 @@
-"""How predictions begin: mistakes are named, bad models are scored, on the tiny data of all four splits."""
+"""How predictions begin: mistakes are named, bad models are scored, on the tiny data of
+all four splits.
+"""
 
 from __future__ import annotations
 
@@ -46,21 +48,29 @@ class World:
 
     def validate(self, path: Path, predict: Predict) -> ValidationResult:
         """Write predictions and validate them."""
-        with PredictionsWriter(path, split=self.size.split, size="tiny", method="m", root=self.root) as out:
+        with PredictionsWriter(
+            path, split=self.size.split, size="tiny", method="m", root=self.root
+        ) as out:
             for scenario in self.positions:
                 out.add(scenario, predict(self, scenario))
         return validate(path, root=self.root, isolated=False)
 
 
-@pytest.fixture(scope="module", params=["cavity", "curl-noise", "fluid", "multimaterial"])
-def world(request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]) -> World:
+@pytest.fixture(
+    scope="module", params=["cavity", "curl-noise", "fluid", "multimaterial"]
+)
+def world(
+    request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]
+) -> World:
     """The test subset of each split."""
     root = tiny_split(request.param).root
     size = load().size(request.param, "tiny")
-    positions, material = {}, {}
+    positions = {}
+    material = {}
     for scenario in sorted(size.subsets["test"]):
         with read_scenario(Truth(size, root).path(scenario)) as file:
-            positions[scenario], material[scenario] = file.read("position"), file.read("material")
+            positions[scenario] = file.read("position")
+            material[scenario] = file.read("material")
     return World(size, root, positions, material)
 
 
@@ -103,13 +113,19 @@ MISTAKES: dict[str, tuple[Predict, str]] = {
     "a third permuted": (lambda w, i: w.truth(i)[:, a_third(w, i)], "order"),
     "under the next number": (lambda w, i: np.roll(w.truth(i), 1, axis=1), "order"),
     # permuted, and predicted to stand still
-    "permuted and wrong": (lambda w, i: np.broadcast_to(w.last(i)[order(w, i)], w.truth(i).shape), "order"),
+    "permuted and wrong": (
+        lambda w, i: np.broadcast_to(w.last(i)[order(w, i)], w.truth(i).shape),
+        "order",
+    ),
     "y first": (lambda w, i: w.truth(i)[..., ::-1], "swapped"),
     # the last given frame first, then the truth
     "early": (lambda w, i: w.truth(i, late=-1), "shifted"),
     # without its first frame; the last one is repeated
     "late": (lambda w, i: np.concatenate([w.truth(i)[1:], w.truth(i)[-1:]]), "shifted"),
-    "steps": (lambda w, i: np.diff(np.concatenate([w.last(i)[None], w.truth(i)]), axis=0), "displacements"),
+    "steps": (
+        lambda w, i: np.diff(np.concatenate([w.last(i)[None], w.truth(i)]), axis=0),
+        "displacements",
+    ),
     "from the last given frame": (lambda w, i: w.truth(i) - w.last(i), "displacements"),
     "standardised": (
         lambda w, i: (w.truth(i) - w.truth(i).mean((0, 1))) / w.truth(i).std((0, 1)),
@@ -124,7 +140,9 @@ def test_a_mistake_is_named(world: World, tmp_path: Path, name: str) -> None:
     """The check ``start`` refuses it, by its own name."""
     predict, word = MISTAKES[name]
     result = world.validate(tmp_path / "p.nc", predict)
-    assert {(finding.check, word in finding.what) for finding in result.errors} == {("start", True)}
+    assert {(finding.check, word in finding.what) for finding in result.errors} == {
+        ("start", True)
+    }
     assert result.exit_code == 1
 
 
@@ -142,12 +160,16 @@ def noise(world: World, scenario: int) -> Floats:
 
 
 BAD: dict[str, Predict] = {
-    "the mean over scenarios": lambda w, i: np.mean([w.truth(j) for j in w.positions], axis=0),
+    "the mean over scenarios": lambda w, i: np.mean(
+        [w.truth(j) for j in w.positions], axis=0
+    ),
     "noise of 0.01": lambda w, i: w.truth(i) + 0.01 * noise(w, i),
     "noise of 0.1": lambda w, i: w.truth(i) + 0.1 * noise(w, i),
     "noise of 0.5": lambda w, i: w.truth(i) + 0.5 * noise(w, i),
     # turned and shrunk, with some noise: what a network trained too little does
-    "turned": lambda w, i: w.truth(i) @ np.array([[0.9, 0.1], [-0.1, 0.8]]) + 0.05 + 0.03 * noise(w, i),
+    "turned": lambda w, i: (
+        w.truth(i) @ np.array([[0.9, 0.1], [-0.1, 0.8]]) + 0.05 + 0.03 * noise(w, i)
+    ),
     "twice as far": lambda w, i: 2 * w.truth(i) - w.last(i),
     "partly lost": partly_lost,
     "all a tenth to the right": lambda w, i: w.truth(i) + np.array([0.1, 0.0]),
@@ -158,7 +180,9 @@ BAD: dict[str, Predict] = {
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_model_is_scored(world: World, tmp_path: Path, name: str) -> None:
-    """Nothing rejects it; a jump at the start, where there is one, is a warning with its size."""
+    """Nothing rejects it; a jump at the start, where there is one, is a warning with
+    its size.
+    """
     predict = BAD[name]
     result = world.validate(tmp_path / "p.nc", predict)
     assert result.valid
@@ -166,7 +190,9 @@ def test_a_bad_model_is_scored(world: World, tmp_path: Path, name: str) -> None:
     scenarios = {int(f.where.split()[1].rstrip(",")) for f in flagged}
     for scenario in world.positions:
         jump = predict(world, scenario)[0].astype("f4") - world.last(scenario)
-        moved = np.diff(world.positions[scenario][: world.given + world.size.task.horizon], axis=0)
+        moved = np.diff(
+            world.positions[scenario][: world.given + world.size.task.horizon], axis=0
+        )
         limit = 10 * np.sqrt((moved.astype("f8") ** 2).sum(-1).max())
         assert (np.sqrt((jump**2).sum(-1).mean()) > limit) == (scenario in scenarios)
 
@@ -180,17 +206,25 @@ def test_what_is_no_mistake(world: World, tmp_path: Path) -> None:
     assert not validate(made.path, root=world.root, isolated=False).findings
     assert not world.validate(tmp_path / "p.nc", lambda held, i: held.truth(i)).findings
     first = min(world.positions)
-    result = world.validate(tmp_path / "p.nc", lambda w, i: w.truth(i, late=-1 if i == first else 0))
+    result = world.validate(
+        tmp_path / "p.nc", lambda w, i: w.truth(i, late=-1 if i == first else 0)
+    )
     assert result.valid
     assert [finding.check for finding in result.warnings] == ["start"]
 
 
 def test_frames_and_particles_mixed_up_are_named() -> None:
-    """An array [particle, frame, space] that was reshaped instead of transposed; turned round it is none."""
+    """An array [particle, frame, space] that was reshaped instead of transposed; turned
+    round it is none.
+    """
     rng = np.random.default_rng(4)
     given = rng.random((60, 2))
     path = given[:, None] + 0.002 * np.cumsum(rng.standard_normal((60, 10, 2)), axis=1)
-    wrong, right = path.reshape(10, 60, 2), path.transpose(1, 0, 2)
+    wrong = path.reshape(10, 60, 2)
+    right = path.transpose(1, 0, 2)
     bounds = ((0.0, 1.0), (0.0, 1.0))
-    assert "mixed up" in mistake(Start(given, right[0], wrong[0], wrong[1], 10), bounds, {}).what
+    assert (
+        "mixed up"
+        in mistake(Start(given, right[0], wrong[0], wrong[1], 10), bounds, {}).what
+    )
     assert mistake(Start(given, right[0], right[0], right[1], 10), bounds, {}) is None

@@ -1,4 +1,6 @@
-"""The differentiable grids: fields are the scorer's, particles go to nodes and back, gradients are right."""
+"""The differentiable grids: fields are the scorer's, particles go to nodes and back,
+gradients are right.
+"""
 
 from __future__ import annotations
 
@@ -19,37 +21,58 @@ from lagbench.errors import UsageError
 GRIDS = [Grid(8), Grid(8, Placement.NODES), Grid(11)]
 
 
-def particles(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> tuple[Any, Any]:
+def particles(
+    *shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0
+) -> tuple[Any, Any]:
     """Return positions and velocities of shape [..., 2] in float64."""
     rng = np.random.default_rng(seed)
     return rng.uniform(low, high, (*shape, 2)), 0.01 * rng.normal(size=(*shape, 2))
 
 
-def torches(*arrays: NDArray[np.float64], dtype: torch.dtype = torch.float64) -> list[Tensor]:
+def torches(
+    *arrays: NDArray[np.float64], dtype: torch.dtype = torch.float64
+) -> list[Tensor]:
     """Return arrays as tensors."""
     return [torch.from_numpy(array).to(dtype) for array in arrays]
 
 
-def fields(x: Tensor, u: Tensor, grid: Grid, *, full: float, counted: Any = None, **where: Any) -> Any:
+def fields(
+    x: Tensor, u: Tensor, grid: Grid, *, full: float, counted: Any = None, **where: Any
+) -> Any:
     """Return the fields of particles."""
-    return torch_grid.fields(torch_grid.transfer(x, u, grid, **where), grid, full, counted)
+    return torch_grid.fields(
+        torch_grid.transfer(x, u, grid, **where), grid, full, counted
+    )
 
 
-def compare(found: torch_grid.Fields, expected: reference.Fields, tolerance: float) -> None:
-    """Compare every field; vorticity and divergence are 0 where the scorer's are NaN."""
+def compare(
+    found: torch_grid.Fields, expected: reference.Fields, tolerance: float
+) -> None:
+    """Compare every field; vorticity and divergence are 0 where the scorer's are
+    NaN.
+    """
     np.testing.assert_array_equal(found.differentiable.numpy(), expected.differentiable)
     for name in ("weight", "velocity", "density", "vorticity", "divergence"):
         truth = np.nan_to_num(getattr(expected, name))
         scale = np.abs(truth).max()
-        np.testing.assert_allclose(getattr(found, name).numpy(), truth, rtol=0, atol=tolerance * scale)
+        np.testing.assert_allclose(
+            getattr(found, name).numpy(), truth, rtol=0, atol=tolerance * scale
+        )
 
 
 @pytest.mark.parametrize("grid", GRIDS, ids=str)
-@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 1e-5)])
-def test_fields_are_those_of_the_scorer(grid: Grid, dtype: torch.dtype, tolerance: float) -> None:
-    """Frames with particles up to the walls and beyond them give the scorer's fields."""
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [(torch.float64, 1e-13), (torch.float32, 1e-5)]
+)
+def test_fields_are_those_of_the_scorer(
+    grid: Grid, dtype: torch.dtype, tolerance: float
+) -> None:
+    """Frames with particles up to the walls and beyond them give the scorer's
+    fields.
+    """
     x, u = particles(2, 3, 500, low=-0.02, high=1.02)
-    x, u = x.astype(np.float32), u.astype(np.float32)
+    x = x.astype(np.float32)
+    u = u.astype(np.float32)
     full = grid.full_weight(500, 1.0)
     expected = reference.fields(x, u, grid, full=full)
     assert expected.differentiable.any()
@@ -59,8 +82,11 @@ def test_fields_are_those_of_the_scorer(grid: Grid, dtype: torch.dtype, toleranc
 
 
 def test_windows_side_by_side_are_as_alone() -> None:
-    """Windows of unequal particle numbers in one row, the second of them empty, give each its own fields."""
-    grid, full = Grid(6), 4.0
+    """Windows of unequal particle numbers in one row, the second of them empty, give
+    each its own fields.
+    """
+    grid = Grid(6)
+    full = 4.0
     x, u = particles(350)
     counts = [150, 0, 200]
     sample = torch.arange(3).repeat_interleave(torch.tensor(counts))
@@ -68,8 +94,12 @@ def test_windows_side_by_side_are_as_alone() -> None:
     for window, end in enumerate(np.cumsum(counts)):
         own = slice(end - counts[window], end)
         alone = reference.fields(x[own], u[own], grid, full=full)
-        np.testing.assert_allclose(found.velocity[window].numpy(), alone.velocity, atol=1e-15)
-        np.testing.assert_allclose(found.weight[window].numpy(), alone.weight, atol=1e-12)
+        np.testing.assert_allclose(
+            found.velocity[window].numpy(), alone.velocity, atol=1e-15
+        )
+        np.testing.assert_allclose(
+            found.weight[window].numpy(), alone.weight, atol=1e-12
+        )
     counted = torch_grid.transfer(*torches(x, u), grid, sample=sample)
     assert torch.equal(counted.weight, found.weight)
 
@@ -81,7 +111,9 @@ def test_counted_nodes_may_be_those_of_the_truth() -> None:
     x, u = particles(400)
     truth = reference.fields(x, u, grid, full=full)
     expected = reference.fields(x / 2, u, grid, full=full, counted=truth.counted)
-    found = fields(*torches(x / 2, u), grid, full=full, counted=torch.from_numpy(truth.counted))
+    found = fields(
+        *torches(x / 2, u), grid, full=full, counted=torch.from_numpy(truth.counted)
+    )
     compare(found, expected, 1e-12)
 
 
@@ -104,10 +136,14 @@ def test_gradients(name: str, cells: int) -> None:
 
 
 def test_weight_and_momentum_are_conserved() -> None:
-    """Away from the walls the weights of a particle sum to 1, wherever it is: the gradient is 0."""
+    """Away from the walls the weights of a particle sum to 1, wherever it is: the
+    gradient is 0.
+    """
     x, u = torches(*particles(30, low=0.3, high=0.7))
     sums = torch_grid.transfer(x.requires_grad_(), u.requires_grad_(), Grid(8))
-    torch.testing.assert_close(sums.weight.sum(), torch.tensor(30.0, dtype=torch.float64))
+    torch.testing.assert_close(
+        sums.weight.sum(), torch.tensor(30.0, dtype=torch.float64)
+    )
     total = sums.weight.sum() + sums.momentum.sum()
     at_x, at_u = torch.autograd.grad(total, (x, u))
     torch.testing.assert_close(at_u, torch.ones_like(at_u))
@@ -115,7 +151,9 @@ def test_weight_and_momentum_are_conserved() -> None:
 
 
 def test_lost_particles_have_no_weight_and_no_gradient() -> None:
-    """Positions outside the box or without a number change nothing, and all gradients stay numbers."""
+    """Positions outside the box or without a number change nothing, and all gradients
+    stay numbers.
+    """
     x, u = torches(*particles(50))
     x[:3] = torch.tensor([[1.5, 0.5], [float("nan"), 0.5], [0.5, -float("inf")]])
     u[1] = float("nan")
@@ -140,8 +178,12 @@ def test_lost_particles_have_no_weight_and_no_gradient() -> None:
         (torch.zeros(1, 5, 2), torch.zeros(1, 5, 2), torch.zeros(5, dtype=torch.int64)),
     ],
 )
-def test_shapes_that_do_not_fit_are_refused(x: Tensor, u: Tensor, sample: Tensor | None) -> None:
-    """Positions, velocities and windows of unequal lengths are errors that give the shapes."""
+def test_shapes_that_do_not_fit_are_refused(
+    x: Tensor, u: Tensor, sample: Tensor | None
+) -> None:
+    """Positions, velocities and windows of unequal lengths are errors that give the
+    shapes.
+    """
     with pytest.raises(UsageError, match="do not fit"):
         torch_grid.transfer(x, u, Grid(4), sample=sample)
 
@@ -149,10 +191,19 @@ def test_shapes_that_do_not_fit_are_refused(x: Tensor, u: Tensor, sample: Tensor
 BOX = ((0.0625, 0.9375), (0.0625, 0.9375))
 
 
-def cloud(particles: int, seed: int = 0, low: float = 0.0625, high: float = 0.9375) -> torch.Tensor:
+def cloud(
+    particles: int, seed: int = 0, low: float = 0.0625, high: float = 0.9375
+) -> torch.Tensor:
     """Return random places in a square box, some of them on its walls and corners."""
-    x = torch.from_numpy(np.random.default_rng(seed).uniform(low, high, (particles, 2)).astype(np.float32))
-    x[0], x[1], x[2, 0], x[3, 1] = low, high, high, low
+    x = torch.from_numpy(
+        np.random.default_rng(seed)
+        .uniform(low, high, (particles, 2))
+        .astype(np.float32)
+    )
+    x[0] = low
+    x[1] = high
+    x[2, 0] = high
+    x[3, 1] = low
     return x
 
 
@@ -161,29 +212,43 @@ def cloud(particles: int, seed: int = 0, low: float = 0.0625, high: float = 0.93
 def test_weights_are_a_partition_of_unity(
     cells: int, bounds: tuple[tuple[float, float], tuple[float, float]]
 ) -> None:
-    """Nine weights >= 0 sum to 1 anywhere in the box, its walls and corners too, at nodes that exist."""
+    """Nine weights >= 0 sum to 1 anywhere in the box, its walls and corners too, at
+    nodes that exist.
+    """
     grid = ParticleGrid(bounds, cells, multiple=4)
     low, high = torch.tensor(bounds).T
     place = low + cloud(500, low=0.0, high=1.0) * (high - low)
     stencil = grid.stencil(place.clamp(low, high), torch.zeros(500, dtype=torch.int64))
     assert float(stencil.weight.min()) >= 0.0
     torch.testing.assert_close(stencil.weight.sum(dim=1), torch.ones(500))
-    assert 0 <= int(stencil.node.min()) <= int(stencil.node.max()) < grid.shape[0] * grid.shape[1]
+    assert (
+        0
+        <= int(stencil.node.min())
+        <= int(stencil.node.max())
+        < grid.shape[0] * grid.shape[1]
+    )
     sums = grid.spread(stencil, torch.ones(500, 1), 1)
     assert float(sums.sum()) == pytest.approx(500, rel=1e-5)
     # quadratic B-splines reproduce 2 + 3 x - 5 y
-    field, (x, y) = 2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y, place.clamp(low, high).T
+    field, (x, y) = (
+        2.0 + 3.0 * grid.axis_x[:, None] - 5.0 * grid.axis_y,
+        place.clamp(low, high).T,
+    )
     found = grid.gather(stencil, field[None, None])[:, 0]
     torch.testing.assert_close(found, 2.0 + 3.0 * x - 5.0 * y, rtol=0, atol=1e-5)
 
 
 def test_spread_is_the_scorers_transfer() -> None:
-    """On the unit box the inner nodes are those of lagbench.data.grid, and so are weight and momentum."""
+    """On the unit box the inner nodes are those of lagbench.data.grid, and so are
+    weight and momentum.
+    """
     place = cloud(400, low=0.1, high=0.9)
     velocity = torch.randn(400, 2, generator=torch.Generator().manual_seed(0))
     grid = ParticleGrid(((0.0, 1.0), (0.0, 1.0)), 16)
     stencil = grid.stencil(place, torch.zeros(400, dtype=torch.int64))
-    found = grid.spread(stencil, torch.cat([torch.ones(400, 1), velocity], dim=1), 1)[0, :, 1:-1, 1:-1]
+    found = grid.spread(stencil, torch.cat([torch.ones(400, 1), velocity], dim=1), 1)[
+        0, :, 1:-1, 1:-1
+    ]
     expected = transfer(place.numpy(), velocity.numpy(), Grid(16))
     np.testing.assert_allclose(found[0], expected.weight, atol=2e-5)
     np.testing.assert_allclose(found[1:].permute(1, 2, 0), expected.momentum, atol=2e-5)
@@ -192,7 +257,8 @@ def test_spread_is_the_scorers_transfer() -> None:
 def test_gather_is_the_adjoint_of_spread() -> None:
     """<spread(v), g> = <v, gather(g)>, in two layers."""
     generator = torch.Generator().manual_seed(0)
-    grid, place = ParticleGrid(BOX, 9, multiple=4), cloud(200)
+    grid = ParticleGrid(BOX, 9, multiple=4)
+    place = cloud(200)
     layer = torch.randint(2, (200,), generator=generator)
     value = torch.randn(200, 3, generator=generator)
     field = torch.randn(2, 3, *grid.shape, generator=generator)
@@ -207,8 +273,11 @@ def test_gather_is_the_adjoint_of_spread() -> None:
 
 
 def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
-    """Forces by torch's own gradients of the weights; their sum and their moment vanish at the nodes."""
-    grid, place = ParticleGrid(BOX, 9, multiple=4), cloud(200)
+    """Forces by torch's own gradients of the weights; their sum and their moment vanish
+    at the nodes.
+    """
+    grid = ParticleGrid(BOX, 9, multiple=4)
+    place = cloud(200)
     layer = torch.arange(200) % 2
     rng = torch.Generator().manual_seed(0)
     stress = torch.randn(200, 3, 3, generator=rng)
@@ -217,12 +286,17 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     found = grid.pushed(stencil, place, stress, mass)
     moved = place.clone().requires_grad_()
     weight = grid.stencil(moved, layer).weight
-    each = [torch.autograd.grad(weight[:, node].sum(), moved, retain_graph=True)[0] for node in range(9)]
+    each = [
+        torch.autograd.grad(weight[:, node].sum(), moved, retain_graph=True)[0]
+        for node in range(9)
+    ]
     slopes = torch.stack(each, dim=1)
     matrix = stress[..., [0, 1, 1, 2]].unflatten(2, (2, 2))
     pulled = -grid.spacing * torch.einsum("pfcd,pnd->pnfc", matrix, slopes)
     columns, rows = grid.shape
-    force = torch.zeros(2 * columns * rows, 3, 2).index_add(0, stencil.node, pulled.flatten(0, 1))
+    force = torch.zeros(2 * columns * rows, 3, 2).index_add(
+        0, stencil.node, pulled.flatten(0, 1)
+    )
     ours = (found * mass).permute(0, 2, 3, 1).reshape(-1, 3, 2)
     torch.testing.assert_close(ours, force, rtol=0, atol=2e-5)
     x, y = torch.cartesian_prod(grid.axis_x, grid.axis_y).repeat(2, 1).T[..., None]
@@ -233,20 +307,31 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
 
 @pytest.mark.parametrize("swap", [False, True])
 @pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
-def test_the_image_of_a_transfer_is_the_transfer_of_the_image(signs: tuple[int, int], swap: bool) -> None:
-    """All eight images of the square: mirrored and turned particles give mirrored and turned sums."""
-    grid, place, zero = ParticleGrid(BOX, 11, multiple=4), cloud(300), torch.zeros(300, dtype=torch.int64)
+def test_the_image_of_a_transfer_is_the_transfer_of_the_image(
+    signs: tuple[int, int], swap: bool
+) -> None:
+    """All eight images of the square: mirrored and turned particles give mirrored and
+    turned sums.
+    """
+    grid = ParticleGrid(BOX, 11, multiple=4)
+    place = cloud(300)
+    zero = torch.zeros(300, dtype=torch.int64)
     turned = (place - 0.5) * torch.tensor(signs) + 0.5
     both = (place, turned.flip(1) if swap else turned)
-    here, found = (grid.spread(grid.stencil(x, zero), torch.ones(300, 1), 1)[0, 0] for x in both)
+    here, found = (
+        grid.spread(grid.stencil(x, zero), torch.ones(300, 1), 1)[0, 0] for x in both
+    )
     expected = here.flip([axis for axis, sign in enumerate(signs) if sign < 0])
-    torch.testing.assert_close(found, expected.T if swap else expected, rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        found, expected.T if swap else expected, rtol=0, atol=1e-4
+    )
 
 
 def test_walls_lie_between_two_rows_of_nodes() -> None:
     """The nodes beside a wall are half a cell from it, on both sides.
 
-    A rollout that diverges gives NaN, which the rollout freezes, and no error of an index.
+    A rollout that diverges gives NaN, which the rollout freezes, and no error of an
+    index.
     """
     grid = ParticleGrid(BOX, 7)
     distance = grid.wall_distance(1.0)

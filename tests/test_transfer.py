@@ -1,4 +1,6 @@
-"""B-spline weights against SciPy, and the exactness and range of the fixed-point sums."""
+"""B-spline weights against SciPy, and the exactness and range of the fixed-point
+sums.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,11 @@ DX = 1.0 / 32.0
 
 
 @ti.kernel
-def evaluate_stencil(x: ti.types.ndarray(), rows: ti.types.ndarray(), base: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
+def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+    x: ti.types.ndarray(),  # type: ignore[valid-type]
+    rows: ti.types.ndarray(),  # type: ignore[valid-type]
+    base: ti.types.ndarray(),  # type: ignore[valid-type]
+):
     for p in range(x.shape[0]):
         row = transfer.stencil(ti.Vector([x[p, 0], x[p, 1], 0.0, 0.0]), 32.0, 33)
         base[p] = ti.bit_cast(row[0][3], ti.i32)
@@ -23,7 +29,11 @@ def evaluate_stencil(x: ti.types.ndarray(), rows: ti.types.ndarray(), base: ti.t
 
 
 @ti.kernel
-def evaluate(value: ti.types.ndarray(), fixed: ti.types.ndarray(), out: ti.types.ndarray()):  # type: ignore[no-untyped-def,valid-type] # noqa: ANN201, D103
+def evaluate(  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+    value: ti.types.ndarray(),  # type: ignore[valid-type]
+    fixed: ti.types.ndarray(),  # type: ignore[valid-type]
+    out: ti.types.ndarray(),  # type: ignore[valid-type]
+):
     for p in range(value.shape[0]):
         fixed[p] = transfer.to_fixed(value[p])
         out[p, 0] = transfer.bounded(value[p], -1.0, 2.0)
@@ -37,24 +47,40 @@ def taichi_runtime() -> None:
 
 
 def test_weights_are_the_quadratic_b_spline() -> None:
-    """Each weight is a product of SciPy's B-splines; moments are 1, 0 and dx^2/4; the rest fits."""
+    """Each weight is a product of SciPy's B-splines; moments are 1, 0 and dx^2/4; the
+    rest fits.
+    """
     x = (np.random.default_rng(0).random((500, 2)) * 0.9 + 0.05).astype(np.float32)
-    rows, base = np.zeros((500, 3, 4), np.float32), np.zeros(500, np.int32)
+    rows = np.zeros((500, 3, 4), np.float32)
+    base = np.zeros(500, np.int32)
     evaluate_stencil(x, rows, base)
-    node, weight = np.stack(np.divmod(base, 33), axis=-1), rows[:, :, :3]
-    distance = (node[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(np.float64) / DX
+    node = np.stack(np.divmod(base, 33), axis=-1)
+    weight = rows[:, :, :3]
+    distance = (node[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(
+        np.float64
+    ) / DX
     assert np.abs(distance).max() <= 1.5
     spline = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)(distance)
-    np.testing.assert_allclose(weight, spline[:, :, None, 0] * spline[:, None, :, 1], rtol=0, atol=2e-6)
+    np.testing.assert_allclose(
+        weight, spline[:, :, None, 0] * spline[:, None, :, 1], rtol=0, atol=2e-6
+    )
     np.testing.assert_allclose(weight.sum(axis=(1, 2)), 1.0, rtol=0, atol=1e-6)
     for axis, along in enumerate((weight.sum(axis=2), weight.sum(axis=1))):
-        np.testing.assert_allclose((along * distance[:, :, axis]).sum(axis=1), 0.0, rtol=0, atol=4e-6)
-        np.testing.assert_allclose((along * distance[:, :, axis] ** 2).sum(axis=1), 0.25, rtol=0, atol=4e-6)
-        np.testing.assert_allclose(rows[:, axis + 1, 3], -distance[:, 1, axis], rtol=0, atol=1e-6)
+        np.testing.assert_allclose(
+            (along * distance[:, :, axis]).sum(axis=1), 0.0, rtol=0, atol=4e-6
+        )
+        np.testing.assert_allclose(
+            (along * distance[:, :, axis] ** 2).sum(axis=1), 0.25, rtol=0, atol=4e-6
+        )
+        np.testing.assert_allclose(
+            rows[:, axis + 1, 3], -distance[:, 1, axis], rtol=0, atol=1e-6
+        )
 
 
 def test_fixed_point_is_numpys_rint() -> None:
-    """Any float32 within the range becomes the integer that NumPy rounds to: halves to the even one."""
+    """Any float32 within the range becomes the integer that NumPy rounds to: halves to
+    the even one.
+    """
     by_hand = {0.5: 0, 1.5: 2, 2.5: 2, -0.5: 0, -1.5: -2, 3.0: 3, 1e-30: 0, 0.75: 1}
     by_hand |= {-(2.0**50): -(2**50), 2.0**50: 2**50}
     rng = np.random.default_rng(1)
@@ -63,11 +89,15 @@ def test_fixed_point_is_numpys_rint() -> None:
     out = np.zeros(len(value), np.int64)
     evaluate(value, out, np.zeros((len(value), 2), np.float32))
     assert out[: len(by_hand)].tolist() == list(by_hand.values())
-    np.testing.assert_array_equal(out, np.rint(value.astype(np.float64)).astype(np.int64))
+    np.testing.assert_array_equal(
+        out, np.rint(value.astype(np.float64)).astype(np.int64)
+    )
 
 
 def test_bounds_and_extremes_meet_nan() -> None:
-    """What is not a number becomes the lower bound as a position, and stays visible as an extreme."""
+    """What is not a number becomes the lower bound as a position, and stays visible as
+    an extreme.
+    """
     value = np.array([-3.0, 0.5, 7.0, np.nan, np.inf], np.float32)
     out = np.zeros((5, 2), np.float32)
     evaluate(value, np.zeros(5, np.int64), out)
@@ -77,7 +107,9 @@ def test_bounds_and_extremes_meet_nan() -> None:
 
 @given(particles=st.integers(1, 2**22), bound=st.floats(1e-6, 1e6))
 def test_sums_cannot_overflow(particles: int, bound: float) -> None:
-    """The scale is a power of two, N bounds fit in 62 bits, and one step is far below float32's."""
+    """The scale is a power of two, N bounds fit in 62 bits, and one step is far below
+    float32's.
+    """
     scale = transfer.fixed_point_scale(particles, bound)
     assert np.frexp(scale)[0] == 0.5
     assert scale * bound <= 2.0**50

@@ -20,11 +20,17 @@ from lagbench.generators.acceptance.experiment import Case, plan
 BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
 
 
-def _tabulated(reynolds: int, name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return ascending abscissae and values of one profile, walls included, misprints left out."""
+def _tabulated(
+    reynolds: int, name: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ascending abscissae and values of one profile, walls included, misprints
+    left out.
+    """
     lines = diagnostics.centre_lines(reynolds)
     assert lines is not None
-    points, values, lid = (diagnostics.Y, lines.u, 1.0) if name == "u" else (diagnostics.X, lines.v, 0.0)
+    points, values, lid = (
+        (diagnostics.Y, lines.u, 1.0) if name == "u" else (diagnostics.X, lines.v, 0.0)
+    )
     known = ~np.isnan(values)
     abscissae = np.concatenate([[0.0], np.array(points)[known][::-1], [1.0]])
     return abscissae, np.concatenate([[0.0], values[known][::-1], [lid]])
@@ -35,20 +41,31 @@ def _tabulated(reynolds: int, name: str) -> tuple[NDArray[np.float64], NDArray[n
 def test_tabulated_profiles_have_no_slips(reynolds: int, name: str) -> None:
     """Mass is conserved in a closed box: each tabulated profile integrates to nearly 0.
 
-    A wrong sign or first digit among the widely spaced points would move the integral by 0.01. Among the
-    points 0.008 apart, each lies within 0.006 of a spline through the others.
+    A wrong sign or first digit among the widely spaced points would move the integral
+    by 0.01. Among the points 0.008 apart, each lies within 0.006 of a spline through
+    the others.
     """
     abscissae, values = _tabulated(reynolds, name)
     assert abs(CubicSpline(abscissae, values).integrate(0.0, 1.0)) < 0.004
-    crowded = [i for i in range(1, len(values) - 1) if abscissae[i + 1] - abscissae[i - 1] < 0.017]
+    crowded = [
+        i
+        for i in range(1, len(values) - 1)
+        if abscissae[i + 1] - abscissae[i - 1] < 0.017
+    ]
     assert len(crowded) >= 3
     for i in crowded:
         others = np.arange(len(values)) != i
-        assert abs(CubicSpline(abscissae[others], values[others])(abscissae[i]) - values[i]) < 0.006
+        assert (
+            abs(
+                CubicSpline(abscissae[others], values[others])(abscissae[i]) - values[i]
+            )
+            < 0.006
+        )
 
 
 def test_misprints_are_left_out() -> None:
-    """The two misprints are NaN, everything else is a number, and Re 7 is not tabulated.
+    """The two misprints are NaN, everything else is a number, and Re 7 is not
+    tabulated.
 
     Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4.
     """
@@ -56,18 +73,29 @@ def test_misprints_are_left_out() -> None:
         (reynolds, name, int(index))
         for reynolds in diagnostics.REYNOLDS
         for name in ("u", "v")
-        for index in np.flatnonzero(np.isnan(getattr(diagnostics.centre_lines(reynolds), name)))
+        for index in np.flatnonzero(
+            np.isnan(getattr(diagnostics.centre_lines(reynolds), name))
+        )
     }
-    assert missing == {(400, "v", diagnostics.X.index(0.9063)), (3200, "u", diagnostics.Y.index(0.4531))}
+    assert missing == {
+        (400, "v", diagnostics.X.index(0.9063)),
+        (3200, "u", diagnostics.Y.index(0.4531)),
+    }
     assert diagnostics.centre_lines(7.0) is None
-    found = diagnostics.deviation(np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0]))
+    found = diagnostics.deviation(
+        np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0])
+    )
     assert found.rmse == pytest.approx(math.sqrt(12.5))
     assert found.maximum == 4.0
 
 
 def test_occupancy_counts_every_particle_once() -> None:
-    """One particle in each cell's middle gives all ones; one outside counts in the nearest cell."""
-    middles = np.stack(np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1).reshape(-1, 2)
+    """One particle in each cell's middle gives all ones; one outside counts in the
+    nearest cell.
+    """
+    middles = np.stack(
+        np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1
+    ).reshape(-1, 2)
     assert np.all(diagnostics.occupancy(middles, BOX) == 1)
     counts = diagnostics.occupancy(np.array([[0.0, 1.0]]), BOX)
     assert counts[0, -1] == 1
@@ -83,7 +111,9 @@ def _nodal(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def test_grid_rates_of_rotation_and_expansion() -> None:
-    """Rigid rotation at rate 3 has vorticity 6 and no divergence; v = 2 x expands at 4."""
+    """Rigid rotation at rate 3 has vorticity 6 and no divergence; v = 2 x expands at
+    4.
+    """
     x, y = np.meshgrid(BOX.nodes - 0.5, BOX.nodes - 0.5, indexing="ij")
     turning = diagnostics.grid_rates(_nodal(-3.0 * y, 3.0 * x), BOX.spacing)
     assert turning.vorticity == pytest.approx(6.0)
@@ -94,7 +124,9 @@ def test_grid_rates_of_rotation_and_expansion() -> None:
 
 
 def test_energies() -> None:
-    """Two particles of mass 2 at speeds 3 and 4: E = 25; a displacement counts per frame."""
+    """Two particles of mass 2 at speeds 3 and 4: E = 25; a displacement counts per
+    frame.
+    """
     velocity = np.array([[3.0, 0.0], [0.0, -4.0]])
     assert diagnostics.kinetic_energy(velocity, 2.0) == 25.0
     assert diagnostics.displacement_energy(velocity + 1.0, np.ones((2, 2)), 2.0) == 25.0
@@ -102,18 +134,23 @@ def test_energies() -> None:
 
 @pytest.mark.parametrize("cells", [34, 35])
 def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
-    """Splines return u = 4 U x (1 - x) y^3 and v = 16 U y (1 - y) x (1 - x)(1 - 2 x), both cubic.
+    """Splines return u = 4 U x (1 - x) y^3 and v = 16 U y (1 - y) x (1 - x)(1 - 2 x),
+    both cubic.
 
     The middle lies on a node for 35 cells and between nodes for 34.
     """
     box = diagnostics.Box(low=0.06, high=0.94, cells=cells)
     s = (box.nodes - box.low) / box.width
     x, y = np.meshgrid(s, s, indexing="ij")
-    u, v = 4.0 * x * (1.0 - x) * y**3, 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
+    u = 4.0 * x * (1.0 - x) * y**3
+    v = 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
     found = diagnostics.extract(0.2 * _nodal(u, v), box, 0.2).at_reference_points()
-    heights, abscissae = np.array(diagnostics.Y), np.array(diagnostics.X)
+    heights = np.array(diagnostics.Y)
+    abscissae = np.array(diagnostics.X)
     assert found.u == pytest.approx(heights**3, abs=1e-12)
-    assert found.v == pytest.approx(4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae), abs=1e-12)
+    assert found.v == pytest.approx(
+        4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae), abs=1e-12
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,7 +162,9 @@ def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
         (Case.CURL_NOISE, 40, 0.0375, 8096, 2e-3),
     ],
 )
-def test_plan_scales_the_full_size(case: Case, grid: int, low: float, particles: int, dt: float) -> None:
+def test_plan_scales_the_full_size(
+    case: Case, grid: int, low: float, particles: int, dt: float
+) -> None:
     """The box stays within half a cell, dt shrinks with dx, particles per cell stay."""
     reynolds = 400.0 if case is Case.CAVITY else None
     settings = plan(case, reynolds=reynolds, grid=grid, substeps=1)
@@ -137,7 +176,9 @@ def test_plan_scales_the_full_size(case: Case, grid: int, low: float, particles:
 
 
 def test_cavity_state_has_the_reynolds_number() -> None:
-    """The viscosity is U L / Re, the top wall alone moves, the fluid is at rest and fills the box evenly."""
+    """The viscosity is U L / Re, the top wall alone moves, the fluid is at rest and
+    fills the box evenly.
+    """
     settings = plan(Case.CAVITY, reynolds=400.0, substeps=1, lid_speed=0.125, seed=3)
     state = experiment.initial_state(settings)
     assert state.viscosity == pytest.approx(0.125 * 0.875 / 400.0)
@@ -153,7 +194,9 @@ def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
     trace = state.affine[:, 0, 0] + state.affine[:, 1, 1]
     assert np.abs(trace).max() <= 2.0**-20
     assert state.viscosity == 0.0
-    viscous = experiment.initial_state(plan(Case.CURL_NOISE, substeps=1, frequency=5, reynolds=1000.0))
+    viscous = experiment.initial_state(
+        plan(Case.CURL_NOISE, substeps=1, frequency=5, reynolds=1000.0)
+    )
     speed = np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1)))
     assert viscous.viscosity == pytest.approx(speed * 0.925 / 1000.0)
 
@@ -166,7 +209,11 @@ def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
         (Case.CAVITY, {"reynolds": math.nan}, "positive"),
         (Case.CAVITY, {"reynolds": 0.5}, "too viscous"),
         (Case.CAVITY, {"reynolds": 100.0, "grid": 8}, "grid is too small"),
-        (Case.CAVITY, {"reynolds": 100.0, "particles": 1224}, "fewer particles than cells"),
+        (
+            Case.CAVITY,
+            {"reynolds": 100.0, "particles": 1224},
+            "fewer particles than cells",
+        ),
         (Case.CAVITY, {"reynolds": 100.0, "dt": 0.1}, "sound"),
         (Case.CAVITY, {"reynolds": 100.0, "lid_speed": 2.0}, "lid"),
         (Case.CAVITY, {"reynolds": 100.0, "lid_off_after": 10}, "lid stops"),
@@ -176,7 +223,9 @@ def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
         (Case.CURL_NOISE, {"frequency": 30}, "frequency"),
     ],
 )
-def test_plan_refuses_what_cannot_work(case: Case, settings: dict[str, Any], words: str) -> None:
+def test_plan_refuses_what_cannot_work(
+    case: Case, settings: dict[str, Any], words: str
+) -> None:
     """Every refusal is a usage error that says what is wrong and what was expected."""
     with pytest.raises(UsageError, match=words) as caught:
         plan(case, **{"substeps": 10, **settings})
@@ -196,13 +245,19 @@ def _arguments(folder: Path, *more: str) -> list[str]:
 
 
 def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
-    """Ghia's points with his values, errors that follow from them, checks, energy that grows.
+    """Ghia's points with his values, errors that follow from them, checks, energy that
+    grows.
 
     All but the timing is equal in a second run, to the byte; the picture is one.
     """
     texts = []
     for _ in range(2):
-        assert __main__.main(_arguments(tmp_path, "--profiles", str(tmp_path / "profiles.png"))) == 0
+        assert (
+            __main__.main(
+                _arguments(tmp_path, "--profiles", str(tmp_path / "profiles.png"))
+            )
+            == 0
+        )
         assert (tmp_path / "profiles.png").read_bytes().startswith(b"\x89PNG")
         found = json.loads((tmp_path / "result.json").read_text())
         assert found.pop("timing")["particle_substeps_per_second"] > 0.0
@@ -214,18 +269,36 @@ def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
     squares = [(point["u"] - point["ghia"]) ** 2 for point in lines["u"]]
     assert found["ghia"]["u_rmse"] == pytest.approx(math.sqrt(sum(squares) / 15))
     assert found["empty_cells"] == 0
-    assert found["jacobian"]["min"] <= found["jacobian"]["min_outside_lid_corners"] <= 1.0
+    assert (
+        found["jacobian"]["min"] <= found["jacobian"]["min_outside_lid_corners"] <= 1.0
+    )
     assert found["kinetic_energy"]["substep"] == list(range(0, 301, 20))
     assert found["kinetic_energy"]["value"] == sorted(found["kinetic_energy"]["value"])
     assert [check["substep"] for check in found["checks"]] == [300]
 
 
 def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
-    """The energy falls once the lid stops; at Re 250 there is no table, so errors are null."""
-    arguments = [*_arguments(tmp_path), "--re", "250", "--substeps", "600", "--lid-off-after", "300"]
+    """The energy falls once the lid stops; at Re 250 there is no table, so errors are
+    null.
+    """
+    arguments = [
+        *_arguments(tmp_path),
+        "--re",
+        "250",
+        "--substeps",
+        "600",
+        "--lid-off-after",
+        "300",
+    ]
     assert __main__.main(arguments) == 0
     found = json.loads((tmp_path / "result.json").read_text())
-    energy = dict(zip(found["kinetic_energy"]["substep"], found["kinetic_energy"]["value"], strict=True))
+    energy = dict(
+        zip(
+            found["kinetic_energy"]["substep"],
+            found["kinetic_energy"]["value"],
+            strict=True,
+        )
+    )
     assert energy[600] < 0.95 * energy[300]
     assert found["largest_rise_after_lid_off"] < 0.0
     assert found["ghia"] is None
@@ -233,9 +306,20 @@ def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> No
 
 
 def test_validate_curl_noise(tmp_path: Path) -> None:
-    """Most of the energy is left after ten frames, and divergence is small against vorticity."""
+    """Most of the energy is left after ten frames, and divergence is small against
+    vorticity.
+    """
     target = tmp_path / "curl.json"
-    options = ["--case", "curl-noise", "--grid", "20", "--frequency", "2", "--substeps", "500"]
+    options = [
+        "--case",
+        "curl-noise",
+        "--grid",
+        "20",
+        "--frequency",
+        "2",
+        "--substeps",
+        "500",
+    ]
     assert __main__.main([*options, "--json", str(target)]) == 0
     found = json.loads(target.read_text())
     assert found["centre_lines"] is None

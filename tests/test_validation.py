@@ -1,4 +1,6 @@
-"""Validation while a model is trained: the scorer's digits, how often, and what a training then says."""
+"""Validation while a model is trained: the scorer's digits, how often, and what a
+training then says.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +32,21 @@ Run = Callable[..., TrainingResult]
 
 @pytest.fixture
 def run(
-    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> Run:
     """Train on tiny curl-noise data."""
     return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift)
 
 
-def validated_on_test(weights: Path, registry: Registry, root: Path, split: str) -> float:
-    """Return what validation says of stored weights when the test subset stands in for valid."""
+def validated_on_test(
+    weights: Path, registry: Registry, root: Path, split: str
+) -> float:
+    """Return what validation says of stored weights when the test subset stands in for
+    valid.
+    """
     task = load_scored_task(registry.size(split, "tiny"), root)
     frames = {}
     for scenario in task.scenarios:
@@ -49,8 +58,16 @@ def validated_on_test(weights: Path, registry: Registry, root: Path, split: str)
 
 def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
     """Return what the score card says of the predictions of stored weights."""
-    predict(weights, weights.with_name("predictions.nc"), root=root, registry=registry, threads=1)
-    card = score(weights.with_name("predictions.nc"), root=root, registry=registry, write=False)
+    predict(
+        weights,
+        weights.with_name("predictions.nc"),
+        root=root,
+        registry=registry,
+        threads=1,
+    )
+    card = score(
+        weights.with_name("predictions.nc"), root=root, registry=registry, write=False
+    )
     return card.scores["submission"][name].mean
 
 
@@ -58,7 +75,9 @@ def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
 def test_digits_of_the_scorer_in_a_full_box(
     run: Run, generated: GenerationResult, unmeasured: Registry, baseline: str
 ) -> None:
-    """On the same scenarios validation and score card have the same vorticity NRMSE, to the digit."""
+    """On the same scenarios validation and score card have the same vorticity NRMSE, to
+    the digit.
+    """
     result = run(baseline, "steps=2")
     assert result.metric == "vorticity_nrmse"
     there = (result.weights, unmeasured, generated.root)
@@ -68,7 +87,9 @@ def test_digits_of_the_scorer_in_a_full_box(
 def test_digits_of_the_scorer_on_the_free_surface(
     run: Run, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
 ) -> None:
-    """The same for the distance of clouds, although rollouts end where the truth rests."""
+    """The same for the distance of clouds, although rollouts end where the truth
+    rests.
+    """
     root = tiny_split("fluid").root
     result = run("neuralmpm", "steps=2", root=root, split="fluid")
     assert result.metric == "cloud_distance"
@@ -77,7 +98,9 @@ def test_digits_of_the_scorer_on_the_free_surface(
 
 
 def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None:
-    """Every scenario of valid counts, the test subset is not needed, and a lost scenario is told."""
+    """Every scenario of valid counts, the test subset is not needed, and a lost
+    scenario is told.
+    """
     root = copied()
     for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
         file.unlink()
@@ -91,7 +114,8 @@ def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None
 
 
 def test_how_often() -> None:
-    """Validations share a training evenly, the last step among them, and take at most 15 % of it.
+    """Validations share a training evenly, the last step among them, and take at most
+    15 % of it.
 
     What a recipe names in `validate_every` wins; 0 means never.
     """
@@ -103,17 +127,26 @@ def test_how_often() -> None:
         (10, 1, 720, 1),
     ):
         count = options.validations(steps, trained=trained, rolled=rolled)
-        at = [s for s in range(1, steps + 1) if options.is_validated(s, steps=steps, validations=count)]
+        at = [
+            s
+            for s in range(1, steps + 1)
+            if options.is_validated(s, steps=steps, validations=count)
+        ]
         assert len(at) == count == expected
         assert at[-1] == steps
         assert at[count // 2 - 1] == steps // 2 or count == 1
-    options, never = TrainingOptions(validate_every=4), TrainingOptions(validate_every=0)
-    assert [s for s in range(1, 11) if options.is_validated(s, steps=10, validations=1)] == [4, 8, 10]
+    options = TrainingOptions(validate_every=4)
+    never = TrainingOptions(validate_every=0)
+    assert [
+        s for s in range(1, 11) if options.is_validated(s, steps=10, validations=1)
+    ] == [4, 8, 10]
     assert not any(never.is_validated(s, steps=10, validations=8) for s in range(1, 11))
 
 
 def test_what_a_training_says(run: Run) -> None:
-    """Record, weights and result tell windows, epochs, times, machine, and the best validation."""
+    """Record, weights and result tell windows, epochs, times, machine, and the best
+    validation.
+    """
     settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
     result = run("drift", *settings, "learning_rate=0.5")
     record = json.loads((result.folder / "training.json").read_text())
@@ -126,7 +159,9 @@ def test_what_a_training_says(run: Run) -> None:
     told = [[entry["step"], entry["vorticity_nrmse"]] for entry in record["validation"]]
     assert budget["validations"] == told
     assert [step for step, _ in told] == [2, 4, 6, 8]
-    assert (budget["best_step"], budget["best"]) == tuple(min(told, key=lambda one: one[1]))
+    assert (budget["best_step"], budget["best"]) == tuple(
+        min(told, key=lambda one: one[1])
+    )
     assert stored["step"] == result.best_step == budget["best_step"] < 8
     assert (budget["gpu_hours"], result.gpu_seconds) == (0.0, 0.0)
     spent = 3600 * (budget["cpu_hours"] + budget["validation_hours"])
@@ -136,19 +171,32 @@ def test_what_a_training_says(run: Run) -> None:
 def test_long_records_are_thinned(run: Run) -> None:
     """Of 22 validations a budget tells at most 20, the last one among them."""
     result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
-    told = json.loads((result.folder / "training.json").read_text())["budget"]["validations"]
+    told = json.loads((result.folder / "training.json").read_text())["budget"][
+        "validations"
+    ]
     assert len(told) <= 20
     assert told[-1][0] == 22
 
 
-def test_fewer_frames_for_tests(run: Run, generated: GenerationResult, unmeasured: Registry) -> None:
-    """`validation_frames` shortens the rollouts, and the metric is that of the shorter task."""
+def test_fewer_frames_for_tests(
+    run: Run, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """`validation_frames` shortens the rollouts, and the metric is that of the shorter
+    task.
+    """
     settings = ("steps=1", "validation_frames=4")
     result = run("drift", *settings)
-    task = load_scored_task(unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid")
+    task = load_scored_task(
+        unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid"
+    )
     short = replace(task, setting=replace(task.setting, horizon=4))
-    model = Drift.build({}, facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured))
+    model = Drift.build(
+        {}, facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    )
     model.load_state_dict(dict(load(result.checkpoint).weights))
     whole = dict.fromkeys(task.scenarios, 20)
-    assert Validation(task=short, frames=dict.fromkeys(task.scenarios, 4))(model) == result.best_value
+    assert (
+        Validation(task=short, frames=dict.fromkeys(task.scenarios, 4))(model)
+        == result.best_value
+    )
     assert Validation(task=task, frames=whole)(model) != result.best_value

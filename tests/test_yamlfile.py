@@ -18,7 +18,9 @@ def _write(folder: Path, text: str | bytes) -> Path:
 
 
 def test_plain_values_are_read(tmp_path: Path) -> None:
-    """Mappings, lists, numbers and strings; a file that is missing or over the bound is named."""
+    """Mappings, lists, numbers and strings; a file that is missing or over the bound is
+    named.
+    """
     text = "a: [1, 2.5, x]\nb: {c: true}\n"
     assert read_yaml(_write(tmp_path, text)) == {"a": [1, 2.5, "x"], "b": {"c": True}}
     with pytest.raises(UnreadableFileError, match=f"at most {MAX_BYTES} bytes"):
@@ -42,7 +44,9 @@ def test_plain_values_are_read(tmp_path: Path) -> None:
         ("[" * 5000 + "]" * 5000, "nested deeper than 32"),
     ],
 )
-def test_what_is_not_plain_is_refused(tmp_path: Path, text: str | bytes, says: str) -> None:
+def test_what_is_not_plain_is_refused(
+    tmp_path: Path, text: str | bytes, says: str
+) -> None:
     """Bombs, doubled keys, Python objects and broken text end in one clear error."""
     with pytest.raises(UnreadableFileError, match=says):
         read_yaml(_write(tmp_path, text))
@@ -68,17 +72,24 @@ def test_what_is_not_plain_is_refused(tmp_path: Path, text: str | bytes, says: s
         ("yes", True),
     ],
 )
-def test_numbers_are_those_of_yaml_1_2(tmp_path: Path, text: str, value: object) -> None:
-    """Base 60, underscores and binary are text, 010 is ten, an exponent needs no point."""
+def test_numbers_are_those_of_yaml_1_2(
+    tmp_path: Path, text: str, value: object
+) -> None:
+    """Base 60, underscores and binary are text, 010 is ten, an exponent needs no
+    point.
+    """
     found = read_yaml(_write(tmp_path, f"a: {text}\n"))["a"]
     assert (found, type(found)) == (value, type(value))
 
 
 @pytest.mark.parametrize(
-    "text", ["12e45678", "1e3", "0x10", "0o17", ".5", "59:59:1.5", "true", "-", "a: b", "é"]
+    "text",
+    ["12e45678", "1e3", "0x10", "0o17", ".5", "59:59:1.5", "true", "-", "a: b", "é"],
 )
 def test_text_stays_text(text: str, tmp_path: Path) -> None:
-    """Hashes that look like numbers among them: what is written is read as the same value."""
+    """Hashes that look like numbers among them: what is written is read as the same
+    value.
+    """
     path = tmp_path / "held.yaml"
     path.write_text(spell_yaml({"held": [text, 1.5, 7]}), encoding="utf-8")
     assert read_yaml(path) == {"held": [text, 1.5, 7]}

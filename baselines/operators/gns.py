@@ -13,15 +13,22 @@ class GNS(Operator):
 
     .. math:: a_i = \sum_j m_{ij}
 
-    With the network's node MLP: :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. It gathers
-    the same with the option ``sum_messages: false``, which changes other operators' node inputs.
+    With the network's node MLP:
+    :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. It gathers the
+    same with the option ``sum_messages: false``, which changes other operators' node
+    inputs.
     """
 
     method = "GNS"
     reads_nodes = False
 
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return summed(edge_index, edge, len(node)), {}

@@ -17,10 +17,9 @@ Losses = Mapping[str, Tensor]  # losses of an operator's own by name, each a sca
 class Operator(nn.Module):
     """An aggregation; node MLP, LayerNorm and residual follow it in the network.
 
-    Class attributes:
-        method: what the board calls a graph network with this operator.
-        weights: weight of each of its own losses in training.
-        reads_nodes: whether it looks at the nodes; else they are not put beside the sums for it.
+    Class attributes: method: what the board calls a graph network with this operator.
+        weights: weight of each of its own losses in training. reads_nodes: whether it
+        looks at the nodes; else they are not put beside the sums for it.
 
     Args:
         inputs: width of a node's input.
@@ -34,17 +33,24 @@ class Operator(nn.Module):
 
     def __init__(self, inputs: int, latent: int, hidden: int) -> None:
         super().__init__()
-        self.inputs, self.latent, self.hidden = inputs, latent, hidden
+        self.inputs = inputs
+        self.latent = latent
+        self.hidden = hidden
 
     @abstractmethod
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and losses of its own if any.
 
         Args:
-            node: latent of each particle, by default beside the sum of the updates of the edges
-                that it receives, shape [particle, inputs].
+            node: latent of each particle, by default beside the sum of the updates of
+                the edges that it receives, shape [particle, inputs].
             edge_index: senders and receivers, shape [2, edge].
             edge: update of each edge, shape [edge, latent].
             generator: source of random numbers; None asks for the same draw every time.
@@ -64,7 +70,12 @@ class Convolution(Operator):
         self.conv = self.layer(inputs, latent, edge_dim=latent)
 
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         return self.conv(node, edge_index, edge), {}

@@ -15,8 +15,8 @@ class PointNet(Operator):
 
     .. math:: a_i = \max_{j \in N(i) \cup \{i\}} h(s_j, m_{ij}), \quad m_{ii} = 0
 
-    h is an MLP of one hidden layer; m_ij stands where PointNet++ has relative positions, the
-    network's node MLP where it has its second MLP.
+    h is an MLP of one hidden layer; m_ij stands where PointNet++ has relative
+    positions, the network's node MLP where it has its second MLP.
     """
 
     method = "GNS + PointNetConv"
@@ -28,7 +28,12 @@ class PointNet(Operator):
         self.local = nn.Sequential(nn.ReLU(inplace=True), Linear(hidden, latent))
 
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: torch.Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers."""
         sender, receiver = edge_index

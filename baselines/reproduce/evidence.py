@@ -1,9 +1,10 @@
-"""What is known of each model: scores, costs, training; from the leaderboard and from runs.
+"""What is known of each model: scores, costs, training; from the leaderboard and from
+runs.
 
-The committed files suffice: entries and score files of ``leaderboard/``, and what each training recorded,
-``<weights>/<split>/<size>/<name>_<seed>.json``. Folders of runs, ``runs/<split>/<size>/<name>-<seed>/``, add
-what is not committed yet. A *name* is that of a baseline, or of a baseline and a variant, as in
-``gns-novorticity``.
+The committed files suffice: entries and score files of ``leaderboard/``, and what each
+training recorded, ``<weights>/<split>/<size>/<name>_<seed>.json``. Folders of runs,
+``runs/<split>/<size>/<name>-<seed>/``, add what is not committed yet. A *name* is that
+of a baseline, or of a baseline and a variant, as in ``gns-novorticity``.
 """
 
 from __future__ import annotations
@@ -36,14 +37,20 @@ from .thesis import ROSTER
 
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"
-"""Where committed weights and the records of their trainings lie, as `lagbench submit --weights` put them."""
+"""Where committed weights and the records of their trainings lie, as
+`lagbench submit --weights` put them.
+"""
 
 STUDIES = Path("docs/studies")
-"""Where committed results lie that are no entries: of studies and protocols of the thesis."""
+"""Where committed results lie that are no entries: of studies and protocols of the
+thesis.
+"""
 
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
 WORDS = re.compile(r"recipe (\S+), step \d+(?:, (?:predicted with )?(.*))?$")
-"""What predictions say of a training by one of our recipes: its name and what was changed."""
+"""What predictions say of a training by one of our recipes: its name and what was
+changed.
+"""
 
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
@@ -62,7 +69,9 @@ class Cost:
     def speed_up(self) -> float | None:
         """Solver time over model time; None where the solver was not measured."""
         solver = self.solver_seconds_per_frame
-        return None if solver is None else solver / self.seconds_per_frame
+        if solver is None:
+            return None
+        return solver / self.seconds_per_frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -71,19 +80,27 @@ class Seeded:
 
     seed: int | None  # None for what has none
     scores: Mapping[str, Score]  # by metric
-    record: Mapping[str, Any]  # what training.json or else the entry says of it; empty where none does
+    record: Mapping[
+        str, Any
+    ]  # what training.json or else the entry says of it; empty where none does
     path: Path  # file of the scores
 
     @property
     def cpu_hours(self) -> float | None:
-        """Processor time of the training without its validations, as entries tell it [h]."""
+        """Processor time of the training without its validations, as entries tell it
+        [h].
+        """
         if "budget" in self.record:
             hours = self.record["budget"]["cpu_hours"]
-            return None if hours is None else float(hours)
+            if hours is None:
+                return None
+            return float(hours)
         seconds = self.record.get("cpu_seconds")
         if seconds is None:
             return None
-        return (float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)) / 3600.0
+        return (
+            float(seconds) - float(self.record.get("validation_cpu_seconds") or 0.0)
+        ) / 3600.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,42 +114,69 @@ class Method:
 
     @cached_property
     def scores(self) -> Mapping[str, Score]:
-        """Scores by metric: the mean over the seeds that have a value, per scenario and frame."""
-        common = [n for n in self.seeds[0].scores if all(n in held.scores for held in self.seeds)]
-        return {name: _joined([held.scores[name] for held in self.seeds]) for name in common}
+        """Scores by metric: the mean over the seeds that have a value, per scenario and
+        frame.
+        """
+        common = [
+            n
+            for n in self.seeds[0].scores
+            if all(n in held.scores for held in self.seeds)
+        ]
+        return {
+            name: _joined([held.scores[name] for held in self.seeds]) for name in common
+        }
 
     @property
     def hours_per_seed(self) -> float | None:
-        """Processor time of a training [h], the mean of those recorded; None where none was."""
+        """Processor time of a training [h], the mean of those recorded; None where none
+        was.
+        """
         known = [hours for held in self.seeds if (hours := held.cpu_hours) is not None]
-        return fmean(known) if known else None
+        if known:
+            return fmean(known)
+        return None
 
     def of_seeds(self, seeds: Collection[int | None]) -> Method:
         """Return this model with the trainings of some seeds only, in their order."""
         held = [one for one in self.seeds if one.seed in seeds]
-        return replace(self, seeds=tuple(sorted(held, key=lambda one: -1 if one.seed is None else one.seed)))
+        return replace(
+            self,
+            seeds=tuple(
+                sorted(held, key=lambda one: -1 if one.seed is None else one.seed)
+            ),
+        )
 
     def spread(self, metric: str) -> float:
-        """Return the sample deviation over seeds of the mean over scenarios; NaN for one seed."""
+        """Return the sample deviation over seeds of the mean over scenarios; NaN for
+        one seed.
+        """
         means = [held.scores[metric].mean for held in self.seeds]
-        return float(np.std(means, ddof=1)) if len(means) > 1 else math.nan
+        if len(means) > 1:
+            return float(np.std(means, ddof=1))
+        return math.nan
 
     def at(self, metric: str, frame: int, scenario: int | None = None) -> float:
-        """Return a metric at an absolute frame, of one scenario or the mean over all; NaN if not measured.
+        """Return a metric at an absolute frame, of one scenario or the mean over all;
+        NaN if not measured.
 
         Of floors only means are kept.
         """
         if metric not in self.scores:
             return math.nan
-        values, scenarios = self.scores[metric].at(frame), self.scores[metric].scenarios
+        values = self.scores[metric].at(frame)
+        scenarios = self.scores[metric].scenarios
         if scenario is None:
             return mean(values)
-        return float(values[scenarios.index(scenario)]) if len(values) == len(scenarios) else math.nan
+        if len(values) == len(scenarios):
+            return float(values[scenarios.index(scenario)])
+        return math.nan
 
     def over_horizon(self, metric: str, scenario: int) -> float:
         """Return a metric of one scenario over the horizon; NaN if not measured."""
         score = self.scores.get(metric)
-        return math.nan if score is None else float(score.values[score.scenarios.index(scenario)])
+        if score is None:
+            return math.nan
+        return float(score.values[score.scenarios.index(scenario)])
 
 
 def _joined(scores: Sequence[Score]) -> Score:
@@ -142,7 +186,9 @@ def _joined(scores: Sequence[Score]) -> Score:
         warnings.simplefilter("ignore", RuntimeWarning)  # undefined for all seeds: NaN
         frames = np.nanmean([score.per_frame for score in scores], axis=0)
         values = np.nanmean([score.values for score in scores], axis=0)
-    undefined = tuple(map(sum, zip(*(score.undefined for score in scores), strict=True)))
+    undefined = tuple(
+        map(sum, zip(*(score.undefined for score in scores), strict=True))
+    )
     return replace(scores[0], per_frame=frames, values=values, undefined=undefined)
 
 
@@ -151,7 +197,9 @@ def ordered(scores: Mapping[str, Score]) -> list[str]:
 
     def loss(name: str) -> float:
         value = scores[name].mean
-        return math.inf if math.isnan(value) else scores[name].metric.loss(value)
+        if math.isnan(value):
+            return math.inf
+        return scores[name].metric.loss(value)
 
     return sorted(scores, key=lambda name: (loss(name), name))
 
@@ -161,10 +209,14 @@ class Sources:
     """Where evidence lies."""
 
     board: Path | None = BOARD  # the leaderboard's folder; None to use runs alone
-    weights: Path = WEIGHTS  # folder of committed weights and what their trainings recorded
+    weights: Path = (
+        WEIGHTS  # folder of committed weights and what their trainings recorded
+    )
     runs: Path | None = None  # folder of runs; None to use committed files alone
     studies: Path = STUDIES  # folder of committed results that are no entries
-    recipe: str | None = None  # variant of the recipes whose runs to read; None for the size's own
+    recipe: str | None = (
+        None  # variant of the recipes whose runs to read; None for the size's own
+    )
     registry: Registry | None = None  # where splits are described; ours when None
     left_out: frozenset[Path] = frozenset()  # folders of runs that are not to be read
 
@@ -174,10 +226,17 @@ class Sources:
 
     def entries(self, split: str, size: str) -> dict[str, Path]:
         """Return the entries of the board by name."""
-        folder = self.board / "submissions" / split / size if self.board else None
-        return {path.stem: path for path in sorted(folder.glob("*.yaml"))} if folder else {}
+        if self.board:
+            folder = self.board / "submissions" / split / size
+        else:
+            folder = None
+        if folder:
+            return {path.stem: path for path in sorted(folder.glob("*.yaml"))}
+        return {}
 
-    def record(self, split: str, size: str, name: str, seed: int | None) -> Mapping[str, Any]:
+    def record(
+        self, split: str, size: str, name: str, seed: int | None
+    ) -> Mapping[str, Any]:
         """Return what a committed training recorded; nothing where it is not there."""
         return read_json(self.weights / split / size / f"{name}_{seed or 0}.json")
 
@@ -191,7 +250,9 @@ class Sources:
         home = self.runs / split
         homes = {"": home / (f"{size}-{self.recipe}" if self.recipe else size)}
         if self.recipe is None:
-            homes |= {path.name[len(size) :]: path for path in sorted(home.glob(f"{size}-*"))}
+            homes |= {
+                path.name[len(size) :]: path for path in sorted(home.glob(f"{size}-*"))
+            }
         for variant, folder in homes.items():
             for run in sorted(folder.glob("*-*")):
                 if run not in self.left_out and (found := RUN.fullmatch(run.name)):
@@ -202,27 +263,41 @@ class Evidence:
     """What is known of the models on one split and size."""
 
     def __init__(self, sources: Sources, split: str, size: str) -> None:
-        """Read entries, score files and records; committed ones win over runs of the same seed."""
+        """Read entries, score files and records; committed ones win over runs of the
+        same seed.
+        """
         self.size = sources.size(split, size)
         self.methods: dict[str, Method] = {}  # by name, floors among them
-        self.stale: list[Path] = []  # score files of another version of the data, which are left out
+        self.stale: list[
+            Path
+        ] = []  # score files of another version of the data, which are left out
         self._weights = sources.weights / split / size
         for name, path in sources.entries(split, size).items():
             entry = read_yaml(path)
             files = list(_score_files(path, entry))  # refuses what is no entry
-            cost = Cost(**entry["cost"]) if entry.get("cost") else None
+            if entry.get("cost"):
+                cost = Cost(**entry["cost"])
+            else:
+                cost = None
             for made, file in files:
                 seed = made.get("seed")
                 record = sources.record(split, size, name, seed) or _told(entry, made)
                 if not record and name in ROSTER and ROSTER[name].weights:
                     record = sources.record(split, size, ROSTER[name].weights, seed)
                 self._add(name, seed, file, record, cost, entry.get("parameters"))
-        committed = {(name, held.seed) for name, method in self.methods.items() for held in method.seeds}
+        committed = {
+            (name, held.seed)
+            for name, method in self.methods.items()
+            for held in method.seeds
+        }
         for name, seed, folder in sources.run_folders(split, size):
             file = folder / NETCDF_NAME
             if file.is_file() and not {(name, seed), (name, None)} & committed:
-                record = read_json(folder / RECORD_NAME) or sources.record(split, size, name, seed)
-                said, cost = read_json(folder / COST_NAME), None
+                record = read_json(folder / RECORD_NAME) or sources.record(
+                    split, size, name, seed
+                )
+                said = read_json(folder / COST_NAME)
+                cost = None
                 if "seconds_per_frame" in said:
                     cost = Cost(
                         seconds_per_frame=float(said["seconds_per_frame"]),
@@ -231,7 +306,9 @@ class Evidence:
                     )
                 self._add(name, seed, file, record, cost)
         for floor in (shipped(self.size) or {}).values():
-            held = Seeded(seed=None, scores=floor.scores, record={}, path=shipped_path(self.size))
+            held = Seeded(
+                seed=None, scores=floor.scores, record={}, path=shipped_path(self.size)
+            )
             self.methods.setdefault(floor.name, Method(name=floor.name, seeds=(held,)))
 
     def _add(
@@ -244,14 +321,18 @@ class Evidence:
         parameters: int | None = None,
     ) -> None:
         """Add one training to a method, unless its scores are of other data."""
-        stored, measured = read_statistics(path), self.size.measured
+        stored = read_statistics(path)
+        measured = self.size.measured
         if measured and stored.identity["dataset_sha256"] != measured.dataset_sha256:
             self.stale.append(path)
             return
         known = self.methods.get(name) or Method(name=name, seeds=())
         self.methods[name] = Method(
             name=name,
-            seeds=(*known.seeds, Seeded(seed=seed, scores=stored.scores(), record=record, path=path)),
+            seeds=(
+                *known.seeds,
+                Seeded(seed=seed, scores=stored.scores(), record=record, path=path),
+            ),
             cost=known.cost or cost,
             parameters=known.parameters or record.get("parameters") or parameters,
         )
@@ -274,59 +355,108 @@ class Evidence:
     @property
     def models(self) -> dict[str, Method]:
         """Everything else, in the order of names."""
-        return {name: self.methods[name] for name in sorted(self.methods) if name not in FLOORS}
+        return {
+            name: self.methods[name]
+            for name in sorted(self.methods)
+            if name not in FLOORS
+        }
 
     def order(self, names: Collection[str] | None = None) -> list[str]:
-        """Return those of some models, of all methods by default, that are ranked, best first."""
-        chosen = {n: self.methods[n] for n in (self.methods if names is None else names) if n in self.methods}
-        return ordered({n: m.scores[self.ranking] for n, m in chosen.items() if self.ranking in m.scores})
+        """Return those of some models, of all methods by default, that are ranked, best
+        first.
+        """
+        chosen = {
+            n: self.methods[n]
+            for n in (self.methods if names is None else names)
+            if n in self.methods
+        }
+        return ordered(
+            {
+                n: m.scores[self.ranking]
+                for n, m in chosen.items()
+                if self.ranking in m.scores
+            }
+        )
 
     @property
     def best_floor(self) -> str | None:
-        """Name of the floor that skill is measured from, as the scorer has it; None where none was scored."""
-        counting = {n: m for n, m in self.methods.items() if n in COUNTING and self.ranking in m.scores}
+        """Name of the floor that skill is measured from, as the scorer has it; None
+        where none was scored.
+        """
+        counting = {
+            n: m
+            for n, m in self.methods.items()
+            if n in COUNTING and self.ranking in m.scores
+        }
         return best_floor({n: m.scores[self.ranking] for n, m in counting.items()})
 
     def skill(self, name: str) -> float:
-        """Return ``1 - score / score of the best floor`` by the ranking metric: 1 perfect, 0 no learning."""
+        """Return ``1 - score / score of the best floor`` by the ranking metric: 1
+        perfect, 0 no learning.
+        """
         floor = self.best_floor
         if floor is None or self.ranking not in self.methods[name].scores:
             return math.nan
         return (
-            1.0 - self.methods[name].scores[self.ranking].mean / self.methods[floor].scores[self.ranking].mean
+            1.0
+            - self.methods[name].scores[self.ranking].mean
+            / self.methods[floor].scores[self.ranking].mean
         )
 
     def trained(self, name: str) -> bool:
-        """Return whether there is a committed record of a training, with scores or without."""
+        """Return whether there is a committed record of a training, with scores or
+        without.
+        """
         return any(self._weights.glob(f"{name}_[0-9]*.json"))
 
 
 def _score_files(path: Path, entry: Any) -> Iterator[tuple[Mapping[str, Any], Path]]:  # noqa: ANN401
-    """Yield every prediction of an entry, submissions/<split>/<size>/<name>.yaml, and its score file."""
+    """Yield every prediction of an entry, submissions/<split>/<size>/<name>.yaml, and
+    its score file.
+    """
     try:
         predictions = [(made.get("seed"), made) for made in entry["predictions"]]
     except (TypeError, KeyError, AttributeError) as error:
-        raise UnreadableFileError("no entry of a leaderboard", where=str(path), got=error) from None
+        raise UnreadableFileError(
+            "no entry of a leaderboard", where=str(path), got=error
+        ) from None
     board = path.parents[3]
     scores = board / "scores" / path.parent.relative_to(board / "submissions")
     for seed, made in predictions:
-        yield made, scores / (f"{path.stem}.nc" if len(predictions) == 1 else f"{path.stem}_{seed}.nc")
+        yield (
+            made,
+            scores
+            / (
+                f"{path.stem}.nc" if len(predictions) == 1 else f"{path.stem}_{seed}.nc"
+            ),
+        )
 
 
 def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what an entry says of a training by one of our recipes, in the terms of training.json."""
-    words, paid = WORDS.search(entry.get("training") or ""), made.get("budget") or {}
-    if not paid and len(entry["predictions"]) == 1:  # of several seeds the entry has the mean
+    """Return what an entry says of a training by one of our recipes, in the terms of
+    training.json.
+    """
+    words = WORDS.search(entry.get("training") or "")
+    paid = made.get("budget") or {}
+    if (
+        not paid and len(entry["predictions"]) == 1
+    ):  # of several seeds the entry has the mean
         paid = entry.get("budget") or {}
     if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
         return {}
-    device, windows = paid.get("device") or entry.get("hardware"), paid.get("windows")
+    device = paid.get("device") or entry.get("hardware")
+    windows = paid.get("windows")
     metric = paid.get("metric")
-    validations = paid.get("validations") if metric else None
+    if metric:
+        validations = paid.get("validations")
+    else:
+        validations = None
     told = {
         "step": paid["steps"],
         "cpu_seconds": 3600.0 * paid["cpu_hours"],
-        "validation": [{"step": step, metric: value} for step, value in validations or ()],
+        "validation": [
+            {"step": step, metric: value} for step, value in validations or ()
+        ],
         "recipe": {
             "name": words[1],
             "changed": words[2],
@@ -338,7 +468,11 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
             "threads": paid.get("threads", 1),
         },
     }
-    return told | ({"windows": round(windows / paid["epochs"])} if windows and paid.get("epochs") else {})
+    return told | (
+        {"windows": round(windows / paid["epochs"])}
+        if windows and paid.get("epochs")
+        else {}
+    )
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -348,16 +482,22 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UnreadableFileError("cannot read the JSON file", where=str(path), got=error) from None
+        raise UnreadableFileError(
+            "cannot read the JSON file", where=str(path), got=error
+        ) from None
     if not isinstance(held, dict):
-        raise UnreadableFileError("no JSON mapping", where=str(path), got=type(held).__name__)
+        raise UnreadableFileError(
+            "no JSON mapping", where=str(path), got=type(held).__name__
+        )
     return held
 
 
 def budget(record: Mapping[str, Any]) -> str:
     """Return steps and windows of a step, as in "5,000 x 2"; a dash where unknown."""
     if "windows" not in record:
-        return "closed form" if record.get("step") == 1 else "-"
+        if record.get("step") == 1:
+            return "closed form"
+        return "-"
     return f"{record['step']:,} x {record['recipe']['training']['batch']}"
 
 
@@ -368,5 +508,8 @@ def hardware(record: Mapping[str, Any]) -> str:
         return "-"
     if said["device"] != "cpu":
         return str(said["device"])
-    threads = "1 thread" if said["threads"] == 1 else f"{said['threads']} threads"
+    if said["threads"] == 1:
+        threads = "1 thread"
+    else:
+        threads = f"{said['threads']} threads"
     return f"{said['processor']}, {threads}"

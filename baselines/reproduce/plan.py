@@ -31,7 +31,8 @@ TABLES: Mapping[str, tuple[str, str]] = {
 SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
 """Share of the thesis's epochs, and what its batch is divided by, by size."""
 
-STUDY_FILE = "mlp_studies.json"  # what the rows came to, in a folder of runs or of committed studies
+# what the rows came to, in a folder of runs or of committed studies
+STUDY_FILE = "mlp_studies.json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,15 +46,24 @@ class Plan:
     weights: Path = WEIGHTS  # folder of committed weights
     studies: Path = COMMITTED  # folder of committed results that are no entries
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
-    recipe: str | None = None  # variant of the recipes, as in short; None for the size's own
+    recipe: str | None = (
+        None  # variant of the recipes, as in short; None for the size's own
+    )
     settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
     device: str = "auto"
-    threads: int | None = None  # of a training on the CPU; one per core by default, one with workers
+    threads: int | None = (
+        None  # of a training on the CPU; one per core by default, one with workers
+    )
     registry: Registry | None = None  # where splits are described; ours when None
-    # folders of runs that could not be made, or are not those that were asked for: nothing of them is shown
+    # folders of runs that could not be made, or are not those that were asked for:
+    # nothing of them is shown
     failed: set[Path] = field(default_factory=set, compare=False, repr=False)
-    _evidence: dict[str, Evidence] = field(default_factory=dict, compare=False, repr=False)
-    _subsets: dict[str, ScoredTask] = field(default_factory=dict, compare=False, repr=False)
+    _evidence: dict[str, Evidence] = field(
+        default_factory=dict, compare=False, repr=False
+    )
+    _subsets: dict[str, ScoredTask] = field(
+        default_factory=dict, compare=False, repr=False
+    )
 
     @cached_property
     def described(self) -> Registry:
@@ -65,10 +75,15 @@ class Plan:
         return self.described.size(split, self.size)
 
     def hash(self, split: str) -> str | None:
-        """Return the hash of a split's data, those at hand before those recorded; None where unknown."""
+        """Return the hash of a split's data, those at hand before those recorded; None
+        where unknown.
+        """
         tier = self.tier(split)
         manifest = read_manifest(self.root, tier.split, tier.name, tier.major)
-        recorded = tier.measured.dataset_sha256 if tier.measured else None
+        if tier.measured:
+            recorded = tier.measured.dataset_sha256
+        else:
+            recorded = None
         return (manifest.dataset_sha256 if manifest else None) or recorded
 
     def has_recipe(self, split: str, model: Model) -> bool:
@@ -82,20 +97,30 @@ class Plan:
             known = recipe_names(find(model.baseline))
         except UsageError:  # it cannot be loaded: training says why
             return True
-        return any(f"{where}/{self.size}-{self.recipe}" in known for where in (split, "*"))
+        return any(
+            f"{where}/{self.size}-{self.recipe}" in known for where in (split, "*")
+        )
 
     def home(self, split: str) -> Path:
         """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""
-        return self.runs / split / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
+        return (
+            self.runs
+            / split
+            / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
+        )
 
     def folder(self, split: str, name: str, seed: int) -> Path:
         """Return the folder of one training."""
         return self.home(split) / f"{name}-{seed}"
 
     def predictions(self, split: str, name: str) -> Path | None:
-        """Return a model's predictions, those of the first seed asked for; None where none were scored."""
+        """Return a model's predictions, those of the first seed asked for; None where
+        none were scored.
+        """
         method = self.evidence(split).methods.get(name)
-        held = sorted(method.seeds if method else (), key=lambda one: one.seed != self.seeds[0])
+        held = sorted(
+            method.seeds if method else (), key=lambda one: one.seed != self.seeds[0]
+        )
         paths = [one.path.with_name(PREDICTIONS) for one in held]
         return next((path for path in paths if path.is_file()), None)
 
@@ -113,14 +138,18 @@ class Plan:
         )
 
     def evidence(self, split: str) -> Evidence:
-        """Return scores, costs and records of a split's runs; read once, after they are made."""
+        """Return scores, costs and records of a split's runs; read once, after they are
+        made.
+        """
         if split not in self._evidence:
             self._evidence[split] = Evidence(self.sources, split, self.size)
         return self._evidence[split]
 
     @property
     def stale(self) -> list[Path]:
-        """Score files of other data among the evidence that was read; they are left out."""
+        """Score files of other data among the evidence that was read; they are left
+        out.
+        """
         return [path for evidence in self._evidence.values() for path in evidence.stale]
 
     def test_subset(self, split: str) -> ScoredTask:
@@ -141,17 +170,27 @@ def study_rows(name: str) -> tuple[Study, ...]:
 
 
 def study_folder(plan: Plan, name: str, study: Study) -> Path:
-    """Return the folder of a row's training; it lies apart from the runs that are scored."""
-    return plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
+    """Return the folder of a row's training; it lies apart from the runs that are
+    scored.
+    """
+    return (
+        plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
+    )
 
 
 def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
-    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the record of ``training``.
+    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the
+    record of ``training``.
 
-    A row of a later folder goes before that of an earlier one; rows of data with another hash are left out.
+    A row of a later folder goes before that of an earlier one; rows of data with
+    another hash are left out.
     """
     held: dict[str, Any] = {}
     for home in homes:
         rows = read_json(home / STUDY_FILE).items()
-        held |= {name: row for name, row in rows if data in (None, row["training"]["dataset_sha256"])}
+        held |= {
+            name: row
+            for name, row in rows
+            if data in (None, row["training"]["dataset_sha256"])
+        }
     return held

@@ -1,11 +1,12 @@
-"""Write docs/results.md from committed files: claims, scores beside the thesis's numbers, costs.
+"""Write docs/results.md from committed files: claims, scores beside the thesis's
+numbers, costs.
 
-    python -m lagbench.baselines.reproduce.results -o docs/results.md [--board leaderboard]
-        [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
+    python -m lagbench.baselines.reproduce.results -o docs/results.md [--board
+        leaderboard] [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
 
-Score files and entries of the leaderboard and what trainings recorded suffice: no data set is read.
-``--runs`` adds what is not committed yet. The same files give the same bytes; ``--check`` writes nothing
-and fails where the page is stale.
+Score files and entries of the leaderboard and what trainings recorded suffice: no data
+set is read. ``--runs`` adds what is not committed yet. The same files give the same
+bytes; ``--check`` writes nothing and fails where the page is stale.
 """
 
 from __future__ import annotations
@@ -25,7 +26,17 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.scoring.tables import ARROWS
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
-from .evidence import BOARD, STUDIES, WEIGHTS, Evidence, Method, Sources, budget, hardware, read_json
+from .evidence import (
+    BOARD,
+    STUDIES,
+    WEIGHTS,
+    Evidence,
+    Method,
+    Sources,
+    budget,
+    hardware,
+    read_json,
+)
 from .plan import TABLES, known_studies, study_name, study_rows
 from .tables import rollout_table, studies_beside_thesis
 from .thesis import (
@@ -83,28 +94,49 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     found = [Evidence(sources, split, size) for size in sizes for split in EXPECTED]
     known = [evidence for evidence in found if evidence.methods]
     learned = [evidence for evidence in known if evidence.models]
-    parts = [HEAD, *_claims(learned), *(part for evidence in known for part in _chapter(evidence))]
+    parts = [
+        HEAD,
+        *_claims(learned),
+        *(part for evidence in known for part in _chapter(evidence)),
+    ]
     homes = [home for home in (sources.studies, sources.runs) if home]
-    protocols, studies = [], []
+    protocols = []
+    studies = []
     for size in sizes:
-        measured = next((p for home in homes if (p := home / "fluid" / size / FILE).is_file()), None)
+        measured = next(
+            (p for home in homes if (p := home / "fluid" / size / FILE).is_file()), None
+        )
         protocols += [beside_thesis(read_json(measured)).text] if measured else []
         for name, (_, split) in TABLES.items():
             data = sources.size(split, size).measured
-            trained = known_studies([h / split / size for h in homes], data.dataset_sha256 if data else None)
+            trained = known_studies(
+                [h / split / size for h in homes], data.dataset_sha256 if data else None
+            )
             if any(study_name(study) in trained for study in study_rows(name)):
                 studies.append(studies_beside_thesis(name, size, trained).text)
-    parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols] if protocols else []
+    parts += (
+        ["## VAR by the thesis's protocol (section 4.8.3)", *protocols]
+        if protocols
+        else []
+    )
     parts += ["## MLPs from frame to frame", *studies] if studies else []
     variants = []
     for model in (model for model in ROSTER.values() if model.varied):
         settings = "".join(f" --set {setting}" for setting in model.settings)
-        recipe = f" --recipe {model.recipe}" if model.recipe else ""
+        if model.recipe:
+            recipe = f" --recipe {model.recipe}"
+        else:
+            recipe = ""
         how = f"`--baseline {model.baseline}{recipe}{settings}`"
         if model.weights:
             how = f"`lagbench predict{settings}` with weights of `{model.weights}`"
         variants.append(f"- `{model.name}`: {how}")
-    parts += [COMMANDS, "\n".join(variants), "## Missing", "\n".join(_missing(found)) or "Nothing."]
+    parts += [
+        COMMANDS,
+        "\n".join(variants),
+        "## Missing",
+        "\n".join(_missing(found)) or "Nothing.",
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -116,8 +148,10 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
         return
     rows = {claim: {e.where: claim_rows(claim, e) for e in learned} for claim in CLAIMS}
     yield (
-        "By the ranking metric over the horizon: ahead in the mean; better (yes) and worse (no) at 5 %, open"
-        " otherwise. Two methods are compared by the seeds that both have, by all where they share none. A"
+        "By the ranking metric over the horizon: ahead in the mean; better (yes) and "
+        "worse (no) at 5 %, open"
+        " otherwise. Two methods are compared by the seeds that both have, by all "
+        "where they share none. A"
         " dash where an entry is missing."
     )
     yield markdown(
@@ -140,14 +174,27 @@ def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
         yield _markdown(ahead)
     yield "### What does a CPU hour buy?"
     yield (
-        "Validation: the least value up to a quarter, half and all of the steps, and what the last doubling"
-        " gained, of the first seed, in the metric that was validated. Models whose last doubling gained more"
-        " than 2 % have not converged. Hours are without validations, as in entries (the first"
+        "Validation: the least value up to a quarter, half and all of the steps, and "
+        "what the last doubling"
+        " gained, of the first seed, in the metric that was validated. Models whose "
+        "last doubling gained more"
+        " than 2 % have not converged. Hours are without validations, as in entries "
+        "(the first"
         " trainings of NeuralMPM did not time them apart)."
     )
-    heads = ("model", "steps x windows", "epochs", "CPU hours per seed", "skill", "validated")
+    heads = (
+        "model",
+        "steps x windows",
+        "epochs",
+        "CPU hours per seed",
+        "skill",
+        "validated",
+    )
     learning = ("validation at 1/4", "1/2", "1", "last doubling")
-    yield markdown(("where", *heads, *learning), [row for e in learned for row in _training_rows(e)])
+    yield markdown(
+        ("where", *heads, *learning),
+        [row for e in learned for row in _training_rows(e)],
+    )
 
 
 def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
@@ -156,13 +203,27 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
         method = evidence.models[name]
         record = method.seeds[0].record
         # beside the step an entry holds one number, the metric that was validated
-        held = [(e["step"], n, v) for e in record.get("validation", ()) for n, v in e.items() if n != "step"]
+        held = [
+            (e["step"], n, v)
+            for e in record.get("validation", ())
+            for n, v in e.items()
+            if n != "step"
+        ]
         best = [
-            min((value for step, _, value in held if step <= share * record["step"]), default=None)
+            min(
+                (value for step, _, value in held if step <= share * record["step"]),
+                default=None,
+            )
             for share in (0.25, 0.5, 1.0)
         ]
-        seen = record["step"] * record["recipe"]["training"]["batch"] if "windows" in record else None
-        gain = 1.0 - best[2] / best[1] if best[1] and best[2] is not None else None
+        if "windows" in record:
+            seen = record["step"] * record["recipe"]["training"]["batch"]
+        else:
+            seen = None
+        if best[1] and best[2] is not None:
+            gain = 1.0 - best[2] / best[1]
+        else:
+            gain = None
         yield [
             evidence.where,
             label(name),
@@ -177,14 +238,21 @@ def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
 
 
 def _chapter(evidence: Evidence) -> Iterator[str]:
-    """Yield what was scored on one split and size: over the horizon, beside the thesis, costs."""
-    from lagbench.baselines.job import changes_of  # loads torch, which the imports of this page do not
+    """Yield what was scored on one split and size: over the horizon, beside the thesis,
+    costs.
+    """
+    from lagbench.baselines.job import (
+        changes_of,
+    )  # loads torch, which the imports of this page do not
 
-    size, task = evidence.size, evidence.size.task
+    task = evidence.size.task
+    size = evidence.size
     yield f"## {evidence.where}"
     yield (
-        f"{size.particles} particles, {task.input_frames} frames given, {task.horizon} predicted,"
-        f" {len(size.subsets['test'])} test scenarios, {len(size.subsets['train'])} to train on; data set"
+        f"{size.particles} particles, {task.input_frames} frames given, "
+        f"{task.horizon} predicted,"
+        f" {len(size.subsets['test'])} test scenarios, {len(size.subsets['train'])} "
+        f"to train on; data set"
         f" {size.version}. Best first by `{evidence.ranking}`."
     )
     yield _horizon(evidence)
@@ -196,28 +264,51 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
     else:
         yield from _vorticity_at(evidence)
     yield (
-        "Cost. Recipe, and what training or prediction changed of it (`none`: nothing), seeds in their order"
-        " where they differ, from the entry's words where no record of the training lies beside it. Speed-up:"
-        " our solver's time for a frame on one core over the model's, same machine. Hours are without"
+        "Cost. Recipe, and what training or prediction changed of it (`none`: "
+        "nothing), seeds in their order"
+        " where they differ, from the entry's words where no record of the training "
+        "lies beside it. Speed-up:"
+        " our solver's time for a frame on one core over the model's, same machine. "
+        "Hours are without"
         " validations."
     )
-    heads = ("model", "recipe", "changed", "parameters", "seeds", "CPU hours per seed", "hardware")
+    heads = (
+        "model",
+        "recipe",
+        "changed",
+        "parameters",
+        "seeds",
+        "CPU hours per seed",
+        "hardware",
+    )
     rows = []
     for name, method in evidence.models.items():
-        record, cost = method.seeds[0].record, method.cost
+        record = method.seeds[0].record
+        cost = method.cost
         recipes = [held.record.get("recipe", {}) for held in method.seeds]
         changed = [
-            recipe.get("changed") or "; ".join(changes_of(recipe)) or ("none" if recipe else "-")
+            recipe.get("changed")
+            or "; ".join(changes_of(recipe))
+            or ("none" if recipe else "-")
             for recipe in recipes
         ]
-        paid = (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up) if cost else (None,) * 3
+        paid = (
+            (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up)
+            if cost
+            else (None,) * 3
+        )
         rows.append(
             [
                 label(name),
-                " / ".join(dict.fromkeys(recipe.get("name", "-") for recipe in recipes)),
+                " / ".join(
+                    dict.fromkeys(recipe.get("name", "-") for recipe in recipes)
+                ),
                 " / ".join(dict.fromkeys(changed)),
                 "-" if method.parameters is None else f"{method.parameters:,}",
-                ", ".join("-" if held.seed is None else str(held.seed) for held in method.seeds),
+                ", ".join(
+                    "-" if held.seed is None else str(held.seed)
+                    for held in method.seeds
+                ),
                 number(method.hours_per_seed),
                 hardware(record),
                 *map(number, paid),
@@ -227,52 +318,89 @@ def _chapter(evidence: Evidence) -> Iterator[str]:
 
 
 def _horizon(evidence: Evidence) -> str:
-    """Return the scores over the horizon of models and floors: skill, ranking metric, the chosen ones."""
+    """Return the scores over the horizon of models and floors: skill, ranking metric,
+    the chosen ones.
+    """
     free = evidence.size.split in TABLE_4_8
     held: dict[str, Metric] = {}
     for method in evidence.methods.values():
         held |= {name: score.metric for name, score in method.scores.items()}
-    chosen = [held[name] for name in dict.fromkeys((evidence.ranking, *CHOSEN)) if name in held]
+    chosen = [
+        held[name]
+        for name in dict.fromkeys((evidence.ranking, *CHOSEN))
+        if name in held
+    ]
     # vorticity says little where the material does not fill the box
     hidden = ("vorticity", "distributions") if free else ()
-    shown = [m for m in chosen if m.direction is not Direction.NONE and m.family not in hidden]
+    shown = [
+        m
+        for m in chosen
+        if m.direction is not Direction.NONE and m.family not in hidden
+    ]
 
     def cell(method: Method, metric: str) -> str:
         if metric not in method.scores:
             return "-"
         score = method.scores[metric]
-        spread = f" ± {number(method.spread(metric), 2)}" if len(method.seeds) > 1 else ""
-        undefined = f", {count} undefined" if (count := sum(score.undefined)) else ""
+        if len(method.seeds) > 1:
+            spread = f" ± {number(method.spread(metric), 2)}"
+        else:
+            spread = ""
+        if count := sum(score.undefined):
+            undefined = f", {count} undefined"
+        else:
+            undefined = ""
         return interval(score.mean, score.interval) + spread + undefined
 
     rows = []
     for name in evidence.order():
         method = evidence.methods[name]
-        seeds = "floor" if name in FLOORS else str(len(method.seeds))
+        if name in FLOORS:
+            seeds = "floor"
+        else:
+            seeds = str(len(method.seeds))
         cells = [cell(method, metric.name) for metric in shown]
         rows.append([label(name), number(evidence.skill(name)), seeds, *cells])
     heads = ["model", "skill", "seeds"]
     for m in shown:  # as in "position_rmse [length], lower"
-        goal = f" {m.perfect:g}" if m.direction is Direction.TARGET else ""
+        if m.direction is Direction.TARGET:
+            goal = f" {m.perfect:g}"
+        else:
+            goal = ""
         heads.append(f"{m.name} [{m.unit}], {ARROWS[m.direction]}{goal}")
     return markdown(heads, rows)
 
 
 def _vorticity_at(evidence: Evidence) -> Iterator[str]:
-    """Yield Tables 5.4 and 5.5 and Fig. 5.13's correlations: ours, T0 in brackets, the thesis's beside."""
-    frame, first = key_frame(evidence.size), scenario_of(evidence.size, 0)
-    thesis = TABLE_5_4 if evidence.size.split == "cavity" else {}
+    """Yield Tables 5.4 and 5.5 and Fig. 5.13's correlations: ours, T0 in brackets, the
+    thesis's beside.
+    """
+    frame = key_frame(evidence.size)
+    first = scenario_of(evidence.size, 0)
+    if evidence.size.split == "cavity":
+        thesis = TABLE_5_4
+    else:
+        thesis = {}
     measures = ("mae", "mse", "rmse", "kl", "pearson")
     yield (
-        f"Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame {frame}, mean over scenarios, in brackets the"
+        f"Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame {frame}, mean over "
+        f"scenarios, in brackets the"
         f" first test scenario (T0){'; the thesis has T0' if thesis else ''}."
     )
-    heads = [f"{m.upper()}{who}" for m in measures for who in (("", ", thesis") if thesis else ("",))]
-    models, rows = evidence.models, []
+    heads = [
+        f"{m.upper()}{who}"
+        for m in measures
+        for who in (("", ", thesis") if thesis else ("",))
+    ]
+    models = evidence.models
+    rows = []
     for name in dict.fromkeys(n for n in (*OPERATORS, *models) if n in models):
         row = [label(name)]
         for measure in measures:
-            values = [models[name].at(f"vorticity_{measure}", frame, where) for where in (None, first)]
+            values = [
+                models[name].at(f"vorticity_{measure}", frame, where)
+                for where in (None, first)
+            ]
             row.append(f"{number(values[0])} ({number(values[1])})")
             row += [number(thesis.get(name, {}).get(measure), 4)] if thesis else []
         rows.append(row)
@@ -285,7 +413,9 @@ def _vorticity_at(evidence: Evidence) -> Iterator[str]:
 
 
 def agreement(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return Kendall's tau of two rankings without ties: 1 the same order, -1 reversed, 0 unrelated."""
+    """Return Kendall's tau of two rankings without ties: 1 the same order, -1 reversed,
+    0 unrelated.
+    """
     pairs = list(combinations(zip(first, second, strict=True), 2))
     turned = sum((a - b) * (x - y) < 0.0 for (a, x), (b, y) in pairs)
     return 1.0 - 2.0 * turned / len(pairs)
@@ -294,15 +424,21 @@ def agreement(first: Sequence[float], second: Sequence[float]) -> float:
 def _missing(found: Sequence[Evidence]) -> Iterator[str]:
     """Yield what has no entry on each split and size, and the command that makes it."""
     for evidence in found:
-        split, size = evidence.size.split, evidence.size.name
+        split = evidence.size.split
+        size = evidence.size.name
         absent = [name for name in EXPECTED[split] if name not in evidence.methods]
         refused = [label(name) for name in absent if evidence.trained(name)]
         missing = [label(name) for name in absent if not evidence.trained(name)]
         if refused:
             yield f"- {evidence.where}: {', '.join(refused)}: trained, no score (docs/baselines.md says why)."
         if missing:
-            what = "all models" if len(missing) == len(EXPECTED[split]) else ", ".join(missing)
-            command = f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
+            if len(missing) == len(EXPECTED[split]):
+                what = "all models"
+            else:
+                what = ", ".join(missing)
+            command = (
+                f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
+            )
             yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
         if evidence.stale:
             yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
@@ -322,13 +458,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--output", "-o", type=Path, default=Path("docs/results.md"))
     parser.add_argument("--board", type=Path, default=BOARD)
     parser.add_argument("--weights", type=Path, default=WEIGHTS)
-    parser.add_argument("--runs", type=Path, help="folder of runs that are not committed yet")
-    parser.add_argument("--studies", type=Path, default=STUDIES, help="committed results that are no entries")
+    parser.add_argument(
+        "--runs", type=Path, help="folder of runs that are not committed yet"
+    )
+    parser.add_argument(
+        "--studies",
+        type=Path,
+        default=STUDIES,
+        help="committed results that are no entries",
+    )
     parser.add_argument("--root", type=Path, help="not needed: no data set is read")
-    parser.add_argument("--check", action="store_true", help="write nothing; fail where it is stale")
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; fail where it is stale"
+    )
     given = parser.parse_args(arguments)
     try:
-        sources = Sources(board=given.board, weights=given.weights, runs=given.runs, studies=given.studies)
+        sources = Sources(
+            board=given.board,
+            weights=given.weights,
+            runs=given.runs,
+            studies=given.studies,
+        )
         page = render(sources).encode()
         if given.check:
             stale = not given.output.is_file() or given.output.read_bytes() != page

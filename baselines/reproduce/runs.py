@@ -1,4 +1,6 @@
-"""Runs: where they lie, and whatever of them is not there yet: train, predict, score."""
+"""Runs: where they lie, and whatever of them is not there yet: train, predict,
+score.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,16 @@ from lagbench.work.pool import Report, crashed
 from lagbench.work.run import run_all
 
 from .evidence import RECORD_NAME, read_json
-from .plan import PREDICTIONS, SHARES, STUDY_FILE, TABLES, Plan, study_folder, study_name, study_rows
+from .plan import (
+    PREDICTIONS,
+    SHARES,
+    STUDY_FILE,
+    TABLES,
+    Plan,
+    study_folder,
+    study_name,
+    study_rows,
+)
 from .thesis import Model, Study
 
 if TYPE_CHECKING:
@@ -35,10 +46,12 @@ WINDOWS = 4096  # most windows of a subset that an error is measured over, evenl
 
 
 def make_runs(plan: Plan, runs: Sequence[Run], *, workers: int = 1) -> int:
-    """Make runs, ``workers`` of them side by side; what fails is said and entered, the others are made.
+    """Make runs, ``workers`` of them side by side; what fails is said and entered, the
+    others are made.
 
-    On one GPU that pays as it does on many cores: small models keep a GPU waiting for their processor.
-    Return 0, or the exit code of the last one that failed; a worker that dies three times ends all.
+    On one GPU that pays as it does on many cores: small models keep a GPU waiting for
+    their processor. Return 0, or the exit code of the last one that failed; a worker
+    that dies three times ends all.
     """
     names = [f"{split} {plan.size} {model.name}-{seed}" for split, model, seed in runs]
     jobs = {name: (plan, name, run) for name, run in zip(names, runs, strict=True)}
@@ -59,7 +72,10 @@ def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
     try:
         make_run(plan, *run)
     except Exception as error:  # the others go on
-        told = error if isinstance(error, LagbenchError) else crashed(error)
+        if isinstance(error, LagbenchError):
+            told = error
+        else:
+            told = crashed(error)
         complain(told, name)
         return told.exit_code
     return 0
@@ -78,8 +94,8 @@ def complain(error: LagbenchError, where: str = "") -> None:
 def make_run(plan: Plan, split: str, model: Model, seed: int) -> None:
     """Train, predict and score what of a run is missing.
 
-    An interrupted training goes on where it stopped; predictions and scores of other data are made again,
-    with a note.
+    An interrupted training goes on where it stopped; predictions and scores of other
+    data are made again, with a note.
     """
     folder = plan.folder(split, model.name, seed)
     check_training(plan, split, model, seed, folder=folder)
@@ -95,23 +111,36 @@ def make_run(plan: Plan, split: str, model: Model, seed: int) -> None:
 
 
 def score_committed(plan: Plan, split: str, model: Model) -> None:
-    """Make a run of a model's committed weights of the least seed, if there are any and no run was scored."""
+    """Make a run of a model's committed weights of the least seed, if there are any and
+    no run was scored.
+    """
     for name, _, folder in plan.sources.run_folders(split, plan.size):
         if name == model.name and (folder / NETCDF_NAME).is_file():
             return
-    known = f"{model.name}-{plan.recipe}" if plan.recipe else model.name
+    if plan.recipe:
+        known = f"{model.name}-{plan.recipe}"
+    else:
+        known = model.name
     files = (plan.weights / split / plan.size).glob(f"{known}_*.pt")
-    seeds = {int(end): path for path in files if (end := path.stem[len(known) + 1 :]).isdecimal()}
+    seeds = {
+        int(end): path
+        for path in files
+        if (end := path.stem[len(known) + 1 :]).isdecimal()
+    }
     if not seeds:
         return
     seed, weights = min(seeds.items())
     folder = plan.folder(split, model.name, seed)
     note(f"{folder}: from {weights}")
-    # predicting comes first: it refuses weights of other data, and then nothing is written
+    # predicting comes first: it refuses weights of other data, and then nothing is
+    # written
     if not (folder / PREDICTIONS).is_file():
         _predict(plan, weights, folder, model.name)
     # with its record the run is one like any other: a later training checks its recipe
-    for source, target in ((weights, "weights.pt"), (weights.with_suffix(".json"), RECORD_NAME)):
+    for source, target in (
+        (weights, "weights.pt"),
+        (weights.with_suffix(".json"), RECORD_NAME),
+    ):
         if source.is_file():
             write_atomically(folder / target, source.read_bytes())
     _score(plan, folder)
@@ -137,7 +166,9 @@ def _score(plan: Plan, folder: Path) -> None:
     score(folder / PREDICTIONS, root=plan.root, registry=plan.registry)
 
 
-def make_training(plan: Plan, split: str, model: Model, seed: int, *, folder: Path) -> None:
+def make_training(
+    plan: Plan, split: str, model: Model, seed: int, *, folder: Path
+) -> None:
     """Train a model unless its training is complete."""
     if _complete(folder):
         return
@@ -158,8 +189,12 @@ def make_training(plan: Plan, split: str, model: Model, seed: int, *, folder: Pa
     )
 
 
-def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: Path) -> None:
-    """Refuse a folder whose training is not the one that was asked for; one without a record passes."""
+def check_training(
+    plan: Plan, split: str, model: Model, seed: int, *, folder: Path
+) -> None:
+    """Refuse a folder whose training is not the one that was asked for; one without a
+    record passes.
+    """
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
@@ -168,20 +203,38 @@ def check_training(plan: Plan, split: str, model: Model, seed: int, *, folder: P
     asked = _recipe(plan, split, model, seed).as_json()
     if record.get("recipe") != asked:
         difference = first_difference(asked, record.get("recipe"))
-        raise UsageError("the run has another recipe", where=str(folder), expected=difference, fix=OTHER)
-    data, got = plan.hash(split), record.get("dataset_sha256")
+        raise UsageError(
+            "the run has another recipe",
+            where=str(folder),
+            expected=difference,
+            fix=OTHER,
+        )
+    data = plan.hash(split)
+    got = record.get("dataset_sha256")
     if data is not None and got != data:
         raise DataError(
-            "the run was trained on other data", where=str(folder), expected=data, got=got, fix=OTHER
+            "the run was trained on other data",
+            where=str(folder),
+            expected=data,
+            got=got,
+            fix=OTHER,
         )
 
 
 def study_model(plan: Plan, study: Study) -> Model:
-    """Return what to train for a row: at ``full`` its own recipe, else the size's recipe with changes."""
-    name, unvalidated = study_name(study), "training.validate_every=0"
+    """Return what to train for a row: at ``full`` its own recipe, else the size's
+    recipe with changes.
+    """
+    name = study_name(study)
+    unvalidated = "training.validate_every=0"
     if plan.size == "full":
         # what tells a row's recipe from the others of its table
-        ends = {"4.2": study.activation, "4.3": study.widths[0], "4.4": len(study.widths), "4.5": study.row}
+        ends = {
+            "4.2": study.activation,
+            "4.3": study.widths[0],
+            "4.4": len(study.widths),
+            "4.5": study.row,
+        }
         variant = f"table-{study.table}-{ends[study.table]}"
         return Model(name, name, varied="mlp", settings=(unvalidated,), recipe=variant)
     share, divisor = SHARES[plan.size]
@@ -199,16 +252,29 @@ def study_model(plan: Plan, study: Study) -> Model:
 
 def make_studies(plan: Plan, name: str) -> None:
     """Train the rows of a table and measure their errors, unless that was done."""
-    split, seed = TABLES[name][1], plan.seeds[0]
+    split = TABLES[name][1]
+    seed = plan.seeds[0]
     path = plan.home(split) / STUDY_FILE
     for study in study_rows(name):
-        folder, model, held = study_folder(plan, name, study), study_model(plan, study), read_json(path)
+        folder = study_folder(plan, name, study)
+        model = study_model(plan, study)
+        held = read_json(path)
         check_training(plan, split, model, seed, folder=folder)
-        if held.get(model.name, {}).get("seed") == seed and (folder / "weights.pt").is_file():
+        if (
+            held.get(model.name, {}).get("seed") == seed
+            and (folder / "weights.pt").is_file()
+        ):
             continue
         make_training(plan, split, model, seed, folder=folder)
-        errors = {subset: one_step_error(plan, split, folder, subset) for subset in ("train", "valid")}
-        held[model.name] = {"seed": seed, **errors, "training": read_json(folder / RECORD_NAME)}
+        errors = {
+            subset: one_step_error(plan, split, folder, subset)
+            for subset in ("train", "valid")
+        }
+        held[model.name] = {
+            "seed": seed,
+            **errors,
+            "training": read_json(folder / RECORD_NAME),
+        }
         write_atomically(path, json.dumps(held, indent=1, sort_keys=True).encode())
 
 
@@ -222,7 +288,12 @@ def one_step_error(plan: Plan, split: str, folder: Path, subset: str) -> float:
 
     model = restore(load(folder / "weights.pt")).eval()
     data = WindowDataset(
-        split, subset=subset, size=plan.size, root=plan.root, history=model.history, registry=plan.registry
+        split,
+        subset=subset,
+        size=plan.size,
+        root=plan.root,
+        history=model.history,
+        registry=plan.registry,
     )
     count = min(len(data), WINDOWS)
     chosen = [i * len(data) // count for i in range(count)]
@@ -248,7 +319,8 @@ def outlook(plan: Plan, split: str, model: Model, seed: int) -> str:
     if _complete(folder):
         return "to predict and score"
     recipe = _recipe(plan, split, model, seed)
-    steps, epochs = recipe.training.steps, recipe.training.epochs
+    steps = recipe.training.steps
+    epochs = recipe.training.epochs
     if steps is not None:
         return f"to train, {recipe.name}: {steps:,} steps"
     return f"to train, {recipe.name}: {'closed form' if epochs is None else f'{epochs:g} epochs'}"
@@ -259,24 +331,41 @@ def _recipe(plan: Plan, split: str, model: Model, seed: int) -> Recipe:
     from lagbench.baselines.catalogue import find
     from lagbench.baselines.recipe import recipe_for
 
-    settings, variant = (*model.settings, *plan.settings), model.recipe or plan.recipe
-    return recipe_for(find(model.baseline), split, plan.size, variant=variant, settings=settings, seed=seed)
+    settings = (*model.settings, *plan.settings)
+    variant = model.recipe or plan.recipe
+    return recipe_for(
+        find(model.baseline),
+        split,
+        plan.size,
+        variant=variant,
+        settings=settings,
+        seed=seed,
+    )
 
 
 def _stale(data: str | None, folder: Path) -> list[Path]:
-    """Return the predictions and scores of a run that are of other data than those of a hash."""
-    predictions, scores = folder / PREDICTIONS, folder / NETCDF_NAME
+    """Return the predictions and scores of a run that are of other data than those of a
+    hash.
+    """
+    predictions = folder / PREDICTIONS
+    scores = folder / NETCDF_NAME
     if data is not None and predictions.is_file():
         with open_predictions(predictions) as found:
             if found.header.dataset_sha256 != data:
                 return [path for path in (predictions, scores) if path.is_file()]
-    if data is not None and scores.is_file() and read_statistics(scores).identity["dataset_sha256"] != data:
+    if (
+        data is not None
+        and scores.is_file()
+        and read_statistics(scores).identity["dataset_sha256"] != data
+    ):
         return [scores]
     return []
 
 
 def _complete(folder: Path) -> bool:
-    """Tell whether weights are there whose training is over, as far as a record says."""
+    """Tell whether weights are there whose training is over, as far as a record
+    says.
+    """
     record = folder / RECORD_NAME
     if not (folder / "weights.pt").is_file():
         return False

@@ -1,13 +1,14 @@
 """VAR(1) by the thesis's own protocol (section 4.8.3, Listing 4.1), timed and weighed.
 
-    python -m lagbench.baselines.reproduce.var_protocol [--split fluid] [--size full] [--root FOLDER]
-        [--lags 1] [--json]
+    python -m lagbench.baselines.reproduce.var_protocol [--split fluid] [--size full]
+        [--root FOLDER] [--lags 1] [--json]
 
-All frames of all scenarios, in the order of their ids, are standardised per feature over all
-frames, flattened and concatenated; the first 70 % are fitted, and the next 15 % forecast from
-the last frame of training. So frames of test scenarios enter, and a forecast runs on across the
-starts of scenarios that it cannot know: as a benchmark it says nothing, as a check of
-the thesis's figures it does. The benchmark's own way is ``lagbench train --baseline var``.
+All frames of all scenarios, in the order of their ids, are standardised per feature
+over all frames, flattened and concatenated; the first 70 % are fitted, and the next 15
+% forecast from the last frame of training. So frames of test scenarios enter, and a
+forecast runs on across the starts of scenarios that it cannot know: as a benchmark it
+says nothing, as a check of the thesis's figures it does. The benchmark's own way is
+``lagbench train --baseline var``.
 """
 
 from __future__ import annotations
@@ -35,10 +36,12 @@ from .drawing import Figure, Sheet
 from .plan import Plan
 from .thesis import SECTION_4_8_3, number
 
-TRAIN, VALID = 0.70, 0.15
+TRAIN = 0.70
+VALID = 0.15
 """Shares of the frames that are fitted and forecast."""
 
-FILE = "var_protocol.json"  # what ``--json`` prints, in a folder of runs or of committed studies
+# what ``--json`` prints, in a folder of runs or of committed studies
+FILE = "var_protocol.json"
 
 States = NDArray[np.float32]
 
@@ -56,16 +59,28 @@ class ProtocolResult:
     peak_gb: float  # largest resident memory of the process [GB]
     condition: float  # condition number of the regressors
     floor: float  # as LeastSquares has it
-    fit_mse: float  # mean squared error of one step over the frames fitted [standardised^2]
+    fit_mse: (
+        float  # mean squared error of one step over the frames fitted [standardised^2]
+    )
     forecast_frames: int  # frames forecast
-    forecast_mse: float  # mean over them [standardised^2]; infinite once a forecast overflows
-    mse_at: dict[int, float]  # mean squared error of single frames of the forecast, by frame [standardised^2]
-    growth: float  # factor per frame by which the last frames of the forecast grow; above 1 it diverges
+    forecast_mse: (
+        float  # mean over them [standardised^2]; infinite once a forecast overflows
+    )
+    mse_at: dict[
+        int, float
+    ]  # mean squared error of single frames of the forecast, by frame [standardised^2]
+    # factor per frame by which the last frames of the forecast grow; above 1 it
+    # diverges
+    growth: float
     persistence_mse: float  # of the last frame of training, kept [standardised^2]
 
 
 def measure(
-    split: str = "fluid", size: str = "full", *, root: str | Path | None = None, lags: int = 1
+    split: str = "fluid",
+    size: str = "full",
+    *,
+    root: str | Path | None = None,
+    lags: int = 1,
 ) -> ProtocolResult:
     """Fit a VAR of so many lags and forecast by the thesis's protocol."""
     # torch is loaded here, so that pages of results are written without it
@@ -76,12 +91,20 @@ def measure(
     for subset in ("train", "valid", "test"):
         paths |= scenario_paths(split, subset=subset, size=size, root=root)
     tier = load().size(split, size)
-    frames = np.empty((sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32)
+    frames = np.empty(
+        (sum(map(tier.frame_count, paths)), tier.particles, 4), np.float32
+    )
     filled = 0
     for _, path in sorted(paths.items()):
-        with read_scenario(path) as file:  # positions and the solver's velocities, block by block
-            for position, velocity in zip(file.blocks("position"), file.blocks("velocity"), strict=True):
-                frames[filled : filled + len(position)] = np.concatenate([position, velocity], axis=-1)
+        with read_scenario(
+            path
+        ) as file:  # positions and the solver's velocities, block by block
+            for position, velocity in zip(
+                file.blocks("position"), file.blocks("velocity"), strict=True
+            ):
+                frames[filled : filled + len(position)] = np.concatenate(
+                    [position, velocity], axis=-1
+                )
                 filled += len(position)
     for feature in np.moveaxis(frames, -1, 0):
         feature -= feature.mean(dtype=np.float64)
@@ -90,12 +113,16 @@ def measure(
     train = int(TRAIN * len(states))
     valid = states[train : train + int(VALID * len(states))]
     rows = LaggedRows([states[:train]], lags=lags)
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     found = solve(rows)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    wall = time.perf_counter() - wall
+    cpu = time.process_time() - cpu
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
     missed = math.fsum(np.square(y - x @ found.coefficients).sum() for x, y in rows)
-    errors, growth = forecast_errors(found.coefficients, states[train - lags : train], valid)
+    errors, growth = forecast_errors(
+        found.coefficients, states[train - lags : train], valid
+    )
     return ProtocolResult(
         split=split,
         size=size,
@@ -109,24 +136,35 @@ def measure(
         fit_mse=float(missed / (rows.rows * len(found.coefficients[0]))),
         forecast_frames=len(valid),
         forecast_mse=float(errors.mean()),
-        mse_at={frame: float(errors[frame - 1]) for frame in (1, 10, 100, 1000) if frame <= len(errors)},
+        mse_at={
+            frame: float(errors[frame - 1])
+            for frame in (1, 10, 100, 1000)
+            if frame <= len(errors)
+        },
         growth=growth,
-        persistence_mse=float(np.square(valid - states[train - 1], dtype=np.float64).mean()),
+        persistence_mse=float(
+            np.square(valid - states[train - 1], dtype=np.float64).mean()
+        ),
     )
 
 
 def forecast_errors(
     coefficients: NDArray[np.float64], last: States, truth: States
 ) -> tuple[NDArray[np.float64], float]:
-    """Forecast and return the mean squared error of each frame and the growth per frame at the end.
+    """Forecast and return the mean squared error of each frame and the growth per frame
+    at the end.
 
-    Coefficients are as :class:`~lagbench.baselines.var.VAR` lays them out; ``last``, shape [lag, feature],
-    are the states before the forecast, the latest last, and ``truth``, shape [frame, feature], those to
-    compare with.
+    Coefficients are as :class:`~lagbench.baselines.var.VAR` lays them out; ``last``,
+    shape [lag, feature], are the states before the forecast, the latest last, and
+    ``truth``, shape [frame, feature], those to compare with.
     """
     history = list(last[::-1].astype(np.float64))
-    errors, norms = np.full(len(truth), np.inf), np.full(len(truth), np.nan)
-    transposed = coefficients.T if coefficients.flags.f_contiguous else np.ascontiguousarray(coefficients.T)
+    errors = np.full(len(truth), np.inf)
+    norms = np.full(len(truth), np.nan)
+    if coefficients.flags.f_contiguous:
+        transposed = coefficients.T
+    else:
+        transposed = np.ascontiguousarray(coefficients.T)
     for frame, true in enumerate(truth):
         state = transposed @ np.concatenate([[1.0], *history])
         history = [state, *history[:-1]]
@@ -136,11 +174,15 @@ def forecast_errors(
         errors[frame] = np.square(state - true).mean()
     grown = norms[np.isfinite(norms)]
     span = min(100, len(grown) - 1)
-    return errors, float((grown[-1] / grown[-1 - span]) ** (1 / span)) if span > 0 else float("nan")
+    return errors, float(
+        (grown[-1] / grown[-1 - span]) ** (1 / span)
+    ) if span > 0 else float("nan")
 
 
 def draw(plan: Plan, figure: Figure) -> Sheet:
-    """Return time, memory and error of the fit and its forecast; measured once per size."""
+    """Return time, memory and error of the fit and its forecast; measured once per
+    size.
+    """
     path = plan.home(figure.split) / FILE
     if not path.is_file():
         found = asdict(measure(figure.split, plan.size, root=plan.root))
@@ -150,33 +192,69 @@ def draw(plan: Plan, figure: Figure) -> Sheet:
 
 def beside_thesis(held: Mapping[str, Any]) -> Sheet:
     """Return what was measured beside the thesis's figures."""
-    thesis, unit = SECTION_4_8_3, "[standardised^2]"
+    thesis = SECTION_4_8_3
+    unit = "[standardised^2]"
     rows: list[tuple[str, float | None, float]] = [
         ("time of the fit [min]", thesis["minutes"], held["fit_seconds"] / 60.0),
         ("processor time of the fit [s]", None, held["cpu_seconds"]),
-        ("memory, thesis: virtual, ours: largest resident [GB]", thesis["gigabytes"], held["peak_gb"]),
+        (
+            "memory, thesis: virtual, ours: largest resident [GB]",
+            thesis["gigabytes"],
+            held["peak_gb"],
+        ),
         ("frames fitted", None, held["frames"]),
         ("condition number of the regressors", None, held["condition"]),
-        ("share of its largest eigenvalue that was added to the Gram matrix", None, held["floor"]),
-        (f"squared error of one step, over the frames fitted {unit}", None, held["fit_mse"]),
+        (
+            "share of its largest eigenvalue that was added to the Gram matrix",
+            None,
+            held["floor"],
+        ),
+        (
+            f"squared error of one step, over the frames fitted {unit}",
+            None,
+            held["fit_mse"],
+        ),
         (f"squared error of the forecast {unit}", thesis["mse"], held["forecast_mse"]),
-        (f"squared error of standing still after those frames {unit}", None, held["persistence_mse"]),
-        ("factor by which the forecast grows per frame at its end", None, held["growth"]),
+        (
+            f"squared error of standing still after those frames {unit}",
+            None,
+            held["persistence_mse"],
+        ),
+        (
+            "factor by which the forecast grows per frame at its end",
+            None,
+            held["growth"],
+        ),
     ]
     at = sorted((int(frame), value) for frame, value in held["mse_at"].items())
-    rows += [(f"squared error in frame {frame} of the forecast {unit}", None, value) for frame, value in at]
-    answer = "diverges" if held["growth"] > 1.0 else "does not diverge"
+    rows += [
+        (f"squared error in frame {frame} of the forecast {unit}", None, value)
+        for frame, value in at
+    ]
+    if held["growth"] > 1.0:
+        answer = "diverges"
+    else:
+        answer = "does not diverge"
     note = (
-        f"VAR of {held['features']} dimensions on {held['split']} {held['size']} by the thesis's protocol:"
-        f" all frames concatenated, the first 70 % fitted, the next 15 %, {held['forecast_frames']} frames,"
-        f" forecast. The forecast {answer}: at its end it grows by a factor of {number(held['growth'], 5)}"
+        f"VAR of {held['features']} dimensions on {held['split']} {held['size']} by "
+        f"the thesis's protocol:"
+        f" all frames concatenated, the first 70 % fitted, the next 15 %, "
+        f"{held['forecast_frames']} frames,"
+        f" forecast. The forecast {answer}: at its end it grows by a factor of "
+        f"{number(held['growth'], 5)}"
         " per frame."
     )
     cells = [
-        (what, number(theirs), f"{ours:,}" if isinstance(ours, int) else number(ours, 5))
+        (
+            what,
+            number(theirs),
+            f"{ours:,}" if isinstance(ours, int) else number(ours, 5),
+        )
         for what, theirs, ours in rows
     ]
-    return Sheet(notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(cells)),))
+    return Sheet(
+        notes=(note,), tables=(Table("", ("", "thesis", "ours"), tuple(cells)),)
+    )
 
 
 def table(result: ProtocolResult) -> str:
@@ -186,7 +264,9 @@ def table(result: ProtocolResult) -> str:
 
 def main() -> int:
     """Measure what the arguments name and print it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     parser.add_argument("--split", default="fluid")
     parser.add_argument("--size", default="full")
     parser.add_argument("--root", type=Path)
@@ -194,7 +274,9 @@ def main() -> int:
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     result = measure(given.split, given.size, root=given.root, lags=given.lags)
-    sys.stdout.write(json.dumps(asdict(result), indent=1) + "\n" if given.json else table(result))
+    sys.stdout.write(
+        json.dumps(asdict(result), indent=1) + "\n" if given.json else table(result)
+    )
     return 0
 
 

@@ -1,13 +1,14 @@
 """Validate the closed-box solver: Ghia's cavity, or the decay of curl noise.
 
-    python -m lagbench.generators.acceptance --case cavity --re 400 --substeps 100000 --json re400.json
-    python -m lagbench.generators.acceptance --case curl-noise --frequency 4 --json curl.json
+    python -m lagbench.generators.acceptance --case cavity --re 400 --substeps 100000
+    --json re400.json python -m lagbench.generators.acceptance --case curl-noise
+    --frequency 4 --json curl.json
 
-Writes u and v at the points of Ghia, Ghia & Shin (1982), their error against the tables at Reynolds
-numbers 100, 400, 1000, 3200 and 5000, the range of J, empty cells (every 10,000 substeps and at the
-end), kinetic energy per frame, divergence against vorticity, and the time taken. All but the
-entries under "timing" is the same in every run. Exit code 0: done; 2: bad options; 5: the solver
-failed; 130: interrupted.
+Writes u and v at the points of Ghia, Ghia & Shin (1982), their error against the tables
+at Reynolds numbers 100, 400, 1000, 3200 and 5000, the range of J, empty cells (every
+10,000 substeps and at the end), kinetic energy per frame, divergence against vorticity,
+and the time taken. All but the entries under "timing" is the same in every run. Exit
+code 0: done; 2: bad options; 5: the solver failed; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ from lagbench.generators.solver import Device
 from .diagnostics import X, Y, box_of, centre_lines, draw
 from .experiment import Case, Result, plan, run, solver_parameters
 
-DIGITS = 9  # significant digits of the numbers in the JSON file: fewer than libraries differ in
+# significant digits of the numbers in the JSON file: fewer than libraries differ in
+DIGITS = 9
 JSON = dict[str, Any]
 
 
@@ -46,16 +48,58 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--case", type=Case, choices=list(Case), required=True, help="which closed box")
     add("--json", type=Path, metavar="FILE", help="results")
-    add("--re", type=float, metavar="R", help="Reynolds number; curl-noise is inviscid without it")
-    add("--grid", type=int, default=40, metavar="N", help="cells across the unit box (default 40)")
-    add("--particles", type=int, metavar="P", help="particles (default 8192 (N/40)^2, curl-noise 8096)")
-    add("--substeps", type=int, metavar="K", help="solver steps (default 100000, curl-noise 600 frames)")
+    add(
+        "--re",
+        type=float,
+        metavar="R",
+        help="Reynolds number; curl-noise is inviscid without it",
+    )
+    add(
+        "--grid",
+        type=int,
+        default=40,
+        metavar="N",
+        help="cells across the unit box (default 40)",
+    )
+    add(
+        "--particles",
+        type=int,
+        metavar="P",
+        help="particles (default 8192 (N/40)^2, curl-noise 8096)",
+    )
+    add(
+        "--substeps",
+        type=int,
+        metavar="K",
+        help="solver steps (default 100000, curl-noise 600 frames)",
+    )
     add("--dt", type=float, help="substep in seconds (default 2e-3 * 40/N)")
     add("--lid-speed", type=float, metavar="U", help="speed of the lid (default 0.15)")
-    add("--lid-off-after", type=int, metavar="K", help="substep after which the lid stands still")
-    add("--frequency", type=int, metavar="F", help="Perlin frequency of curl noise (default 4)")
-    add("--seed", type=int, default=0, help="seed of the particle lattice and the stirring")
-    add("--device", type=Device, choices=list(Device), default=Device.CPU, help="where to run")
+    add(
+        "--lid-off-after",
+        type=int,
+        metavar="K",
+        help="substep after which the lid stands still",
+    )
+    add(
+        "--frequency",
+        type=int,
+        metavar="F",
+        help="Perlin frequency of curl noise (default 4)",
+    )
+    add(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the particle lattice and the stirring",
+    )
+    add(
+        "--device",
+        type=Device,
+        choices=list(Device),
+        default=Device.CPU,
+        help="where to run",
+    )
     add("--profiles", type=Path, metavar="PNG", help="draw the centre lines (cavity)")
     given = parser.parse_args(arguments)
     try:
@@ -74,18 +118,39 @@ def perform(given: argparse.Namespace) -> JSON:
     substeps = given.substeps
     if substeps is None:
         substeps = 100_000 if given.case is Case.CAVITY else 30_000 * given.grid // 40
-    same = ("grid", "particles", "dt", "lid_speed", "lid_off_after", "frequency", "seed")
+    same = (
+        "grid",
+        "particles",
+        "dt",
+        "lid_speed",
+        "lid_off_after",
+        "frequency",
+        "seed",
+    )
     others = {name: getattr(given, name) for name in same}
     experiment = plan(given.case, substeps=substeps, reynolds=given.re, **others)
     # Make sure that the files can be written, before the long run.
     if given.profiles is not None and given.case is not Case.CAVITY:
-        raise UsageError("curl noise has no centre-line profiles", where="--profiles", fix="leave it out")
-    if given.profiles is not None and given.profiles.suffix.lower() not in {".png", ".pdf", ".svg"}:
         raise UsageError(
-            "not a picture format", where="--profiles", expected=".png, .pdf or .svg", got=given.profiles
+            "curl noise has no centre-line profiles",
+            where="--profiles",
+            fix="leave it out",
+        )
+    if given.profiles is not None and given.profiles.suffix.lower() not in {
+        ".png",
+        ".pdf",
+        ".svg",
+    }:
+        raise UsageError(
+            "not a picture format",
+            where="--profiles",
+            expected=".png, .pdf or .svg",
+            got=given.profiles,
         )
     files = {"--json": given.json, "--profiles": given.profiles}
-    for flag, path in ((flag, path) for flag, path in files.items() if path is not None):
+    for flag, path in (
+        (flag, path) for flag, path in files.items() if path is not None
+    ):
         fresh = not path.exists()
         try:
             path.absolute().parent.mkdir(parents=True, exist_ok=True)
@@ -103,11 +168,15 @@ def perform(given: argparse.Namespace) -> JSON:
     with Progress(console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(experiment.case.value, total=experiment.substeps)
         result = run(
-            experiment, device=given.device, report=lambda done: progress.update(task, completed=done)
+            experiment,
+            device=given.device,
+            report=lambda done: progress.update(task, completed=done),
         )
     found = document(result)
     if given.json is not None:
-        given.json.write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        given.json.write_text(
+            json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
     if given.profiles is not None and result.profiles is not None:
         e = experiment
         title = f"Re {e.reynolds:g}, {e.grid} x {e.grid}, {e.substeps} substeps"
@@ -128,7 +197,8 @@ def rounded(value: object) -> object:
 
 def document(result: Result) -> JSON:
     """Return everything a run has shown, as the JSON file states it."""
-    e, checks = result.experiment, result.checks
+    e = result.experiment
+    checks = result.checks
     parameters = solver_parameters(e)
     box = box_of(parameters)
     work = e.particles * e.substeps
@@ -136,14 +206,25 @@ def document(result: Result) -> JSON:
     lines: JSON | None = None
     if (apart := result.deviations()) is not None:
         u, v = apart
-        against = {"u_rmse": u.rmse, "v_rmse": v.rmse, "u_max": u.maximum, "v_max": v.maximum}
+        against = {
+            "u_rmse": u.rmse,
+            "v_rmse": v.rmse,
+            "u_max": u.maximum,
+            "v_max": v.maximum,
+        }
     if result.profiles is not None:
-        ours, ghia = result.profiles.at_reference_points(), centre_lines(e.reynolds or 0.0)
+        ours = result.profiles.at_reference_points()
+        ghia = centre_lines(e.reynolds or 0.0)
         lines = {"averaged_substeps": [result.averaged_from, e.substeps]}
         for name, along, abscissae in (("u", "y", Y), ("v", "x", X)):
-            known = np.full(len(abscissae), np.nan) if ghia is None else getattr(ghia, name)
+            known = (
+                np.full(len(abscissae), np.nan) if ghia is None else getattr(ghia, name)
+            )
             points = zip(abscissae, getattr(ours, name), known, strict=True)
-            lines[name] = [{along: x, name: float(v), "ghia": float(theirs)} for x, v, theirs in points]
+            lines[name] = [
+                {along: x, name: float(v), "ghia": float(theirs)}
+                for x, v, theirs in points
+            ]
     found: JSON = {
         "format": 1,
         "case": e.case.value,
@@ -156,13 +237,20 @@ def document(result: Result) -> JSON:
         "jacobian": {
             "min": min(c.jacobian_min for c in checks),
             "max": max(c.jacobian_max for c in checks),
-            "min_outside_lid_corners": min(c.jacobian_min_outside_lid_corners for c in checks),
-            "max_outside_lid_corners": max(c.jacobian_max_outside_lid_corners for c in checks),
+            "min_outside_lid_corners": min(
+                c.jacobian_min_outside_lid_corners for c in checks
+            ),
+            "max_outside_lid_corners": max(
+                c.jacobian_max_outside_lid_corners for c in checks
+            ),
         },
         "empty_cells": max(c.empty_cells for c in checks),
         "divergence_over_vorticity": checks[-1].divergence_over_vorticity,
         "checks": [asdict(c) for c in checks],
-        "kinetic_energy": {"substep": result.frame_substeps, "value": result.kinetic_energy},
+        "kinetic_energy": {
+            "substep": result.frame_substeps,
+            "value": result.kinetic_energy,
+        },
         "energy_retention": result.retention,
         "largest_rise_after_lid_off": result.largest_rise_after_lid_off,
         "timing": {
@@ -176,19 +264,29 @@ def document(result: Result) -> JSON:
 
 def summary(found: JSON) -> str:
     """Return the results in a few lines."""
-    j, ghia_error = found["jacobian"], found["ghia"]
+    j = found["jacobian"]
+    ghia_error = found["ghia"]
     lines = [
-        f"J {j['min']:.4f} to {j['max']:.4f}, outside the lid corners {j['min_outside_lid_corners']:.4f} "
+        f"J {j['min']:.4f} to {j['max']:.4f}, outside the lid corners "
+        f"{j['min_outside_lid_corners']:.4f} "
         f"to {j['max_outside_lid_corners']:.4f}; empty cells {found['empty_cells']}",
-        f"{found['timing']['nanoseconds_per_particle_substep']:.1f} ns per particle and substep",
+        f"{found['timing']['nanoseconds_per_particle_substep']:.1f} ns per particle "
+        f"and substep",
     ]
     if ghia_error is not None:
-        lines.insert(0, "against Ghia: " + ", ".join(f"{k} {v:.4f}" for k, v in ghia_error.items()))
+        lines.insert(
+            0,
+            "against Ghia: " + ", ".join(f"{k} {v:.4f}" for k, v in ghia_error.items()),
+        )
     if found["case"] == Case.CURL_NOISE and found["energy_retention"] is not None:
         ratio = f"divergence over vorticity {found['divergence_over_vorticity']:.4f}"
         lines.insert(0, f"energy left {found['energy_retention']:.3f}, {ratio}")
     if found["largest_rise_after_lid_off"] is not None:
-        lines.insert(0, f"largest rise of energy with the lid off {found['largest_rise_after_lid_off']:.2e}")
+        lines.insert(
+            0,
+            f"largest rise of energy with the lid off "
+            f"{found['largest_rise_after_lid_off']:.2e}",
+        )
     return "\n".join(lines)
 
 

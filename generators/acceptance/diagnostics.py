@@ -1,15 +1,17 @@
-"""Quantities that tell whether a closed box simulates well: J, occupancy, energy, divergence, profiles.
+"""Quantities that tell whether a closed box simulates well: J, occupancy, energy,
+divergence, profiles.
 
-NumPy only; every function takes arrays, none a solver. Centre-line profiles of a lid-driven cavity
-are compared with those of Ghia, Ghia & Shin:
+NumPy only; every function takes arrays, none a solver. Centre-line profiles of a
+lid-driven cavity are compared with those of Ghia, Ghia & Shin:
 
-U. Ghia, K. N. Ghia, C. T. Shin, J. Comput. Phys. 48 (1982) 387-411, Tables I and II: u/U on
-x = 1/2 and v/U on y = 1/2 of the unit cavity, the lid at y = 1 moving to +x with speed U.
-The values at the walls (0, and 1 on the lid) are left out: they are boundary conditions.
+U. Ghia, K. N. Ghia, C. T. Shin, J. Comput. Phys. 48 (1982) 387-411, Tables I and II:
+u/U on x = 1/2 and v/U on y = 1/2 of the unit cavity, the lid at y = 1 moving to +x with
+speed U. The values at the walls (0, and 1 on the lid) are left out: they are boundary
+conditions.
 
-Misprints of the paper, NaN here: at Re 400, v(0.9063) = -0.23827 does not lie on a smooth
-curve through its neighbours (about -0.38 does); at Re 3200, u(0.4531) = -0.86636 has its
-decimal point one place too far right.
+Misprints of the paper, NaN here: at Re 400, v(0.9063) = -0.23827 does not lie on a
+smooth curve through its neighbours (about -0.38 does); at Re 3200, u(0.4531) = -0.86636
+has its decimal point one place too far right.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ from scipy.interpolate import CubicSpline
 
 from lagbench.generators.split import ClosedBoxParameters
 
-CORNER_CELLS = 5  # extent of the regions under the two ends of the lid, where J is far from 1 [cells]
+# extent of the regions under the two ends of the lid, where J is far from 1 [cells]
+CORNER_CELLS = 5
 
 Reals = NDArray[np.floating]
 
@@ -49,7 +52,9 @@ class Box:
     @property
     def nodes(self) -> NDArray[np.float64]:
         """Coordinates of the nodes between two walls [length], shape [cells]."""
-        return np.asarray(self.low + self.spacing * (np.arange(self.cells) + 0.5), dtype=np.float64)
+        return np.asarray(
+            self.low + self.spacing * (np.arange(self.cells) + 0.5), dtype=np.float64
+        )
 
 
 def box_of(parameters: ClosedBoxParameters) -> Box:
@@ -59,7 +64,9 @@ def box_of(parameters: ClosedBoxParameters) -> Box:
 
 
 def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
-    """Count the particles in each cell, shape [cells, cells]; one outside counts for the nearest."""
+    """Count the particles in each cell, shape [cells, cells]; one outside counts for
+    the nearest.
+    """
     cell = np.floor((position - box.low) / box.spacing).astype(np.int64)
     column, row = np.clip(cell, 0, box.cells - 1).T
     counts = np.bincount(column * box.cells + row, minlength=box.cells**2)
@@ -69,7 +76,8 @@ def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
 def lid_corners(position: Reals, box: Box) -> NDArray[np.bool_]:
     """Tell which particles lie in the 5 x 5 cells at either end of the top wall."""
     extent = CORNER_CELLS * box.spacing
-    x, y = position[:, 0], position[:, 1]
+    x = position[:, 0]
+    y = position[:, 1]
     return (y > box.high - extent) & ((x < box.low + extent) | (x > box.high - extent))
 
 
@@ -79,7 +87,9 @@ def kinetic_energy(velocity: Reals, mass: float) -> float:
 
 
 def displacement_energy(after: Reals, before: Reals, mass: float) -> float:
-    """Return the kinetic energy of x(f) - x(f-1), taking the frame as the unit of time."""
+    """Return the kinetic energy of x(f) - x(f-1), taking the frame as the unit of
+    time.
+    """
     return kinetic_energy(after.astype(np.float64) - before.astype(np.float64), mass)
 
 
@@ -92,19 +102,26 @@ class Rates:
 
     @property
     def ratio(self) -> float:
-        """Divergence over vorticity [1]; 0 for incompressible flow, NaN for a fluid at rest."""
-        return self.divergence / self.vorticity if self.vorticity > 0.0 else float("nan")
+        """Divergence over vorticity [1]; 0 for incompressible flow, NaN for a fluid at
+        rest.
+        """
+        return (
+            self.divergence / self.vorticity if self.vorticity > 0.0 else float("nan")
+        )
 
 
 def grid_rates(velocity: Reals, spacing: float) -> Rates:
-    """Return RMS divergence and vorticity of a nodal velocity [column, row, 2] by central differences."""
+    """Return RMS divergence and vorticity of a nodal velocity [column, row, 2] by
+    central differences.
+    """
     field = velocity.astype(np.float64)
     along_x = (field[2:, 1:-1] - field[:-2, 1:-1]) / (2.0 * spacing)
     along_y = (field[1:-1, 2:] - field[1:-1, :-2]) / (2.0 * spacing)
     divergence = along_x[..., 0] + along_y[..., 1]
     vorticity = along_x[..., 1] - along_y[..., 0]
     return Rates(
-        divergence=float(np.sqrt(np.mean(divergence**2))), vorticity=float(np.sqrt(np.mean(vorticity**2)))
+        divergence=float(np.sqrt(np.mean(divergence**2))),
+        vorticity=float(np.sqrt(np.mean(vorticity**2))),
     )
 
 
@@ -177,8 +194,12 @@ REYNOLDS = tuple(_U)  # Reynolds numbers U L / nu that are tabulated here
 class CentreLines:
     """Velocities on the two centre lines."""
 
-    u: NDArray[np.float64]  # u/U at (1/2, Y) [1], shape [15]; NaN where there is no value
-    v: NDArray[np.float64]  # v/U at (X, 1/2) [1], shape [15]; NaN where there is no value
+    u: NDArray[
+        np.float64
+    ]  # u/U at (1/2, Y) [1], shape [15]; NaN where there is no value
+    v: NDArray[
+        np.float64
+    ]  # v/U at (X, 1/2) [1], shape [15]; NaN where there is no value
 
 
 @dataclass(frozen=True)
@@ -196,16 +217,23 @@ def centre_lines(reynolds: float) -> CentreLines | None:
     return CentreLines(u=np.array(_U[int(reynolds)]), v=np.array(_V[int(reynolds)]))
 
 
-def deviation(measured: NDArray[np.float64], reference: NDArray[np.float64]) -> Deviation:
+def deviation(
+    measured: NDArray[np.float64], reference: NDArray[np.float64]
+) -> Deviation:
     """Compare two profiles at the points where the reference has a value."""
     known = ~np.isnan(reference)
     difference = measured[known] - reference[known]
-    return Deviation(rmse=float(np.sqrt(np.mean(difference**2))), maximum=float(np.max(np.abs(difference))))
+    return Deviation(
+        rmse=float(np.sqrt(np.mean(difference**2))),
+        maximum=float(np.max(np.abs(difference))),
+    )
 
 
 @dataclass(frozen=True)
 class Profiles:
-    """Velocity on the two centre lines, as splines in units of box width and lid speed."""
+    """Velocity on the two centre lines, as splines in units of box width and lid
+    speed.
+    """
 
     u: CubicSpline  # u/U against height on x = 1/2
     v: CubicSpline  # v/U against abscissa on y = 1/2
@@ -216,7 +244,8 @@ class Profiles:
 
 
 def extract(velocity: NDArray[np.floating], box: Box, lid_speed: float) -> Profiles:
-    """Return the profiles of a nodal velocity between the walls [length/s], shape [column, row, 2].
+    """Return the profiles of a nodal velocity between the walls [length/s], shape
+    [column, row, 2].
 
     Cubic splines through the nodes and the walls, where the fluid moves with the wall.
     """
@@ -224,16 +253,22 @@ def extract(velocity: NDArray[np.floating], box: Box, lid_speed: float) -> Profi
     nodes = (box.nodes - box.low) / box.width
     middle_u = _spline(nodes, field[:, :, 0], 0.0, 0.0)(0.5)
     middle_v = _spline(nodes, field[:, :, 1].T, 0.0, 0.0)(0.5)
-    return Profiles(u=_spline(nodes, middle_u, 0.0, 1.0), v=_spline(nodes, middle_v, 0.0, 0.0))
+    return Profiles(
+        u=_spline(nodes, middle_u, 0.0, 1.0), v=_spline(nodes, middle_v, 0.0, 0.0)
+    )
 
 
 def _spline(nodes: Array, values: Array, at_low: float, at_high: float) -> CubicSpline:
     """Interpolate along the first axis between a wall value at 0 and one at 1."""
     low, high = (np.full((1, *values.shape[1:]), value) for value in (at_low, at_high))
-    return CubicSpline(np.concatenate([[0.0], nodes, [1.0]]), np.concatenate([low, values, high]))
+    return CubicSpline(
+        np.concatenate([[0.0], nodes, [1.0]]), np.concatenate([low, values, high])
+    )
 
 
-def draw(profiles: Profiles, reference: CentreLines | None, title: str, path: Path) -> None:
+def draw(
+    profiles: Profiles, reference: CentreLines | None, title: str, path: Path
+) -> None:
     """Draw u against height and v against abscissa, Ghia's points over them."""
     from matplotlib.figure import Figure
 

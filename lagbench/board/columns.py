@@ -1,4 +1,6 @@
-"""Columns of the board's tables, what a row has in each, and the presets that choose among them."""
+"""Columns of the board's tables, what a row has in each, and the presets that choose
+among them.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +18,48 @@ from .entry import EntryBudget
 from .model import Floor, Row, Tab, Value
 
 MAIN_METRICS = 5
-"""Metrics of the first table, the ranking one among them; with more it would be wider than a screen."""
+"""Metrics of the first table, the ranking one among them; with more it would be wider
+than a screen.
+"""
 
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "position": (
-        *("cloud_distance", "position_rmse_20", "position_rmse", "position_mae", "velocity_rmse"),
-        *("velocity_mae", "attribute_mse", "mse_avg", "mse_end", "sliced_w2", "sinkhorn", "sinkhorn_pot"),
-        *(f"position_rmse_{material}" for material in ("liquid", "jelly", "snow", "rope")),
+        *(
+            "cloud_distance",
+            "position_rmse_20",
+            "position_rmse",
+            "position_mae",
+            "velocity_rmse",
+        ),
+        *(
+            "velocity_mae",
+            "attribute_mse",
+            "mse_avg",
+            "mse_end",
+            "sliced_w2",
+            "sinkhorn",
+            "sinkhorn_pot",
+        ),
+        *(
+            f"position_rmse_{material}"
+            for material in ("liquid", "jelly", "snow", "rope")
+        ),
     ),
     "vorticity": (
-        *("vorticity_nrmse", "vorticity_rmse", "vorticity_mae", "vorticity_pearson", "stable_frames"),
+        *(
+            "vorticity_nrmse",
+            "vorticity_rmse",
+            "vorticity_mae",
+            "vorticity_pearson",
+            "stable_frames",
+        ),
         *("spectrum_error", "vorticity_residual_std", "vorticity_residual_max"),
-        *("vorticity_residual_slope", "vorticity_kl", "vorticity_kl_hist", "vorticity_w1"),
+        *(
+            "vorticity_residual_slope",
+            "vorticity_kl",
+            "vorticity_kl_hist",
+            "vorticity_w1",
+        ),
     ),
     "energy": (
         *("energy_error", "energy_ratio", "energy_retention", "energy_retention_true"),
@@ -37,10 +69,26 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
         *("momentum_error", "angular_momentum_error", "density_rmse"),
         *("divergence_rms", "divergence_rms_true", "shape_error", "connectivity"),
     ),
-    "training": ("track", "windows", "epochs", "cpu_hours", "gpu_hours", "parameters", "seeds"),
-    "cost": ("speed_up", "seconds_per_frame", "solver_seconds_per_frame", "parameters", "device"),
+    "training": (
+        "track",
+        "windows",
+        "epochs",
+        "cpu_hours",
+        "gpu_hours",
+        "parameters",
+        "seeds",
+    ),
+    "cost": (
+        "speed_up",
+        "seconds_per_frame",
+        "solver_seconds_per_frame",
+        "parameters",
+        "device",
+    ),
 }
-"""Columns by preset; those that a data set lacks are left out, the ranking one stands first."""
+"""Columns by preset; those that a data set lacks are left out, the ranking one stands
+first.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,18 +103,26 @@ class Column:
     form: str = "number"  # how cells are written: number, count, factor or text
     reported: bool = False  # said by the submitter, computed again by nobody
     meaning: str
-    of: Callable[[Row | Floor], object] | None = None  # what a row has there, where no metric stands behind
+    of: Callable[[Row | Floor], object] | None = (
+        None  # what a row has there, where no metric stands behind
+    )
 
     @property
     def quantity(self) -> str:
         """Label and unit, as an axis has them."""
-        return f"{self.label} [{self.unit}]" if self.unit else self.label
+        if self.unit:
+            return f"{self.label} [{self.unit}]"
+        return self.label
 
     def loss(self, value: float) -> float:
-        """Return the value turned so that smaller is better; NaN for what is not judged."""
+        """Return the value turned so that smaller is better; NaN for what is not
+        judged.
+        """
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
-        return {Direction.LOWER: value, Direction.HIGHER: -value}.get(self.direction, math.nan)
+        return {Direction.LOWER: value, Direction.HIGHER: -value}.get(
+            self.direction, math.nan
+        )
 
 
 SKILL = Column(
@@ -74,7 +130,8 @@ SKILL = Column(
     label="skill",
     direction=Direction.HIGHER,
     perfect=1.0,
-    meaning="1 - score / score of the best floor, by the ranking metric: 0 is nothing learned, 1 perfect.",
+    meaning="1 - score / score of the best floor, by the ranking metric: 0 is nothing "
+    "learned, 1 perfect.",
 )
 
 
@@ -88,18 +145,46 @@ def _of(part: str, key: str) -> Callable[[Row | Floor], object]:
 
 def _reported(part: str, key: str, label: str, meaning: str, **how: Any) -> Column:  # noqa: ANN401
     """Return a column of what submitters say."""
-    return Column(key=key, label=label, meaning=meaning, reported=True, of=_of(part, key), **how)
+    return Column(
+        key=key, label=label, meaning=meaning, reported=True, of=_of(part, key), **how
+    )
 
 
 SPEED_UP = "Time of the solver over that of the model per frame."
 TIME = "Wall time of a frame of one scenario."
 TRACK = "Equal compute for all, or trained until it no longer helped."
 OF_ENTRY = (
-    _reported("cost", "speed_up", "speed\u2011up", SPEED_UP, form="factor", direction=Direction.HIGHER),
-    _reported("cost", "seconds_per_frame", "time per frame", TIME, unit="s", direction=Direction.LOWER),
-    _reported("cost", "solver_seconds_per_frame", "solver time per frame", "On the same machine.", unit="s"),
+    _reported(
+        "cost",
+        "speed_up",
+        "speed\u2011up",
+        SPEED_UP,
+        form="factor",
+        direction=Direction.HIGHER,
+    ),
+    _reported(
+        "cost",
+        "seconds_per_frame",
+        "time per frame",
+        TIME,
+        unit="s",
+        direction=Direction.LOWER,
+    ),
+    _reported(
+        "cost",
+        "solver_seconds_per_frame",
+        "solver time per frame",
+        "On the same machine.",
+        unit="s",
+    ),
     _reported("cost", "device", "device", "Machine of both times.", form="text"),
-    _reported("", "parameters", "parameters", "Trainable parameters of the model.", form="count"),
+    _reported(
+        "",
+        "parameters",
+        "parameters",
+        "Trainable parameters of the model.",
+        form="count",
+    ),
     Column(
         key="budget",
         label="budget",
@@ -124,10 +209,21 @@ OF_ENTRY = (
         key="checked",
         label="scores",
         form="text",
-        meaning="Verified: the maintainers scored these predictions again. As submitted: they did not.",
-        of=lambda row: ("verified" if row.verified else "as submitted") if isinstance(row, Row) else "",
+        meaning="Verified: the maintainers scored these predictions again. As "
+        "submitted: they did not.",
+        of=lambda row: (
+            ("verified" if row.verified else "as submitted")
+            if isinstance(row, Row)
+            else ""
+        ),
     ),
-    Column(key="date", label="date", form="text", meaning="Of the submission.", of=_of("", "date")),
+    Column(
+        key="date",
+        label="date",
+        form="text",
+        meaning="Of the submission.",
+        of=_of("", "date"),
+    ),
 )
 """Columns that no metric stands behind."""
 
@@ -138,23 +234,42 @@ def _budget(budget: EntryBudget | None) -> str:
         return ""
     hours = {"CPU": budget.cpu_hours, "GPU": budget.gpu_hours}
     said = [f"{text(value)} {kind} h" for kind, value in hours.items() if value]
-    return " + ".join(said) or (f"{_count(float(budget.windows))} windows" if budget.windows else "")
+    return " + ".join(said) or (
+        f"{_count(float(budget.windows))} windows" if budget.windows else ""
+    )
 
 
 def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
-    """Return all columns of a tab by key: skill, the metrics to show at first, the others, then the rest."""
+    """Return all columns of a tab by key: skill, the metrics to show at first, the
+    others, then the rest.
+    """
     found = {name for row in tab.lines for name in row.values}
     names = [name for name in dict.fromkeys((*tab.columns, *metrics)) if name in found]
-    columns = [SKILL] if any(row.skill for row in tab.rows) else []
+    if any(row.skill for row in tab.rows):
+        columns = [SKILL]
+    else:
+        columns = []
     for metric in (metrics[name] for name in names):
-        unit = "" if metric.unit == "1" else metric.unit.replace("^2", "²")
-        shown = Column(key=metric.name, label=words(metric.name), unit=unit, meaning=sentence(metric))
-        columns.append(replace(shown, direction=metric.direction, perfect=metric.perfect))
+        if metric.unit == "1":
+            unit = ""
+        else:
+            unit = metric.unit.replace("^2", "²")
+        shown = Column(
+            key=metric.name,
+            label=words(metric.name),
+            unit=unit,
+            meaning=sentence(metric),
+        )
+        columns.append(
+            replace(shown, direction=metric.direction, perfect=metric.perfect)
+        )
     return {column.key: column for column in (*columns, *OF_ENTRY)}
 
 
 def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
-    """Return the keys of each preset that has something to show, main first, all last."""
+    """Return the keys of each preset that has something to show, main first, all
+    last.
+    """
     main = ("skill", *tab.columns[:MAIN_METRICS], "speed_up", "budget", "checked")
     return {
         name: tuple(key for key in columns if key in ("skill", tab.ranking, *keys))
@@ -164,29 +279,43 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
 
 
 def value_of(row: Row | Floor, column: Column) -> float | str:
-    """Return what a row has in a column; NaN, or an empty text, where it has nothing."""
+    """Return what a row has in a column; NaN, or an empty text, where it has
+    nothing.
+    """
     if (value := held(row, column.key)) is not None:
         return value.mean
-    found = column.of(row) if column.of else None
+    if column.of:
+        found = column.of(row)
+    else:
+        found = None
     if column.form == "text":
         return str(found or "")
-    return math.nan if found is None else float(str(found))
+    if found is None:
+        return math.nan
+    return float(str(found))
 
 
 def loss_of(row: Row | Floor, column: Column) -> float:
-    """Return what a row loses in a column, smaller is better; NaN where nothing is judged.
+    """Return what a row loses in a column, smaller is better; NaN where nothing is
+    judged.
 
-    Of a metric that aims at a value the mean of the scenarios' losses: beside and beyond do not cancel.
+    Of a metric that aims at a value the mean of the scenarios' losses: beside and
+    beyond do not cancel.
     """
-    value, found = value_of(row, column), held(row, column.key)
+    value = value_of(row, column)
+    found = held(row, column.key)
     if column.direction is Direction.TARGET and found is not None:
         return mean(np.array([column.loss(one) for one in found.per_scenario]))
-    return math.nan if isinstance(value, str) else column.loss(value)
+    if isinstance(value, str):
+        return math.nan
+    return column.loss(value)
 
 
 def held(row: Row | Floor, key: str) -> Value | None:
     """Return the value of a metric, or the skill; None where a row has none."""
-    return row.skill if key == "skill" and isinstance(row, Row) else row.values.get(key)
+    if key == "skill" and isinstance(row, Row):
+        return row.skill
+    return row.values.get(key)
 
 
 def written(value: float | str, form: str) -> str:
@@ -200,7 +329,9 @@ def written(value: float | str, form: str) -> str:
     if form == "count":
         return _count(value)
     said = text(value)
-    return f"{said}×" if form == "factor" and math.isfinite(value) else said
+    if form == "factor" and math.isfinite(value):
+        return f"{said}×"
+    return said
 
 
 def _count(value: float) -> str:

@@ -1,4 +1,6 @@
-"""The checks of a leaderboard by name, what they find, and what is suspect in an entry by itself."""
+"""The checks of a leaderboard by name, what they find, and what is suspect in an entry
+by itself.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,12 @@ from lagbench.submission.findings import Finding, Severity
 from .entry import Entry
 from .folder import Folder
 
-ROUNDING = 1e-6  # share of the greatest value by which rounding may take one below zero, or above one
+# share of the greatest value by which rounding may take one below zero, or above one
+ROUNDING = 1e-6
 
-RESCORE = "submit the predictions again: lagbench submit; the score block is not for editing"
+RESCORE = (
+    "submit the predictions again: lagbench submit; the score block is not for editing"
+)
 FLOORS_ANEW = "remove the file: `lagbench submit` writes the floors anew"
 
 
@@ -50,7 +55,8 @@ CHECKS: Mapping[str, Check] = {
         "write it with `lagbench submit`",
     ),
     "schema": Check(
-        "unknown or missing keys, values that do not fit, addresses that are no named host's",
+        "unknown or missing keys, values that do not fit, addresses that are no "
+        "named host's",
         "the entry does not fit",
         "what leaderboard/schema.json says",
         "docs/submitting.md describes the keys",
@@ -129,17 +135,20 @@ CHECKS: Mapping[str, Check] = {
         "no track, since the predictions have no budgets",
     ),
     "weights": Check(
-        "weights that are missing, edited, out of place, without an entry or of two; more than 40 MB of"
+        "weights that are missing, edited, out of place, without an entry or of two; "
+        "more than 40 MB of"
         " them; a long or broken record of a training",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
-        "submit with the weights again: lagbench submit --weights; or remove what no entry names",
+        "submit with the weights again: lagbench submit --weights; or remove what no "
+        "entry names",
     ),
     "twin": Check(
         "the same predictions under two names or seeds",
         "the same predictions stand here twice",
         "predictions of its own",
-        "submit predictions once; if the method has a new name, supersede the old entry",
+        "submit predictions once; if the method has a new name, supersede the "
+        "old entry",
     ),
     "stray": Check(
         "a score file that no entry has",
@@ -148,7 +157,8 @@ CHECKS: Mapping[str, Check] = {
         "add its entry, or remove it",
     ),
     "floor": Check(
-        "scores of a floor that are unknown, cannot be read, or belong to something else",
+        "scores of a floor that are unknown, cannot be read, or belong to "
+        "something else",
         "no floor of the scorer",
         "scores of a floor that `lagbench submit` wrote",
         FLOORS_ANEW,
@@ -160,7 +170,8 @@ CHECKS: Mapping[str, Check] = {
         "remove the line: it holds for nothing any more",
     ),
     "base": Check(
-        "an entry that was there before and that the change touches, removes or alters in status",
+        "an entry that was there before and that the change touches, removes or "
+        "alters in status",
         "the change alters what was there before",
         "the same as before",
         "leave it as it was; if it is yours, say so: --own METHOD",
@@ -174,7 +185,8 @@ CHECKS: Mapping[str, Check] = {
         "a shipped score of a floor that is not what the data give, measured again",
         "the shipped scores of a floor are not those of the data",
         "the scores that the package ships",
-        "lagbench verify; if the data are the recorded ones, python -m lagbench.scoring.record",
+        "lagbench verify; if the data are the recorded ones, python -m "
+        "lagbench.scoring.record",
     ),
     "page": Check(
         "a page or schema.json that is not what the submissions give",
@@ -195,7 +207,9 @@ def finding(
     expected: object = None,
     fix: str | None = None,
 ) -> Finding:
-    """Return something that rejects a pull request; what is not said is the check's own wording."""
+    """Return something that rejects a pull request; what is not said is the check's own
+    wording.
+    """
     own = CHECKS[check]
     return Finding(
         check=check,
@@ -210,14 +224,17 @@ def finding(
 
 def finding_of(check: str, error: LagbenchError, where: object) -> Finding:
     """Return an error as a finding."""
-    return finding(check, where, error.got, what=error.what, expected=error.expected, fix=error.fix)
+    return finding(
+        check, where, error.got, what=error.what, expected=error.expected, fix=error.fix
+    )
 
 
 def print_of(tallies: Mapping[int, Tally]) -> str:
-    """Return what only the same predictions share: their errors in every scenario and frame.
+    """Return what only the same predictions share: their errors in every scenario and
+    frame.
 
-    Those that lagbench measures: what a package measures beside them tells nothing apart. What is changed
-    by hand, scoring again tells.
+    Those that lagbench measures: what a package measures beside them tells nothing
+    apart. What is changed by hand, scoring again tells.
     """
     digest = hashlib.sha256()
     for scenario, tally in sorted(tallies.items()):
@@ -229,7 +246,9 @@ def print_of(tallies: Mapping[int, Tally]) -> str:
 
 
 def prints_of(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
-    """Return what only the same predictions share, whatever they are called, and where."""
+    """Return what only the same predictions share, whatever they are called, and
+    where.
+    """
     found = {}
     for path in (path for entry in others.values() for path in entry.score_paths):
         with suppress(UnreadableFileError):  # `leaderboard check` tells of those
@@ -240,24 +259,36 @@ def prints_of(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
 def impossible(held: Stored) -> Iterator[str]:
     """Yield values that no prediction can have, whoever wrote them.
 
-    Errors and distances are never negative, correlations never above one; and where one error
-    of a scenario is zero at all frames, so are the others: the prediction is the truth.
+    Errors and distances are never negative, correlations never above one; and where one
+    error of a scenario is zero at all frames, so are the others: the prediction is the
+    truth.
     """
     for scenario, tally in sorted(held.scores.tallies.items()):
         errors = {}
         for name in tally.names:
-            metric, series = METRICS.get(name), tally.series(name)
+            metric = METRICS.get(name)
+            series = tally.series(name)
             known = series[~np.isnan(series)]
             if metric is None or not known.size:
                 continue
             room = ROUNDING * np.abs(known).max()
-            low = metric.direction is Direction.LOWER and metric.perfect == 0.0 and known.min() < -room
-            high = metric.direction is Direction.HIGHER and metric.perfect == 1.0 and known.max() > 1.0 + room
+            low = (
+                metric.direction is Direction.LOWER
+                and metric.perfect == 0.0
+                and known.min() < -room
+            )
+            high = (
+                metric.direction is Direction.HIGHER
+                and metric.perfect == 1.0
+                and known.max() > 1.0 + room
+            )
             if low or high:
                 yield f"{name} {known.min() if low else known.max():.6g} in scenario {scenario}"
             if name.endswith(("_mse", "_mae")):
                 errors[name] = bool(np.any(known != 0.0))
-        for name in [name for name, some in errors.items() if not some and any(errors.values())]:
+        for name in [
+            name for name, some in errors.items() if not some and any(errors.values())
+        ]:
             yield f"{name} 0 at all frames of scenario {scenario}, though the prediction is not the truth"
 
 
@@ -265,7 +296,8 @@ LOOKALIKES = str.maketrans(
     "авекмнорстухіјѕԁһӏԛԝгпαβεηικνορτυχζγω01",  # noqa: RUF001 (that is the point)
     "abekmhopctyxijsdhlqwrnabehlkvoptuxzywol",
 )
-"""Letters of other scripts, and digits, beside the Latin letters that they look like."""
+"""Letters of other scripts, and digits, beside the Latin letters that they look like.
+"""
 
 
 def skeleton(name: str) -> str:
@@ -274,6 +306,10 @@ def skeleton(name: str) -> str:
     >>> skeleton("GN\u0405 1") == skeleton("gns-l")
     True
     """
-    folded = unicodedata.normalize("NFKD", unicodedata.normalize("NFKD", name).casefold())
-    plain = "".join(letter for letter in folded if letter.isalnum()).translate(LOOKALIKES)
+    folded = unicodedata.normalize(
+        "NFKD", unicodedata.normalize("NFKD", name).casefold()
+    )
+    plain = "".join(letter for letter in folded if letter.isalnum()).translate(
+        LOOKALIKES
+    )
     return plain.replace("i", "l")

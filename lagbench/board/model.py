@@ -1,7 +1,8 @@
 """What a board shows: tabs, rows and floors, every number formed from score files.
 
-Plain values only, so that a page, a table in the terminal and a test read the same thing.
-Undefined numbers are NaN. Text of entries comes from strangers: it is data, never markup.
+Plain values only, so that a page, a table in the terminal and a test read the same
+thing. Undefined numbers are NaN. Text of entries comes from strangers: it is data,
+never markup.
 """
 
 from __future__ import annotations
@@ -29,13 +30,17 @@ class Value:
     low: float  # lower bound of the 95 % interval
     high: float
     per_scenario: tuple[float, ...]  # mean over seeds, in the order of Tab.scenarios
-    at: Mapping[int, float]  # mean at Tab.marked; empty for metrics that mean nothing at one frame
+    at: Mapping[
+        int, float
+    ]  # mean at Tab.marked; empty for metrics that mean nothing at one frame
     undefined: int  # frames without a value, all scenarios and seeds together
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curve:
-    """A metric over frames: mean over scenarios and seeds, with its band; NaN where undefined."""
+    """A metric over frames: mean over scenarios and seeds, with its band; NaN where
+    undefined.
+    """
 
     frames: tuple[int, ...]  # absolute numbers, at most 120, first and last included
     mean: Floats
@@ -58,11 +63,17 @@ class Pictures:
 
     scenario: int
     map_frames: tuple[int, ...]  # frames of interest and the last one
-    vorticity: NDArray[np.float32]  # [1/frame], NaN elsewhere, shape [map frame, x node, y node]
+    vorticity: NDArray[
+        np.float32
+    ]  # [1/frame], NaN elsewhere, shape [map frame, x node, y node]
     histograms: tuple[Histogram, ...]  # of it over the truth's range, by map frame
     film_frames: tuple[int, ...]
-    material: NDArray[np.int8]  # of each film particle: 0 liquid, 1 jelly, 2 snow, 3 rope
-    film: NDArray[np.float32]  # positions in [-0.5, 1.5] [length], shape [film frame, particle, 2]
+    material: NDArray[
+        np.int8
+    ]  # of each film particle: 0 liquid, 1 jelly, 2 snow, 3 rope
+    film: NDArray[
+        np.float32
+    ]  # positions in [-0.5, 1.5] [length], shape [film frame, particle, 2]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,7 +86,9 @@ class Floor:
     curves: Mapping[str, Curve]
     energy: Curve | None
     counts: bool = True  # whether it may be the best floor
-    cost: Cost | None = None  # what a frame costs it and the solver, on the machine that measured
+    cost: Cost | None = (
+        None  # what a frame costs it and the solver, on the machine that measured
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,9 +99,12 @@ class Row:
     current: bool  # scored on the data set version of today; others are not ranked
     rank: int | None  # in the order of the ranking metric; None where not ranked
     tied: bool  # cannot be told from the leader at 5 %
-    p: float  # against the leader, corrected by Holm; NaN for the leader and without a claim
+    # against the leader, corrected by Holm; NaN for the leader and without a claim
+    p: float
     verified: Verification | None  # the maintainers scored these predictions again
-    skill: Value | None  # 1 - score / score of the best floor, where the score files say it
+    skill: (
+        Value | None
+    )  # 1 - score / score of the best floor, where the score files say it
     values: Mapping[str, Value]
     seed_means: tuple[float, ...]  # mean of the ranking metric of each seed
     curves: Mapping[str, Curve]
@@ -114,7 +130,9 @@ class Row:
     @property
     def warnings(self) -> tuple[Flag, ...]:
         """What the validation warned of for any seed."""
-        return _merged([flag for file in self.entry.score.files for flag in file.warnings])
+        return _merged(
+            [flag for file in self.entry.score.files for flag in file.warnings]
+        )
 
     @property
     def diverged(self) -> int:
@@ -123,15 +141,21 @@ class Row:
 
 
 def _merged(found: Sequence[Flag]) -> tuple[Flag, ...]:
-    """Return flags by name, each once, with the reasons that any seed gave and the greatest share."""
+    """Return flags by name, each once, with the reasons that any seed gave and the
+    greatest share.
+    """
     held: dict[str, list[Flag]] = {}
     for flag in found:
         held.setdefault(flag.name, []).append(flag)
     return tuple(
         Flag.model_construct(
             name=name,
-            reasons=tuple(dict.fromkeys(reason for flag in flags for reason in flag.reasons)),
-            share=max((flag.share for flag in flags if flag.share is not None), default=None),
+            reasons=tuple(
+                dict.fromkeys(reason for flag in flags for reason in flag.reasons)
+            ),
+            share=max(
+                (flag.share for flag in flags if flag.share is not None), default=None
+            ),
         )
         for name, flags in held.items()
     )
@@ -149,12 +173,16 @@ class Tab:
     ranking: str  # name of the metric that ranks
     decided: bool  # whether there are scenarios enough for a p-value
     columns: tuple[str, ...]  # names of metrics to show at first, the ranking one first
-    curves: tuple[str, ...]  # names of metrics with curves, the ranking one or what stands for it first
+    curves: tuple[
+        str, ...
+    ]  # names of metrics with curves, the ranking one or what stands for it first
     energy: Curve  # true kinetic energy
     truth: Pictures  # those of the rows have the same scenario and frames
     rows: tuple[Row, ...]  # ranked ones by rank, then the others
     floors: tuple[Floor, ...]
-    solver_seconds: float | None = None  # processor time of a frame of the solver itself [s]
+    solver_seconds: float | None = (
+        None  # processor time of a frame of the solver itself [s]
+    )
 
     @property
     def id(self) -> str:
@@ -169,8 +197,12 @@ class Tab:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Board:
-    """Everything that a page draws; equal submissions give equal boards, in any file order."""
+    """Everything that a page draws; equal submissions give equal boards, in any file
+    order.
+    """
 
     tabs: tuple[Tab, ...]  # in the order of the registry
-    empty: tuple[tuple[str, str], ...]  # splits and sizes that have no learned entry yet
+    empty: tuple[
+        tuple[str, str], ...
+    ]  # splits and sizes that have no learned entry yet
     metrics: Mapping[str, Metric]  # those that occur, in the table's order

@@ -1,9 +1,10 @@
 """Score predictions and write the entry: ``lagbench submit``.
 
-What can be refused is refused before the work: together what needs no file, then together what the
-files must be for. Then all files are written beside their places and moved there, last the YAML file,
-which names them by SHA-256: what a kill between two moves leaves behind, ``lagbench leaderboard check``
-finds. ``lagbench leaderboard build`` draws the board's page anew.
+What can be refused is refused before the work: together what needs no file, then
+together what the files must be for. Then all files are written beside their places and
+moved there, last the YAML file, which names them by SHA-256: what a kill between two
+moves leaves behind, ``lagbench leaderboard check`` finds.
+``lagbench leaderboard build`` draws the board's page anew.
 """
 
 from __future__ import annotations
@@ -50,16 +51,34 @@ from .entry import (
     ScoreBlock,
     last_day,
 )
-from .entry_file import Model, active_beside, examine, listed, read_verified, readable, spell, unverified
+from .entry_file import (
+    Model,
+    active_beside,
+    examine,
+    listed,
+    read_verified,
+    readable,
+    spell,
+    unverified,
+)
 from .findings import print_of, prints_of, skeleton
-from .folder import FLOORS, SUBMISSIONS, VERIFIED, Folder, Place, entry_path, score_paths
+from .folder import (
+    FLOORS,
+    SUBMISSIONS,
+    VERIFIED,
+    Folder,
+    Place,
+    entry_path,
+    score_paths,
+)
 from .ranking import combine, scored_file, summarise, write_floors
 from .seeds import extendable, require_new, seeds_of
 from .weights import named_weights, require_weights, stage_weights
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
 
-STAGE = ".submit-"  # begins the folder in which score files are prepared; a killed process leaves it behind
+# begins the folder in which score files are prepared; a killed process leaves it behind
+STAGE = ".submit-"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +93,9 @@ class SubmitResult:
     std: float | None  # over seeds; None for one seed
     flags: tuple[str, ...]  # names of flags that were raised
     board: Path
-    files: tuple[Path, ...]  # what was written; verified.yaml, where the entry before had a line there
+    files: tuple[
+        Path, ...
+    ]  # what was written; verified.yaml, where the entry before had a line there
     kept: tuple[Path, ...]  # weights of the entry before that are those of this one
     removed: tuple[Path, ...]  # what only the entry before had
 
@@ -94,42 +115,69 @@ def submit(
     progress: Callable[[Progress], None] | None = None,
     examined: Callable[[ValidationResult], None] | None = None,
 ) -> SubmitResult:
-    """Score predictions, a file per seed; write entry and score files, and those of floors beside them.
+    """Score predictions, a file per seed; write entry and score files, and those of
+    floors beside them.
 
-    ``weights`` made the predictions and are kept beside the entry: at most one file per seed. With ``add``
-    the files are further seeds of the entry of that name, whose other predictions need not be at hand; what
-    it says of the method stays, but for what ``meta`` says. ``examined`` is told what each validation found.
+    ``weights`` made the predictions and are kept beside the entry: at most one file per
+    seed. With ``add`` the files are further seeds of the entry of that name, whose
+    other predictions need not be at hand; what it says of the method stays, but for
+    what ``meta`` says. ``examined`` is told what each validation found.
 
     Raises:
-        UsageError: a key is missing, the entry is there already or, with ``add``, is not or has changed
-            meanwhile, the files do not belong together, name or predictions are another's, or no leaderboard.
+        UsageError: a key is missing, the entry is there already or, with ``add``, is
+            not or has changed meanwhile, the files do not belong together, name or
+            predictions are another's, or no leaderboard.
         UnreadableFileError: predictions or weights cannot be read.
-        ChecksFailedError: they are not valid; with ``add``, what lies beside the entry is not what it names.
+        ChecksFailedError: they are not valid; with ``add``, what lies beside the entry
+            is not what it names.
         DataError: the test subset is missing, or they were made from another data set.
-        WorkFailedError: the disk is full or not writable, or a score file became too long.
+        WorkFailedError: the disk is full or not writable, or a score file became too
+            long.
     """
-    folder, paths = Folder(board), [Path(path) for path in predictions]
+    folder = Folder(board)
+    paths = [Path(path) for path in predictions]
     mistakes = Mistakes()
     with mistakes:
         if add and replace:
-            raise UsageError("an entry is added to or replaced", where="--add, --replace", fix="give one")
+            raise UsageError(
+                "an entry is added to or replaced",
+                where="--add, --replace",
+                fix="give one",
+            )
         if not add:
             # what readers need
-            needed = {"authors": "--author NAME", "command": "--command 'what makes the predictions again'"}
-            if missing := [option for key, option in needed.items() if not getattr(meta, key)]:
+            needed = {
+                "authors": "--author NAME",
+                "command": "--command 'what makes the predictions again'",
+            }
+            if missing := [
+                option for key, option in needed.items() if not getattr(meta, key)
+            ]:
                 fix = "give them as options, or authors and command in a file: --from meta.yaml"
-                raise UsageError("the entry lacks what readers need", expected=" and ".join(missing), fix=fix)
+                raise UsageError(
+                    "the entry lacks what readers need",
+                    expected=" and ".join(missing),
+                    fix=fix,
+                )
     with mistakes:
         if new_board:
             folder.require_room()
         else:
-            folder.require("run it from the root of a clone, name it with --board, or begin one: --new-board")
+            folder.require(
+                "run it from the root of a clone, name it with --board, or begin one: "
+                "--new-board"
+            )
     with mistakes:
         for path in paths:
             check_file(path, fix=WRITE)
         if not 1 <= len(paths) <= MOST_SEEDS:
-            what = "too many files" if paths else "no predictions"
-            raise UsageError(what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths))
+            if paths:
+                what = "too many files"
+            else:
+                what = "no predictions"
+            raise UsageError(
+                what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths)
+            )
     mistakes.tell()
     plan = _planned(
         folder,
@@ -142,8 +190,18 @@ def submit(
         root=root,
         registry=registry,
     )
-    scored = partial(score, root=root, workers=workers, registry=registry, progress=progress, write=False)
-    cards = [scored(path, validated=result) for path, result in zip(paths, plan.results, strict=True)]
+    scored = partial(
+        score,
+        root=root,
+        workers=workers,
+        registry=registry,
+        progress=progress,
+        write=False,
+    )
+    cards = [
+        scored(path, validated=result)
+        for path, result in zip(paths, plan.results, strict=True)
+    ]
     prints = [print_of(card.tallies[SUBMISSION]) for card in cards]
     require_new(prints, paths, prints_of(folder, plan.rivals))
     try:
@@ -164,10 +222,14 @@ class _Plan(NamedTuple):
     about: About
     made: Sequence[Prediction]  # what it says of each file
     results: Sequence[ValidationResult]
-    outside: Sequence[float | None]  # share of positions beyond the box, where the validation warns
+    outside: Sequence[
+        float | None
+    ]  # share of positions beyond the box, where the validation warns
     sources: Sequence[Path | None]  # weights of each file
     others: Mapping[Path, Entry]  # active entries of the same data set
-    rivals: Mapping[Path, Entry]  # entries whose predictions it cannot have: others, and added_to
+    rivals: Mapping[
+        Path, Entry
+    ]  # entries whose predictions it cannot have: others, and added_to
     added_to: Entry | None
 
 
@@ -183,8 +245,14 @@ def _planned(
     add: bool,
     examined: Callable[[ValidationResult], None] | None,
 ) -> _Plan:
-    """Refuse invalid files, then together what they must be for; return what the entry will say of them."""
-    headers, hashes, outside, results, described = [], [], [], [], registry or load()
+    """Refuse invalid files, then together what they must be for; return what the entry
+    will say of them.
+    """
+    headers = []
+    hashes = []
+    outside = []
+    results = []
+    described = registry or load()
     for path in paths:
         result = validate(path, root=root, require_truth=True, registry=registry)
         if examined is not None:
@@ -193,19 +261,31 @@ def _planned(
         results.append(result)
         with open_predictions(path) as opened:
             if (got := opened.header.split) not in (known := described.splits):
-                raise UsageError("no split of a leaderboard", where=str(path), expected=[*known], got=got)
+                raise UsageError(
+                    "no split of a leaderboard",
+                    where=str(path),
+                    expected=[*known],
+                    got=got,
+                )
             headers.append(opened.header)
             hashes.append(result.sha256 or opened.content_sha256())
             size = described.size(opened.header.split, opened.header.size)
             warned = any(found.check == OUTSIDE for found in result.warnings)
             outside.append(outside_share(opened, size) if warned else None)
-    others, before, mistakes = dict[Path, Entry](), None, Mistakes()
+    others = dict[Path, Entry]()
+    before = None
+    mistakes = Mistakes()
     with mistakes:
         seeds = seeds_of(headers)
     with mistakes:
         if meta.urls and len(meta.urls) != len(headers):
             fix = f"give {len(headers)}, one per file in their order, or none"
-            raise UsageError("addresses do not match the files", where="--url", got=len(meta.urls), fix=fix)
+            raise UsageError(
+                "addresses do not match the files",
+                where="--url",
+                got=len(meta.urls),
+                fix=fix,
+            )
         urls = meta.urls or (None,) * len(headers)
     with mistakes:
         place = (headers[0].split, headers[0].size, _method(headers[0], meta))
@@ -223,7 +303,12 @@ def _planned(
         for name, holder in names.items():
             if skeleton(name) == skeleton(label):
                 fix = "choose another, or say what differs, in meta.yaml: `name: GNS, six terms`"
-                raise UsageError("the name looks like another's", where=holder, got=ascii(label), fix=fix)
+                raise UsageError(
+                    "the name looks like another's",
+                    where=holder,
+                    got=ascii(label),
+                    fix=fix,
+                )
         read_verified(folder)  # a line of it may have to go
     with mistakes:
         about = _about(headers, meta, before)
@@ -231,27 +316,49 @@ def _planned(
         sources = require_weights(weights, headers, others)
     mistakes.tell()
     rivals = others | ({} if before is None else {before.yaml_path: before})
-    taken = {made.sha256: str(where) for where, entry in rivals.items() for made in entry.predictions}
+    taken = {
+        made.sha256: str(where)
+        for where, entry in rivals.items()
+        for made in entry.predictions
+    }
     require_new(hashes, paths, taken)
-    made, whole = [], folder.path.resolve()
-    for path, sha256, header, seed, url in zip(paths, hashes, headers, seeds, urls, strict=True):
+    made = []
+    whole = folder.path.resolve()
+    for path, sha256, header, seed, url in zip(
+        paths, hashes, headers, seeds, urls, strict=True
+    ):
         inside = path.resolve()
-        kept = inside.relative_to(whole).as_posix() if inside.is_relative_to(whole) else None
-        said: dict[str, object] = {"seed": seed, "sha256": sha256, "url": url, "path": kept}
+        if inside.is_relative_to(whole):
+            kept = inside.relative_to(whole).as_posix()
+        else:
+            kept = None
+        said: dict[str, object] = {
+            "seed": seed,
+            "sha256": sha256,
+            "url": url,
+            "path": kept,
+        }
         said |= {"bytes": path.stat().st_size, "budget": header.budget}
-        made.append(_fitting(Prediction, said, where=path, fix="name the file otherwise, or move it"))
+        made.append(
+            _fitting(
+                Prediction, said, where=path, fix="name the file otherwise, or move it"
+            )
+        )
     return _Plan(place, about, made, results, outside, sources, others, rivals, before)
 
 
 def _method(header: Header, meta: Meta) -> str:
-    """Return the id of the method: the one given, else the label of the predictions if it can be one."""
+    """Return the id of the method: the one given, else the label of the predictions if
+    it can be one.
+    """
     name = meta.method or header.method
     if examine(Meta, {"method": name})[1]:
         raise UsageError(
             "the label of the predictions cannot name an entry",
             expected="small letters, digits and single hyphens",
             got=ascii(name),
-            fix=f"name it: --method {re.sub('[^a-z0-9]+', '-', name.lower()).strip('-') or 'my-model'}",
+            fix=f"name it: --method "
+            f"{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-') or 'my-model'}",
         )
     if name in KNOWN_FLOORS:
         fix = "name your method otherwise; the floors are added by themselves"
@@ -260,18 +367,27 @@ def _method(header: Header, meta: Meta) -> str:
 
 
 def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About:
-    """Return what is said of the method: by ``meta``, else by the entry before, else by the predictions."""
-    first, budgets = headers[0], [header.budget for header in headers]
+    """Return what is said of the method: by ``meta``, else by the entry before, else by
+    the predictions.
+    """
+    first = headers[0]
+    budgets = [header.budget for header in headers]
     if before is not None:
         budgets = [*(made.budget for made in before.predictions), *budgets]
         said = {name: getattr(meta, name) for name in meta.model_fields_set}
-        stays = {name: getattr(before, name) for name in About.model_fields if name not in ("budget", "date")}
+        stays = {
+            name: getattr(before, name)
+            for name in About.model_fields
+            if name not in ("budget", "date")
+        }
         meta = meta.model_copy(update=stays | said)
     held = {name: getattr(meta, name) for name in About.model_fields}
     held["name"] = meta.name or first.method[:100]
     held["date"] = meta.date or datetime.datetime.now(datetime.UTC).date()
     if held["date"] > (last := last_day()):
-        raise UsageError("a day to come", where="date", expected=f"at most {last}", got=meta.date)
+        raise UsageError(
+            "a day to come", where="date", expected=f"at most {last}", got=meta.date
+        )
     held["training"] = meta.training or (first.training or "")[:LONGEST_TEXT]
     if meta.parameters is None:
         held["parameters"] = first.parameters
@@ -284,11 +400,14 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
         raise UsageError(
             "a track is not stated",
             where="budget.track",
-            fix="leave it out: it follows from the budget that `lagbench predict` writes into predictions.nc",
+            fix="leave it out: it follows from the budget that `lagbench predict` "
+            "writes into predictions.nc",
         )
     held["budget"] = EntryBudget.of(first.size, budgets) or meta.budget
     if held["budget"] is None and before is not None and before.budget is not None:
-        held["budget"] = before.budget.model_copy(update={"track": None})  # a track follows from all budgets
+        held["budget"] = before.budget.model_copy(
+            update={"track": None}
+        )  # a track follows from all budgets
     return _fitting(About, held)
 
 
@@ -297,31 +416,47 @@ def _fitting(
     held: Mapping[str, object],
     *,
     where: object = None,
-    fix: str = "say it otherwise in --from meta.yaml; docs/submitting.md describes the keys",
+    fix: str = "say it otherwise in --from meta.yaml; docs/submitting.md describes "
+    "the keys",
 ) -> Model:
     """Return what an entry says, or what of it its schema refuses."""
     found, mistakes = examine(kind, held)
     if found is None:
-        what, place = "the entry does not fit the schema", None if where is None else str(where)
+        what = "the entry does not fit the schema"
+        if where is None:
+            place = None
+        else:
+            place = str(where)
         raise ChecksFailedError(what, where=place, got=listed(mistakes), fix=fix)
     return found
 
 
 def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitResult:
-    """Write all files beside their places, then move them there, the entry last; remove the old one's others.
+    """Write all files beside their places, then move them there, the entry last; remove
+    the old one's others.
 
-    A full disk is met before anything of the old entry is touched. An entry that is added to keeps its
-    score files, under new names where it had but one.
+    A full disk is met before anything of the old entry is touched. An entry that is
+    added to keeps its score files, under new names where it had but one.
     """
-    place, added_to, header = plan.place, plan.added_to, cards[0].header
+    place = plan.place
+    added_to = plan.added_to
+    header = cards[0].header
     split, size, method = place
-    staying, lying = (added_to.predictions, added_to.score_paths) if added_to else ((), ())
-    made, sources = [*staying, *plan.made], [*(None for _ in staying), *plan.sources]
-    names, yaml_path = score_paths(place, [one.seed for one in made]), entry_path(place)
+    staying, lying = (
+        (added_to.predictions, added_to.score_paths) if added_to else ((), ())
+    )
+    made = [*staying, *plan.made]
+    sources = [*(None for _ in staying), *plan.sources]
+    names = score_paths(place, [one.seed for one in made])
+    yaml_path = entry_path(place)
     before = readable(folder.path / yaml_path)
     if added_to is not None and before != added_to:
         fix = "submit again: what was added meanwhile stays"
-        raise UsageError("the entry changed while the files were scored", where=str(yaml_path), fix=fix)
+        raise UsageError(
+            "the entry changed while the files were scored",
+            where=str(yaml_path),
+            fix=fix,
+        )
     (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=STAGE, dir=folder.path) as stage:
         staged = [Path(stage) / name.name for name in names]
@@ -337,32 +472,65 @@ def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitR
                     got=f"{length} bytes",
                     fix="uninstall packages that add metrics, and submit again",
                 )
-        files = added_to.score.files if added_to else ()
+        if added_to:
+            files = added_to.score.files
+        else:
+            files = ()
         files += tuple(map(scored_file, cards, staged[len(staying) :], plan.outside))
         kept = named_weights(folder, place, made, sources, before, plan.others)
-        made = [one.model_copy(update={"weights": held}) for one, held in zip(made, kept, strict=True)]
+        made = [
+            one.model_copy(update={"weights": held})
+            for one, held in zip(made, kept, strict=True)
+        ]
         block = ScoreBlock(
             lagbench=version("lagbench"),
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_stored(target).scores for target in staged])),
+            metrics=summarise(
+                combine([read_stored(target).scores for target in staged])
+            ),
         )
-        said = dict(plan.about) | {"format": 2, "split": split, "size": size, "method": method}
-        said |= {"predictions": tuple(made), "score": block, "reason": added_to.reason if added_to else ""}
-        said["dataset"] = DataSet(version=header.dataset_version, sha256=header.dataset_sha256)
+        said = dict(plan.about) | {
+            "format": 2,
+            "split": split,
+            "size": size,
+            "method": method,
+        }
+        said |= {
+            "predictions": tuple(made),
+            "score": block,
+            "reason": added_to.reason if added_to else "",
+        }
+        said["dataset"] = DataSet(
+            version=header.dataset_version, sha256=header.dataset_sha256
+        )
         entry = _fitting(Entry, said)
         # score files that lie there are the same bytes as staged
-        moves = {name: path for name, path in zip(names, staged, strict=True) if name not in lying}
+        moves = {
+            name: path
+            for name, path in zip(names, staged, strict=True)
+            if name not in lying
+        }
         moves |= stage_weights(Path(stage), kept, sources)
-        texts = {Path(VERIFIED): unverified(folder, entry), yaml_path: spell(entry)}  # the entry last
+        texts = {
+            Path(VERIFIED): unverified(folder, entry),
+            yaml_path: spell(entry),
+        }  # the entry last
         for number, (name, text) in enumerate(texts.items()):
             if text is not None:
-                moves[name] = Path(stage) / f"{number}.yaml"  # a method may be called verified
+                moves[name] = (
+                    Path(stage) / f"{number}.yaml"
+                )  # a method may be called verified
                 moves[name].write_bytes(text)
         records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
-        idle = sorted((set(before.files if before else ()) - set(entry.files)) | (records - set(moves)))
-        folder.require_unlinked([*moves, *(name.parent for name in idle), Path(FLOORS, split, size)])
+        idle = sorted(
+            (set(before.files if before else ()) - set(entry.files))
+            | (records - set(moves))
+        )
+        folder.require_unlinked(
+            [*moves, *(name.parent for name in idle), Path(FLOORS, split, size)]
+        )
         removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
         refuse_folders(removed)
         floors = write_floors(cards[0], folder)
@@ -380,6 +548,10 @@ def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitR
         flags=tuple(dict.fromkeys(flag.name for file in files for flag in file.flags)),
         board=folder.path,
         files=(*(folder.path / name for name in reversed(moves)), *floors),
-        kept=tuple(folder.path / held.path for held in kept if held and Path(held.path) not in moves),
+        kept=tuple(
+            folder.path / held.path
+            for held in kept
+            if held and Path(held.path) not in moves
+        ),
         removed=tuple(removed),
     )

@@ -22,7 +22,15 @@ from .options import (
     option,
     root_of,
 )
-from .output import complain, counted, print_blocks, print_json, progress_bar, say, spell_bytes
+from .output import (
+    complain,
+    counted,
+    print_blocks,
+    print_json,
+    progress_bar,
+    say,
+    spell_bytes,
+)
 from .output import show as tell
 
 if TYPE_CHECKING:
@@ -35,24 +43,41 @@ BOARD = Path("leaderboard")
 
 def submit(
     predictions: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; one per seed.")
+        list[Path],
+        typer.Argument(metavar="FILE...", help="A predictions.nc; one per seed."),
     ],
     source: Annotated[
         Path | None,
-        option("--from FILE", "YAML that describes the method, see docs/submitting.md; options win."),
+        option(
+            "--from FILE",
+            "YAML that describes the method, see docs/submitting.md; options win.",
+        ),
     ] = None,
-    method: Annotated[str | None, option("--method ID", "Names the entry, as in my-model.")] = None,
+    method: Annotated[
+        str | None, option("--method ID", "Names the entry, as in my-model.")
+    ] = None,
     authors: Annotated[list[str] | None, option("--author NAME", "Repeatable.")] = None,
-    command: Annotated[str | None, option("--command TEXT", "What makes the predictions again.")] = None,
-    urls: Annotated[list[str] | None, option("--url URL", "Where FILE can be had; one per FILE.")] = None,
+    command: Annotated[
+        str | None, option("--command TEXT", "What makes the predictions again.")
+    ] = None,
+    urls: Annotated[
+        list[str] | None, option("--url URL", "Where FILE can be had; one per FILE.")
+    ] = None,
     weights: Annotated[
         list[Path] | None,
-        option("--weights FILE", "weights.pt to keep beside the entry; at most one a seed."),
+        option(
+            "--weights FILE", "weights.pt to keep beside the entry; at most one a seed."
+        ),
     ] = None,
-    replace: Annotated[bool, option("--replace", "Replace the entry of that name.")] = False,
-    add: Annotated[bool, option("--add", "Add seeds to the entry of that name; its others stay.")] = False,
+    replace: Annotated[
+        bool, option("--replace", "Replace the entry of that name.")
+    ] = False,
+    add: Annotated[
+        bool, option("--add", "Add seeds to the entry of that name; its others stay.")
+    ] = False,
     new_board: Annotated[
-        bool, option("--new-board", "Begin a leaderboard in --board, where there is none.")
+        bool,
+        option("--new-board", "Begin a leaderboard in --board, where there is none."),
     ] = False,
     board: BoardOption = BOARD,
     root: RootOption = None,
@@ -60,11 +85,15 @@ def submit(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Score predictions and write their entry and score files into the leaderboard's folder."""
+    """Score predictions and write their entry and score files into the leaderboard's
+    folder.
+    """
     from lagbench.board.entry_file import read_meta
     from lagbench.board.submit import submit as run
 
-    meta = read_meta(source, {"method": method, "authors": authors, "command": command, "urls": urls})
+    meta = read_meta(
+        source, {"method": method, "authors": authors, "command": command, "urls": urls}
+    )
     with progress_bar(quiet=quiet or as_json) as draw:
         result = run(
             predictions,
@@ -85,69 +114,106 @@ def submit(
 def _submitted(result: SubmitResult) -> Iterator[str]:
     from lagbench.board.folder import VERIFIED
 
-    mean = "undefined" if result.mean is None else f"{result.mean:.4g}"
-    spread = "" if result.std is None else f" ± {result.std:.2g} over seeds"
+    if result.mean is None:
+        mean = "undefined"
+    else:
+        mean = f"{result.mean:.4g}"
+    if result.std is None:
+        spread = ""
+    else:
+        spread = f" ± {result.std:.2g} over seeds"
     yield f"{result.method} on {result.split} {result.size}: {result.ranking} {mean}{spread}"
     yield from (f"flag {flag}: raised" for flag in result.flags)
     if result.size == "tiny" and result.board == BOARD:
         advice = "it is for trying out: --board trial --new-board"
-        typer.echo(f"warning: tiny has too few scenarios to rank anything; {advice}", err=True)
+        typer.echo(
+            f"warning: tiny has too few scenarios to rank anything; {advice}", err=True
+        )
     yield "written: " + ", ".join(map(str, result.files))
     for what, paths in {"kept": result.kept, "removed": result.removed}.items():
         if paths:
             yield f"{what}, of the entry before: " + ", ".join(map(str, paths))
     if result.board / VERIFIED in result.files:
         yield "its line of verified.yaml is gone: maintainers score the entry again"
-    where = "" if result.board == BOARD else f" --board {result.board}"
+    if result.board == BOARD:
+        where = ""
+    else:
+        where = f" --board {result.board}"
     yield f"next: lagbench leaderboard check{where}; to look at it: lagbench leaderboard build{where}"
 
 
-leaderboard = typer.Typer(no_args_is_help=True, help="Draw, check and show the leaderboard.")
+leaderboard = typer.Typer(
+    no_args_is_help=True, help="Draw, check and show the leaderboard."
+)
 
 
 @leaderboard.command("build", epilog="Example: lagbench leaderboard build")
 def build(
     board: BoardOption = BOARD,
-    check: Annotated[bool, option("--check", "Write nothing; fail where the page is stale.")] = False,
+    check: Annotated[
+        bool, option("--check", "Write nothing; fail where the page is stale.")
+    ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Draw the page: one self-contained index.html; the same submissions give the same bytes."""
+    """Draw the page: one self-contained index.html; the same submissions give the same
+    bytes.
+    """
     from lagbench.board.build import build as run
 
     result = run(board, check=check)
-    state = "written" if result.page in result.written else "up to date"
+    if result.page in result.written:
+        state = "written"
+    else:
+        state = "up to date"
     what = f"{counted(result.rows, 'entry')}, {counted(result.tabs, 'tab')}, {spell_bytes(result.bytes)}"
     tell(result, [f"{result.page}: {what}, {state}"], as_json=as_json, quiet=quiet)
 
 
-@leaderboard.command("check", epilog="Example: lagbench leaderboard check --base origin/main")
+@leaderboard.command(
+    "check", epilog="Example: lagbench leaderboard check --base origin/main"
+)
 def check(
     board: BoardOption = BOARD,
     base: Annotated[
-        str | None, option("--base REF", "Find what the folder alters of entries that this commit has.")
+        str | None,
+        option(
+            "--base REF", "Find what the folder alters of entries that this commit has."
+        ),
     ] = None,
     own: Annotated[
-        list[str] | None, option("--own METHOD", "With --base: an entry of yours; repeatable.")
+        list[str] | None,
+        option("--own METHOD", "With --base: an entry of yours; repeatable."),
     ] = None,
-    page: Annotated[bool, option("--page", "Compare index.html and schema.json too.")] = False,
+    page: Annotated[
+        bool, option("--page", "Compare index.html and schema.json too.")
+    ] = False,
     predictions: Annotated[
-        list[Path] | None, option("--predictions FILE", "Score an entry's predictions again; repeatable.")
+        list[Path] | None,
+        option("--predictions FILE", "Score an entry's predictions again; repeatable."),
     ] = None,
     recording: Annotated[
-        bool, option("--record", "With --predictions: note what is confirmed in verified.yaml.")
+        bool,
+        option(
+            "--record", "With --predictions: note what is confirmed in verified.yaml."
+        ),
     ] = False,
     root: Annotated[
         Path | None,
         option(
             "--root FOLDER",
-            "Where data sets live; without --predictions the shipped floors of those there are measured"
+            "Where data sets live; without --predictions the shipped floors of those "
+            "there are measured"
             " again.",
             parser=root_of,
         ),
     ] = None,
-    split: Annotated[str | None, option("--split NAME", "With --root: floors of this split only.")] = None,
-    size: Annotated[str | None, option("--size NAME", "With --root: floors of this size only.")] = None,
+    split: Annotated[
+        str | None, option("--split NAME", "With --root: floors of this split only.")
+    ] = None,
+    size: Annotated[
+        str | None, option("--size NAME", "With --root: floors of this size only.")
+    ] = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -156,8 +222,14 @@ def check(
     from lagbench.scoring.floors import measured_sizes
 
     if (split or size) and not root:
-        raise UsageError("--split and --size say whose floors are measured again", fix="give --root as well")
-    sizes = measured_sizes(root, split=split, name=size) if root and not predictions else []
+        raise UsageError(
+            "--split and --size say whose floors are measured again",
+            fix="give --root as well",
+        )
+    if root and not predictions:
+        sizes = measured_sizes(root, split=split, name=size)
+    else:
+        sizes = []
     if root and not predictions and not sizes:
         fix = "make them with `lagbench generate`, or name another --root"
         raise DataError("no test scenarios are there", where=str(root), fix=fix)
@@ -181,23 +253,40 @@ def check(
 
 def _checked(result: CheckResult, *, recording: bool) -> Iterator[str]:
     for one in result.confirmed:
-        close = "exactly" if one.difference == 0.0 else f"to {one.difference:.1e}, relative"
+        if one.difference == 0.0:
+            close = "exactly"
+        else:
+            close = f"to {one.difference:.1e}, relative"
         yield f"{one.predictions}: confirms {one.score_file} of {one.entry} {close}"
-    yield from (f"{name}: measured again {', '.join(floors)}" for name, floors in result.floors.items())
+    yield from (
+        f"{name}: measured again {', '.join(floors)}"
+        for name, floors in result.floors.items()
+    )
     yield from (f"recorded as verified: {entry}" for entry in result.recorded)
     for entry in result.partly if recording and not result.findings else ():
         yield f"not recorded: {entry}: give the predictions of all its seeds in one call"
-    state = counted(len(result.findings), "finding") if result.findings else "nothing wrong"
-    looked = ", page compared" if result.page_checked else ""
+    if result.findings:
+        state = counted(len(result.findings), "finding")
+    else:
+        state = "nothing wrong"
+    if result.page_checked:
+        looked = ", page compared"
+    else:
+        looked = ""
     yield f"{result.folder}: {counted(result.entries, 'entry')}, {state}{looked}"
 
 
-@leaderboard.command("picture", epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg")
+@leaderboard.command(
+    "picture",
+    epilog="Example: lagbench leaderboard picture cavity --size mini -o cost.svg",
+)
 def picture(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: NewSizeOption = None,
-    output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path("cost.svg"),
+    output: Annotated[Path, option("--output -o FILE", "SVG file to write.")] = Path(
+        "cost.svg"
+    ),
     board: BoardOption = BOARD,
     quiet: QuietFlag = False,
 ) -> None:
@@ -209,19 +298,32 @@ def picture(
 
     wanted = locate_new(chosen(name, split), size).size
     if output.suffix.lower() != ".svg":
-        raise UsageError("the picture is an SVG file", where="--output", expected="a .svg name", got=output)
+        raise UsageError(
+            "the picture is an SVG file",
+            where="--output",
+            expected="a .svg name",
+            got=output,
+        )
     drawn = draw(collect(board, only=[(wanted.split, wanted.name)]), wanted)
     write_atomically(output, drawn.encode(), option="--output")
     say(str(output), quiet=quiet)
 
 
-@leaderboard.command("show", epilog="Example: lagbench leaderboard show cavity --size mini")
+@leaderboard.command(
+    "show", epilog="Example: lagbench leaderboard show cavity --size mini"
+)
 def show(
     name: SplitArgument = None,
     split: SplitOption = None,
-    size: Annotated[str | None, option("--size NAME", "tiny, mini or full; all by default.")] = None,
-    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to show; repeatable.")] = None,
-    wide: Annotated[bool, option("--wide", "Show the first metrics of each data set.")] = False,
+    size: Annotated[
+        str | None, option("--size NAME", "tiny, mini or full; all by default.")
+    ] = None,
+    metric: Annotated[
+        list[str] | None, option("--metric NAME", "Metric to show; repeatable.")
+    ] = None,
+    wide: Annotated[
+        bool, option("--wide", "Show the first metrics of each data set.")
+    ] = False,
     board: BoardOption = BOARD,
     as_json: JsonFlag = False,
 ) -> None:
@@ -231,12 +333,23 @@ def show(
     from lagbench.board.show import as_plain, chosen_data_sets, tables
 
     known = Folder(board).data_sets()
-    held = collect(board, only=chosen_data_sets(known, chosen(name, split) if name or split else None, size))
+    held = collect(
+        board,
+        only=chosen_data_sets(
+            known, chosen(name, split) if name or split else None, size
+        ),
+    )
     if as_json:
         print_json(as_plain(held))
         return
     print_blocks(tables(held, metric or (), wide=wide))
     if known and not held.tabs:
-        say(f"{board}: scores of earlier tasks alone; score predictions for today's: lagbench submit")
+        say(
+            f"{board}: scores of earlier tasks alone; score predictions for today's: "
+            f"lagbench submit"
+        )
     elif not held.tabs:
-        say(f"{board}: no entries yet; the first: lagbench submit predictions.nc --from meta.yaml")
+        say(
+            f"{board}: no entries yet; the first: lagbench submit predictions.nc "
+            f"--from meta.yaml"
+        )

@@ -1,8 +1,8 @@
 """The command that shows everything once, from nothing to a leaderboard: demo.
 
-Data at size ``tiny``, a trained model, its scores, a page. Everything lies under one root folder,
-which the demo may fill as it likes: the data sets, ``pictures/``, ``runs/`` and a leaderboard of
-its own, never the one of the repository.
+Data at size ``tiny``, a trained model, its scores, a page. Everything lies under one
+root folder, which the demo may fill as it likes: the data sets, ``pictures/``,
+``runs/`` and a leaderboard of its own, never the one of the repository.
 """
 
 from __future__ import annotations
@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from lagbench.errors import DataError, LagbenchError, UnreadableFileError, UsageError, check_installed
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    check_installed,
+)
 
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
 from .output import print_table, progress_bar, show, spell_seconds
@@ -37,9 +43,14 @@ if TYPE_CHECKING:
 
 
 DEMO_SIZE = "tiny"
-MODEL, MODEL_SPLIT = "neuralmpm", "cavity"  # the baseline that the demo trains, and the split that it learns
+MODEL = "neuralmpm"
+MODEL_SPLIT = (
+    "cavity"  # the baseline that the demo trains, and the split that it learns
+)
 SETTINGS = ("training.steps=150",)
-"""Changes to the recipe of size tiny: half a minute, and better than what costs no learning with any seed."""
+"""Changes to the recipe of size tiny: half a minute, and better than what costs no
+learning with any seed.
+"""
 
 METRICS = ("position_rmse_20", "vorticity_pearson", "outside_share")
 """What the table of scores shows beside the metric that ranks."""
@@ -56,12 +67,16 @@ class DemoResult:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelResult:
-    """The model of the demo: how it was trained, what it predicted, how it scored, the page."""
+    """The model of the demo: how it was trained, what it predicted, how it scored, the
+    page.
+    """
 
     training: TrainingResult  # result of train
     prediction: PredictionResult  # result of predict
     card: ScoreCard  # its scores beside those of the floors
-    solver: SolverBench | None  # what our solver takes here; None where it cannot be timed
+    solver: (
+        SolverBench | None
+    )  # what our solver takes here; None where it cannot be timed
     entry: SubmitResult  # its entry of the leaderboard
     page: BuildResult  # the leaderboard's page
 
@@ -78,7 +93,9 @@ def demo_split(
     workers: int | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> DemoResult:
-    """Generate, verify and draw one split at size ``tiny``; the picture lies in ``pictures/`` of the root."""
+    """Generate, verify and draw one split at size ``tiny``; the picture lies in
+    ``pictures/`` of the root.
+    """
     from lagbench.data.local import resolve_root
     from lagbench.data.registry import load
     from lagbench.draw.plot import plot_frame
@@ -87,12 +104,15 @@ def demo_split(
 
     folder = resolve_root(root)
     size = load().size(split, DEMO_SIZE)
-    generation = generate(split, DEMO_SIZE, root=folder, workers=workers, progress=progress)
+    generation = generate(
+        split, DEMO_SIZE, root=folder, workers=workers, progress=progress
+    )
     verification = verify(split, DEMO_SIZE, root=folder, complete=True)
     verification.check()
     pictures = folder / "pictures"
     pictures.mkdir(exist_ok=True)
-    first, frame = size.subsets["test"][0], size.task.frames_of_interest[-1]
+    first = size.subsets["test"][0]
+    frame = size.task.frames_of_interest[-1]
     picture = plot_frame(size.path(folder, first), frame, pictures / f"{split}.png")
     return DemoResult(generation=generation, verification=verification, picture=picture)
 
@@ -110,7 +130,9 @@ def model_left_out(registry: Registry) -> str | None:
 
 
 def demo_board(root: str | Path | None = None) -> Path:
-    """Return the folder of the demo's leaderboard; refuse one with entries of other sizes."""
+    """Return the folder of the demo's leaderboard; refuse one with entries of other
+    sizes.
+    """
     from lagbench.board.folder import Folder
     from lagbench.data.local import resolve_root
 
@@ -128,13 +150,15 @@ def demo_board(root: str | Path | None = None) -> Path:
 
 
 def demo_model(
-    *, root: str | Path | None = None, progress: Callable[[Progress], None] | None = None
+    *,
+    root: str | Path | None = None,
+    progress: Callable[[Progress], None] | None = None,
 ) -> ModelResult:
     """Train a small model, predict, score and submit it, draw the page.
 
-    The data set must be there, see :func:`demo_split`. One thread: a model as small as this gains
-    nothing by a second, and the same machine trains the same weights. Interrupted, it goes on with
-    the training at the next call.
+    The data set must be there, see :func:`demo_split`. One thread: a model as small as
+    this gains nothing by a second, and the same machine trains the same weights.
+    Interrupted, it goes on with the training at the next call.
     """
     from lagbench.baselines.catalogue import find
     from lagbench.baselines.predict import predict
@@ -146,14 +170,23 @@ def demo_model(
     from lagbench.data.local import resolve_root
     from lagbench.scoring.score import score
 
-    folder, board = resolve_root(root), demo_board(root)
+    folder = resolve_root(root)
+    board = demo_board(root)
     run = folder / "runs" / f"{MODEL_SPLIT}-{MODEL}"
-    here: dict[str, Any] = {"root": folder, "device": "cpu", "threads": 1, "progress": progress}
-    begin = partial(train, MODEL, MODEL_SPLIT, DEMO_SIZE, settings=SETTINGS, output=run, **here)
+    here: dict[str, Any] = {
+        "root": folder,
+        "device": "cpu",
+        "threads": 1,
+        "progress": progress,
+    }
+    begin = partial(
+        train, MODEL, MODEL_SPLIT, DEMO_SIZE, settings=SETTINGS, output=run, **here
+    )
     try:
         training = begin()
     except (UsageError, DataError, UnreadableFileError):
-        # What is left of another version or was damaged is the demo's own: not worth an error.
+        # What is left of another version or was damaged is the demo's own: not worth an
+        # error.
         training = begin(fresh=True)
     prediction = predict(training.weights, run / "predictions.nc", method=MODEL, **here)
     solver = _solver_time()
@@ -162,12 +195,17 @@ def demo_model(
         name=f"{find(MODEL).model.method}, {training.steps} steps",
         authors=("lagbench demo",),
         licence="MIT",
-        notes="Trained for seconds to show the way; it says little of what such a model can do.",
+        notes="Trained for seconds to show the way; it says little of what such a "
+        "model can do.",
         hardware=prediction.device,
         command="lagbench demo",
-        solver_seconds_per_frame=None if solver is None else round_digits(solver.seconds_per_frame, 6),
+        solver_seconds_per_frame=None
+        if solver is None
+        else round_digits(solver.seconds_per_frame, 6),
     )
-    entry = submit([prediction.path], said, board=board, root=folder, replace=True, new_board=True)
+    entry = submit(
+        [prediction.path], said, board=board, root=folder, replace=True, new_board=True
+    )
     return ModelResult(
         training=training,
         prediction=prediction,
@@ -209,7 +247,12 @@ def demo(
             splits[split] = demo_split(split, root=root, workers=workers, progress=draw)
     if not (as_json or quiet):
         rows = [
-            (split, (one.generation.dataset_sha256 or "")[:16], one.verification.verdict, one.picture)
+            (
+                split,
+                (one.generation.dataset_sha256 or "")[:16],
+                one.verification.verdict,
+                one.picture,
+            )
             for split, one in splits.items()
         ]
         print_table("", ("split", "hash", "data set", "picture"), rows)
@@ -221,18 +264,34 @@ def demo(
         with progress_bar(quiet=quiet, counted="done") as draw:
             model = demo_model(root=root, progress=draw)
     seconds = time.monotonic() - started
-    made = None if model is None else {**vars(model), "card": model.card.as_json()}
-    value = {"splits": splits, "model": made, "model_left_out": left_out, "seconds": seconds}
-    show(value, _summary(len(splits), model, left_out, seconds), as_json=as_json, quiet=quiet)
+    if model is None:
+        made = None
+    else:
+        made = {**vars(model), "card": model.card.as_json()}
+    value = {
+        "splits": splits,
+        "model": made,
+        "model_left_out": left_out,
+        "seconds": seconds,
+    }
+    show(
+        value,
+        _summary(len(splits), model, left_out, seconds),
+        as_json=as_json,
+        quiet=quiet,
+    )
 
 
-def _summary(splits: int, model: ModelResult | None, left_out: str | None, seconds: float) -> Iterator[str]:
+def _summary(
+    splits: int, model: ModelResult | None, left_out: str | None, seconds: float
+) -> Iterator[str]:
     done = f"{splits} data sets, verified and drawn"
     if model is None:
         yield f"{done}, in {spell_seconds(seconds)}"
         yield f"no model, no leaderboard: {left_out}"
     else:
-        card, training = model.card, model.training
+        card = model.card
+        training = model.training
         names = tuple(dict.fromkeys((card.ranking, *METRICS)))
         rows = []
         for row, scores in card.scores.items():

@@ -18,44 +18,67 @@ SourceArgument = Annotated[
     str | None, typer.Argument(metavar="SPLIT|FILE", help="Split, or a scenario file.")
 ]
 SplitNameOption = Annotated[str | None, option("--split NAME", "The same as SPLIT.")]
-ScenarioOption = Annotated[int | None, option("--scenario ID", "Scenario; the first of test by default.")]
-OutputOption = Annotated[Path | None, option("--output -o FILE", "File to write; named after the data.")]
+ScenarioOption = Annotated[
+    int | None, option("--scenario ID", "Scenario; the first of test by default.")
+]
+OutputOption = Annotated[
+    Path | None, option("--output -o FILE", "File to write; named after the data.")
+]
 
 
 def _source(
-    name: str | None, split: str | None, size: str | None, scenario: int | None, root: Path | None
+    name: str | None,
+    split: str | None,
+    size: str | None,
+    scenario: int | None,
+    root: Path | None,
 ) -> Path:
-    """Return the scenario file that a user means by its path or by split, size and id."""
+    """Return the scenario file that a user means by its path or by split, size and
+    id.
+    """
     from lagbench.data.local import locate, remedy
     from lagbench.store.copy import bring
 
     if name is not None and name.endswith(".nc"):
         return Path(name)
     tier, folder, _ = locate(chosen(name, split), size, root=root)
-    wanted = tier.subsets["test"][0] if scenario is None else scenario
+    if scenario is None:
+        wanted = tier.subsets["test"][0]
+    else:
+        wanted = scenario
     subset = tier.subset_of(wanted)
     bring(tier, folder, [wanted])
     path = tier.path(folder, wanted)
     if not path.is_file():
-        option = f"--subset {subset}" if scenario is None else f"--scenarios {wanted}"
+        if scenario is None:
+            option = f"--subset {subset}"
+        else:
+            option = f"--scenarios {wanted}"
         raise DataError(
-            f"scenario {wanted} is not there", where=str(path), fix=remedy(tier, option, root=folder)
+            f"scenario {wanted} is not there",
+            where=str(path),
+            fix=remedy(tier, option, root=folder),
         )
     return path
 
 
 @contextmanager
 def _told_as_given(*names: str | None) -> Iterator[None]:
-    """Call what is wrong with a file that the user named an unreadable file, no damaged data set."""
+    """Call what is wrong with a file that the user named an unreadable file, no damaged
+    data set.
+    """
     try:
         yield
     except DataError as error:
-        if not any(name and (error.where or "").startswith(str(Path(name))) for name in names):
+        if not any(
+            name and (error.where or "").startswith(str(Path(name))) for name in names
+        ):
             raise
         raise UnreadableFileError(
             error.what,
             where=error.where,
-            expected=error.expected or "a scenario file, as lagbench generate writes it",
+            expected=error.expected
+            or "a scenario file, as lagbench generate writes it",
             got=error.got,
             fix="name another file, or a split: lagbench plot cavity --size tiny",
         ) from error
@@ -64,12 +87,19 @@ def _told_as_given(*names: str | None) -> Iterator[None]:
 def _target(path: Path) -> Path:
     """Return the path of a file to write, whose folder must be there."""
     if not path.parent.is_dir():
-        raise UsageError("there is no such folder", where="--output", got=path.parent, fix="create it first")
+        raise UsageError(
+            "there is no such folder",
+            where="--output",
+            got=path.parent,
+            fix="create it first",
+        )
     return path
 
 
 def _default_name(source: Path, ending: str) -> Path:
-    """Return a file name in this folder: split-size-scenario where the path tells them."""
+    """Return a file name in this folder: split-size-scenario where the path tells
+    them.
+    """
     parts = source.absolute().parts
     named = len(parts) > 5 and parts[-3].startswith("v")
     words = (parts[-5], parts[-4], source.stem) if named else (source.stem,)
@@ -81,14 +111,21 @@ def plot(
     split: SplitNameOption = None,
     size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
-    frame: Annotated[int, option("--frame", "Frame number; negative ones from the end.")] = -1,
-    kind: Annotated[str, option("--kind", "all, speed, material, vorticity or streamlines.")] = "all",
+    frame: Annotated[
+        int, option("--frame", "Frame number; negative ones from the end.")
+    ] = -1,
+    kind: Annotated[
+        str, option("--kind", "all, speed, material, vorticity or streamlines.")
+    ] = "all",
     sheet: Annotated[
         bool, option("--sheet", "Draw many scenarios of the split on one page instead.")
     ] = False,
     output: OutputOption = None,
     dpi: Annotated[
-        int, option("--dpi", "Pixels per inch of PNG, and of clouds in PDF.", min=32, max=1200)
+        int,
+        option(
+            "--dpi", "Pixels per inch of PNG, and of clouds in PDF.", min=32, max=1200
+        ),
     ] = 128,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -111,7 +148,9 @@ def plot(
     with _told_as_given(name):
         if output is None:
             with open_recording(source) as recording:
-                output = _default_name(source, f"-frame{recording.frame_number(frame)}.png")
+                output = _default_name(
+                    source, f"-frame{recording.frame_number(frame)}.png"
+                )
         target = _target(output)
         plot_frame(source, frame, target, kind=kind, dpi=dpi)
     show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)
@@ -120,13 +159,20 @@ def plot(
 def animate(
     name: SourceArgument = None,
     second: Annotated[
-        str | None, typer.Argument(metavar="FILE", help="Second scenario file, drawn beside the first.")
+        str | None,
+        typer.Argument(
+            metavar="FILE", help="Second scenario file, drawn beside the first."
+        ),
     ] = None,
     split: SplitNameOption = None,
     size: PresentSizeOption = None,
     scenario: ScenarioOption = None,
-    beside: Annotated[int | None, option("--beside ID", "Second scenario of the split.")] = None,
-    kind: Annotated[str | None, option("--kind", "speed, material or vorticity.")] = None,
+    beside: Annotated[
+        int | None, option("--beside ID", "Second scenario of the split.")
+    ] = None,
+    kind: Annotated[
+        str | None, option("--kind", "speed, material or vorticity.")
+    ] = None,
     fps: Annotated[float, option("--fps", "Frames shown per second.")] = 30.0,
     every: Annotated[int, option("--every", "Show every n-th frame.", min=1)] = 1,
     output: OutputOption = None,
@@ -141,11 +187,22 @@ def animate(
     if output is not None:
         check_ending(output)
     source = _source(name, split, size, scenario, root)
-    other = Path(second) if second else None
+    if second:
+        other = Path(second)
+    else:
+        other = None
     if beside is not None:
         other = _source(name, split, size, beside, root)
     target = _target(output or _default_name(source, ".mp4"))
     hidden = quiet or as_json
     with _told_as_given(name, second):
-        run(source, target, beside=other, kind=kind, frames_per_second=fps, every=every, quiet=hidden)
+        run(
+            source,
+            target,
+            beside=other,
+            kind=kind,
+            frames_per_second=fps,
+            every=every,
+            quiet=hidden,
+        )
     show({"output": target}, [str(target)], as_json=as_json, quiet=quiet)

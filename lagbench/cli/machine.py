@@ -22,7 +22,17 @@ from lagbench.work.machine import available_cores
 from lagbench.work.pool import Pool, Report, Task
 
 NEEDED = (
-    *("numpy", "scipy", "xarray", "netCDF4", "h5py", "dask", "pandas", "pydantic", "PyYAML"),
+    *(
+        "numpy",
+        "scipy",
+        "xarray",
+        "netCDF4",
+        "h5py",
+        "dask",
+        "pandas",
+        "pydantic",
+        "PyYAML",
+    ),
     *("typer", "rich", "platformdirs", "filelock", "fsspec"),
 )
 OPTIONAL = {"taichi": "generate", "matplotlib": "plots", "imageio": "plots"}
@@ -52,15 +62,24 @@ class Diagnosis:
 
 
 def doctor(root: str | Path | None = None) -> Diagnosis:
-    """Look at what lagbench needs on this machine, data sets under ``root``; changes nothing."""
+    """Look at what lagbench needs on this machine, data sets under ``root``; changes
+    nothing.
+    """
     folder = resolve_root(root)
     native = platform.machine() in {"x86_64", "AMD64"} and platform.system() == "Linux"
-    promise = "bits as in datasets.yaml" if native else "bits may differ: see docs/determinism.md"
+    if native:
+        promise = "bits as in datasets.yaml"
+    else:
+        promise = "bits may differ: see docs/determinism.md"
     cores = f"{platform.machine()}, {available_cores()} of {os.cpu_count()} cores; {promise}"
     return Diagnosis(
         checks=(
             Check(name="lagbench", state="ok", detail=version("lagbench")),
-            Check(name="python", state="ok", detail=f"{platform.python_version()} on {platform.platform()}"),
+            Check(
+                name="python",
+                state="ok",
+                detail=f"{platform.python_version()} on {platform.platform()}",
+            ),
             Check(name="processor", state="ok", detail=cores),
             *(_library(name) for name in NEEDED),
             *(_library(name, extra) for name, extra in OPTIONAL.items()),
@@ -76,8 +95,12 @@ def _library(name: str, extra: str | None = None) -> Check:
         return Check(name=name, state="ok", detail=version(name))
     except PackageNotFoundError:
         if extra is None:
-            return Check(name=name, state="broken", detail="not installed: pip install lagbench")
-        return Check(name=name, state="missing", detail=f"pip install 'lagbench[{extra}]'")
+            return Check(
+                name=name, state="broken", detail="not installed: pip install lagbench"
+            )
+        return Check(
+            name=name, state="missing", detail=f"pip install 'lagbench[{extra}]'"
+        )
 
 
 def _attempt(name: str, look: Callable[[], str]) -> Check:
@@ -113,15 +136,17 @@ class SolverBench:
     particles: int  # particles of the scenario
     substeps: int  # solver steps of a frame
     frames: int  # frames that were timed
-    # mean processor time of a frame [s], so that other work on the machine does not count; writing
-    # it to disk is not part of it
+    # mean processor time of a frame [s], so that other work on the machine does not
+    # count; writing it to disk is not part of it
     seconds_per_frame: float
 
 
 def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
-    """Simulate the first test scenario and time so many frames, or as many as half a second takes.
+    """Simulate the first test scenario and time so many frames, or as many as half a
+    second takes.
 
-    Taichi starts once per process: call this from one of its own, as :func:`bench_apart` does.
+    Taichi starts once per process: call this from one of its own, as
+    :func:`bench_apart` does.
     """
     tier = load().size(split, size)
     check_installed("taichi", extra="generate")
@@ -132,23 +157,38 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     solver = build(solver_constants(tier))
     solver.load([draw(tier, tier.subsets["test"][0])])
     solver.advance(WARM_UP * tier.substeps_per_frame)
-    started, timed = time.process_time(), 0
+    started = time.process_time()
+    timed = 0
     while timed < frames or time.process_time() - started < LEAST:
         solver.advance(tier.substeps_per_frame)
         solver.position()
         timed += 1
     seconds = (time.process_time() - started) / timed
-    flow = {"particles": tier.particles, "substeps": tier.substeps_per_frame, "frames": timed}
+    flow = {
+        "particles": tier.particles,
+        "substeps": tier.substeps_per_frame,
+        "frames": timed,
+    }
     return SolverBench(split=split, size=size, **flow, seconds_per_frame=seconds)
 
 
 def bench_apart(split: str, size: str) -> SolverBench:
-    """Time the solver in a process of its own, which this one's memory and threads do not disturb."""
+    """Time the solver in a process of its own, which this one's memory and threads do
+    not disturb.
+    """
     load().size(split, size)
     check_installed("taichi", extra="generate")
     with Pool(1) as pool:
-        pool.submit(Task(name=f"bench of {split} {size}", function=_bench, arguments=(split, size)))
-        timed: SolverBench = next(event.value for event in pool.events() if event.kind == "done")
+        pool.submit(
+            Task(
+                name=f"bench of {split} {size}",
+                function=_bench,
+                arguments=(split, size),
+            )
+        )
+        timed: SolverBench = next(
+            event.value for event in pool.events() if event.kind == "done"
+        )
     return timed
 
 

@@ -35,7 +35,10 @@ def counted(number: int, noun: str) -> str:
     >>> counted(1, "finding"), counted(2, "entry")
     ('1 finding', '2 entries')
     """
-    many = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    if noun.endswith("y"):
+        many = f"{noun[:-1]}ies"
+    else:
+        many = f"{noun}s"
     return f"{number} {noun if number == 1 else many}"
 
 
@@ -50,8 +53,12 @@ def print_json(value: object) -> None:
     typer.echo(json.dumps(_plain(value), indent=2, sort_keys=True, allow_nan=False))
 
 
-def show(value: object, words: Iterable[str], *, as_json: bool, quiet: bool = False) -> None:
-    """Print a result as one JSON object, or the lines that say it in words, formed only then."""
+def show(
+    value: object, words: Iterable[str], *, as_json: bool, quiet: bool = False
+) -> None:
+    """Print a result as one JSON object, or the lines that say it in words, formed only
+    then.
+    """
     if as_json:
         print_json(value)
     elif not quiet:
@@ -60,24 +67,34 @@ def show(value: object, words: Iterable[str], *, as_json: bool, quiet: bool = Fa
 
 
 def complain(result: ValidationResult) -> None:
-    """Tell on stderr what rejects a file; the error that follows names the first finding only."""
+    """Tell on stderr what rejects a file; the error that follows names the first
+    finding only.
+    """
     if len(result.errors) > 1:
         typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
 
 
 def blocks(table: Table, width: int = WIDTH) -> Iterator[Table]:
-    """Yield a table in pieces that are no wider, each with the columns that say what a row is."""
+    """Yield a table in pieces that are no wider, each with the columns that say what a
+    row is.
+    """
     columns = list(zip(table.columns, *table.rows, strict=True))
-    widths = [max(len(line) for cell in column for line in cell.split("\n")) for column in columns]
+    widths = [
+        max(len(line) for cell in column for line in cell.split("\n"))
+        for column in columns
+    ]
     widths[-1] = min(widths[-1], LAST)
-    own, chosen = sum(widths[: table.keys]) + GAP * table.keys, list[list[int]]([[]])
+    own = sum(widths[: table.keys]) + GAP * table.keys
+    chosen = list[list[int]]([[]])
     for i in range(table.keys, len(columns)):
         taken = own + sum(widths[j] + GAP for j in chosen[-1])
         if chosen[-1] and taken + widths[i] > width:
             chosen.append([])
         chosen[-1].append(i)
     for number, block in enumerate(chosen):
-        heads, *rows = zip(*columns[: table.keys], *(columns[i] for i in block), strict=True)
+        heads, *rows = zip(
+            *columns[: table.keys], *(columns[i] for i in block), strict=True
+        )
         yield Table("" if number else table.title, heads, tuple(rows), table.keys)
 
 
@@ -90,33 +107,58 @@ def print_blocks(tables: Iterable[Table]) -> None:
 
 def _plain(value: object) -> object:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {
+            f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
+        }
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
         return [_plain(item) for item in value]
-    return str(value) if isinstance(value, Path) else value
+    if isinstance(value, Path):
+        return str(value)
+    return value
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table on stdout; only its last column wraps, numbers stand on the right."""
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Print a table on stdout; only its last column wraps, numbers stand on the
+    right.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table as Drawn
     from rich.text import Text
 
     cells = [[str(cell) for cell in row] for row in rows]
-    heading = Text(title) if title else None
-    table = Drawn(title=heading, box=SIMPLE_HEAD, title_justify="left", pad_edge=False, show_edge=False)
+    if title:
+        heading = Text(title)
+    else:
+        heading = None
+    table = Drawn(
+        title=heading,
+        box=SIMPLE_HEAD,
+        title_justify="left",
+        pad_edge=False,
+        show_edge=False,
+    )
     for number, column in enumerate(columns, start=1):
         numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
-        table.add_column(Text(column), justify="right" if numeric else "left", no_wrap=number < len(columns))
+        table.add_column(
+            Text(column),
+            justify="right" if numeric else "left",
+            no_wrap=number < len(columns),
+        )
     for row in cells:
         table.add_row(*(Text(cell) for cell in row))
     console = Console()
     # In a file or a pipe the width is fixed, so that the output is the same everywhere.
-    width = console.width if console.is_terminal else 120
-    # On a narrow terminal long lines run on to the next: a number cut short would be worse.
+    if console.is_terminal:
+        width = console.width
+    else:
+        width = 120
+    # On a narrow terminal long lines run on to the next: a number cut short would be
+    # worse.
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
     least = sum(widths[:-1]) + min(widths[-1], LAST) + GAP * len(widths)
     Console(width=max(width, least)).print(table, "")
@@ -132,7 +174,9 @@ def spell_bytes(count: float) -> str:
         if count < 1000 or unit == "GB":
             break
         count /= 1000
-    return f"{count:.0f} {unit}" if count >= 100 or unit == "B" else f"{count:.1f} {unit}"
+    if count >= 100 or unit == "B":
+        return f"{count:.0f} {unit}"
+    return f"{count:.1f} {unit}"
 
 
 def spell_seconds(seconds: float) -> str:
@@ -144,15 +188,20 @@ def spell_seconds(seconds: float) -> str:
     if seconds < 100:
         return f"{max(seconds, 1):.0f} s"
     minutes = seconds / 60
-    return f"{minutes:.0f} min" if minutes < 100 else f"{minutes / 60:.1f} h"
+    if minutes < 100:
+        return f"{minutes:.0f} min"
+    return f"{minutes / 60:.1f} h"
 
 
 @contextmanager
-def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callable[[State], None] | None]:
-    """Yield what tells of progress: how much is done, how fast, and the time left; None for silence.
+def progress_bar(
+    *, quiet: bool, counted: str = "scenarios"
+) -> Iterator[Callable[[State], None] | None]:
+    """Yield what tells of progress: how much is done, how fast, and the time left; None
+    for silence.
 
-    A terminal shows a bar; a file or a pipe gets a line per minute, so that short work leaves none.
-    ``counted`` is what the work is counted in.
+    A terminal shows a bar; a file or a pipe gets a line per minute, so that short work
+    leaves none. ``counted`` is what the work is counted in.
     """
     if quiet:
         from lagbench.store.copy import quietly
@@ -164,15 +213,25 @@ def progress_bar(*, quiet: bool, counted: str = "scenarios") -> Iterator[Callabl
         yield _in_lines(counted)
         return
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    stage, count = TextColumn("{task.description}"), TextColumn("{task.fields[count]}")
+    stage = TextColumn("{task.description}")
+    count = TextColumn("{task.fields[count]}")
     columns = (stage, BarColumn(), TaskProgressColumn(), count, TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None, count="")
 
         def draw(news: State) -> None:
-            told: dict[str, Any] = {"description": news.stage, "count": _count(news, counted)}
+            told: dict[str, Any] = {
+                "description": news.stage,
+                "count": _count(news, counted),
+            }
             bar.update(task, total=news.total or None, completed=news.done, **told)
 
         yield draw
@@ -187,9 +246,18 @@ def _in_lines(counted: str) -> Callable[[State], None]:
             return
         last = now
         known = news.scenarios and news.rate
-        left = (news.scenarios - news.scenarios_done) / news.rate if known else math.inf
-        still = f", {spell_seconds(left)} left" if math.isfinite(left) else ""
-        share = f"{news.done / news.total:.0%}, " if news.total else ""
+        if known:
+            left = (news.scenarios - news.scenarios_done) / news.rate
+        else:
+            left = math.inf
+        if math.isfinite(left):
+            still = f", {spell_seconds(left)} left"
+        else:
+            still = ""
+        if news.total:
+            share = f"{news.done / news.total:.0%}, "
+        else:
+            share = ""
         with suppress(OSError):  # the work goes on without a reader
             typer.echo(f"{news.stage}: {share}{_count(news, counted)}{still}", err=True)
 
@@ -197,5 +265,8 @@ def _in_lines(counted: str) -> Callable[[State], None]:
 
 
 def _count(news: State, counted: str) -> str:
-    of = f"/{news.scenarios}" if news.scenarios else ""
+    if news.scenarios:
+        of = f"/{news.scenarios}"
+    else:
+        of = ""
     return f"{news.scenarios_done}{of} {counted}, {news.rate:.2f}/s"

@@ -22,14 +22,24 @@ from .options import (
     chosen,
     option,
 )
-from .output import complain, counted, print_blocks, print_json, progress_bar, say, show, spell_bytes
+from .output import (
+    complain,
+    counted,
+    print_blocks,
+    print_json,
+    progress_bar,
+    say,
+    show,
+    spell_bytes,
+)
 
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
     from lagbench.submission.findings import ValidationResult
 
 OwnSplitOption = Annotated[
-    str | None, option("--split NAME", "Split that they must be for; a local one by its folder.")
+    str | None,
+    option("--split NAME", "Split that they must be for; a local one by its folder."),
 ]
 EveryFlag = Annotated[bool, option("--all", "Show every metric.")]
 
@@ -38,8 +48,12 @@ def template(
     name: SplitArgument = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
-    overwrite: Annotated[bool, option("--overwrite", "Replace a file of that name.")] = False,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
+        "predictions.nc"
+    ),
+    overwrite: Annotated[
+        bool, option("--overwrite", "Replace a file of that name.")
+    ] = False,
     root: RootOption = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -47,7 +61,9 @@ def template(
     """Write a valid predictions.nc to fill: the persistence prediction."""
     from lagbench.submission.writer import template as run
 
-    result = run(chosen(name, split), size, output=output, overwrite=overwrite, root=root)
+    result = run(
+        chosen(name, split), size, output=output, overwrite=overwrite, root=root
+    )
     first, last = result.frames
     shape = f"{len(result.scenarios)} scenarios, frames {first} to {last}, {result.particles} particles"
     words = [f"{result.path}: {shape}, {spell_bytes(result.bytes)}"]
@@ -55,7 +71,9 @@ def template(
 
 
 def validate(
-    predictions: Annotated[Path, typer.Argument(metavar="FILE", help="A predictions.nc.")],
+    predictions: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A predictions.nc.")
+    ],
     split: OwnSplitOption = None,
     root: RootOption = None,
     as_json: JsonFlag = False,
@@ -69,10 +87,13 @@ def validate(
     check(result)
     words = [str(finding) for finding in result.findings]
     for reason in dict.fromkeys(result.skipped.values()):
-        checks = ", ".join(check for check, why in result.skipped.items() if why == reason)
+        checks = ", ".join(
+            check for check, why in result.skipped.items() if why == reason
+        )
         words.append(f"not made, since {reason}: {checks}")
     counts = (
-        f"{counted(len(result.errors), 'error')}, {counted(len(result.warnings), 'warning')}, "
+        f"{counted(len(result.errors), 'error')}, "
+        f"{counted(len(result.warnings), 'warning')}, "
         f"{counted(len(result.passed), 'check')} passed"
     )
     words.append(f"{result.path}: {result.verdict}, {counts}")
@@ -82,7 +103,10 @@ def validate(
 
 def score(
     predictions: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="A predictions.nc; several with --report.")
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="A predictions.nc; several with --report."
+        ),
     ],
     split: OwnSplitOption = None,
     root: RootOption = None,
@@ -90,18 +114,24 @@ def score(
         Path | None,
         option(
             "--output -o FOLDER",
-            "Where scores go; beside predictions.nc by default, of other and of several files in folders"
+            "Where scores go; beside predictions.nc by default, of other and of "
+            "several files in folders"
             " named like them.",
         ),
     ] = None,
     report: Annotated[
-        Path | None, option("--report FOLDER", "Write index.html with all figures there.")
+        Path | None,
+        option("--report FOLDER", "Write index.html with all figures there."),
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
-    extras: Annotated[str, option("--extras NAMES", "Extras with metrics, as in transport.")] = "",
+    extras: Annotated[
+        str, option("--extras NAMES", "Extras with metrics, as in transport.")
+    ] = "",
     every: EveryFlag = False,
-    floors: Annotated[bool, option("--all-floors", "Show every floor, not only the best.")] = False,
+    floors: Annotated[
+        bool, option("--all-floors", "Show every floor, not only the best.")
+    ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -109,7 +139,9 @@ def score(
     from lagbench.scoring.score import score as run
 
     if len(predictions) > 1 and report is None:
-        raise UsageError("several files are scored for one report", fix="add --report FOLDER")
+        raise UsageError(
+            "several files are scored for one report", fix="add --report FOLDER"
+        )
     targets, (root, check) = _targets(predictions, output), _wanted(split, root)
 
     def examined(result: ValidationResult) -> None:
@@ -138,13 +170,19 @@ def score(
         cards.append(card)
     written = None
     try:
-        if report is not None:  # before a word is printed: a reader such as head may close the pipe
+        if (
+            report is not None
+        ):  # before a word is printed: a reader such as head may close the pipe
             from lagbench.report.report import write_report
 
             written = write_report(report, cards, predictions, root=root)
     finally:
         if as_json:
-            print_json(cards[0].as_json() if len(cards) == 1 else [card.as_json() for card in cards])
+            print_json(
+                cards[0].as_json()
+                if len(cards) == 1
+                else [card.as_json() for card in cards]
+            )
         elif not quiet:
             from lagbench.scoring.tables import card_tables, flag_lines
 
@@ -158,7 +196,9 @@ def score(
 
 
 def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path | None]:
-    """Return the folder for the scores of each file; refuse two files with one folder."""
+    """Return the folder for the scores of each file; refuse two files with one
+    folder.
+    """
     if len(predictions) == 1:
         return [output]
     targets = [(output or path.parent) / path.stem for path in predictions]
@@ -170,13 +210,18 @@ def _targets(predictions: Sequence[Path], output: Path | None) -> Sequence[Path 
                 "the scores of two files would go to one folder",
                 where=str(target),
                 got=f"{other} and {path}",
-                fix="name each file once, give them names of their own, or leave --output out",
+                fix="name each file once, give them names of their own, or leave "
+                "--output out",
             )
     return targets
 
 
-def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[ValidationResult]:
-    """Refuse, before any is scored, an invalid file and one to another split or size."""
+def _checked_together(
+    predictions: Sequence[Path], root: Path | None
+) -> list[ValidationResult]:
+    """Refuse, before any is scored, an invalid file and one to another split or
+    size.
+    """
     from lagbench.submission.validation import validate as examine
 
     results: list[ValidationResult] = []
@@ -197,8 +242,12 @@ def _checked_together(predictions: Sequence[Path], root: Path | None) -> list[Va
     return results
 
 
-def _wanted(split: str | None, root: Path | None) -> tuple[Path | None, Callable[[ValidationResult], None]]:
-    """Return the root, which the path of a local split names, and what refuses predictions for another."""
+def _wanted(
+    split: str | None, root: Path | None
+) -> tuple[Path | None, Callable[[ValidationResult], None]]:
+    """Return the root, which the path of a local split names, and what refuses
+    predictions for another.
+    """
     name = None
     if split is not None:
         from lagbench.data.local import home
@@ -207,8 +256,15 @@ def _wanted(split: str | None, root: Path | None) -> tuple[Path | None, Callable
 
     def check(result: ValidationResult) -> None:
         if name is not None and result.split not in (None, name):
-            what, fix = "the predictions are for another split", "name that one, or leave --split out"
-            raise UsageError(what, where=str(result.path), expected=name, got=ascii(result.split), fix=fix)
+            what = "the predictions are for another split"
+            fix = "name that one, or leave --split out"
+            raise UsageError(
+                what,
+                where=str(result.path),
+                expected=name,
+                got=ascii(result.split),
+                fix=fix,
+            )
 
     return root, check
 
@@ -216,17 +272,26 @@ def _wanted(split: str | None, root: Path | None) -> tuple[Path | None, Callable
 def compare(
     first: Annotated[
         str,
-        typer.Argument(metavar="A", help="scores.json or .nc, a folder of one or of seeds, predictions.nc."),
+        typer.Argument(
+            metavar="A",
+            help="scores.json or .nc, a folder of one or of seeds, predictions.nc.",
+        ),
     ],
-    second: Annotated[str, typer.Argument(metavar="B", help="Another, or the name of a floor.")],
-    metric: Annotated[list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")] = None,
+    second: Annotated[
+        str, typer.Argument(metavar="B", help="Another, or the name of a floor.")
+    ],
+    metric: Annotated[
+        list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
+    ] = None,
     root: RootOption = None,
     workers: WorkersOption = None,
     every: EveryFlag = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Compare two methods over scenarios, and over seeds where there are several: tests and intervals."""
+    """Compare two methods over scenarios, and over seeds where there are several: tests
+    and intervals.
+    """
     from lagbench.scoring.compare import compare as run
 
     result = run(first, second, metrics=metric or (), root=root, workers=workers)

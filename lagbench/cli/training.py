@@ -36,36 +36,56 @@ EXTRA = "baselines"
 DeviceOption = Annotated[str, option("--device NAME", "cpu, cuda, or auto.")]
 ThreadsOption = Annotated[
     int | None,
-    option("--threads N", "CPU threads; else OMP_NUM_THREADS, else its share of the cores.", min=1),
+    option(
+        "--threads N",
+        "CPU threads; else OMP_NUM_THREADS, else its share of the cores.",
+        min=1,
+    ),
 ]
 
 
 def train(
     name: SplitArgument = None,
     baseline: Annotated[
-        str | None, option("--baseline NAME", "Model, as in gns; see docs/baselines.md.")
+        str | None,
+        option("--baseline NAME", "Model, as in gns; see docs/baselines.md."),
     ] = None,
     split: SplitOption = None,
     size: PresentSizeOption = None,
-    recipe: Annotated[str | None, option("--recipe NAME", "Variant, as in short; or a YAML file.")] = None,
-    settings: Annotated[
-        list[str] | None, option("--set KEY=VALUE", "Change the recipe: training.steps=100; repeatable.")
+    recipe: Annotated[
+        str | None, option("--recipe NAME", "Variant, as in short; or a YAML file.")
     ] = None,
-    seed: Annotated[int | None, option("--seed N", "Seed of all chance.", min=0)] = None,
+    settings: Annotated[
+        list[str] | None,
+        option("--set KEY=VALUE", "Change the recipe: training.steps=100; repeatable."),
+    ] = None,
+    seed: Annotated[
+        int | None, option("--seed N", "Seed of all chance.", min=0)
+    ] = None,
     start: Annotated[
-        Path | None, option("--start FILE", "weights.pt to start from; of another size perhaps.")
+        Path | None,
+        option("--start FILE", "weights.pt to start from; of another size perhaps."),
     ] = None,
     root: RootOption = None,
     output: Annotated[
         Path | None,
-        option("--output -o FOLDER", "By default in runs/, named after recipe, baseline and seed."),
+        option(
+            "--output -o FOLDER",
+            "By default in runs/, named after recipe, baseline and seed.",
+        ),
     ] = None,
-    resume: Annotated[bool, option("--resume/--no-resume", "Go on with what is there.")] = True,
+    resume: Annotated[
+        bool, option("--resume/--no-resume", "Go on with what is there.")
+    ] = True,
     fresh: Annotated[bool, option("--fresh", "Train anew whatever is there.")] = False,
     device: DeviceOption = "auto",
-    processes: Annotated[int, option("--processes N", "Processes, one device each (DDP).", min=1)] = 1,
+    processes: Annotated[
+        int, option("--processes N", "Processes, one device each (DDP).", min=1)
+    ] = 1,
     threads: ThreadsOption = None,
-    workers: Annotated[int, option("--workers N", "Processes that read windows ahead.", min=0)] = 0,
+    workers: Annotated[
+        int, option("--workers N", "Processes that read windows ahead.", min=0)
+    ] = 0,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -73,17 +93,27 @@ def train(
     from lagbench.errors import check_installed
 
     if baseline is None:
-        raise UsageError("no model is named", where="--baseline", fix="name one, as in --baseline gns")
+        raise UsageError(
+            "no model is named",
+            where="--baseline",
+            fix="name one, as in --baseline gns",
+        )
     if fresh and not resume:
         fix = "--fresh trains anew whatever is there; --no-resume leaves alone what is there"
-        raise UsageError("two options that exclude each other", where="--fresh and --no-resume", fix=fix)
+        raise UsageError(
+            "two options that exclude each other",
+            where="--fresh and --no-resume",
+            fix=fix,
+        )
     split = chosen(name, split)
     for module in ("torch", "torch_geometric", "pytorch_lightning"):
         check_installed(module, extra=EXTRA)
     from lagbench.data.local import locate
 
     if "LOCAL_RANK" not in os.environ:  # of several processes one tells an error
-        locate(split, size, root=root)  # PyTorch takes seconds to load: what can be refused before, is
+        locate(
+            split, size, root=root
+        )  # PyTorch takes seconds to load: what can be refused before, is
     with progress_bar(quiet=quiet):
         from lagbench.baselines.machine import is_helper
         from lagbench.baselines.train import train as run
@@ -122,7 +152,9 @@ def _warn_of_scores(
     variant: str | None,
     settings: tuple[str, ...],
 ) -> None:
-    """Say on stderr why a user's own data cannot be scored, before a training is spent on them."""
+    """Say on stderr why a user's own data cannot be scored, before a training is spent
+    on them.
+    """
     from lagbench.baselines.catalogue import find
     from lagbench.baselines.recipe import recipe_for
     from lagbench.data.local import locate
@@ -131,7 +163,9 @@ def _warn_of_scores(
     tier, home, _ = locate(split, size, root=root)
     if tier.simulated:
         return
-    plan = recipe_for(find(baseline), tier.split, tier.name, variant=variant, settings=settings)
+    plan = recipe_for(
+        find(baseline), tier.split, tier.name, variant=variant, settings=settings
+    )
     reasons = list(unusable(tier, home, validated=plan.training.validate_every != 0))
     if reasons:
         warning = "warning: what is trained here cannot be scored as it should"
@@ -140,7 +174,9 @@ def _warn_of_scores(
 
 @contextmanager
 def _told_once() -> Iterator[None]:
-    """Let one process of each machine tell an error that befell all, and the first alone an interrupt."""
+    """Let one process of each machine tell an error that befell all, and the first
+    alone an interrupt.
+    """
     from lagbench.baselines.machine import is_helper
 
     try:
@@ -163,7 +199,9 @@ def _where(split: str, root: Path | None) -> str:
 
     found = home(split, root=root)
     local = found.registry.split(found.name).generator == NO_GENERATOR
-    return f" --root {root or found.root}" if root or local else ""
+    if root or local:
+        return f" --root {root or found.root}"
+    return ""
 
 
 def _trained(result: TrainingResult, where: str) -> Iterator[str]:
@@ -180,15 +218,24 @@ def _trained(result: TrainingResult, where: str) -> Iterator[str]:
         yield f"  started    from {result.start}; hours and track count what they took"
     yield f"  parameters {result.parameters}"
     terms = sorted(result.loss, key=lambda name: (name == "total", name))
-    yield "  loss       " + ", ".join(f"{name} {result.loss[name]:.4g}" for name in terms)
+    yield "  loss       " + ", ".join(
+        f"{name} {result.loss[name]:.4g}" for name in terms
+    )
     if result.best_value is not None:
-        worse = ": nothing better than the weights that it started from" if result.best_step == 0 else ""
+        if result.best_step == 0:
+            worse = ": nothing better than the weights that it started from"
+        else:
+            worse = ""
         best = f"{result.best_value:.4g} on valid, step {result.best_step}{worse}"
         yield f"  best       {result.metric} {best}"
     share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
-    seen = f"{result.windows_seen:,} windows, " if result.windows_seen else ""
+    if result.windows_seen:
+        seen = f"{result.windows_seen:,} windows, "
+    else:
+        seen = ""
     yield (
-        f"  budget     {seen}{result.epochs:.3g} epochs; {share:.0%} of the processor time for validations;"
+        f"  budget     {seen}{result.epochs:.3g} epochs; {share:.0%} of the processor "
+        f"time for validations;"
         f" {result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
     )
     yield f"  weights    {result.weights}"
@@ -198,20 +245,32 @@ def _trained(result: TrainingResult, where: str) -> Iterator[str]:
 
 
 def predict(
-    checkpoint: Annotated[Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")],
-    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path("predictions.nc"),
-    size: Annotated[str | None, option("--size NAME", "Another size than that of the training.")] = None,
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")
+    ],
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
+        "predictions.nc"
+    ),
+    size: Annotated[
+        str | None, option("--size NAME", "Another size than that of the training.")
+    ] = None,
     settings: Annotated[
-        list[str] | None, option("--set KEY=VALUE", "Change the model: model.average=true; repeatable.")
+        list[str] | None,
+        option("--set KEY=VALUE", "Change the model: model.average=true; repeatable."),
     ] = None,
     root: RootOption = None,
     device: DeviceOption = "auto",
     threads: ThreadsOption = None,
     batch: Annotated[
-        int | None, option("--batch N", "Scenarios side by side; 1 on a CPU, all on a GPU.", min=1)
+        int | None,
+        option("--batch N", "Scenarios side by side; 1 on a CPU, all on a GPU.", min=1),
     ] = None,
-    method: Annotated[str | None, option("--method NAME", "What the board shall call it.")] = None,
-    solver: Annotated[bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")] = True,
+    method: Annotated[
+        str | None, option("--method NAME", "What the board shall call it.")
+    ] = None,
+    solver: Annotated[
+        bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
+    ] = True,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -228,7 +287,9 @@ def predict(
     def time_solver(split: str, size: str) -> float | None:
         nonlocal timed
         timed = _solver_time(split, size, quiet=quiet)
-        return None if timed is None else timed.seconds_per_frame
+        if timed is None:
+            return None
+        return timed.seconds_per_frame
 
     with progress_bar(quiet=quiet) as draw:
         result = run(
@@ -249,7 +310,9 @@ def predict(
 
 
 def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
-    """Return what the solver takes here; None for local splits, and where it cannot run: stderr says why."""
+    """Return what the solver takes here; None for local splits, and where it cannot
+    run: stderr says why.
+    """
     from lagbench.data.registry import load
 
     from .machine import bench_apart
@@ -267,25 +330,32 @@ def _solver_time(split: str, size: str, *, quiet: bool) -> SolverBench | None:
 def _predicted(
     result: PredictionResult, solver: SolverBench | None, replaced: bool, where: str
 ) -> Iterator[str]:
-    trained = f", trained at {result.trained_size}" if result.trained_size != result.size else ""
+    if result.trained_size != result.size:
+        trained = f", trained at {result.trained_size}"
+    else:
+        trained = ""
     trained += "".join(f", {setting}" for setting in result.settings)
     yield f"{result.path}: {result.method}{trained}, {result.scenarios} scenarios, {result.frames} frames"
     if replaced:
         yield "  in place of the predictions that were there"
     yield (
-        f"  model   {result.seconds_per_frame:.3g} s per frame ({result.seconds_without_search:.3g} s"
+        f"  model   {result.seconds_per_frame:.3g} s per frame "
+        f"({result.seconds_without_search:.3g} s"
         f" without the neighbour search) on {result.device}"
     )
     if solver is not None:
         ratio = result.seconds_per_frame / solver.seconds_per_frame
-        slower, faster = (
-            f"{ratio:.2g} times as fast as the model",
-            f"the model is {1 / ratio:.2g} times as fast",
-        )
-        beside = slower if ratio > 1 else faster
+        slower = f"{ratio:.2g} times as fast as the model"
+        faster = f"the model is {1 / ratio:.2g} times as fast"
+        if ratio > 1:
+            beside = slower
+        else:
+            beside = faster
         yield f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this machine: {beside}"
     if result.diverged:
-        marks = ", ".join(f"scenario {i} at frame {frame}" for i, frame in result.diverged.items())
+        marks = ", ".join(
+            f"scenario {i} at frame {frame}" for i, frame in result.diverged.items()
+        )
         yield f"  frozen  {marks}: not finite from there on"
     yield f"next: lagbench score {result.path}{where}"
 
@@ -298,21 +368,31 @@ def bench(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Time our solver on this machine: processor seconds per frame of one scenario on one core."""
+    """Time our solver on this machine: processor seconds per frame of one scenario on
+    one core.
+    """
     from lagbench.data.local import locate_new
 
     from .machine import bench_solver
 
     if what != "solver":
         fix = "lagbench bench solver"
-        raise UsageError(f"nothing to time is called {what!r}", expected="solver", fix=fix)
+        raise UsageError(
+            f"nothing to time is called {what!r}", expected="solver", fix=fix
+        )
     tier = locate_new(chosen(None, split), size).size
     if not tier.simulated:
         fix = "lagbench list names splits of ours"
-        raise UsageError("a local split cannot be simulated", where="--split", got=tier.split, fix=fix)
+        raise UsageError(
+            "a local split cannot be simulated",
+            where="--split",
+            got=tier.split,
+            fix=fix,
+        )
     result = bench_solver(tier.split, tier.name, frames=frames)
     told = (
-        f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of {result.particles}"
+        f"{result.split} {result.size}: {result.seconds_per_frame:.3g} s per frame of "
+        f"{result.particles}"
         f" particles, {result.substeps} substeps, on one core"
     )
     show(result, [told], as_json=as_json, quiet=quiet)

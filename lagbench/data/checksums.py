@@ -7,8 +7,9 @@ content hash of a scenario is built from its values alone, in two levels::
     content  = SHA-256(canonical JSON of {split, size, major, scenario, subset, seed,
                                           parameters, variables: {name: variable}})
 
-so that variables can be hashed side by side while frames arrive, and a damaged one can be
-named. Values are little-endian, in C order, with one zero and one NaN; docs/format.md has it all.
+so that variables can be hashed side by side while frames arrive, and a damaged one can
+be named. Values are little-endian, in C order, with one zero and one NaN;
+docs/format.md has it all.
 """
 
 from __future__ import annotations
@@ -34,11 +35,14 @@ BLOCK_BYTES = 1 << 18
 def plain(value: object) -> object:
     """Return a JSON value equal to an attribute, whatever library read it.
 
-    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one element
-    become Python numbers; -0.0 becomes 0.0.
+    Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
+    element become Python numbers; -0.0 becomes 0.0.
     """
     if isinstance(value, (np.ndarray, np.generic)):
-        value = value.item() if value.size == 1 else value.tolist()
+        if value.size == 1:
+            value = value.item()
+        else:
+            value = value.tolist()
     if isinstance(value, bytes):
         value = value.decode("utf-8")
     if isinstance(value, int):
@@ -56,27 +60,35 @@ def plain(value: object) -> object:
 
 
 def round_digits(value: float, digits: int = 9) -> float:
-    """Return a number rounded to significant digits, nine as in every published statistic.
+    """Return a number rounded to significant digits, nine as in every published
+    statistic.
 
     What is not finite stays; -0.0 becomes 0.0.
 
     >>> round_digits(2 / 3), round_digits(2 / 3, 4), round_digits(float("inf"))
     (0.666666667, 0.6667, inf)
     """
-    return float(f"{value:.{digits}g}") + 0.0 if math.isfinite(value) else value
+    if math.isfinite(value):
+        return float(f"{value:.{digits}g}") + 0.0
+    return value
 
 
 def canonical_json(value: object) -> bytes:
     """Return the one JSON text of a value, as UTF-8.
 
-    Keys sorted by code point, no white space, no escapes beyond what JSON demands, floats in
-    the shortest form that reads back equal (``repr``), integers without a point.
+    Keys sorted by code point, no white space, no escapes beyond what JSON demands,
+    floats in the shortest form that reads back equal (``repr``), integers without a
+    point.
 
     >>> canonical_json({"b": 1, "a": [-0.0, 1e-7]})
     b'{"a":[0.0,1e-07],"b":1}'
     """
     text = json.dumps(
-        plain(value), sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False
+        plain(value),
+        sort_keys=True,
+        separators=(",", ":"),
+        ensure_ascii=False,
+        allow_nan=False,
     )
     return text.encode("utf-8")
 
@@ -92,19 +104,30 @@ def dtype_name(dtype: object) -> str:
         return "string"
     if resolved.kind in "iuf":
         return str(resolved.name)
-    raise DataError("a type cannot be hashed", expected="integers, floats or strings", got=str(resolved))
+    raise DataError(
+        "a type cannot be hashed",
+        expected="integers, floats or strings",
+        got=str(resolved),
+    )
 
 
 class VariableHasher:
     """SHA-256 of one variable whose values arrive in C order, piece by piece."""
 
-    def __init__(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
+    def __init__(
+        self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]
+    ) -> None:
         self.name = name  # name of the variable
         self.dtype = dtype_name(dtype)
         self._missing = math.prod(shape)
         self._sha = hashlib.sha256()
         self._joint = b""
-        header = {"name": name, "dtype": self.dtype, "dims": list(dims), "shape": list(shape)}
+        header = {
+            "name": name,
+            "dtype": self.dtype,
+            "dims": list(dims),
+            "shape": list(shape),
+        }
         self._sha.update(canonical_json(header) + b"\n")
 
     def update(self, values: ArrayLike) -> None:
@@ -113,7 +136,9 @@ class VariableHasher:
         if dtype_name(array.dtype) != self.dtype:
             raise self._wrong("values have another type", self.dtype, array.dtype)
         if array.size > self._missing:
-            raise self._wrong("too many values", f"at most {self._missing} more", array.size)
+            raise self._wrong(
+                "too many values", f"at most {self._missing} more", array.size
+            )
         self._missing -= array.size
         if self.dtype == "string":
             for item in array.reshape(-1).tolist():
@@ -123,7 +148,9 @@ class VariableHasher:
                 self._sha.update(self._joint + text.encode("utf-8"))
                 self._joint = b"\0"
             return
-        little = array.astype(array.dtype.newbyteorder("<"), order="C", copy=False).reshape(-1)
+        little = array.astype(
+            array.dtype.newbyteorder("<"), order="C", copy=False
+        ).reshape(-1)
         step = BLOCK_BYTES // little.itemsize
         for start in range(0, little.size, step):
             self._sha.update(_canonical(little[start : start + step]).data)
@@ -131,20 +158,29 @@ class VariableHasher:
     def hexdigest(self) -> str:
         """Return the hash, 64 hex digits."""
         if self._missing:
-            raise self._wrong("values are missing", "as many as the shape holds", f"{self._missing} fewer")
+            raise self._wrong(
+                "values are missing",
+                "as many as the shape holds",
+                f"{self._missing} fewer",
+            )
         return self._sha.hexdigest()
 
     def _wrong(self, what: str, expected: object, got: object) -> DataError:
-        return DataError(what, where=f"variable {self.name!r}", expected=expected, got=got)
+        return DataError(
+            what, where=f"variable {self.name!r}", expected=expected, got=got
+        )
 
 
 def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return a block with one zero and one NaN; the block itself where nothing changes."""
+    """Return a block with one zero and one NaN; the block itself where nothing
+    changes.
+    """
     if block.dtype.kind != "f":
         return block
     bits = block.view(f"<i{block.itemsize}")
-    # The bits of -0.0 are the smallest integer of their width, and a minimum passes NaN on: two
-    # fast reductions find both, and integers keep subnormals where a library flushes them to zero.
+    # The bits of -0.0 are the smallest integer of their width, and a minimum passes NaN
+    # on: two fast reductions find both, and integers keep subnormals where a library
+    # flushes them to zero.
     negative_zero = np.iinfo(bits.dtype).min
     if bits.min() > negative_zero and not np.isnan(block.min()):
         return block
@@ -161,7 +197,9 @@ class ContentHasher:
         self.identity = identity  # what enters beside the variables
         self._variables: dict[str, VariableHasher] = {}
 
-    def declare(self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]) -> None:
+    def declare(
+        self, name: str, dtype: object, dims: Sequence[object], shape: Sequence[int]
+    ) -> None:
         """Announce a variable before its values come."""
         self._variables[name] = VariableHasher(name, dtype, dims, shape)
 
@@ -171,7 +209,9 @@ class ContentHasher:
 
     def digests(self) -> dict[str, str]:
         """Return the hash of every variable, sorted by name."""
-        return {name: self._variables[name].hexdigest() for name in sorted(self._variables)}
+        return {
+            name: self._variables[name].hexdigest() for name in sorted(self._variables)
+        }
 
     def hexdigest(self) -> str:
         """Return the content hash, 64 hex digits."""
@@ -187,15 +227,23 @@ def file_sha256(path: Path) -> str:
 
 def subset_hash(hashes: Mapping[int, str]) -> str:
     """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id."""
-    lines = "".join(f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes))
+    lines = "".join(
+        f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes)
+    )
     return hashlib.sha256(lines.encode("ascii")).hexdigest()
 
 
 def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) -> str:
-    """Return the data set hash over train, valid and test; other subsets are left out."""
+    """Return the data set hash over train, valid and test; other subsets are left
+    out.
+    """
     missing = [subset for subset in HASHED_SUBSETS if subset not in subsets]
     if missing:
-        raise DataError("the data set hash needs every subset", where=f"{split} {size}", got=f"no {missing}")
+        raise DataError(
+            "the data set hash needs every subset",
+            where=f"{split} {size}",
+            got=f"no {missing}",
+        )
     hashed = {subset: subsets[subset] for subset in HASHED_SUBSETS}
     whole = {"split": split, "size": size, "major": major, "subsets": hashed}
     return hashlib.sha256(canonical_json(whole)).hexdigest()

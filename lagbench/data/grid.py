@@ -6,8 +6,9 @@ Node velocity is ``sum_p(w u) / sum_p(w)`` with ``w(d) = b(d_x / h) b(d_y / h)``
     b(s) = (3/2 - |s|)^2 / 2     for 1/2 <= |s| <= 3/2, else 0.
 
 The scorer, the plots and the differentiable twin in the training loss share this one
-definition. Arrays of particles have shape [..., particle, 2], fields [..., x node, y node];
-leading axes are frames or scenarios, and a batch gives the same bits as its frames alone.
+definition. Arrays of particles have shape [..., particle, 2], fields [..., x node, y
+node]; leading axes are frames or scenarios, and a batch gives the same bits as its
+frames alone.
 """
 
 from __future__ import annotations
@@ -25,12 +26,15 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 COUNTED_SHARE = 0.35
-"""A node counts from this share of a full interior node's weight: walls (1/2) do, corners (1/4) not."""
+"""A node counts from this share of a full interior node's weight: walls (1/2) do,
+corners (1/4) not.
+"""
 
 EMPTY_SHARE = 1e-3
 """Below this share of a full node's weight a node is empty and its velocity is 0."""
 
-_LOW, _HIGH = 1, 2  # rows that the stencil of a particle in the unit box can reach past the grid
+_LOW = 1
+_HIGH = 2  # rows that the stencil of a particle in the unit box can reach past the grid
 
 
 class Placement(enum.StrEnum):
@@ -55,7 +59,12 @@ class Grid:
     def __post_init__(self) -> None:
         """Accept the placement's name as it stands in datasets.yaml."""
         if self.cells < 2:
-            raise UsageError("a grid needs cells", where="cells", expected="at least 2", got=self.cells)
+            raise UsageError(
+                "a grid needs cells",
+                where="cells",
+                expected="at least 2",
+                got=self.cells,
+            )
         object.__setattr__(self, "placement", Placement(self.placement))
 
     @property
@@ -71,7 +80,9 @@ class Grid:
     @property
     def origin(self) -> float:
         """Position of node 0 in units of h: 1/2 or 0."""
-        return 0.5 if self.placement is Placement.CELL_CENTRES else 0.0
+        if self.placement is Placement.CELL_CENTRES:
+            return 0.5
+        return 0.0
 
     @property
     def axis(self) -> Floats:
@@ -102,7 +113,8 @@ class Fields:
 
     grid: Grid  # where the nodes lie
     weight: Floats  # sum(w) [1], shape [..., x node, y node]
-    velocity: Floats  # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    velocity: Floats
     counted: Mask  # nodes that count, shape [..., x node, y node]
     full: float  # weight of a full interior node [1]
 
@@ -113,18 +125,24 @@ class Fields:
 
     @cached_property
     def differentiable(self) -> Mask:
-        """Nodes at which vorticity and divergence stand, shape [..., x node, y node]."""
+        """Nodes at which vorticity and divergence stand, shape [..., x node, y
+        node].
+        """
         return differentiable_nodes(self.counted)
 
     @cached_property
     def vorticity(self) -> Floats:
         """``dv/dx - du/dy`` [unit of u / length], NaN where not differentiable."""
-        return np.where(self.differentiable, vorticity(self.velocity, self.grid.spacing), np.nan)
+        return np.where(
+            self.differentiable, vorticity(self.velocity, self.grid.spacing), np.nan
+        )
 
     @cached_property
     def divergence(self) -> Floats:
         """``du/dx + dv/dy`` [unit of u / length], NaN where not differentiable."""
-        return np.where(self.differentiable, divergence(self.velocity, self.grid.spacing), np.nan)
+        return np.where(
+            self.differentiable, divergence(self.velocity, self.grid.spacing), np.nan
+        )
 
 
 def fields(
@@ -139,11 +157,12 @@ def fields(
 
     Args:
         position: particle positions [length], shape [..., particle, 2].
-        velocity: particle velocities u, shape [..., particle, 2]; per frame gives 1/frame.
+        velocity: particle velocities u, shape [..., particle, 2]; per frame gives
+            1/frame.
         grid: grid of the fields.
         full: weight of a full interior node, :meth:`Grid.full_weight` [1].
-        counted: nodes that count, those of the truth when a prediction is scored; by default
-            those of these particles.
+        counted: nodes that count, those of the truth when a prediction is scored; by
+            default those of these particles.
     """
     sums = transfer(position, velocity, grid)
     if counted is None:
@@ -154,7 +173,8 @@ def fields(
 def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     """Sum weights and momenta of the particles at the nodes.
 
-    Particles outside the unit box, or with a position that is no number, carry no weight.
+    Particles outside the unit box, or with a position that is no number, carry no
+    weight.
 
     Args:
         position: particle positions [length], shape [..., particle, 2].
@@ -167,8 +187,11 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
-        expected, got = "two arrays of one shape [..., particle, 2]", f"{x.shape} and {u.shape}"
-        raise UsageError("positions and velocities do not fit", expected=expected, got=got)
+        expected = "two arrays of one shape [..., particle, 2]"
+        got = f"{x.shape} and {u.shape}"
+        raise UsageError(
+            "positions and velocities do not fit", expected=expected, got=got
+        )
     sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
         _scatter(x[frame], u[frame], grid, sums[frame])
@@ -176,10 +199,15 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
 
 
 def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
-    """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame to ``out``, [3, x node, y node]."""
-    if not (x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0):  # NaN is not inside either
+    """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame to ``out``, [3,
+    x node, y node].
+    """
+    if not (
+        x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
+    ):  # NaN is not inside either
         inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
-        x, u = x[inside], u[inside]
+        x = x[inside]
+        u = u[inside]
     s = x.T * grid.cells
     s -= grid.origin
     base = np.floor(s - 0.5)
@@ -200,16 +228,21 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
     corner = (base[0] + base[1]).astype(np.intp)
     along_x, along_y = np.ascontiguousarray(u.T)
 
-    # node numbers stay those of the corner; what is added to is shifted to the node instead
+    # node numbers stay those of the corner; what is added to is shifted to the node
+    # instead
     size = side * side
-    sums, momenta = (np.zeros(size + 2 * side + 2, dtype) for dtype in (np.float64, np.complex128))
-    weight, product = np.empty(len(corner)), np.empty(len(corner), np.complex128)
+    sums, momenta = (
+        np.zeros(size + 2 * side + 2, dtype) for dtype in (np.float64, np.complex128)
+    )
+    weight = np.empty(len(corner))
+    product = np.empty(len(corner), np.complex128)
     for i in range(3):
         for k in range(3):
             shift = i * side + k
             np.multiply(weights[0, i], weights[1, k], out=weight)
             np.add.at(sums[shift:], corner, weight)
-            # both components go into one sum of complex numbers, which takes less than two of real ones
+            # both components go into one sum of complex numbers, which takes less than
+            # two of real ones
             np.multiply(weight, along_x, out=product.real)
             np.multiply(weight, along_y, out=product.imag)
             np.add.at(momenta[shift:], corner, product)
@@ -218,15 +251,21 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
 
 
 def counted_nodes(weight: Floats, full: float) -> Mask:
-    """Return the nodes with at least :data:`COUNTED_SHARE` of a full interior node's weight."""
+    """Return the nodes with at least :data:`COUNTED_SHARE` of a full interior node's
+    weight.
+    """
     return weight >= COUNTED_SHARE * full
 
 
 def node_velocity(sums: Transfer, full: float) -> Floats:
-    """Return ``sum(w u) / sum(w)``, 0 where the weight is below :data:`EMPTY_SHARE` of full."""
+    """Return ``sum(w u) / sum(w)``, 0 where the weight is below :data:`EMPTY_SHARE` of
+    full.
+    """
     filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
     velocity = np.zeros_like(sums.momentum)
-    np.divide(sums.momentum, sums.weight[..., None], out=velocity, where=filled[..., None])
+    np.divide(
+        sums.momentum, sums.weight[..., None], out=velocity, where=filled[..., None]
+    )
     return velocity
 
 
@@ -234,13 +273,17 @@ def differentiable_nodes(counted: Mask) -> Mask:
     """Return the nodes whose four neighbours exist and count."""
     inner = np.zeros_like(counted)
     inner[..., 1:-1, 1:-1] = (
-        counted[..., 2:, 1:-1] & counted[..., :-2, 1:-1] & counted[..., 1:-1, 2:] & counted[..., 1:-1, :-2]
+        counted[..., 2:, 1:-1]
+        & counted[..., :-2, 1:-1]
+        & counted[..., 1:-1, 2:]
+        & counted[..., 1:-1, :-2]
     )
     return inner
 
 
 def vorticity(velocity: Floats, spacing: float) -> Floats:
-    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2 Omega.
+    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2
+    Omega.
 
     Central differences, 0 on the rim of the grid where there is none.
 
@@ -248,7 +291,8 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    u, v = velocity[..., 0], velocity[..., 1]
+    u = velocity[..., 0]
+    v = velocity[..., 1]
     slope = np.zeros(u.shape)
     slope[..., 1:-1, :] = (v[..., 2:, :] - v[..., :-2, :]) / (2.0 * spacing)
     slope[..., 1:-1] -= (u[..., 2:] - u[..., :-2]) / (2.0 * spacing)
@@ -256,13 +300,15 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
 
 
 def divergence(velocity: Floats, spacing: float) -> Floats:
-    """Return ``du/dx + dv/dy``; an incompressible flow gives 0. Differences as of the vorticity.
+    """Return ``du/dx + dv/dy``; an incompressible flow gives 0. Differences as of the
+    vorticity.
 
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].
         spacing: distance h between nodes [length].
     """
-    u, v = velocity[..., 0], velocity[..., 1]
+    u = velocity[..., 0]
+    v = velocity[..., 1]
     slope = np.zeros(u.shape)
     slope[..., 1:-1, :] = (u[..., 2:, :] - u[..., :-2, :]) / (2.0 * spacing)
     slope[..., 1:-1] += (v[..., 2:] - v[..., :-2]) / (2.0 * spacing)

@@ -1,9 +1,11 @@
-"""Look at a stranger's HDF5 file without trusting it: what it holds, before values are read.
+"""Look at a stranger's HDF5 file without trusting it: what it holds, before values are
+read.
 
-HDF5 lets a file point to other files (external links, external storage, virtual data sets), ask
-for plug-ins, and claim any size. Here links are listed and never followed, and what a header
-declares is held against what the file holds. :func:`check_structure` refuses a file; formats
-that report all their findings together use :func:`describe` and :func:`storage_problem`.
+HDF5 lets a file point to other files (external links, external storage, virtual data
+sets), ask for plug-ins, and claim any size. Here links are listed and never followed,
+and what a header declares is held against what the file holds. :func:`check_structure`
+refuses a file; formats that report all their findings together use :func:`describe` and
+:func:`storage_problem`.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ MAX_ATTRIBUTE = 1 << 16
 """Longest attribute that is read [bytes]."""
 
 MAX_CACHE = 1 << 27
-"""Most memory for chunks that must stay unpacked while rows are read in order [bytes]."""
+"""Most memory for chunks that must stay unpacked while rows are read in order [bytes].
+"""
 
 MAX_CHUNKS = 200_000
 """Most chunks of an array; each costs some microseconds to find."""
@@ -40,7 +43,9 @@ DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
 
 MOST = 200
-"""Times its packed length that an array beyond HARMLESS may unpack to; particles at rest reach 100."""
+"""Times its packed length that an array beyond HARMLESS may unpack to; particles at
+rest reach 100.
+"""
 
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 FOREIGN: Mapping[bytes, str] = {
@@ -92,10 +97,17 @@ def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> N
         ) from error
     if head != SIGNATURE:
         text = head.isascii() and head.decode("ascii").isprintable()
-        guess = ("text" if text else "bytes of another format") if head else "an empty file"
-        got = next((what for start, what in FOREIGN.items() if head.startswith(start)), guess)
+        if head:
+            guess = "text" if text else "bytes of another format"
+        else:
+            guess = "an empty file"
+        got = next(
+            (what for start, what in FOREIGN.items() if head.startswith(start)), guess
+        )
         expected = "HDF5, as netCDF4 is"
-        raise UnreadableFileError("not an HDF5 file", where=str(path), expected=expected, got=got, fix=fix)
+        raise UnreadableFileError(
+            "not an HDF5 file", where=str(path), expected=expected, got=got, fix=fix
+        )
 
 
 @contextmanager
@@ -105,7 +117,9 @@ def reading(path: Path, variable: str | None = None) -> Iterator[None]:
         yield
     except LagbenchError:
         raise
-    except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
+    except (
+        Exception
+    ) as error:  # no list of types holds: damage surfaces as nearly any of them
         raise UnreadableFileError(
             "HDF5 cannot read the file",
             where=str(path) if variable is None else f"{path}, variable {variable!r}",
@@ -116,8 +130,12 @@ def reading(path: Path, variable: str | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def opened(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading: no lock, nothing but a regular file of bounded length."""
+def opened(
+    path: Path, *, longest: int | None = None, fix: str = AGAIN
+) -> Iterator[h5py.File]:
+    """Open an HDF5 file for reading: no lock, nothing but a regular file of bounded
+    length.
+    """
     check_file(path, longest=longest, fix=fix)
     with reading(path):
         file = h5py.File(path, "r", locking=False)
@@ -133,7 +151,9 @@ class Odd:
 
 
 class Problem(NamedTuple):
-    """What is wrong with the storage of an array, what would be right, and what was found."""
+    """What is wrong with the storage of an array, what would be right, and what was
+    found.
+    """
 
     what: str
     expected: str
@@ -163,7 +183,9 @@ class Array:
     @property
     def chunk_bytes(self) -> int:
         """Length of an unpacked chunk [bytes]; 0 where it is not chunked."""
-        return self.item * math.prod(self.chunks) if self.chunks else 0
+        if self.chunks:
+            return self.item * math.prod(self.chunks)
+        return 0
 
 
 def members_of(group: h5py.Group, most: int = MAX_LINKS) -> tuple[dict[str, str], int]:
@@ -206,20 +228,28 @@ def attribute_of(owner: h5py.HLObject, name: str) -> object:
             return Odd("no UTF-8")
     if isinstance(value, str) and len(value) > MAX_ATTRIBUTE:
         return Odd(f"{len(value)} characters")
-    return value if isinstance(value, (str, int, float)) else Odd("neither a text nor a number")
+    if isinstance(value, (str, int, float)):
+        return value
+    return Odd("neither a text nor a number")
 
 
 def layout_of(dataset: h5py.Dataset) -> str:
-    """Return how the values are stored: one of :data:`INSIDE`, "virtual", "external files" or "unknown"."""
+    """Return how the values are stored: one of :data:`INSIDE`, "virtual", "external
+    files" or "unknown".
+    """
     plist = dataset.id.get_create_plist()
-    return "external files" if plist.get_external_count() else LAYOUTS.get(plist.get_layout(), "unknown")
+    if plist.get_external_count():
+        return "external files"
+    return LAYOUTS.get(plist.get_layout(), "unknown")
 
 
 def describe(dataset: h5py.Dataset) -> Array:
     """Return what the header of a data set says; no value is read."""
-    plist, layout = dataset.id.get_create_plist(), layout_of(dataset)
+    plist = dataset.id.get_create_plist()
+    layout = layout_of(dataset)
     # HDF5 opens the sources of a virtual data set to tell its shape.
-    elsewhere, plain = layout not in INSIDE, (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
+    elsewhere = layout not in INSIDE
+    plain = (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
     simple = not elsewhere and dataset.id.get_space().get_simple_extent_type() in plain
     filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
     sizes: list[int] = []
@@ -233,28 +263,44 @@ def describe(dataset: h5py.Dataset) -> Array:
         item=kind.get_size(),
         layout=layout,
         chunks=tuple(plist.get_chunk()) if layout == "chunked" else None,
-        packed=sum(sizes) if layout == "chunked" else 0 if elsewhere else dataset.id.get_storage_size(),
+        packed=sum(sizes)
+        if layout == "chunked"
+        else 0
+        if elsewhere
+        else dataset.id.get_storage_size(),
         largest_chunk=max(sizes, default=0),
         filters=tuple(code for code, *_ in filters),
         foreign_filters=tuple(
-            f"{text.decode('ascii', 'replace')} ({code})" for code, *_, text in filters if code not in FILTERS
+            f"{text.decode('ascii', 'replace')} ({code})"
+            for code, *_, text in filters
+            if code not in FILTERS
         ),
     )
 
 
 def dims_of(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of the dimension scales that netCDF attaches, one per dimension."""
+    """Return the names of the dimension scales that netCDF attaches, one per
+    dimension.
+    """
     rank: int = dataset.id.rank
     if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):
         return ("",) * rank
     attribute = h5py.h5a.open(dataset.id, b"DIMENSION_LIST")
     kind = attribute.get_type()
-    is_list = kind.get_class() == h5py.h5t.VLEN and kind.get_super().get_class() == h5py.h5t.REFERENCE
+    is_list = (
+        kind.get_class() == h5py.h5t.VLEN
+        and kind.get_super().get_class() == h5py.h5t.REFERENCE
+    )
     if not is_list or attribute.shape != (rank,):
         return ("",) * rank
     scales = dataset.attrs["DIMENSION_LIST"]
-    names = (h5py.h5r.get_name(scale[0], dataset.id) or b"" if len(scale) else b"" for scale in scales)
-    return tuple(name.decode("utf-8", "backslashreplace").rsplit("/", 1)[-1] for name in names)
+    names = (
+        h5py.h5r.get_name(scale[0], dataset.id) or b"" if len(scale) else b""
+        for scale in scales
+    )
+    return tuple(
+        name.decode("utf-8", "backslashreplace").rsplit("/", 1)[-1] for name in names
+    )
 
 
 def _kind(kind: h5py.h5t.TypeID) -> str:
@@ -262,9 +308,14 @@ def _kind(kind: h5py.h5t.TypeID) -> str:
     if kind.get_class() == h5py.h5t.FLOAT:
         if kind in (h5py.h5t.IEEE_F32LE, h5py.h5t.IEEE_F32BE):
             return "float32"
-        return f"float{8 * kind.get_size()}" if kind.get_size() != 4 else "a float of 4 bytes, not IEEE"
+        if kind.get_size() != 4:
+            return f"float{8 * kind.get_size()}"
+        return "a float of 4 bytes, not IEEE"
     if kind.get_class() == h5py.h5t.INTEGER:
-        sign = "" if kind.get_sign() == h5py.h5t.SGN_2 else "u"
+        if kind.get_sign() == h5py.h5t.SGN_2:
+            sign = ""
+        else:
+            sign = "u"
         return f"{sign}int{8 * kind.get_size()}"
     return KINDS.get(kind.get_class(), "another type")
 
@@ -272,91 +323,158 @@ def _kind(kind: h5py.h5t.TypeID) -> str:
 def cache_of(array: Array) -> tuple[int, int]:
     """Return the bytes and the number of chunks to keep while frames are read in order.
 
-    A chunk is unpacked once if all chunks that a frame touches stay until the frames, and for
-    chunks over several scenarios the scenarios, that share them are through.
+    A chunk is unpacked once if all chunks that a frame touches stay until the frames,
+    and for chunks over several scenarios the scenarios, that share them are through.
     """
     if array.chunks is None or array.shape is None:
         return 0, 1
     counts = [-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)]
-    rows = counts[1:2] if array.chunks[0] > 1 else []
+    if array.chunks[0] > 1:
+        rows = counts[1:2]
+    else:
+        rows = []
     kept = max(1, math.prod([*rows, *counts[2:]]))
     return kept * array.chunk_bytes, kept
 
 
-def storage_problem(array: Array, *, length: int, cache: int = MAX_CACHE) -> Problem | None:
-    """Return why an array reaches outside its file, needs plug-ins, or is a trap; None where it is sound.
+def storage_problem(
+    array: Array, *, length: int, cache: int = MAX_CACHE
+) -> Problem | None:
+    """Return why an array reaches outside its file, needs plug-ins, or is a trap; None
+    where it is sound.
 
-    ``length`` is that of the file [bytes]: chunks may overlap, and then promise more than it has;
-    ``cache`` the most memory for chunks that must stay unpacked [bytes].
+    ``length`` is that of the file [bytes]: chunks may overlap, and then promise more
+    than it has; ``cache`` the most memory for chunks that must stay unpacked [bytes].
     """
     if array.shape is None:
         away = "file" in array.layout or array.layout == "virtual"
-        what = "the values lie in other files" if away else "there are no values"
-        return Problem(what, "compact, contiguous or chunked storage in this file", array.layout)
+        if away:
+            what = "the values lie in other files"
+        else:
+            what = "there are no values"
+        return Problem(
+            what, "compact, contiguous or chunked storage in this file", array.layout
+        )
     if array.foreign_filters:
         got = ", ".join(array.foreign_filters)
-        return Problem("a filter is needed that not every reader has", "zlib, shuffle, checksum or none", got)
+        return Problem(
+            "a filter is needed that not every reader has",
+            "zlib, shuffle, checksum or none",
+            got,
+        )
     if len(set(array.filters)) < len(array.filters):
         # Each zlib in a pipeline multiplies what a chunk may unpack to by a thousand.
         got = f"filters {', '.join(map(str, array.filters[:10]))}"
-        return Problem("a filter is applied more than once", "each filter at most once", got)
+        return Problem(
+            "a filter is applied more than once", "each filter at most once", got
+        )
     if array.packed > length:
         got = f"{array.packed} bytes in a file of {length}"
-        return Problem("the values claim more room than the file has", f"at most {length} bytes", got)
+        return Problem(
+            "the values claim more room than the file has",
+            f"at most {length} bytes",
+            got,
+        )
     if array.chunks is None or len(array.shape) != len(array.chunks):
         return None
-    count = math.prod(-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True))
+    count = math.prod(
+        -(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)
+    )
     if count > MAX_CHUNKS:
-        return Problem("too many chunks", f"at most {MAX_CHUNKS}", f"{count} of shape {array.chunks}")
+        return Problem(
+            "too many chunks",
+            f"at most {MAX_CHUNKS}",
+            f"{count} of shape {array.chunks}",
+        )
     whole = array.chunk_bytes
     if array.largest_chunk > 2 * whole + 1024:
         # zlib unpacks as much as the stream says: a thousand times its length at worst.
         got = f"{array.largest_chunk} bytes"
-        return Problem("a chunk is longer packed than unpacked", f"about {whole} bytes at most", got)
+        return Problem(
+            "a chunk is longer packed than unpacked",
+            f"about {whole} bytes at most",
+            got,
+        )
     size = cache_of(array)[0]
     if size > cache:
         got = f"chunks {array.chunks}: {size} bytes"
-        return Problem("frames cannot be read without unpacking much more", f"at most {cache} bytes", got)
+        return Problem(
+            "frames cannot be read without unpacking much more",
+            f"at most {cache} bytes",
+            got,
+        )
     return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """What a format expects of a file: everything else is refused before a value is read."""
+    """What a format expects of a file: everything else is refused before a value is
+    read.
+    """
 
     members: int = MAX_LINKS  # most members of a group
-    groups: Collection[str] | None = ()  # groups below the root that it may have; None: any
-    texts: bool = False  # whether arrays may hold texts; these share one heap of any length
+    groups: (
+        Collection[str] | None
+    ) = ()  # groups below the root that it may have; None: any
+    texts: bool = (
+        False  # whether arrays may hold texts; these share one heap of any length
+    )
     unpacked: int | None = None  # most bytes that all arrays together may become
-    cache: int = MAX_CACHE  # most bytes of chunks that must stay unpacked while frames are read in order
+    # most bytes of chunks that must stay unpacked while frames are read in order
+    cache: int = MAX_CACHE
 
 
-def check_structure(file: h5py.File, path: Path, expected: Structure) -> dict[str, Array]:
-    """Return the arrays of an open file by name ("a", "group/b"); refuse what may harm a reader.
+def check_structure(
+    file: h5py.File, path: Path, expected: Structure
+) -> dict[str, Array]:
+    """Return the arrays of an open file by name ("a", "group/b"); refuse what may harm
+    a reader.
 
-    Refused are links, foreign storage and filters, filters that are applied twice, groups and
-    types that the format does not have, and arrays that unpack to far more than the file holds:
-    by their headers, and large chunks by unpacking them up to the length that they declare.
+    Refused are links, foreign storage and filters, filters that are applied twice,
+    groups and types that the format does not have, and arrays that unpack to far more
+    than the file holds: by their headers, and large chunks by unpacking them up to the
+    length that they declare.
     """
 
     def refused(name: str, what: str, wanted: str, got: str) -> UnreadableFileError:
-        where = f"{path}, {name!a}" if name else str(path)
+        if name:
+            where = f"{path}, {name!a}"
+        else:
+            where = str(path)
         fix = "write it again without links, filters of its own, and arrays larger than their values"
         return UnreadableFileError(what, where=where, expected=wanted, got=got, fix=fix)
 
     def names() -> Iterator[str]:
         root, _ = members_of(file["/"], expected.members)
-        for prefix in ["", *(f"{name}/" for name, kind in root.items() if kind == "group")]:
+        for prefix in [
+            "",
+            *(f"{name}/" for name, kind in root.items() if kind == "group"),
+        ]:
             members, count = members_of(file[prefix or "/"], expected.members)
             if count > expected.members:
-                raise refused(prefix, "too many members", f"at most {expected.members}", str(count))
+                raise refused(
+                    prefix,
+                    "too many members",
+                    f"at most {expected.members}",
+                    str(count),
+                )
             for name, kind in members.items():
                 if kind == "variable":
                     yield f"{prefix}{name}"
-                elif kind != "group" or prefix or not (expected.groups is None or name in expected.groups):
-                    raise refused(prefix + name, "a member that is no variable", "a variable", kind)
+                elif (
+                    kind != "group"
+                    or prefix
+                    or not (expected.groups is None or name in expected.groups)
+                ):
+                    raise refused(
+                        prefix + name,
+                        "a member that is no variable",
+                        "a variable",
+                        kind,
+                    )
 
-    length, found = path.stat().st_size, {}
+    length = path.stat().st_size
+    found = {}
     with reading(path):
         for name in names():
             array = found[name] = describe(file[name])
@@ -364,7 +482,9 @@ def check_structure(file: h5py.File, path: Path, expected: Structure) -> dict[st
                 raise refused(name, *problem)
             text = expected.texts and array.kind in ("string", "variable-length")
             if not text and not array.kind.startswith(("float", "int", "uint")):
-                raise refused(name, "an array of another type", "plain numbers", array.kind)
+                raise refused(
+                    name, "an array of another type", "plain numbers", array.kind
+                )
             if problem := _inflation(file[name], array):
                 raise refused(name, *problem)
     total = sum(array.unpacked + array.chunk_bytes for array in found.values())
@@ -378,22 +498,42 @@ def _inflation(dataset: h5py.Dataset, array: Array) -> Problem | None:
     """Hold what an array declares against what its chunks hold."""
     if array.unpacked > max(HARMLESS, MOST * array.packed):
         what = "the array would unpack to far more than the file holds"
-        return Problem(what, f"at most {MOST} times {array.packed} bytes", f"{array.unpacked} bytes")
-    if array.largest_chunk * DEFLATE_RATIO <= HARMLESS or h5py.h5z.FILTER_DEFLATE not in array.filters:
+        return Problem(
+            what,
+            f"at most {MOST} times {array.packed} bytes",
+            f"{array.unpacked} bytes",
+        )
+    if (
+        array.largest_chunk * DEFLATE_RATIO <= HARMLESS
+        or h5py.h5z.FILTER_DEFLATE not in array.filters
+    ):
         return None
     places: list[tuple[int, ...]] = []
     dataset.id.chunk_iter(
-        lambda chunk: places.append(chunk.chunk_offset) if chunk.size * DEFLATE_RATIO > HARMLESS else None
+        lambda chunk: (
+            places.append(chunk.chunk_offset)
+            if chunk.size * DEFLATE_RATIO > HARMLESS
+            else None
+        )
     )
     most = array.chunk_bytes + 4  # a checksum may stand behind the values
     for place in places:
         mask, raw = dataset.id.read_direct_chunk(place)
-        applied = [code for bit, code in enumerate(array.filters) if not mask >> bit & 1]
+        applied = [
+            code for bit, code in enumerate(array.filters) if not mask >> bit & 1
+        ]
         if h5py.h5z.FILTER_DEFLATE not in applied:
             continue
         after = applied[applied.index(h5py.h5z.FILTER_DEFLATE) + 1 :]
         packed = bytes(raw)[: len(raw) - 4 * len(after)]
         # no writer packs first and shuffles then
-        if h5py.h5z.FILTER_SHUFFLE in after or len(zlib.decompressobj().decompress(packed, most + 1)) > most:
-            return Problem("a chunk unpacks to more than it declares", f"{array.chunk_bytes} bytes", "more")
+        if (
+            h5py.h5z.FILTER_SHUFFLE in after
+            or len(zlib.decompressobj().decompress(packed, most + 1)) > most
+        ):
+            return Problem(
+                "a chunk unpacks to more than it declares",
+                f"{array.chunk_bytes} bytes",
+                "more",
+            )
     return None

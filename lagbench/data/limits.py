@@ -1,8 +1,9 @@
 """Which parameters a size needs, and which values its numbers may have.
 
-Checked when a datasets.yaml is loaded, for every split alike; what the constants of a solver
-may be is told where it gets them (``lagbench.generators.constants``). Every mistake is a
-``ValueError`` whose message names key, expected, got and, for names, the nearest known one.
+Checked when a datasets.yaml is loaded, for every split alike; what the constants of a
+solver may be is told where it gets them (``lagbench.generators.constants``). Every
+mistake is a ``ValueError`` whose message names key, expected, got and, for names, the
+nearest known one.
 
 Scenario ids as text: ``0,3-5`` means 0, 3, 4 and 5.
 """
@@ -34,10 +35,20 @@ class Limit:
     def holds(self, value: object) -> bool:
         """Tell whether a value is a finite number within the limit."""
         kinds = int if self.whole else (int, float)
-        if isinstance(value, bool) or not isinstance(value, kinds) or not math.isfinite(value):
+        if (
+            isinstance(value, bool)
+            or not isinstance(value, kinds)
+            or not math.isfinite(value)
+        ):
             return False
-        above = self.low < value if self.open_low else self.low <= value
-        below = value < self.high if self.open_high else value <= self.high
+        if self.open_low:
+            above = self.low < value
+        else:
+            above = self.low <= value
+        if self.open_high:
+            below = value < self.high
+        else:
+            below = value <= self.high
         return above and below
 
     def __str__(self) -> str:
@@ -46,11 +57,22 @@ class Limit:
         >>> print(Limit(low=1, high=4096, whole=True))
         an integer, >= 1 and <= 4096
         """
-        low = f"{'>' if self.open_low else '>='} {self.low:.10g}" if self.low > -math.inf else ""
-        high = f"{'<' if self.open_high else '<='} {self.high:.10g}" if self.high < math.inf else ""
+        if self.low > -math.inf:
+            low = f"{'>' if self.open_low else '>='} {self.low:.10g}"
+        else:
+            low = ""
+        if self.high < math.inf:
+            high = f"{'<' if self.open_high else '<='} {self.high:.10g}"
+        else:
+            high = ""
         sides = " and ".join(side for side in (low, high) if side)
-        kind = "an integer" if self.whole else "a finite number"
-        return f"{kind}, {sides}" if sides else kind
+        if self.whole:
+            kind = "an integer"
+        else:
+            kind = "a finite number"
+        if sides:
+            return f"{kind}, {sides}"
+        return kind
 
 
 NEEDED = {
@@ -66,22 +88,36 @@ FRAMES = Limit(low=1, high=1_000_000, whole=True)
 """Frames of one scenario."""
 
 
-def check_parameters(size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]) -> None:
+def check_parameters(
+    size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]
+) -> None:
     """Refuse unknown, missing and impossible parameters of a size."""
     for name in given:
         if name not in declared:
-            raise ValueError(f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}")
+            raise ValueError(
+                f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
+            )
     missing = [n for n, value in declared.items() if value is None and n not in given]
     if missing:
         raise ValueError(f"size {size}: no value for {', '.join(missing)}")
     for name in NEEDED:
         if name not in declared:
-            raise ValueError(f"parameters: no {name!r}, which every split needs; {nearest(name, declared)}")
+            raise ValueError(
+                f"parameters: no {name!r}, which every split needs; "
+                f"{nearest(name, declared)}"
+            )
     for name, default in declared.items():
-        key = f"sizes.{size}.parameters.{name}" if name in given else f"parameters.{name}.value"
-        value, limit = given.get(name, default), NEEDED.get(name, Limit())
-        # Texts and switches are a split's own affair, unless the name is one that every split needs.
-        if not limit.holds(value) and (name in NEEDED or not isinstance(value, bool | str)):
+        if name in given:
+            key = f"sizes.{size}.parameters.{name}"
+        else:
+            key = f"parameters.{name}.value"
+        value = given.get(name, default)
+        limit = NEEDED.get(name, Limit())
+        # Texts and switches are a split's own affair, unless the name is one that every
+        # split needs.
+        if not limit.holds(value) and (
+            name in NEEDED or not isinstance(value, bool | str)
+        ):
             raise ValueError(f"{key}: expected {limit}; got {value!r}")
 
 
@@ -89,7 +125,9 @@ def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
     """Refuse unknown subsets and ids that stand in two of them."""
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
-        raise ValueError(f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}")
+        raise ValueError(
+            f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
+        )
     ids = [i for subset in subsets.values() for i in subset]
     if len(ids) != len(set(ids)):
         raise ValueError(f"size {size}: a scenario stands in two subsets")
@@ -123,7 +161,9 @@ MAX_ID = 9999
 """Largest scenario id: file names have four digits."""
 
 
-def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") -> tuple[int, ...]:
+def parse_ids(
+    text: str | int, *, where: str = "--scenarios", noun: str = "id"
+) -> tuple[int, ...]:
     """Return the scenario ids that a text names, in its order.
 
     Args:
@@ -132,7 +172,8 @@ def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") 
         noun: what the numbers are, for messages.
 
     Raises:
-        UsageError: the text is no list of ids, a range runs backwards, or an id stands twice.
+        UsageError: the text is no list of ids, a range runs backwards, or an id stands
+            twice.
 
     >>> parse_ids("0,3-5")
     (0, 3, 4, 5)
@@ -140,14 +181,17 @@ def parse_ids(text: str | int, *, where: str = "--scenarios", noun: str = "id") 
 
     def bad(got: str) -> UsageError:
         expected = f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5"
-        return UsageError(f"bad list of {noun}s {text!r}", where=where, expected=expected, got=got)
+        return UsageError(
+            f"bad list of {noun}s {text!r}", where=where, expected=expected, got=got
+        )
 
     ids: list[int] = []
     for part in str(text).replace(" ", "").split(","):
         match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
         if match is None:
             raise bad(f"{part!r} is no {noun} and no range")
-        first, last = int(match[1]), int(match[2] or match[1])
+        first = int(match[1])
+        last = int(match[2] or match[1])
         if last < first:
             raise bad(f"{part!r} runs backwards")
         ids.extend(range(first, last + 1))
@@ -168,4 +212,6 @@ def spell_ids(ids: Iterable[int]) -> str:
             runs[-1].append(i)
         else:
             runs.append([i])
-    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+    return ",".join(
+        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs
+    )

@@ -1,12 +1,15 @@
-"""Where a split is described and where its data live: by its name, or by the path of its folder.
+"""Where a split is described and where its data live: by its name, or by the path of
+its folder.
 
-The *root folder* holds all data sets; one in an object store is a working copy on this machine.
+The *root folder* holds all data sets; one in an object store is a working copy on this
+machine.
 
-A *local split* is a folder ``<root>/<name>/`` with its own description, ``split.yaml`` (laid out
-as datasets.yaml), and its data in the same places as those of any other split. So
-``--split path/to/own`` means the split ``own`` with the root folder ``path/to``; once the root
-is named (``--root path/to``), its name is enough. Files from strangers carry names only: a path
-is understood where the user gives one, in :func:`locate` and :func:`home`, and nowhere else.
+A *local split* is a folder ``<root>/<name>/`` with its own description, ``split.yaml``
+(laid out as datasets.yaml), and its data in the same places as those of any other
+split. So ``--split path/to/own`` means the split ``own`` with the root folder
+``path/to``; once the root is named (``--root path/to``), its name is enough. Files from
+strangers carry names only: a path is understood where the user gives one, in
+:func:`locate` and :func:`home`, and nowhere else.
 
 What makes a data set whole again, in words for the user.
 """
@@ -24,7 +27,16 @@ from typing import NamedTuple
 from lagbench.atomic import write_atomically
 from lagbench.errors import UnreadableFileError, UsageError, check_regular, nearest
 
-from .layout import CACHE_VARIABLE, MARK, as_url, dataset_folder, expanded, place_of, spelled, url_of
+from .layout import (
+    CACHE_VARIABLE,
+    MARK,
+    as_url,
+    dataset_folder,
+    expanded,
+    place_of,
+    spelled,
+    url_of,
+)
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"
@@ -44,8 +56,9 @@ def resolve_root(root: str | Path | None = None) -> Path:
     """Return the folder that holds all data sets.
 
     Args:
-        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data folder.
-            A URL (``s3://bucket/prefix``) stands for its working copy, see :mod:`.layout`.
+        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data
+            folder. A URL (``s3://bucket/prefix``) stands for its working copy, see
+            :mod:`.layout`.
 
     Raises:
         UsageError: no file system can have a folder of that name.
@@ -78,9 +91,13 @@ def resolve_root(root: str | Path | None = None) -> Path:
 
 
 def root_url(root: str | Path | None) -> str | None:
-    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No copy is made."""
+    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No
+    copy is made.
+    """
     given = _given(root)
-    return None if given is None else as_url(given)
+    if given is None:
+        return None
+    return as_url(given)
 
 
 def _given(root: str | Path | None) -> str | Path | None:
@@ -97,7 +114,9 @@ def _given(root: str | Path | None) -> str | Path | None:
 
 
 class Home(NamedTuple):
-    """A split by name, the root folder of its data, and the registry that describes it."""
+    """A split by name, the root folder of its data, and the registry that describes
+    it.
+    """
 
     name: str
     root: Path
@@ -105,7 +124,9 @@ class Home(NamedTuple):
 
 
 class Located(NamedTuple):
-    """One size of a split, the root folder of its data, and the registry that describes it."""
+    """One size of a split, the root folder of its data, and the registry that describes
+    it.
+    """
 
     size: Size
     root: Path
@@ -115,13 +136,14 @@ class Located(NamedTuple):
 class RootedRegistry(Registry):
     """A registry that also knows the local splits of one root folder.
 
-    A local split never replaces one of the same name, and its description is read when it is
-    first asked for.
+    A local split never replaces one of the same name, and its description is read when
+    it is first asked for.
     """
 
     def __init__(self, base: Registry, root: Path) -> None:
         super().__init__(base.splits, base.measured, base.files)
-        self.base, self.root = base, root
+        self.base = base
+        self.root = root
 
     def split(self, name: str) -> Split:
         """Return a split by name."""
@@ -129,21 +151,30 @@ class RootedRegistry(Registry):
             self._add(name)
         if name not in self.splits:
             known = (*self.splits, *self.local_names())
-            raise UsageError(f"no split {name!r}", where="--split", fix=nearest(name, known))
+            raise UsageError(
+                f"no split {name!r}", where="--split", fix=nearest(name, known)
+            )
         return self.splits[name]
 
     def local_names(self) -> tuple[str, ...]:
-        """Return the names of the root's local splits, sorted; those that others have left out."""
+        """Return the names of the root's local splits, sorted; those that others have
+        left out.
+        """
         try:
             found = [path.parent.name for path in self.root.glob(f"*/{DESCRIPTION}")]
         except OSError:
             return ()
-        return tuple(sorted(name for name in found if is_name(name) and name not in self.base.splits))
+        return tuple(
+            sorted(
+                name for name in found if is_name(name) and name not in self.base.splits
+            )
+        )
 
     def _add(self, name: str) -> None:
         path = self.root / name / DESCRIPTION
         split, measured = _described(path, name)
-        self.splits[name], self.files[name] = split, path
+        self.splits[name] = split
+        self.files[name] = path
         self.measured = {**self.measured, name: measured}
 
 
@@ -167,11 +198,18 @@ def rooted(root: Path, registry: Registry | None = None) -> RootedRegistry:
     return RootedRegistry(base.base if isinstance(base, RootedRegistry) else base, root)
 
 
-def home(split: str | Path, *, root: str | Path | None = None, registry: Registry | None = None) -> Home:
-    """Return what a user means by ``--split``: a name, or the path of a local split's folder.
+def home(
+    split: str | Path,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Home:
+    """Return what a user means by ``--split``: a name, or the path of a local split's
+    folder.
 
-    What has a separator (``path/to/own``, ``./own``, ``own/``) is a path; so is a name that no
-    split has while the current folder holds a local split of that name, and any ``Path``.
+    What has a separator (``path/to/own``, ``./own``, ``own/``) is a path; so is a name
+    that no split has while the current folder holds a local split of that name, and any
+    ``Path``.
 
     Args:
         split: name or path.
@@ -179,7 +217,8 @@ def home(split: str | Path, *, root: str | Path | None = None, registry: Registr
         registry: the other splits; ours when None.
 
     Raises:
-        UsageError: unknown split, no local split at the path, or a path and another root.
+        UsageError: unknown split, no local split at the path, or a path and another
+            root.
         UnreadableFileError: the description of the local split is not right.
     """
     named = isinstance(split, str)
@@ -205,7 +244,8 @@ def locate(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Located:
-    """Return one size of the split that a user means, and where its data live; see :func:`home`.
+    """Return one size of the split that a user means, and where its data live; see
+    :func:`home`.
 
     Args:
         split: name or path.
@@ -214,16 +254,20 @@ def locate(
         registry: the other splits; ours when None.
 
     Raises:
-        UsageError: see :func:`home`; the split has no such size, or of several or no sizes that
-            are there none is named.
+        UsageError: see :func:`home`; the split has no such size, or of several or no
+            sizes that are there none is named.
         UnreadableFileError: the description of the local split is not right.
     """
     name, folder, known = home(split, root=root, registry=registry)
-    return Located(known.size(name, size or _only_size(name, folder, known)), folder, known)
+    return Located(
+        known.size(name, size or _only_size(name, folder, known)), folder, known
+    )
 
 
 SIZE_TO_MAKE = "mini"
-"""The size that is generated or downloaded where none is named: minutes and some hundred MB."""
+"""The size that is generated or downloaded where none is named: minutes and some
+hundred MB.
+"""
 
 
 def locate_new(
@@ -233,25 +277,43 @@ def locate_new(
     root: str | Path | None = None,
     registry: Registry | None = None,
 ) -> Located:
-    """Return what :func:`locate` does for what is yet to be made: mini, or the only size, when None."""
+    """Return what :func:`locate` does for what is yet to be made: mini, or the only
+    size, when None.
+    """
     name, folder, known = home(split, root=root, registry=registry)
     sizes = known.split(name).sizes
-    default = SIZE_TO_MAKE if SIZE_TO_MAKE in sizes else next(iter(sizes))
+    if SIZE_TO_MAKE in sizes:
+        default = SIZE_TO_MAKE
+    else:
+        default = next(iter(sizes))
     return Located(known.size(name, size or default), folder, known)
 
 
 def _only_size(split: str, root: Path, known: Registry) -> str:
     """Return the size that a split has, or of which there are data."""
     sizes = [known.size(split, name) for name in known.split(split).sizes]
-    here = [s for s in sizes if any(dataset_folder(root, split, s.name, s.major).glob("*/*.nc"))]
+    here = [
+        s
+        for s in sizes
+        if any(dataset_folder(root, split, s.name, s.major).glob("*/*.nc"))
+    ]
     found = here or (sizes if len(sizes) == 1 else [])
     if len(found) == 1:
         return found[0].name
     names = ", ".join(size.name for size in here) or f"no data of {split}"
-    option = f"--size {here[0].name}" if here else remedy(sizes[-1], root=root)
-    wrong = "several sizes are there: name one" if here else "no size is named, and none is there"
-    if url_of(root) is not None and not here:  # the store may hold it: only what was fetched is known
-        wrong, option = "no size is named, and none was fetched from the store", "name it with --size"
+    if here:
+        option = f"--size {here[0].name}"
+    else:
+        option = remedy(sizes[-1], root=root)
+    if here:
+        wrong = "several sizes are there: name one"
+    else:
+        wrong = "no size is named, and none is there"
+    if (
+        url_of(root) is not None and not here
+    ):  # the store may hold it: only what was fetched is known
+        wrong = "no size is named, and none was fetched from the store"
+        option = "name it with --size"
     raise UsageError(
         wrong,
         where="--size",
@@ -263,7 +325,8 @@ def _only_size(split: str, root: Path, known: Registry) -> str:
 
 def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Home:
     """Return the local split of a folder."""
-    name, parent = folder.name, folder.parent
+    name = folder.name
+    parent = folder.parent
     if root is not None and resolve_root(root).resolve() != parent.resolve():
         raise UsageError(
             "a path and another root name the split",
@@ -276,9 +339,11 @@ def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Hom
         raise UsageError(
             "no local split there",
             where="--split",
-            expected=f"the name of a split, or a folder that holds {DESCRIPTION}, named like its split",
+            expected=f"the name of a split, or a folder that holds {DESCRIPTION}, "
+            f"named like its split",
             got=folder,
-            fix="lagbench list names the splits; lagbench import and lagbench adopt make local ones",
+            fix="lagbench list names the splits; lagbench import and lagbench adopt "
+            "make local ones",
         )
     known = rooted(parent, registry)
     if name not in known.local_names():
@@ -324,8 +389,19 @@ def remedy(size: Size, *options: str, root: Path | None = None) -> str:
     'lagbench generate --split cavity --size tiny --subset test'
     """
     if size.simulated:
-        if root is not None and (url_of(root) or "").startswith(("http://", "https://")):
+        if root is not None and (url_of(root) or "").startswith(
+            ("http://", "https://")
+        ):
             return "nothing can be written over HTTP: tell whoever serves the address, or name another --root"
-        place = [] if root is None else [f"--root {spelled(root)}"]
-        return " ".join((f"lagbench generate --split {size.split} --size {size.name}", *options, *place))
+        if root is None:
+            place = []
+        else:
+            place = [f"--root {spelled(root)}"]
+        return " ".join(
+            (
+                f"lagbench generate --split {size.split} --size {size.name}",
+                *options,
+                *place,
+            )
+        )
     return "remove the folder and make the local split again: lagbench adopt, or lagbench import"

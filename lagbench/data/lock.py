@@ -1,8 +1,9 @@
 """One writer per data set version; the second waits, or says who holds the lock.
 
-The operating system drops the lock when its process ends, however it ends, so that a killed
-generation blocks nobody. A small file beside the lock names the holder; it is information
-only and never decides. Start workers by ``spawn``: a forked child would inherit the lock.
+The operating system drops the lock when its process ends, however it ends, so that a
+killed generation blocks nobody. A small file beside the lock names the holder; it is
+information only and never decides. Start workers by ``spawn``: a forked child would
+inherit the lock.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ def dataset_lock(
     timeout: float | None = None,
     on_wait: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
-    """Hold the lock of one data set version; where another has it, tell, wait, or say who."""
+    """Hold the lock of one data set version; where another has it, tell, wait, or say
+    who.
+    """
     import filelock
 
     folder = dataset_folder(root, split, size, major)
@@ -64,14 +67,24 @@ def dataset_lock(
             try:
                 lock.acquire(timeout=-1 if timeout is None else timeout)
             except filelock.Timeout:
-                what, got = "another process writes this data set", str(read_holder(folder) or last)
+                what = "another process writes this data set"
+                got = str(read_holder(folder) or last)
                 fix = "wait until it ends, or end it; files that are complete stay"
-                raise WorkFailedError(what, where=str(folder), got=got, fix=fix) from None
+                raise WorkFailedError(
+                    what, where=str(folder), got=got, fix=fix
+                ) from None
     except OSError as error:
-        why, fix = error.strerror or error, "name a folder that you may write to: --root or LAGBENCH_ROOT"
-        raise WorkFailedError("cannot lock the data set", where=str(folder), got=why, fix=fix) from error
+        why = error.strerror or error
+        fix = "name a folder that you may write to: --root or LAGBENCH_ROOT"
+        raise WorkFailedError(
+            "cannot lock the data set", where=str(folder), got=why, fix=fix
+        ) from error
     try:
-        holder = Holder(os.getpid(), socket.gethostname(), datetime.now(UTC).isoformat(timespec="seconds"))
+        holder = Holder(
+            os.getpid(),
+            socket.gethostname(),
+            datetime.now(UTC).isoformat(timespec="seconds"),
+        )
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())
         yield
     finally:
@@ -80,7 +93,9 @@ def dataset_lock(
 
 
 def read_holder(folder: Path) -> Holder | None:
-    """Return who last took the lock of a data set folder; None where it is not written."""
+    """Return who last took the lock of a data set folder; None where it is not
+    written.
+    """
     try:
         return Holder(**json.loads((folder / HOLDER_NAME).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):

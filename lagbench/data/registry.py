@@ -1,9 +1,9 @@
 """The registry: what datasets.yaml says about every split and size.
 
-A split is a family of simulated scenarios, a size one tier of it. Everything that decides
-bits (parameters, scenario ids, frame counts) is written by hand; everything that follows
-from them (hashes, statistics, twin floor) stands under ``measured`` and is written by
-``python -m lagbench.generators.record``.
+A split is a family of simulated scenarios, a size one tier of it. Everything that
+decides bits (parameters, scenario ids, frame counts) is written by hand; everything
+that follows from them (hashes, statistics, twin floor) stands under ``measured`` and is
+written by ``python -m lagbench.generators.record``.
 
 Splits that other installed packages add, none of which can harm ours.
 """
@@ -30,7 +30,13 @@ from pydantic import (
     model_validator,
 )
 
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, loaded, nearest
+from lagbench.errors import (
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    loaded,
+    nearest,
+)
 
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
@@ -39,7 +45,8 @@ from .limits import parse_ids as parse_ids
 from .limits import spell_ids as spell_ids
 
 GROUP = "lagbench.generators"
-"""Entry points of this group name a split and its module; ours register the same way."""
+"""Entry points of this group name a split and its module; ours register the same way.
+"""
 
 
 class PluginWarning(UserWarning):
@@ -49,8 +56,9 @@ class PluginWarning(UserWarning):
 def installed(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, of the packages that are installed now.
 
-    Python reads the files of every package at each call. Here they are read again once a folder on the
-    path has changed, as it does where a package is installed or removed.
+    Python reads the files of every package at each call. Here they are read again once
+    a folder on the path has changed, as it does where a package is installed or
+    removed.
     """
     changed = []
     for place in sys.path:
@@ -91,7 +99,9 @@ class _Strict(BaseModel):
     def _known_keys(cls, data: Any) -> Any:  # noqa: ANN401
         for key in data if isinstance(data, Mapping) else ():
             if key not in cls.model_fields:
-                raise ValueError(f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}")
+                raise ValueError(
+                    f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}"
+                )
         return data
 
 
@@ -116,9 +126,13 @@ class Task(_Strict):
 
     input_frames: int = Field(gt=1)  # frames given at the start of a test scenario
     horizon: int = Field(gt=0)  # frames to predict after them
-    frames_of_interest: tuple[int, ...] = Field(strict=False)  # absolute frames at which the scorer reports
+    frames_of_interest: tuple[int, ...] = Field(
+        strict=False
+    )  # absolute frames at which the scorer reports
     score_grid: ScoreGrid  # grid of the scorer's fields
-    radius: float = Field(gt=0, allow_inf_nan=False)  # connectivity radius for graph models [length]
+    radius: float = Field(
+        gt=0, allow_inf_nan=False
+    )  # connectivity radius for graph models [length]
 
 
 class Measured(_Strict):
@@ -175,7 +189,11 @@ class Size(BaseModel):
         """Return a parameter's value."""
         if name not in self.parameters:
             where = f"datasets.yaml, {self.split} {self.name}"
-            raise UsageError(f"no parameter {name!r}", where=where, fix=nearest(name, self.parameters))
+            raise UsageError(
+                f"no parameter {name!r}",
+                where=where,
+                fix=nearest(name, self.parameters),
+            )
         return self.parameters[name].value
 
     @property
@@ -213,8 +231,14 @@ class Size(BaseModel):
         for subset, ids in self.subsets.items():
             if scenario in ids:
                 return subset
-        expected = ", ".join(f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items())
-        raise UsageError(f"no scenario {scenario}", where=f"{self.split} {self.name}", expected=expected)
+        expected = ", ".join(
+            f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items()
+        )
+        raise UsageError(
+            f"no scenario {scenario}",
+            where=f"{self.split} {self.name}",
+            expected=expected,
+        )
 
     def key(self, scenario: int) -> ScenarioKey:
         """Return what names a scenario."""
@@ -236,22 +260,31 @@ class Size(BaseModel):
         return next(count for count, ids in self.frames.items() if scenario in ids)
 
     def file_bytes(self, scenario: int) -> int:
-        """Return the most bytes that a scenario's file takes, in sum over a data set."""
-        # Position and velocity are two float32 each; header, constants and chunk index take 64 KiB at most.
+        """Return the most bytes that a scenario's file takes, in sum over a data
+        set.
+        """
+        # Position and velocity are two float32 each; header, constants and chunk index
+        # take 64 KiB at most.
         return self.frame_count(scenario) * self.particles * 16 + 64 * 1024
 
     def longest_file(self, scenario: int) -> int:
-        """Return the bytes beyond which no file of a scenario goes, whatever a store says of it."""
+        """Return the bytes beyond which no file of a scenario goes, whatever a store
+        says of it.
+        """
         # What zlib cannot pack becomes longer.
         return round(1.25 * self.file_bytes(scenario)) + (1 << 20)
 
     def frames_behind(self, scenario: int) -> int:
         """Return how many of a scenario's frames lie behind the horizon of the task."""
-        return max(0, self.frame_count(scenario) - self.task.input_frames - self.task.horizon)
+        return max(
+            0, self.frame_count(scenario) - self.task.input_frames - self.task.horizon
+        )
 
 
 class Split(_Strict):
-    """A named data set: version, provenance, parameters, sizes, and base URLs of its mirrors."""
+    """A named data set: version, provenance, parameters, sizes, and base URLs of its
+    mirrors.
+    """
 
     version: str = Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")
     title: str
@@ -263,12 +296,16 @@ class Split(_Strict):
     parameters: dict[str, Parameter]
     # a size's name is that of a folder
     sizes: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,63}$")], _SizeEntry]
-    mirrors: tuple[Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")], ...] = Field((), strict=False)
+    mirrors: tuple[Annotated[str, Field(pattern=r"^https?://[^\s/]\S*$")], ...] = Field(
+        (), strict=False
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Split:
         for name, size in self.sizes.items():
-            check_parameters(name, size.parameters, {n: p.value for n, p in self.parameters.items()})
+            check_parameters(
+                name, size.parameters, {n: p.value for n, p in self.parameters.items()}
+            )
             check_subsets(name, size.subsets)
             needed = size.task.input_frames + size.task.horizon
             check_frames(name, size.frames, size.subsets, task_frames=needed)
@@ -291,7 +328,9 @@ class Registry:
     def split(self, name: str) -> Split:
         """Return a split by name."""
         if name not in self.splits:
-            raise UsageError(f"no split {name!r}", where="--split", fix=nearest(name, self.splits))
+            raise UsageError(
+                f"no split {name!r}", where="--split", fix=nearest(name, self.splits)
+            )
         return self.splits[name]
 
     def size(self, split: str, name: str) -> Size:
@@ -299,7 +338,9 @@ class Registry:
         parent = self.split(split)
         if name not in parent.sizes:
             fix = nearest(name, parent.sizes)
-            raise UsageError(f"split {split!r} has no size {name!r}", where="--size", fix=fix)
+            raise UsageError(
+                f"split {split!r} has no size {name!r}", where="--size", fix=fix
+            )
         entry = parent.sizes[name]
         return Size(
             split=split,
@@ -336,23 +377,30 @@ def load(path: Path | None = None) -> Registry:
     """Return the validated registry, splits of other installed packages included.
 
     Args:
-        path: a datasets.yaml; else the one that ``LAGBENCH_REGISTRY`` names; else ours, with
-            the splits that entry points name; a package whose split cannot be read, or has a
-            name that is taken, is left out with a :class:`~lagbench.data.registry.PluginWarning`.
+        path: a datasets.yaml; else the one that ``LAGBENCH_REGISTRY`` names; else ours,
+            with the splits that entry points name; a package whose split cannot be
+            read, or has a name that is taken, is left out with a
+            :class:`~lagbench.data.registry.PluginWarning`.
 
     Raises:
         UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
     """
     given = path or os.environ.get(REGISTRY_VARIABLE)
-    file = Path(given) if given else default_path()
-    return _load(Path(given) if given else None, file.stat().st_mtime_ns if file.exists() else 0)
+    if given:
+        file = Path(given)
+    else:
+        file = default_path()
+    return _load(
+        Path(given) if given else None, file.stat().st_mtime_ns if file.exists() else 0
+    )
 
 
 @functools.cache
 def _load(path: Path | None, modified: int) -> Registry:
     """Load a file once per modification time."""
     own = _read(path or default_path())
-    splits, measured = dict(own.splits), dict(own.measured)
+    splits = dict(own.splits)
+    measured = dict(own.measured)
     files = dict.fromkeys(splits, path or default_path())
     for point in dict.fromkeys(installed(GROUP)) if path is None else ():
         name = point.name
@@ -368,28 +416,53 @@ def _load(path: Path | None, modified: int) -> Registry:
             place = Path(module.REGISTRY)
             theirs = _read(place)
             splits[name] = Registry(theirs.splits, {}).split(name)
-            measured[name], files[name] = theirs.measured.get(name, {}), place
-        except Exception as error:  # a stranger's module: importing it may raise anything
-            package = point.dist.name if point.dist else point.value.partition(".")[0]
-            reason = error if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}"
-            message = f"package {package} adds no split {name!r} ({point.value}): {reason}"
+            measured[name] = theirs.measured.get(name, {})
+            files[name] = place
+        except (
+            Exception
+        ) as error:  # a stranger's module: importing it may raise anything
+            if point.dist:
+                package = point.dist.name
+            else:
+                package = point.value.partition(".")[0]
+            reason = (
+                error
+                if isinstance(error, LagbenchError)
+                else f"{type(error).__name__}: {error}"
+            )
+            message = (
+                f"package {package} adds no split {name!r} ({point.value}): {reason}"
+            )
             warnings.warn(message, PluginWarning, stacklevel=2)
     return Registry(splits, measured, files)
 
 
 def _read(path: Path) -> _File:
     """Validate one datasets.yaml; say where and what is wrong with it."""
-    from .yamlfile import read_yaml  # a child that validates is told of the sizes, and starts sooner without
+    from .yamlfile import (
+        read_yaml,
+    )  # a child that validates is told of the sizes, and starts sooner without
 
     try:
         return _File.model_validate(read_yaml(path))
     except ValidationError as error:
-        lines = [""]  # for each mistake: key, what is expected there, and what was got if that is short
+        lines = [
+            ""
+        ]  # for each mistake: key, what is expected there, and what was got if that is short
         for item in error.errors()[:10]:
-            given, message = item["input"], item["msg"].removeprefix("Value error, ")
-            if isinstance(given, int) and given.bit_length() > 256:  # Python prints no thousands of digits
+            given = item["input"]
+            message = item["msg"].removeprefix("Value error, ")
+            if (
+                isinstance(given, int) and given.bit_length() > 256
+            ):  # Python prints no thousands of digits
                 given = f"an integer of {given.bit_length()} bits"
             short = isinstance(given, str | int | float) and "; got " not in message
-            lines.append(f"{'.'.join(map(str, item['loc']))}: {message}{f'; got {given!r}' if short else ''}")
-        what, fix = f"{error.error_count()} mistake(s) in the registry", "mend the keys named above"
-        raise UnreadableFileError(what, where=str(path), got="\n    ".join(lines), fix=fix) from None
+            lines.append(
+                f"{'.'.join(map(str, item['loc']))}: "
+                f"{message}{f'; got {given!r}' if short else ''}"
+            )
+        what = f"{error.error_count()} mistake(s) in the registry"
+        fix = "mend the keys named above"
+        raise UnreadableFileError(
+            what, where=str(path), got="\n    ".join(lines), fix=fix
+        ) from None

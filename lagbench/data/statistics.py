@@ -5,12 +5,14 @@ With x(f) the positions of frame f and the frame as time unit (Tables 5.1 and 5.
     u(f) = x(f) - x(f-1)             a(f) = u(f) - u(f-1)
     mean = sum(q) / n                std  = sqrt(sum(q^2) / n - mean^2)
 
-per component, over all particles, frames and scenarios of a subset (population std, no n - 1).
+per component, over all particles, frames and scenarios of a subset (population std, no
+n - 1).
 
-The nine digits that come out depend on the data alone. Positions are float32 in the unit box,
-so their float64 sums over one frame and those of their differences are exact up to 2^13
-particles away from 0; squares add in a fixed order within a frame; and frames and scenarios
-are joined by ``math.fsum``, which is correctly rounded whatever the order or the chunks.
+The nine digits that come out depend on the data alone. Positions are float32 in the
+unit box, so their float64 sums over one frame and those of their differences are exact
+up to 2^13 particles away from 0; squares add in a fixed order within a frame; and
+frames and scenarios are joined by ``math.fsum``, which is correctly rounded whatever
+the order or the chunks.
 """
 
 from __future__ import annotations
@@ -60,7 +62,10 @@ def scenario_moments(frames: Iterable[NDArray[np.float32]]) -> dict[str, Moments
             counts[name] += values.shape[1]
             totals[name].append(values.sum(axis=1))
             squares[name].append((values * values).sum(axis=1))
-    return {name: Moments(counts[name], _fsum(totals[name]), _fsum(squares[name])) for name in QUANTITIES}
+    return {
+        name: Moments(counts[name], _fsum(totals[name]), _fsum(squares[name]))
+        for name in QUANTITIES
+    }
 
 
 def combine(scenarios: Iterable[dict[str, Moments]]) -> dict[str, Moments]:
@@ -83,7 +88,10 @@ def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float
         if moments.count:
             mean = [total / moments.count for total in moments.total]
             pairs = zip(moments.squares, mean, strict=True)
-            std = [math.sqrt(max(0.0, square / moments.count - m * m)) for square, m in pairs]
+            std = [
+                math.sqrt(max(0.0, square / moments.count - m * m))
+                for square, m in pairs
+            ]
             result[f"{name}_mean"] = tuple(map(round_digits, mean))
             result[f"{name}_std"] = tuple(map(round_digits, std))
     return result
@@ -92,14 +100,20 @@ def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float
 def file_statistics(paths: Sequence[Path]) -> dict[str, tuple[float, ...]]:
     """Return the statistics of scenario files, read one frame at a time."""
     if not paths:
-        raise DataError("no scenario files", expected="at least one file for statistics")
+        raise DataError(
+            "no scenario files", expected="at least one file for statistics"
+        )
     return statistics([file_moments(path) for path in paths])
 
 
-def file_moments(path: Path, report: Callable[[int], None] = lambda _: None) -> dict[str, Moments]:
+def file_moments(
+    path: Path, report: Callable[[int], None] = lambda _: None
+) -> dict[str, Moments]:
     """Return the moments of one scenario file, read one frame at a time."""
     with read_scenario(path) as file:
-        moments = scenario_moments(frame for block in file.blocks("position") for frame in block)
+        moments = scenario_moments(
+            frame for block in file.blocks("position") for frame in block
+        )
     report(1)
     return moments
 

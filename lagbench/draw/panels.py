@@ -47,26 +47,40 @@ UNITS = {  # what colour bars say: physical time throughout, as velocity in the 
     Panel.STREAMLINES: "speed on the grid  [length/s]",
 }
 
-DOT = 1.25  # diameter of a drawn particle in particle spacings: neighbours overlap a little
-MOST_DOTS = 1 << 16  # particles drawn at the most; more would take memory and no eye would tell
+# diameter of a drawn particle in particle spacings: neighbours overlap a little
+DOT = 1.25
+MOST_DOTS = (
+    1 << 16
+)  # particles drawn at the most; more would take memory and no eye would tell
 
-FEW_NODES = 4  # with neighbours to differentiate over, below which no streamline is drawn
-_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])  # along walls left, right, bottom, top
+FEW_NODES = (
+    4  # with neighbours to differentiate over, below which no streamline is drawn
+)
+_ALONG = np.array(
+    [(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)]
+)  # along walls left, right, bottom, top
 
 
 def limit_of(panel: Panel, scene: Scene) -> float:
-    """Return the top of the colour scale: what all but the extreme per cent stay below."""
+    """Return the top of the colour scale: what all but the extreme per cent stay
+    below.
+    """
     if panel is Panel.SPEED:
         values = scene.speed
     elif panel is Panel.VORTICITY:
         values = np.abs(scene.vorticity[scene.fields.differentiable])
     else:
         values = _grid_speed(scene)[scene.fields.counted]
-    top = float(np.percentile(values, 99.0)) if values.size else 0.0
+    if values.size:
+        top = float(np.percentile(values, 99.0))
+    else:
+        top = 0.0
     return top or 1.0
 
 
-def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float = 1.0) -> None:
+def draw(
+    axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float = 1.0
+) -> None:
     """Draw one frame inside its box."""
     draw_walls(axes, scene.recording, scene.frame)
     scale = colour_scale(panel, limit)
@@ -78,10 +92,15 @@ def draw(axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float 
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
         fields = scene.fields
-        _draw_field(axes, scene, np.where(fields.counted, _grid_speed(scene), np.nan), scale)
+        _draw_field(
+            axes, scene, np.where(fields.counted, _grid_speed(scene), np.nan), scale
+        )
         if fields.differentiable.sum() < FEW_NODES:
             return
-        u, v = (np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T for axis in (0, 1))
+        u, v = (
+            np.ma.masked_array(fields.velocity[..., axis], ~fields.counted).T
+            for axis in (0, 1)
+        )
         axes.streamplot(
             fields.grid.axis,
             fields.grid.axis,
@@ -103,17 +122,23 @@ def box_of(recording: Recording) -> tuple[float, float, float, float]:
 
 
 def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats]]:
-    """Yield each wall that slides towards a frame with its velocity along itself [length/s], shape [2]."""
+    """Yield each wall that slides towards a frame with its velocity along itself
+    [length/s], shape [2].
+    """
     for wall, velocity in enumerate(recording.wall_velocity[frame] * _ALONG):
         if velocity.any():
             yield wall, velocity
 
 
 def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
-    """Draw the walls as bands around the box; five arrowheads show which way a moving one slides."""
+    """Draw the walls as bands around the box; five arrowheads show which way a moving
+    one slides.
+    """
     from matplotlib.patches import Polygon, Rectangle
 
-    axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[], aspect="equal", frame_on=False)
+    axes.set(
+        xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[], aspect="equal", frame_on=False
+    )
     left, right, bottom, top = box_of(recording)
     bands = [
         (0, bottom, left, top - bottom),
@@ -122,7 +147,11 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
         (left, top, right - left, 1 - top),
     ]
     axes.add_patch(Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0))
-    axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=PAPER, lw=0, zorder=0.5))
+    axes.add_patch(
+        Rectangle(
+            (left, bottom), right - left, top - bottom, color=PAPER, lw=0, zorder=0.5
+        )
+    )
     for wall, velocity in moving_walls(recording, frame):
         x, y, width, height = bands[wall]
         axes.add_patch(Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6))
@@ -132,13 +161,16 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
         length = np.abs(along) * max(width, height)
         for share in (-0.4, -0.2, 0.0, 0.2, 0.4):
             middle = np.array([x + width / 2, y + height / 2]) + share * length
-            tip, tail = middle + size * along, middle - 0.7 * size * along
+            tip = middle + size * along
+            tail = middle - 0.7 * size * along
             corners = [tip, tail + size * across, tail - size * across]
             axes.add_patch(Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7))
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
-    """Draw a dot for every particle, or for every k-th of too many, cut off at the walls."""
+    """Draw a dot for every particle, or for every k-th of too many, cut off at the
+    walls.
+    """
     step = -(-len(scene.position) // MOST_DOTS)
     x, y = scene.position[::step].T
     # the marker area at which neighbouring particles overlap a little [point^2]
@@ -153,13 +185,18 @@ def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
     from matplotlib.patches import Rectangle
 
     left, right, bottom, top = box_of(recording)
-    return Rectangle((left, bottom), right - left, top - bottom, transform=axes.transData)
+    return Rectangle(
+        (left, bottom), right - left, top - bottom, transform=axes.transData
+    )
 
 
 def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) -> None:
-    """Draw values at nodes as one square each, cut off at the walls; NaN stays paper."""
+    """Draw values at nodes as one square each, cut off at the walls; NaN stays
+    paper.
+    """
     grid = scene.fields.grid
-    low, high = grid.axis[0] - grid.spacing / 2, grid.axis[-1] + grid.spacing / 2
+    low = grid.axis[0] - grid.spacing / 2
+    high = grid.axis[-1] + grid.spacing / 2
     image = axes.imshow(
         np.ma.masked_invalid(field.T),
         origin="lower",
@@ -180,7 +217,9 @@ def _grid_speed(scene: Scene) -> Floats:
 
 
 def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
-    """Return the colours of speeds from 0, or vorticities from minus the limit, to the limit."""
+    """Return the colours of speeds from 0, or vorticities from minus the limit, to the
+    limit.
+    """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -189,13 +228,23 @@ def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
     return ScalarMappable(Normalize(0.0, limit), speed_map())
 
 
-def colour_bar(axes: Axes, panel: Panel, limit: float, *, label: str | None = None) -> None:
-    """Draw a horizontal colour bar with its unit; pointed where values lie beyond it."""
+def colour_bar(
+    axes: Axes, panel: Panel, limit: float, *, label: str | None = None
+) -> None:
+    """Draw a horizontal colour bar with its unit; pointed where values lie beyond
+    it.
+    """
     from matplotlib.ticker import MaxNLocator
 
     drawn = axes.get_figure()
-    extend = "both" if panel is Panel.VORTICITY else "max"
-    bar = drawn.colorbar(colour_scale(panel, limit), cax=axes, orientation="horizontal", extend=extend)  # type: ignore[union-attr]
+    if panel is Panel.VORTICITY:
+        extend = "both"
+    else:
+        extend = "max"
+    assert drawn is not None  # axes stand in a figure
+    bar = drawn.colorbar(
+        colour_scale(panel, limit), cax=axes, orientation="horizontal", extend=extend
+    )
     bar.outline.set_visible(False)
     bar.set_label(label or UNITS[panel], labelpad=3)
     bar.ax.tick_params(length=0, pad=3)
@@ -209,7 +258,15 @@ def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
 
     axes.set_axis_off()
     handles = [
-        Line2D([], [], ls="", marker="o", ms=6, color=MATERIAL_COLOURS[m], label=MATERIALS[m])
+        Line2D(
+            [],
+            [],
+            ls="",
+            marker="o",
+            ms=6,
+            color=MATERIAL_COLOURS[m],
+            label=MATERIALS[m],
+        )
         for m in np.unique(materials)
     ]
     axes.legend(

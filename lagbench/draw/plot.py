@@ -1,8 +1,8 @@
 """Pictures of one frame, and contact sheets: many scenarios of a split on one page.
 
-Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same bytes. Splits whose
-scenarios draw a ``family`` or ``pair`` get a sheet of one row per kind over time; the others get a table of
-scenarios at one frame.
+Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same
+bytes. Splits whose scenarios draw a ``family`` or ``pair`` get a sheet of one row per
+kind over time; the others get a table of scenarios at one frame.
 """
 
 from __future__ import annotations
@@ -20,23 +20,59 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.store.copy import bring
 
-from .panels import TITLES, Panel, colour_bar, draw, limit_of, material_key, moving_walls
+from .panels import (
+    TITLES,
+    Panel,
+    colour_bar,
+    draw,
+    limit_of,
+    material_key,
+    moving_walls,
+)
 from .recording import Recording, Scene, open_recording
 from .style import DPI, MUTED, figure, header, save
 
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["KINDS", "Panel", "check_kind", "contact_sheet", "describe", "plot_frame", "scenario_files"]
+__all__ = [
+    "KINDS",
+    "Panel",
+    "check_kind",
+    "contact_sheet",
+    "describe",
+    "plot_frame",
+    "scenario_files",
+]
 
 
 COLUMNS = 6
-TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)  # moments of a row over time, as shares of the last frame
-MOMENTS = (1 / 9, 1 / 2, 1.0)  # the same of the last frame of interest, for flows that walls drive
-DRIVEN, DECAYING = 30, 36  # scenarios on a sheet of flows that walls drive, that only decay (Figs. 5.7, 5.20)
-CELL, CELL_GAP, LABEL, RIM, HEAD, FOOT = 1.3, 0.08, 0.18, 0.22, 0.7, 0.58  # of a sheet [inch]
+TIMES = (
+    0.0,
+    0.05,
+    0.1,
+    0.2,
+    0.5,
+    1.0,
+)  # moments of a row over time, as shares of the last frame
+MOMENTS = (
+    1 / 9,
+    1 / 2,
+    1.0,
+)  # the same of the last frame of interest, for flows that walls drive
+DRIVEN = 30
+# scenarios on a sheet of flows that walls drive, that only decay (Figs. 5.7, 5.20)
+DECAYING = 36
+CELL = 1.3
+CELL_GAP = 0.08
+LABEL = 0.18
+RIM = 0.22
+HEAD = 0.7
+FOOT = 0.58  # of a sheet [inch]
 KIND_PARAMETERS = ("family", "pair")
-WALL_SHARE = 0.6  # the fluid itself seldom moves faster than this share of the wall's speed
+WALL_SHARE = (
+    0.6  # the fluid itself seldom moves faster than this share of the wall's speed
+)
 
 
 _Cell = tuple[Scene, str, float]  # a small panel: scene, label, top of the colour scale
@@ -72,8 +108,9 @@ def contact_sheet(
         output: file to write, ending in .png, .pdf or .svg.
         root: folder that holds all data sets; see ``resolve_root``.
         kind: what each panel shows; the default suits the split.
-        frame: frame to show where the sheet is a table of scenarios; when None, the first, the last
-            frame of interest of what starts at rest, or three frames up to that of what is driven.
+        frame: frame to show where the sheet is a table of scenarios; when None, the
+            first, the last frame of interest of what starts at rest, or three frames up
+            to that of what is driven.
         dpi: pixels per inch.
         registry: where splits are described; ours when None.
 
@@ -87,30 +124,51 @@ def contact_sheet(
     if not files:
         where = f"{tier.split} {size} under {folder}"
         raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
-    panel = None if kind is None else Panel(kind)
+    if kind is None:
+        panel = None
+    else:
+        panel = Panel(kind)
     found: dict[str, Path] = {}  # the first scenario of every family or pair
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            named = [str(recording.parameters[n]) for n in KIND_PARAMETERS if n in recording.parameters]
+            named = [
+                str(recording.parameters[n])
+                for n in KIND_PARAMETERS
+                if n in recording.parameters
+            ]
             if named and named[0]:
                 found.setdefault(named[0], path)
     kinds = dict(sorted(found.items(), key=lambda item: item[1].name))
-    sheet = _over_time(kinds, panel, splits) if kinds else _table(files, panel, frame, splits)
+    if kinds:
+        sheet = _over_time(kinds, panel, splits)
+    else:
+        sheet = _table(files, panel, frame, splits)
     columns = max(len(row) for row in sheet.rows)
     width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, 5.0)
     height = HEAD + len(sheet.rows) * (CELL + LABEL + CELL_GAP) + FOOT
     with figure(width, height, dpi=dpi) as drawn:
-        header(drawn, f"{splits.split(tier.split).title} · {tier.split} {size}", sheet.subtitle, left=RIM)
+        header(
+            drawn,
+            f"{splits.split(tier.split).title} · {tier.split} {size}",
+            sheet.subtitle,
+            left=RIM,
+        )
         for row, cells in enumerate(sheet.rows):
             for column, (scene, label, limit) in enumerate(cells):
                 left = RIM + column * (CELL + CELL_GAP)
-                bottom = height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
-                axes = drawn.add_axes((left / width, bottom / height, CELL / width, CELL / height))
+                bottom = (
+                    height - HEAD - (row + 1) * (CELL + LABEL + CELL_GAP) + CELL_GAP
+                )
+                axes = drawn.add_axes(
+                    (left / width, bottom / height, CELL / width, CELL / height)
+                )
                 axes.set_title(label, fontsize=7.5, color=MUTED, pad=2.5)
                 draw(axes, sheet.panel, scene, limit=limit, detail=0.0)
         below = drawn.add_axes((RIM / width, 0.42 / height, 2.6 / width, 0.09 / height))
         if sheet.panel is Panel.MATERIAL:
-            shown = [scene.recording.material for row in sheet.rows for scene, *_ in row]
+            shown = [
+                scene.recording.material for row in sheet.rows for scene, *_ in row
+            ]
             material_key(below, np.concatenate(shown))
         else:
             colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
@@ -118,7 +176,9 @@ def contact_sheet(
 
 
 def scenario_files(size: Size, root: Path) -> list[Path]:
-    """Return the scenario files that are there: train, valid, test, extra, each by id."""
+    """Return the scenario files that are there: train, valid, test, extra, each by
+    id.
+    """
     paths = (size.path(root, i) for ids in size.subsets.values() for i in sorted(ids))
     return [path for path in paths if path.is_file()]
 
@@ -128,41 +188,77 @@ def _over_time(kinds: dict[str, Path], panel: Panel | None, splits: Registry) ->
     rows = []
     for path in kinds.values():
         with open_recording(path, registry=splits) as recording:
-            rows.append([recording.scene(round(share * (recording.frames - 1))) for share in TIMES])
+            rows.append(
+                [
+                    recording.scene(round(share * (recording.frames - 1)))
+                    for share in TIMES
+                ]
+            )
     if panel is None:
         mixed = any(np.unique(row[0].recording.material).size > 1 for row in rows)
-        panel = Panel.MATERIAL if mixed else Panel.SPEED
+        if mixed:
+            panel = Panel.MATERIAL
+        else:
+            panel = Panel.SPEED
     limit = max(limit_of(panel, scene) for row in rows for scene in row)
     cells = []
     for kind, row in zip(kinds, rows, strict=True):
-        labels = [f"{row[0].recording.scenario}  {kind}", *(f"frame {scene.frame}" for scene in row[1:])]
-        cells.append([(scene, label, limit) for scene, label in zip(row, labels, strict=True)])
-    return _Sheet(rows=cells, panel=panel, subtitle="the first scenario of each kind over time", limit=limit)
+        labels = [
+            f"{row[0].recording.scenario}  {kind}",
+            *(f"frame {scene.frame}" for scene in row[1:]),
+        ]
+        cells.append(
+            [(scene, label, limit) for scene, label in zip(row, labels, strict=True)]
+        )
+    return _Sheet(
+        rows=cells,
+        panel=panel,
+        subtitle="the first scenario of each kind over time",
+        limit=limit,
+    )
 
 
-def _table(files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry) -> _Sheet:
+def _table(
+    files: Sequence[Path], panel: Panel | None, frame: int | None, splits: Registry
+) -> _Sheet:
     """Return a table of scenarios at one frame, or at three of what is driven."""
     with open_recording(files[0], registry=splits) as recording:
         driven = bool(recording.wall_velocity.any())
         panel = panel or (Panel.STREAMLINES if driven else Panel.VORTICITY)
-        frames = [frame] if frame is not None else [0]
+        if frame is not None:
+            frames = [frame]
+        else:
+            frames = [0]
         if frame is None and (driven or not recording.scene(0).speed.any()):
-            latest = min(recording.size.task.frames_of_interest[-1], recording.frames - 1)
-            frames = [round(share * latest) for share in MOMENTS] if driven else [latest]
+            latest = min(
+                recording.size.task.frames_of_interest[-1], recording.frames - 1
+            )
+            if driven:
+                frames = [round(share * latest) for share in MOMENTS]
+            else:
+                frames = [latest]
     scenes = []
     for path in files[: DRIVEN if driven else DECAYING]:
         with open_recording(path, registry=splits) as recording:
             scenes += [recording.scene(moment) for moment in frames]
     scaled = driven and panel in (Panel.STREAMLINES, Panel.SPEED)
     common = float(np.median([limit_of(panel, scene) for scene in scenes]))
-    limits = [WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common for s in scenes]
+    limits = [
+        WALL_SHARE * np.abs(s.recording.wall_velocity).max() if scaled else common
+        for s in scenes
+    ]
     labels = [f"frame {scene.frame}" for scene in scenes]
     for i in range(0, len(scenes), len(frames)):  # the first of each scenario
         recording = scenes[i].recording
-        labels[i] = "   ".join([str(recording.scenario), *_marks(recording, ("frequency",))[:1]])
+        labels[i] = "   ".join(
+            [str(recording.scenario), *_marks(recording, ("frequency",))[:1]]
+        )
     cells = list(zip(scenes, labels, limits, strict=True))
     shown = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
-    columns = COLUMNS if len(frames) == 1 else 3 * len(frames)
+    if len(frames) == 1:
+        columns = COLUMNS
+    else:
+        columns = 3 * len(frames)
     return _Sheet(
         rows=[cells[i : i + columns] for i in range(0, len(cells), columns)],
         panel=panel,
@@ -176,7 +272,11 @@ ALL = "all"
 KINDS = (ALL, *(str(panel) for panel in Panel))
 """What :func:`plot_frame` can draw."""
 
-SIDE, GAP, MARGIN, TOP, BAR = 3.25, 0.25, 0.25, 0.96, 0.66  # of a frame [inch]
+SIDE = 3.25
+GAP = 0.25
+MARGIN = 0.25
+TOP = 0.96
+BAR = 0.66  # of a frame [inch]
 SEPARATOR = "  ·  "
 DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 
@@ -184,7 +284,9 @@ DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
 def check_kind(kind: str) -> None:
     """Refuse a kind of picture that :func:`plot_frame` cannot draw."""
     if kind not in KINDS:
-        raise UsageError(f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS))
+        raise UsageError(
+            f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS)
+        )
 
 
 def plot_frame(
@@ -207,7 +309,8 @@ def plot_frame(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown kind, no such frame, a name with another ending, no matplotlib.
+        UsageError: unknown kind, no such frame, a name with another ending, no
+            matplotlib.
         DataError: the scenario file is missing or damaged.
     """
     check_kind(kind)
@@ -215,9 +318,16 @@ def plot_frame(
         scene = recording.scene(frame)
     mixed = np.unique(recording.material).size > 1
     three = [Panel.SPEED, Panel.VORTICITY]
-    three = [Panel.MATERIAL, *three] if mixed else [*three, Panel.STREAMLINES]
-    panels = three if kind == ALL else [Panel(kind)]
-    width, height = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP, TOP + SIDE + BAR
+    if mixed:
+        three = [Panel.MATERIAL, *three]
+    else:
+        three = [*three, Panel.STREAMLINES]
+    if kind == ALL:
+        panels = three
+    else:
+        panels = [Panel(kind)]
+    width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
+    height = TOP + SIDE + BAR
     with figure(width, height, dpi=dpi) as drawn:
         subtitle = describe(recording)
         if len(panels) > 1:
@@ -225,17 +335,24 @@ def plot_frame(
             said = [subtitle, f"frame {scene.frame}", f"t = {scene.time:.2f} s"]
             for wall, v in moving_walls(recording, scene.frame):
                 way = DIRECTIONS[int(np.sign(v[0])), int(np.sign(v[1]))]
-                said.append(f"{WALLS[wall]} wall moves {way} at {np.abs(v).max():.3g} length/s")
+                said.append(
+                    f"{WALLS[wall]} wall moves {way} at {np.abs(v).max():.3g} length/s"
+                )
             subtitle = SEPARATOR.join(said)
         header(drawn, recording.title, subtitle, left=MARGIN)
         for column, panel in enumerate(panels):
             left = (MARGIN + column * (SIDE + GAP)) / width
             axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
-            moment = f" at frame {scene.frame}, t = {scene.time:.2f} s" if len(panels) == 1 else ""
+            if len(panels) == 1:
+                moment = f" at frame {scene.frame}, t = {scene.time:.2f} s"
+            else:
+                moment = ""
             axes.set_title(TITLES[panel] + moment)
             limit = limit_of(panel, scene)
             draw(axes, panel, scene, limit=limit)
-            below = drawn.add_axes((left, (BAR - 0.2) / height, SIDE / width, 0.09 / height))
+            below = drawn.add_axes(
+                (left, (BAR - 0.2) / height, SIDE / width, 0.09 / height)
+            )
             if panel is Panel.MATERIAL:
                 material_key(below, recording.material)
             else:
@@ -244,11 +361,23 @@ def plot_frame(
 
 
 def describe(recording: Recording) -> str:
-    """Return split, size, scenario and what sets it apart, as in "cavity full · scenario 3 · Re 120"."""
-    parts = [f"{recording.size.split} {recording.size.name}", f"scenario {recording.scenario}"]
+    """Return split, size, scenario and what sets it apart, as in "cavity full ·
+    scenario 3 · Re 120".
+    """
+    parts = [
+        f"{recording.size.split} {recording.size.name}",
+        f"scenario {recording.scenario}",
+    ]
     return SEPARATOR.join([*parts, *_marks(recording, ("family", "pair", "frequency"))])
 
 
 def _marks(recording: Recording, names: Sequence[str]) -> list[str]:
-    marks = [] if recording.reynolds is None else [f"Re {recording.reynolds:.0f}"]
-    return marks + [f"{name} {recording.parameters[name]}" for name in names if name in recording.parameters]
+    if recording.reynolds is None:
+        marks = []
+    else:
+        marks = [f"Re {recording.reynolds:.0f}"]
+    return marks + [
+        f"{name} {recording.parameters[name]}"
+        for name in names
+        if name in recording.parameters
+    ]

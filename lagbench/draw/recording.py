@@ -37,7 +37,9 @@ class Scene:
     recording: Recording  # scenario that the frame belongs to
     frame: int  # absolute frame number
     position: NDArray[np.float64]  # [length], shape [particle, 2]
-    velocity: NDArray[np.float64]  # velocity of the solver [length/s], shape [particle, 2]
+    velocity: NDArray[
+        np.float64
+    ]  # velocity of the solver [length/s], shape [particle, 2]
     # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
     displacement: NDArray[np.float64]
 
@@ -86,8 +88,12 @@ class Recording:
         self.frames = frames  # recorded frames
         self._read = read
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
-        self.material = read("material", slice(None))[self._present].astype(np.int8)  # [particle]
-        self.wall_velocity = np.zeros((frames, 4, 2))  # [length/s], [frame, wall, 2]; zeros without walls
+        self.material = read("material", slice(None))[self._present].astype(
+            np.int8
+        )  # [particle]
+        self.wall_velocity = np.zeros(
+            (frames, 4, 2)
+        )  # [length/s], [frame, wall, 2]; zeros without walls
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
@@ -111,7 +117,9 @@ class Recording:
     def reynolds(self) -> float | None:
         """Reynolds number, None where there is none."""
         value = self.parameters.get("reynolds_number")
-        return None if value is None else float(value)
+        if value is None:
+            return None
+        return float(value)
 
     def frame_number(self, frame: int) -> int:
         """Return an absolute frame number; negative ones count from the end."""
@@ -119,20 +127,31 @@ class Recording:
         try:
             frame = operator.index(frame)
         except TypeError:
-            what, got = "a frame is named by a whole number", repr(frame)
+            what = "a frame is named by a whole number"
+            got = repr(frame)
         else:
             if -self.frames <= frame < self.frames:
                 return frame % self.frames
-            what, got = f"no frame {frame}", frame
+            what = f"no frame {frame}"
+            got = frame
         expected = f"0 to {self.frames - 1}"
-        raise UsageError(what, where=f"scenario {self.scenario}", expected=expected, got=got)
+        raise UsageError(
+            what, where=f"scenario {self.scenario}", expected=expected, got=got
+        )
 
     def scene(self, frame: int) -> Scene:
         """Return one frame; negative numbers count from the end."""
         number = self.frame_number(frame)
-        position, velocity = self._particles("position", number), self._particles("velocity", number)
-        before = self._particles("position", number - 1) if number else None
-        displacement = velocity * self.size.frame_interval if before is None else position - before
+        position = self._particles("position", number)
+        velocity = self._particles("velocity", number)
+        if number:
+            before = self._particles("position", number - 1)
+        else:
+            before = None
+        if before is None:
+            displacement = velocity * self.size.frame_interval
+        else:
+            displacement = position - before
         return Scene(self, number, position, velocity, displacement)
 
     def _particles(self, name: str, frame: int) -> NDArray[np.float64]:
@@ -149,13 +168,21 @@ def open_recording(
         return
     with read_scenario(Path(source)) as file:
         head = file.header
-        identity = {"split": head.key.split, "size": head.key.size, "scenario": head.key.scenario}
+        identity = {
+            "split": head.key.split,
+            "size": head.key.size,
+            "scenario": head.key.scenario,
+        }
         splits = _beside(source, registry)
-        yield Recording(identity, head.parameters, head.frames, {*file.variables}, file.read, splits)
+        yield Recording(
+            identity, head.parameters, head.frames, {*file.variables}, file.read, splits
+        )
 
 
 def _beside(file: str | Path, registry: Registry | None) -> Registry:
-    """Return a registry that also knows the local splits of the root of a scenario file."""
+    """Return a registry that also knows the local splits of the root of a scenario
+    file.
+    """
     parents = Path(file).absolute().parents  # the root is where `scenario_path` has it
     return rooted(parents[min(4, len(parents) - 1)], registry)
 
@@ -163,26 +190,52 @@ def _beside(file: str | Path, registry: Registry | None) -> Registry:
 def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
     """Return the recording that a data set of one scenario holds."""
     if "scenario" in data.dims:
-        got, fix = f"a data set of {data.sizes['scenario']}", "choose one: data.sel(scenario=3)"
+        got = f"a data set of {data.sizes['scenario']}"
+        fix = "choose one: data.sel(scenario=3)"
         raise UsageError("a picture shows one scenario", got=got, fix=fix)
     attributes: dict[str, Any] = {str(k): v for k, v in data.attrs.items()}
     names = ("split", "size", "scenario")
-    identity = {n: data.coords[n].item() if n in data.coords else attributes[n] for n in names}
-    held = data["frame"].values.tolist() if "frame" in data.dims else []
-    frames = int(data["frame_count"]) if "frame_count" in data else len(held)
+    identity = {
+        n: data.coords[n].item() if n in data.coords else attributes[n] for n in names
+    }
+    if "frame" in data.dims:
+        held = data["frame"].values.tolist()
+    else:
+        held = []
+    if "frame_count" in data:
+        frames = int(data["frame_count"])
+    else:
+        frames = len(held)
     if not held or held != list(range(max(frames, len(held)))):
         raise UsageError(
             "a picture needs all frames of a scenario: a frame is called by its number",
             where="coordinate frame",
             expected=f"0, 1, 2, ... to {max(frames, len(held), 1) - 1}",
-            got=f"{len(held)}: {', '.join(map(str, held[:3]))}, ..." if held else "no dimension frame",
-            fix="choose a scenario only, data.sel(scenario=3), and say which frame to draw",
+            got=f"{len(held)}: {', '.join(map(str, held[:3]))}, ..."
+            if held
+            else "no dimension frame",
+            fix="choose a scenario only, data.sel(scenario=3), and say which "
+            "frame to draw",
         )
 
     def read(name: str, frames: slice | int) -> NDArray[Any]:
         variable = data[name]
-        return np.asarray(variable.isel(frame=frames) if "frame" in variable.dims else variable)
+        return np.asarray(
+            variable.isel(frame=frames) if "frame" in variable.dims else variable
+        )
 
-    file = data.encoding.get("source")  # as xarray and open_split note where the data are from
-    splits = _beside(file, registry) if isinstance(file, str | Path) else registry or load()
-    return Recording(identity, attributes, frames, {str(name) for name in data.variables}, read, splits)
+    file = data.encoding.get(
+        "source"
+    )  # as xarray and open_split note where the data are from
+    if isinstance(file, str | Path):
+        splits = _beside(file, registry)
+    else:
+        splits = registry or load()
+    return Recording(
+        identity,
+        attributes,
+        frames,
+        {str(name) for name in data.variables},
+        read,
+        splits,
+    )

@@ -1,9 +1,10 @@
-"""Figures without a display: one style, one set of colours, PNG files with the same bytes every time.
+"""Figures without a display: one style, one set of colours, PNG files with the same
+bytes every time.
 
-Materials take hues of Okabe & Ito (2008), which stay apart under every common colour vision
-deficiency and in grey. Speed and vorticity take matplotlib maps that do as well. All of them,
-with the blends that smooth edges, fit the 256 colours of one palette: PNG and GIF files use
-it, stay small, and show each colour as drawn.
+Materials take hues of Okabe & Ito (2008), which stay apart under every common colour
+vision deficiency and in grey. Speed and vorticity take matplotlib maps that do as well.
+All of them, with the blends that smooth edges, fit the 256 colours of one palette: PNG
+and GIF files use it, stay small, and show each colour as drawn.
 """
 
 from __future__ import annotations
@@ -38,12 +39,16 @@ MATERIAL_COLOURS = ("#0072b2", "#d55e00", "#56b4e9", "#e69f00")
 
 
 def speed_map() -> ListedColormap:
-    """Return the map of speeds: dark when slow, never so light that paper swallows it."""
+    """Return the map of speeds: dark when slow, never so light that paper swallows
+    it.
+    """
     return _cut("plasma", 0.0, 0.9, 80)
 
 
 def vorticity_map() -> ListedColormap:
-    """Return the diverging map of vorticities: blue clockwise, red counter-clockwise, white none."""
+    """Return the diverging map of vorticities: blue clockwise, red counter-clockwise,
+    white none.
+    """
     return _cut("RdBu_r", 0.04, 0.96, 81)  # the middle of an odd number is no vorticity
 
 
@@ -64,7 +69,13 @@ def colours() -> NDArray[np.uint8]:
     drawn = [paper[None], speeds, np.asarray(vorticity_map().colors)[:, :3] * 255.0]
     # blends with the paper where edges are smoothed
     drawn += [_blend(speeds[::3], paper, 0.62), _blend(speeds[::5], paper, 0.3)]
-    for colour, shares in ((INK, 8), (MUTED, 6), (MOVING, 4), (WALL, 3), *((m, 4) for m in MATERIAL_COLOURS)):
+    for colour, shares in (
+        (INK, 8),
+        (MUTED, 6),
+        (MOVING, 4),
+        (WALL, 3),
+        *((m, 4) for m in MATERIAL_COLOURS),
+    ):
         for share in np.arange(1, shares + 1) / shares:
             drawn.append(_blend(rgb(colour)[None].astype(float), paper, share))
     table = np.concatenate(drawn).round().astype(np.uint8)
@@ -79,7 +90,9 @@ def reduced(image: Image) -> Image:
     return image.quantize(palette=palette, dither=images.Dither.NONE)
 
 
-def _blend(table: NDArray[np.float64], paper: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+def _blend(
+    table: NDArray[np.float64], paper: NDArray[np.float64], share: float
+) -> NDArray[np.float64]:
     return share * table + (1.0 - share) * paper
 
 
@@ -87,20 +100,26 @@ def _cut(name: str, low: float, high: float, levels: int) -> ListedColormap:
     """Return a stretch of one of matplotlib's maps in so many colours."""
     matplotlib = require("matplotlib", extra="plots")
     colors = require("matplotlib.colors", extra="plots")
-    cut: ListedColormap = colors.ListedColormap(matplotlib.colormaps[name](np.linspace(low, high, levels)))
+    cut: ListedColormap = colors.ListedColormap(
+        matplotlib.colormaps[name](np.linspace(low, high, levels))
+    )
     return cut
 
 
 ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
 
 DPI = 128  # a power of two: every whole number of pixels is exact in inches
-COARSEST, FINEST = 32, 1200  # pixels per inch that a picture may have
+COARSEST = 32
+FINEST = 1200  # pixels per inch that a picture may have
 
 _STYLE = {
-    "font.family": "DejaVu Sans",  # ships with matplotlib, so that text has the same pixels everywhere
+    # ships with matplotlib, so that text has the same pixels everywhere
+    "font.family": "DejaVu Sans",
     "font.size": 9.0,
     "text.color": INK,
-    **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), MUTED),
+    **dict.fromkeys(
+        ("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), MUTED
+    ),
     "axes.titlecolor": INK,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
@@ -114,10 +133,15 @@ _STYLE = {
 
 @contextmanager
 def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
-    """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says; save it inside."""
+    """Yield an empty figure in lagbench's style, whatever the user's matplotlibrc says;
+    save it inside.
+    """
     if not (isinstance(dpi, int | float | np.number) and COARSEST <= dpi <= FINEST):
         raise UsageError(
-            "no such number of pixels per inch", where="--dpi", expected=f"{COARSEST} to {FINEST}", got=dpi
+            "no such number of pixels per inch",
+            where="--dpi",
+            expected=f"{COARSEST} to {FINEST}",
+            got=dpi,
         )
     matplotlib = require("matplotlib", extra="plots")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -134,8 +158,12 @@ def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
 def header(drawn: Figure, title: str, subtitle: str, *, left: float) -> None:
     """Write a title and a second, quieter line at the top left."""
     width, height = drawn.get_size_inches()
-    drawn.text(left / width, 1 - 0.16 / height, title, fontsize=13, fontweight="bold", va="top")
-    drawn.text(left / width, 1 - 0.43 / height, subtitle, fontsize=9.5, color=MUTED, va="top")
+    drawn.text(
+        left / width, 1 - 0.16 / height, title, fontsize=13, fontweight="bold", va="top"
+    )
+    drawn.text(
+        left / width, 1 - 0.43 / height, subtitle, fontsize=9.5, color=MUTED, va="top"
+    )
 
 
 def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
@@ -156,18 +184,27 @@ def png_bytes(drawn: Figure) -> bytes:
 
 
 def save(drawn: Figure, output: str | Path) -> Path:
-    """Write the figure to a file, with the same bytes every time and whole or not at all; return its path."""
+    """Write the figure to a file, with the same bytes every time and whole or not at
+    all; return its path.
+    """
     path = Path(output)
     ending = path.suffix.lower()
     if ending not in ENDINGS:
         expected = f"a name ending in {', '.join(ENDINGS)}"
-        raise UsageError("pictures are PNG, PDF or SVG files", where="output", expected=expected, got=path)
+        raise UsageError(
+            "pictures are PNG, PDF or SVG files",
+            where="output",
+            expected=expected,
+            got=path,
+        )
     if ending == ".png":
         data = png_bytes(drawn)
     else:
         import matplotlib as mpl
 
-        nothing = dict.fromkeys(("Date",) if ending == ".svg" else ("CreationDate", "Producer", "Creator"))
+        nothing = dict.fromkeys(
+            ("Date",) if ending == ".svg" else ("CreationDate", "Producer", "Creator")
+        )
         with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
             drawn.savefig(buffer, format=ending[1:], metadata=nothing)
             data = buffer.getvalue()

@@ -33,7 +33,10 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
     Cells that start and end with a backtick are code and stay as they are.
     """
-    numeric = [all(isinstance(row[i], int | float) for row in rows) and bool(rows) for i in range(len(head))]
+    numeric = [
+        all(isinstance(row[i], int | float) for row in rows) and bool(rows)
+        for i in range(len(head))
+    ]
     lines = [map(escape, head), ("---:" if right else "---" for right in numeric)]
     lines += [map(_cell, row) for row in rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
@@ -41,11 +44,20 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 def _cell(value: object) -> str:
     if isinstance(value, bool):
-        return "yes" if value else "no"
+        if value:
+            return "yes"
+        return "no"
     if isinstance(value, int):
         return f"{value:,}"
     if isinstance(value, float):
         return f"{value:.9g}"
     text = str(value)
-    is_code = len(text) > 2 and text.startswith("`") and text.endswith("`") and "`" not in text[1:-1]
-    return text.replace("|", "\\|") if is_code else escape(text)
+    is_code = (
+        len(text) > 2
+        and text.startswith("`")
+        and text.endswith("`")
+        and "`" not in text[1:-1]
+    )
+    if is_code:
+        return text.replace("|", "\\|")
+    return escape(text)

@@ -19,7 +19,12 @@ if TYPE_CHECKING:
 
 __all__ = ["adopt", "download", "export", "import_split"]
 
-_HOMES = {"adopt": "adoption", "download": "downloading", "export": "exporting", "import_split": "adoption"}
+_HOMES = {
+    "adopt": "adoption",
+    "download": "downloading",
+    "export": "exporting",
+    "import_split": "adoption",
+}
 
 
 def __getattr__(name: str) -> object:

@@ -1,7 +1,8 @@
-"""Trajectories in arrays of one's own: .npy, .npz and netCDF files, read frame by frame where they allow it.
+"""Trajectories in arrays of one's own: .npy, .npz and netCDF files, read frame by frame
+where they allow it.
 
-The files come from strangers: nothing is unpickled, no link is followed, and no more memory is taken than
-their bytes can fill.
+The files come from strangers: nothing is unpickled, no link is followed, and no more
+memory is taken than their bytes can fill.
 """
 
 from __future__ import annotations
@@ -25,13 +26,27 @@ from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 from .mistakes import check_meaning
 from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
 
-READABLE = (".npy", ".npz", ".nc")  # files that are adopted: an array, named arrays, netCDF
-ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = "position", "velocity", "material", "wall_velocity"
-CLASSIC = b"CDF"  # first bytes of the older netCDF formats, which cannot point to other files
+READABLE = (
+    ".npy",
+    ".npz",
+    ".nc",
+)  # files that are adopted: an array, named arrays, netCDF
+ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = (
+    "position",
+    "velocity",
+    "material",
+    "wall_velocity",
+)
+CLASSIC = (
+    b"CDF"  # first bytes of the older netCDF formats, which cannot point to other files
+)
 
-# What may be in a netCDF-4 file; chunks by default span many frames, so that more of them stay unpacked.
+# What may be in a netCDF-4 file; chunks by default span many frames, so that more of
+# them stay unpacked.
 NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
-Row = tuple[Path, int | None]  # a file and, where it holds several, the number of the trajectory in it
+Row = tuple[
+    Path, int | None
+]  # a file and, where it holds several, the number of the trajectory in it
 
 
 def natural(paths: Sequence[Path]) -> list[Path]:
@@ -39,7 +54,9 @@ def natural(paths: Sequence[Path]) -> list[Path]:
 
     def key(path: Path) -> tuple[list[tuple[int, str]], str]:
         parts = re.split(r"(\d+)", str(path))
-        return [(int(part) if part.isdecimal() else -1, part) for part in parts], str(path)
+        return [(int(part) if part.isdecimal() else -1, part) for part in parts], str(
+            path
+        )
 
     return sorted(paths, key=key)
 
@@ -47,7 +64,13 @@ def natural(paths: Sequence[Path]) -> list[Path]:
 def rows_of(path: Path) -> list[Row]:
     """Return the trajectories of a file, or of the files of a folder by name."""
     if path.is_dir():
-        found = natural([file for file in path.iterdir() if file.suffix in READABLE and file.is_file()])
+        found = natural(
+            [
+                file
+                for file in path.iterdir()
+                if file.suffix in READABLE and file.is_file()
+            ]
+        )
         if found:
             return [row for file in found for row in rows_of(file)]
     if path.suffix not in READABLE or not path.is_file():
@@ -58,30 +81,46 @@ def rows_of(path: Path) -> list[Row]:
             got="a folder without such files" if path.is_dir() else None,
         )
     if path.stat().st_size == 0:
-        raise UnreadableFileError("the file is empty", where=str(path), expected="a trajectory")
+        raise UnreadableFileError(
+            "the file is empty", where=str(path), expected="a trajectory"
+        )
     if path.suffix != ".npy" or len(shape := _array(path).shape) != 4:
         return [(path, None)]
     if shape[0] > MAX_ID + 1:
         expected = f"at most {MAX_ID + 1}"
-        raise DataError("too many trajectories", where=str(path), expected=expected, got=shape[0])
+        raise DataError(
+            "too many trajectories", where=str(path), expected=expected, got=shape[0]
+        )
     return [(path, row) for row in range(shape[0])]
 
 
 def open_row(which: Row, interval: float | None) -> Trajectory:
-    """Return a trajectory; what its arrays mean is looked at where the time between frames is given [s]."""
+    """Return a trajectory; what its arrays mean is looked at where the time between
+    frames is given [s].
+    """
     path, row = which
-    name = str(path) if row is None else f"{path}, trajectory {row}"
+    if row is None:
+        name = str(path)
+    else:
+        name = f"{path}, trajectory {row}"
     with _reading(path):
         if path.suffix == ".npy":
             array = _array(path)
             arrays = {POSITION: array if row is None else array[row]}
         else:
-            arrays = _npz(path) if path.suffix == ".npz" else _netcdf(path)
+            if path.suffix == ".npz":
+                arrays = _npz(path)
+            else:
+                arrays = _netcdf(path)
         return _trajectory(path, name, arrays, interval)
 
 
-def _trajectory(path: Path, name: str, arrays: Mapping[str, Any], interval: float | None) -> Trajectory:
-    """Return the trajectory of named arrays after a look at their shapes and, given an interval, meaning."""
+def _trajectory(
+    path: Path, name: str, arrays: Mapping[str, Any], interval: float | None
+) -> Trajectory:
+    """Return the trajectory of named arrays after a look at their shapes and, given an
+    interval, meaning.
+    """
     if POSITION not in arrays:
         raise UnreadableFileError(
             "there are no positions",
@@ -97,7 +136,9 @@ def _trajectory(path: Path, name: str, arrays: Mapping[str, Any], interval: floa
     material = np.zeros(particles, np.int8)
     if MATERIAL in arrays:
         what = "materials: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS))
-        _check_numbers(f"{name}, {MATERIAL}", arrays[MATERIAL], what, (particles,), kinds="iu")
+        _check_numbers(
+            f"{name}, {MATERIAL}", arrays[MATERIAL], what, (particles,), kinds="iu"
+        )
         material = np.asarray(arrays[MATERIAL][...])
         if not np.isin(material, range(len(MATERIALS))).all():
             raise DataError(f"these are no {what}", where=f"{name}, {MATERIAL}")
@@ -120,7 +161,11 @@ def _trajectory(path: Path, name: str, arrays: Mapping[str, Any], interval: floa
                 yield frame, None if velocity is None else np.asarray(velocity[number])
 
     return Trajectory(
-        name=name, frames=frames, material=material.astype(np.int8), read=read, wall_velocity=walls
+        name=name,
+        frames=frames,
+        material=material.astype(np.int8),
+        read=read,
+        wall_velocity=walls,
     )
 
 
@@ -131,7 +176,9 @@ def _check_numbers(
     *shapes: tuple[int, ...],
     kinds: str = "iuf",
 ) -> None:
-    """Refuse an array of another shape or other kinds of values, by what its file declares."""
+    """Refuse an array of another shape or other kinds of values, by what its file
+    declares.
+    """
     if tuple(array.shape) not in shapes or _dtype(array).kind not in kinds:
         raise DataError(
             f"these are no {what}",
@@ -143,9 +190,13 @@ def _check_numbers(
 
 
 def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
-    """Return the type of values; netCDF has types of its own for texts and lists, here objects."""
+    """Return the type of values; netCDF has types of its own for texts and lists, here
+    objects.
+    """
     stored = getattr(array, "datatype", array.dtype)
-    return stored if isinstance(stored, np.dtype) else np.dtype(object)
+    if isinstance(stored, np.dtype):
+        return stored
+    return np.dtype(object)
 
 
 def _array(path: Path) -> NDArray[Any]:
@@ -157,7 +208,9 @@ def _array(path: Path) -> NDArray[Any]:
 
 
 def _check_header(name: str, stream: IO[bytes], length: int) -> None:
-    """Refuse objects, and more values than a .npy stream of some length [bytes] can hold."""
+    """Refuse objects, and more values than a .npy stream of some length [bytes] can
+    hold.
+    """
     shape, _, dtype = read_header(stream)
     if dtype.hasobject:
         raise UnreadableFileError(
@@ -181,7 +234,9 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             name = f"{path}, {member.filename}"
-            check_inflation(name, packed=member.compress_size, unpacked=member.file_size)
+            check_inflation(
+                name, packed=member.compress_size, unpacked=member.file_size
+            )
             if member.filename.removesuffix(".npy") in ARRAYS:
                 with archive.open(member) as stream:
                     _check_header(name, stream, member.file_size)
@@ -215,7 +270,9 @@ def _netcdf(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what damaged bytes raise, which is nearly any type, into an UnreadableFileError."""
+    """Turn what damaged bytes raise, which is nearly any type, into an
+    UnreadableFileError.
+    """
     try:
         yield
     except LagbenchError:

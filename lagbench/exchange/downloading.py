@@ -36,7 +36,9 @@ from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
 REMEDY = "try again; if it stays so, name another store: --from"
-Reason = DataError | WorkFailedError | UsageError  # why something could not be downloaded
+Reason = (
+    DataError | WorkFailedError | UsageError
+)  # why something could not be downloaded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +48,9 @@ class DownloadResult:
     split: str  # name of the split
     size: str  # name of the size
     folder: Path  # folder of the data set
-    mirror: str | None  # store that files came from; None where none was needed or reached
+    mirror: (
+        str | None
+    )  # store that files came from; None where none was needed or reached
     downloaded: tuple[int, ...]  # ids that were downloaded
     kept: tuple[int, ...]  # ids whose files were there and right
     generated: tuple[int, ...]  # ids that were simulated instead
@@ -73,16 +77,18 @@ def download(
     on_wait: Callable[[str], None] | None = None,
     registry: Registry | None = None,
 ) -> DownloadResult:
-    """Fetch the scenarios of a split that are not on disk yet; simulate those no store has.
+    """Fetch the scenarios of a split that are not on disk yet; simulate those no store
+    has.
 
-    Every file has a temporary name until its content hash is that of datasets.yaml. What was
-    fetched before an interruption is not fetched again.
+    Every file has a temporary name until its content hash is that of datasets.yaml.
+    What was fetched before an interruption is not fetched again.
 
     Args:
         split: name of the split, or path of a local split's folder.
         size: name of the size; mini when None, or the only one that the split has.
         mirror: URL of a copy of a root folder, or of a folder of archives, see
-            :mod:`lagbench.store.archive`; else the mirrors of datasets.yaml in order, then releases.
+            :mod:`lagbench.store.archive`; else the mirrors of datasets.yaml in order,
+            then releases.
         subset: some subsets only.
         scenarios: some ids only.
         root: folder of all data sets, see :func:`lagbench.data.local.resolve_root`.
@@ -95,16 +101,18 @@ def download(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset or scenario, or no store is known and nothing
-            may be simulated.
+        UsageError: unknown split, size, subset or scenario, or no store is known and
+            nothing may be simulated.
         DataError: the store sent what is no data or has another length or content, see
             :mod:`lagbench.store.objects`; the file is gone, all that were right stay.
-        WorkFailedError: the connection kept breaking, the disk is full, no store answers or is
-            fast enough and nothing may be simulated.
+        WorkFailedError: the connection kept breaking, the disk is full, no store
+            answers or is fast enough and nothing may be simulated.
     """
     started = time.monotonic()
     if connections < 1:
-        raise UsageError("no file comes without a connection", where="--connections", expected=">= 1")
+        raise UsageError(
+            "no file comes without a connection", where="--connections", expected=">= 1"
+        )
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
     urls = (mirror,) if mirror else (*splits.split(tier.split).mirrors, *releases(tier))
@@ -113,7 +121,13 @@ def download(
         publication(tier, folder) as store,
     ):
         held = [i for i in wanted if store and i in store.held]
-        work = _Download(tier, folder, [i for i in wanted if i not in held], Meter(progress), connections)
+        work = _Download(
+            tier,
+            folder,
+            [i for i in wanted if i not in held],
+            Meter(progress),
+            connections,
+        )
         try:
             reason = work.run(urls)
         finally:
@@ -132,8 +146,13 @@ def download(
         if not or_generate:
             raise reason
         if announce is not None:
-            place = f" ({reason.where})" if reason.where else ""
-            announce(f"{reason.what}{place}: simulating scenarios {spell_ids(work.missing)}")
+            if reason.where:
+                place = f" ({reason.where})"
+            else:
+                place = ""
+            announce(
+                f"{reason.what}{place}: simulating scenarios {spell_ids(work.missing)}"
+            )
         rest = generate(
             tier.split,
             tier.name,
@@ -164,27 +183,45 @@ def download(
 class _Download:
     """What is there, what is fetched, what is recorded."""
 
-    def __init__(self, size: Size, root: Path, wanted: Sequence[int], meter: Meter, connections: int) -> None:
-        self.size, self.root, self._meter, self._connections = size, root, meter, connections
+    def __init__(
+        self,
+        size: Size,
+        root: Path,
+        wanted: Sequence[int],
+        meter: Meter,
+        connections: int,
+    ) -> None:
+        self.size = size
+        self.root = root
+        self._meter = meter
+        self._connections = connections
         self.url: str | None = None  # store that files came from
         self.downloaded: list[int] = []
         self.bytes = 0
-        self._recorded = dict(size.measured.scenario_sha256) if size.measured else {}
+        if size.measured:
+            self._recorded = dict(size.measured.scenario_sha256)
+        else:
+            self._recorded = {}
         self._old = read_or_empty(size, root)
         meter.begin("checking", total=len(wanted), scenarios=len(wanted))
-        findings = [examine(root, size, i, manifest=self._old, quick=True) for i in wanted]
+        findings = [
+            examine(root, size, i, manifest=self._old, quick=True) for i in wanted
+        ]
         self._entries = [finding.entry for finding in findings if finding.entry]
         self.kept = [f.scenario for f in findings if f.state is State.GOOD]
         self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
 
     def run(self, urls: Iterable[str]) -> Reason:
-        """Fetch what is missing from stores in turn, unless one lies; return why something still is."""
+        """Fetch what is missing from stores in turn, unless one lies; return why
+        something still is.
+        """
         place = f"{self.size.split} {self.size.name}"
         reason: Reason = UsageError(
             "no store is known to download from",
             where=place,
             got=f"{RELEASES}, a placeholder" if self.size.simulated else None,
-            fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out --no-generate",
+            fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out "
+            f"--no-generate",
         )
         unknown = [i for i in self.missing if i not in self._recorded]
         if unknown:
@@ -199,9 +236,12 @@ class _Download:
         return reason
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
-        """Fetch what one store has; return the error of the last file that it has not."""
+        """Fetch what one store has; return the error of the last file that it has
+        not.
+        """
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
-        # What its manifest says of the files that datasets.yaml means; None without one.
+        # What its manifest says of the files that datasets.yaml means; None without
+        # one.
         claims: dict[int, FileEntry] | None = None
         last: NotInStoreError | None = None
         place = address_of(self.size, url, MANIFEST_NAME)
@@ -209,11 +249,16 @@ class _Download:
             text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
             manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
             claims = {entry.scenario: entry for entry in manifest.files}
-            other = [i for i in self.missing if i in claims and not claims[i].has_hash(self._recorded[i])]
+            other = [
+                i
+                for i in self.missing
+                if i in claims and not claims[i].has_hash(self._recorded[i])
+            ]
             refuse_strangers(manifest, other, where=place, remedy=REMEDY)
         wanted = {}
         for i in self.missing:
-            key, claim = self.size.key(i), (claims or {}).get(i)
+            key = self.size.key(i)
+            claim = (claims or {}).get(i)
             wanted[i] = Wanted(
                 url=address_of(self.size, url, f"{key.subset}/{i:04d}.nc"),
                 target=scenario_path(self.root, key),
@@ -227,15 +272,24 @@ class _Download:
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
         try:
             if claims is None:  # it may have the archive of the data set instead
-                limit = sum(map(self.size.longest_file, self.size.scenarios)) + MANIFEST_LIMIT
-                archive = fetch_archive(self.size, url, wanted, self._count, limit=limit, remedy=REMEDY)
+                limit = (
+                    sum(map(self.size.longest_file, self.size.scenarios))
+                    + MANIFEST_LIMIT
+                )
+                archive = fetch_archive(
+                    self.size, url, wanted, self._count, limit=limit, remedy=REMEDY
+                )
                 with suppress(NotInStoreError), closing(archive) as arrived:
                     for claim in arrived:
                         self._take(url, claim.scenario, claim)
                     return None
                 claims = {}
-                wanted = {i: one for i, one in wanted.items() if i not in self.downloaded}
-            with closing(fetch_scenarios(wanted, self._count, connections=self._connections)) as arrivals:
+                wanted = {
+                    i: one for i, one in wanted.items() if i not in self.downloaded
+                }
+            with closing(
+                fetch_scenarios(wanted, self._count, connections=self._connections)
+            ) as arrivals:
                 for scenario, absent in arrivals:
                     if absent is None:
                         self._take(url, scenario, claims.get(scenario))
@@ -249,7 +303,9 @@ class _Download:
         entry = describe_file(self.root, self.size.key(scenario))
         if claim is not None:  # files of earlier versions state no facts
             facts = entry.facts or claim.facts
-            entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
+            entry = entry.model_copy(
+                update={"facts": facts, "twin_floor": claim.twin_floor}
+            )
         self._entries.append(entry)
         self.downloaded.append(scenario)
         self.url = url
@@ -262,10 +318,16 @@ class _Download:
     def record(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
         note_entries(self.size.folder(self.root), self._entries)
-        kept = tuple(entry for entry in self._old.files if entry.scenario not in self.missing)
-        manifest = merged(self.size, self._old.model_copy(update={"files": kept}), self._entries)
+        kept = tuple(
+            entry for entry in self._old.files if entry.scenario not in self.missing
+        )
+        manifest = merged(
+            self.size, self._old.model_copy(update={"files": kept}), self._entries
+        )
         if self.size.measured and "train" in manifest.subset_sha256:
-            rows = {name: tuple(row) for name, row in self.size.measured.statistics.items()}
+            rows = {
+                name: tuple(row) for name, row in self.size.measured.statistics.items()
+            }
             manifest = manifest.model_copy(update={"statistics": rows})
         if manifest.files:
             write_manifest(self.root, manifest)

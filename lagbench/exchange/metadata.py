@@ -1,12 +1,13 @@
 """What both formats say beside positions: metadata.json, and kinds of particles.
 
-Programs of other code bases pass over keys of metadata.json that they do not know; ours stand
-together under ``lagbench``, so that what we export comes back with its task and its place in the box.
+Programs of other code bases pass over keys of metadata.json that they do not know; ours
+stand together under ``lagbench``, so that what we export comes back with its task and
+its place in the box.
 
-Both formats mark each particle with a number below 9, which their models embed; only a few have
-a meaning to the programs: particles that move as prescribed, and padding. Our materials go to
-numbers without such a meaning, one each, so that nothing is lost. On the way back a number that
-no material has must be told what it stands for, or left out.
+Both formats mark each particle with a number below 9, which their models embed; only a
+few have a meaning to the programs: particles that move as prescribed, and padding. Our
+materials go to numbers without such a meaning, one each, so that nothing is lost. On
+the way back a number that no material has must be told what it stands for, or left out.
 """
 
 from __future__ import annotations
@@ -21,7 +22,14 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    TypeAdapter,
+    ValidationError,
+)
 
 from lagbench.atomic import write_atomically
 from lagbench.data import MATERIALS
@@ -33,7 +41,9 @@ OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Shapes = Mapping[str, Sequence[tuple[int, int]]]  # frames and particles of every trajectory, by subset
+Shapes = Mapping[
+    str, Sequence[tuple[int, int]]
+]  # frames and particles of every trajectory, by subset
 
 
 class Format(enum.StrEnum):
@@ -43,7 +53,10 @@ class Format(enum.StrEnum):
     LAGRANGEBENCH_H5 = "lagrangebench-h5"
 
 
-ENDINGS = {Format.GNS_NPZ: ".npz", Format.LAGRANGEBENCH_H5: ".h5"}  # of the files of subsets
+ENDINGS = {
+    Format.GNS_NPZ: ".npz",
+    Format.LAGRANGEBENCH_H5: ".h5",
+}  # of the files of subsets
 
 NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
@@ -51,7 +64,10 @@ NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
 }
 
 # of particles of a wall at rest, and of one that moves
-WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {Format.GNS_NPZ: (3, 3), Format.LAGRANGEBENCH_H5: (1, 2)}
+WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {
+    Format.GNS_NPZ: (3, 3),
+    Format.LAGRANGEBENCH_H5: (1, 2),
+}
 
 MEANINGS: Mapping[Format, Mapping[int, str]] = {  # of numbers without a material
     Format.GNS_NPZ: {0: "rigid", 3: "kinematic: a boundary that moves as prescribed"},
@@ -67,39 +83,65 @@ def parse_format(name: str) -> Format:
     """Return a format by name; of an unknown one the UsageError names the nearest."""
     known = [form.value for form in Format]
     if name not in known:
-        raise UsageError(f"no format {name!r}", where="--format", fix=nearest(name, known))
+        raise UsageError(
+            f"no format {name!r}", where="--format", fix=nearest(name, known)
+        )
     return Format(name)
 
 
 def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the number of each particle's material, shape [particle]."""
-    return np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64).take(material)
+    return np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64).take(
+        material
+    )
 
 
 def materials_of(
-    form: Format, numbers: NDArray[Any], particles: int, *, given: Mapping[int, str], where: str
+    form: Format,
+    numbers: NDArray[Any],
+    particles: int,
+    *,
+    given: Mapping[int, str],
+    where: str,
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return the material of each particle kept, and a mask over all; ``given`` is what the user said."""
+    """Return the material of each particle kept, and a mask over all; ``given`` is what
+    the user said.
+    """
     gns = form is Format.GNS_NPZ
-    if numbers.dtype.kind not in "iu" or numbers.shape not in [(particles,), *([(), (1,)] if gns else [])]:
+    if numbers.dtype.kind not in "iu" or numbers.shape not in [
+        (particles,),
+        *([(), (1,)] if gns else []),
+    ]:
         raise UnreadableFileError(
             "these are no kinds of particles",
             where=where,
-            expected=f"an integer, or {particles} of them" if gns else f"{particles} integers",
+            expected=f"an integer, or {particles} of them"
+            if gns
+            else f"{particles} integers",
             got=f"{numbers.dtype} of shape {numbers.shape}",
         )
     numbers = np.broadcast_to(numbers, (particles,))
-    known = {number: name for name, number in NUMBERS[form].items()} | {PADDING: DROP} | dict(given)
-    codes = {number: _DROPPED if name == DROP else _code(name) for number, name in known.items()}
+    known = (
+        {number: name for name, number in NUMBERS[form].items()}
+        | {PADDING: DROP}
+        | dict(given)
+    )
+    codes = {
+        number: _DROPPED if name == DROP else _code(name)
+        for number, name in known.items()
+    }
     found = np.unique(numbers).tolist()
     strange = [number for number in found if number not in codes]
     if strange:
         raise UnreadableFileError(
             "particles of a kind that no material is known for",
             where=where,
-            expected=", ".join(f"{number} ({name})" for number, name in sorted(known.items())),
+            expected=", ".join(
+                f"{number} ({name})" for number, name in sorted(known.items())
+            ),
             got=", ".join(f"{n} ({MEANINGS[form].get(n, 'unknown')})" for n in strange),
-            fix=f"say what they stand for: --kinds {strange[0]}=jelly, or leave them out: {strange[0]}=drop",
+            fix=f"say what they stand for: --kinds {strange[0]}=jelly, or leave them "
+            f"out: {strange[0]}=drop",
         )
     material = np.empty(numbers.shape, dtype=np.int8)
     for number in found:
@@ -127,7 +169,9 @@ def parse_kinds(text: str | None) -> dict[int, str]:
     for part in text.split(",") if text else ():
         number, _, name = part.strip().partition("=")
         if not re.fullmatch(r"-?[0-9]{1,9}", number):
-            raise UsageError("bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text)
+            raise UsageError(
+                "bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text
+            )
         if name != DROP:
             _code(name)
         kinds[int(number)] = name
@@ -146,10 +190,14 @@ class Hints(BaseModel):
     density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
     input_frames: Annotated[int, Field(gt=1)] | None = None  # frames given
     horizon: Annotated[int, Field(gt=0)] | None = None  # frames to predict
-    frames_of_interest: tuple[int, ...] | None = None  # absolute frames at which the scorer reports
+    frames_of_interest: tuple[int, ...] | None = (
+        None  # absolute frames at which the scorer reports
+    )
     cells: Annotated[int, Field(gt=3)] | None = None  # cells across of the score grid
     placement: Literal["cell_centres", "nodes"] | None = None  # where its nodes lie
-    wall_particle_type: tuple[int, ...] = ()  # numbers of particles that are walls, no material
+    wall_particle_type: tuple[
+        int, ...
+    ] = ()  # numbers of particles that are walls, no material
 
 
 class Source(BaseModel):
@@ -159,14 +207,22 @@ class Source(BaseModel):
 
     bounds: tuple[Pair, Pair]  # box of the source [its length]
     radius: Length = Field(alias="default_connectivity_radius")  # [its length]
-    frame_interval: Length | None = Field(alias="dt")  # time between frames [s]; None where none is stated
-    spacing: Length | None = Field(alias="dx")  # distance of neighbouring particles at first [its length]
-    periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")  # along x and y
+    frame_interval: Length | None = Field(
+        alias="dt"
+    )  # time between frames [s]; None where none is stated
+    spacing: Length | None = Field(
+        alias="dx"
+    )  # distance of neighbouring particles at first [its length]
+    periodic: tuple[bool, bool] = Field(
+        alias="periodic_boundary_conditions"
+    )  # along x and y
     hints: Hints = Field(alias="lagbench")  # what our own exports add
 
 
 def floor_of(value: float) -> float:
-    """Return the largest multiple of 2^-20 below: taken off a float32 beyond it, nothing is lost."""
+    """Return the largest multiple of 2^-20 below: taken off a float32 beyond it,
+    nothing is lost.
+    """
     return math.floor(value * 2**20) / 2**20
 
 
@@ -184,16 +240,25 @@ def describe(
     free_slip: bool,
     wall: float | None = None,
 ) -> dict[str, object]:
-    """Return the metadata of an export whose walls, where they are particles, are ``wall`` thick [length]."""
-    task, grid = size.task, size.task.score_grid
+    """Return the metadata of an export whose walls, where they are particles, are
+    ``wall`` thick [length].
+    """
+    grid = size.task.score_grid
+    task = size.task
     short = {"vel": "velocity", "acc": "acceleration"}
     common = {
-        "bounds": [[low - o, high - o] for (low, high), o in zip(size.bounds, origin, strict=True)],
+        "bounds": [
+            [low - o, high - o]
+            for (low, high), o in zip(size.bounds, origin, strict=True)
+        ],
         "default_connectivity_radius": task.radius,
         "dim": 2,
         **{f"{s}_mean": list(statistics[f"{name}_mean"]) for s, name in short.items()},
         # Models divide by a deviation: 0 becomes 1.
-        **{f"{s}_std": [v or 1.0 for v in statistics[f"{name}_std"]] for s, name in short.items()},
+        **{
+            f"{s}_std": [v or 1.0 for v in statistics[f"{name}_std"]]
+            for s, name in short.items()
+        },
     }
     own = {
         "split": size.split,
@@ -215,9 +280,14 @@ def describe(
     }
     if form is Format.GNS_NPZ:
         shortest = min(frames for subset in shapes.values() for frames, _ in subset)
-        special: dict[str, object] = {"sequence_length": shortest, "dt": size.frame_interval}
+        special: dict[str, object] = {
+            "sequence_length": shortest,
+            "dt": size.frame_interval,
+        }
     else:
-        parameters = {name: parameter.value for name, parameter in size.parameters.items()}
+        parameters = {
+            name: parameter.value for name, parameter in size.parameters.items()
+        }
         frames_of = {subset: rows[0][0] for subset, rows in shapes.items()}
         special = {
             "case": size.split.upper(),
@@ -233,16 +303,26 @@ def describe(
             "artificial_alpha": 0.0,
             "free_slip": free_slip,
             "is_bc_trick": False,
-            # One less than frames: the last one is a target only, as in the data sets of that code base.
-            **{f"sequence_length_{subset}": frames_of[subset] - 1 for subset in ("train", "test")},
-            **{f"num_trajs_{subset}": len(shapes[subset]) for subset in ("train", "test")},
+            # One less than frames: the last one is a target only, as in the data sets
+            # of that code base.
+            **{
+                f"sequence_length_{subset}": frames_of[subset] - 1
+                for subset in ("train", "test")
+            },
+            **{
+                f"num_trajs_{subset}": len(shapes[subset])
+                for subset in ("train", "test")
+            },
             "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
             "periodic_boundary_conditions": [False, False],
         }
-        # Its cell lists start at 0 and are as long as the bounds are apart: particles beyond the
-        # difference would lose their neighbours.
+        # Its cell lists start at 0 and are as long as the bounds are apart: particles
+        # beyond the difference would lose their neighbours.
         if wall is not None:
-            special["bounds"] = [[0.0, h + wall - o] for (_, h), o in zip(size.bounds, origin, strict=True)]
+            special["bounds"] = [
+                [0.0, h + wall - o]
+                for (_, h), o in zip(size.bounds, origin, strict=True)
+            ]
         elif not from_walls:
             special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
     return {**common, **special, OWN_KEY: own}
@@ -251,44 +331,66 @@ def describe(
 def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
     """Write metadata.json whole or not at all; return its path."""
     path = folder / NAME
-    write_atomically(path, (json.dumps(metadata, indent=1) + "\n").encode(), option="--output")
+    write_atomically(
+        path, (json.dumps(metadata, indent=1) + "\n").encode(), option="--output"
+    )
     return path
 
 
 def read_source(folder: Path, form: Format) -> Source:
-    """Return what a metadata.json says; what is missing, no JSON or incomplete is an UnreadableFileError."""
+    """Return what a metadata.json says; what is missing, no JSON or incomplete is an
+    UnreadableFileError.
+    """
     path = folder / NAME
     where = str(path)
     try:
         with path.open("rb") as stream:
             text = stream.read(MAX_BYTES + 1)
         if len(text) > MAX_BYTES:
-            raise UnreadableFileError("the file is too large", where=where, expected=f"<= {MAX_BYTES} bytes")
+            raise UnreadableFileError(
+                "the file is too large", where=where, expected=f"<= {MAX_BYTES} bytes"
+            )
         values = json.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise UnreadableFileError(
             "cannot read the metadata", where=where, expected="a JSON object", got=error
         ) from error
     if not isinstance(values, dict):
-        raise UnreadableFileError("the metadata are no JSON object", where=where, got=type(values).__name__)
+        raise UnreadableFileError(
+            "the metadata are no JSON object", where=where, got=type(values).__name__
+        )
     # Newer GNS programs keep one block for training and one for rollouts.
     block = values.get("train")
-    values = block if isinstance(block, dict) else values
+    if isinstance(block, dict):
+        values = block
+    else:
+        values = values
     if values.get("dim", 2) != 2:
         raise UnreadableFileError(
-            "the data are not plane", where=f"{path}, key dim", expected=2, got=repr(values["dim"])
+            "the data are not plane",
+            where=f"{path}, key dim",
+            expected=2,
+            got=repr(values["dim"]),
         )
-    every = values.get("write_every", 1) if form is Format.LAGRANGEBENCH_H5 else 1
+    if form is Format.LAGRANGEBENCH_H5:
+        every = values.get("write_every", 1)
+    else:
+        every = 1
     try:
         step = TypeAdapter(float).validate_python(values.get("dt") or 0.0)
         steps = TypeAdapter(float).validate_python(every)
         return Source.model_validate(
             {
                 "bounds": values.get("bounds"),
-                "default_connectivity_radius": values.get("default_connectivity_radius"),
+                "default_connectivity_radius": values.get(
+                    "default_connectivity_radius"
+                ),
                 "dt": step * steps or None,
                 "dx": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
-                "periodic_boundary_conditions": values.get("periodic_boundary_conditions") or (False, False),
+                "periodic_boundary_conditions": values.get(
+                    "periodic_boundary_conditions"
+                )
+                or (False, False),
                 OWN_KEY: values.get(OWN_KEY) or {},
             }
         )

@@ -1,13 +1,16 @@
-"""Coarse solver: the same equations on the grid of the next smaller size, with its time step.
+"""Coarse solver: the same equations on the grid of the next smaller size, with its time
+step.
 
-What a surrogate must be compared with: accuracy against cost. It learns nothing either, but it
-knows the equations, the viscosity, the materials and the motion of the walls to the end. A seeded
-subset of the particles, as many as the smaller size has and as evenly spread as they are, carries
-the mass. In a full box the others move as those around them do (see :mod:`.floor`); on a free
-surface each keeps its offset to the nearest of its material that carries mass.
+What a surrogate must be compared with: accuracy against cost. It learns nothing either,
+but it knows the equations, the viscosity, the materials and the motion of the walls to
+the end. A seeded subset of the particles, as many as the smaller size has and as evenly
+spread as they are, carries the mass. In a full box the others move as those around them
+do (see :mod:`.floor`); on a free surface each keeps its offset to the nearest of its
+material that carries mass.
 
-The solver starts from displacements alone: in full boxes the velocity of the last given frame is
-extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall it is ``u(f) + g / 2``.
+The solver starts from displacements alone: in full boxes the velocity of the last given
+frame is extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall it is
+``u(f) + g / 2``.
 """
 
 from __future__ import annotations
@@ -27,21 +30,35 @@ from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mi
 
 if TYPE_CHECKING:
     from lagbench.generators.solver import Solver
-    from lagbench.generators.split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+    from lagbench.generators.split import (
+        ClosedBoxParameters,
+        FreeSurfaceParameters,
+        InitialState,
+    )
 
 NEXT = {"full": "mini", "mini": "tiny"}
 """The next smaller size of each size."""
 
-SPLITS = {"cavity": ("full",), "fluid": ("full", "mini"), "multimaterial": ("full", "mini")}
-"""Sizes that are solved; the effective viscosity of curl noise is its grid's, so it is not."""
+SPLITS = {
+    "cavity": ("full",),
+    "fluid": ("full", "mini"),
+    "multimaterial": ("full", "mini"),
+}
+"""Sizes that are solved; the effective viscosity of curl noise is its grid's, so it is
+not.
+"""
 
 
 def coarser(size: Size) -> Size | None:
-    """Return the size whose grid is used; None where a size is not solved or has no coarser grid."""
+    """Return the size whose grid is used; None where a size is not solved or has no
+    coarser grid.
+    """
     if size.name not in SPLITS.get(size.split, ()):
         return None
     found = load().size(size.split, NEXT[size.name])
-    return found if found.grid < size.grid else None
+    if found.grid < size.grid:
+        return found
+    return None
 
 
 def predict(given: Given) -> Prediction:
@@ -56,22 +73,27 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
     require("taichi", extra="generate")
     from lagbench.generators.constants import solver_constants
 
-    count, now = min(coarse.particles, len(given.last)), given.last.copy()
+    count = min(coarse.particles, len(given.last))
+    now = given.last.copy()
     carriers = spread_subset(now, given.material, count)
     others = np.setdiff1d(np.arange(len(now)), carriers)
     leader = _leaders(given, carriers, others)
-    offset, before = now[others] - now[carriers][leader], now[carriers]
+    offset = now[others] - now[carriers][leader]
+    before = now[carriers]
     solver = _solver(replace(solver_constants(coarse), particles=count))
     solver.load([_state(given, carriers)])
     for frame in given.predicted_frames:
         solver.advance(coarse.substeps_per_frame)
         after = solver.position()[0].astype(np.float64)
         if fills_box(given.size) and others.size:
-            field = linear_field(*mirrored(given, before, after - before, given.walls[frame]))
+            field = linear_field(
+                *mirrored(given, before, after - before, given.walls[frame])
+            )
             now[others] = now[others] + field(now[others])
         else:
             now[others] = after[leader] + offset
-        now[carriers], before = after, after
+        now[carriers] = after
+        before = after
         now = given.inside(now)
         yield now.astype("float32")
 
@@ -84,10 +106,14 @@ def _solver(constants: ClosedBoxParameters | FreeSurfaceParameters) -> Solver:
     return build(constants, threads=1)
 
 
-def spread_subset(position: Floats, material: NDArray[np.integer], count: int) -> NDArray[np.intp]:
-    """Return the numbers of particles spread evenly over each material: one, drawn, of each small group.
+def spread_subset(
+    position: Floats, material: NDArray[np.integer], count: int
+) -> NDArray[np.intp]:
+    """Return the numbers of particles spread evenly over each material: one, drawn, of
+    each small group.
 
-    Groups are neighbours in columns of nearly equal counts, as the lattices of full boxes are.
+    Groups are neighbours in columns of nearly equal counts, as the lattices of full
+    boxes are.
     """
     rank = np.empty(len(position), np.intp)
     for kind in np.unique(material):
@@ -98,17 +124,25 @@ def spread_subset(position: Floats, material: NDArray[np.integer], count: int) -
     order = np.lexsort((position[:, 1], rank, material))
     draws = np.random.Generator(np.random.PCG64(0)).random(count)
     groups = np.array_split(order, count)
-    return np.sort([group[int(u * len(group))] for u, group in zip(draws, groups, strict=True)])
+    return np.sort(
+        [group[int(u * len(group))] for u, group in zip(draws, groups, strict=True)]
+    )
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     from lagbench.generators.split import InitialState
 
-    interval, count = given.size.frame_interval, len(carriers)
+    interval = given.size.frame_interval
+    count = len(carriers)
     if fills_box(given.size):
-        velocity = (1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])) / interval
+        velocity = (
+            1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])
+        ) / interval
     else:
-        velocity = given.step / interval + [0.0, -0.5 * float(given.size.value("gravity")) * interval]
+        velocity = given.step / interval + [
+            0.0,
+            -0.5 * float(given.size.value("gravity")) * interval,
+        ]
     # row 0 of a program never acts: row 1 is on the way to the first predicted frame
     walls = given.walls[given.predicted_frames[0] - 1 :] / interval
     return InitialState(
@@ -123,22 +157,29 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     )
 
 
-def _leaders(given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return for each other particle the index of the nearest of its material that carries mass."""
+def _leaders(
+    given: Given, carriers: NDArray[np.intp], others: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """Return for each other particle the index of the nearest of its material that
+    carries mass.
+    """
     from scipy.spatial import KDTree
 
     leader = np.zeros(len(others), np.intp)
     for kind in np.unique(given.material[others]):
         pool = np.flatnonzero(given.material[carriers] == kind)
         led = np.flatnonzero(given.material[others] == kind)
-        leader[led] = pool[KDTree(given.last[carriers[pool]]).query(given.last[others[led]])[1]]
+        leader[led] = pool[
+            KDTree(given.last[carriers[pool]]).query(given.last[others[led]])[1]
+        ]
     return leader
 
 
 FLOOR = Floor(
     name="coarse-solver",
     title="Coarse solver",
-    definition="The solver itself on the grid of the next smaller size, with its time step: it knows the"
+    definition="The solver itself on the grid of the next smaller size, with its time "
+    "step: it knows the"
     " equations, the materials and what drives the flow.",
     applies=lambda size: coarser(size) is not None,
     predict=predict,

@@ -1,6 +1,7 @@
 """Extrapolations: every particle goes on by itself, and stops at the walls.
 
-With n given frames, u = x(n-1) - x(n-2) and g = -gravity * frame_interval^2, k frames on:
+With n given frames, u = x(n-1) - x(n-2) and g = -gravity * frame_interval^2, k frames
+on:
 
     persistence        x(n-1)
     constant velocity  x(n-1) + k u
@@ -30,9 +31,14 @@ def on_lines(given: Given) -> Prediction:
 
 def on_parabolas(given: Given) -> Prediction:
     """Yield positions on parabolas."""
-    g = np.array([0.0, -float(given.size.value("gravity"))]) * given.size.frame_interval**2
+    g = (
+        np.array([0.0, -float(given.size.value("gravity"))])
+        * given.size.frame_interval**2
+    )
     for k, _ in enumerate(given.predicted_frames, start=1):
-        yield given.inside(given.last + k * given.step + g * (k * (k + 1) / 2)).astype("float32")
+        yield given.inside(given.last + k * given.step + g * (k * (k + 1) / 2)).astype(
+            "float32"
+        )
 
 
 PERSISTENCE = Floor(
@@ -52,7 +58,8 @@ CONSTANT_VELOCITY = Floor(
 FREE_FLIGHT = Floor(
     name="free-flight",
     title="Free flight",
-    definition="Every particle falls freely from its last given velocity and stops at the walls.",
+    definition="Every particle falls freely from its last given velocity and stops at "
+    "the walls.",
     applies=lambda size: not fills_box(size) and "gravity" in size.parameters,
     predict=on_parabolas,
 )

@@ -1,10 +1,10 @@
 """A floor: what predicts without learning, and all that it may know of a test scenario.
 
-Some carry the particles of a full box by a velocity field that is known at scattered points.
-Between the points the field is linear on their Delaunay triangles. Beyond a wall stand mirror
-images of the points near it, so that the field meets the wall's condition half-way: where
-walls hold the fluid, the image of u is ``2 u_wall - u``; where they let it slide, its normal
-component is reversed.
+Some carry the particles of a full box by a velocity field that is known at scattered
+points. Between the points the field is linear on their Delaunay triangles. Beyond a
+wall stand mirror images of the points near it, so that the field meets the wall's
+condition half-way: where walls hold the fluid, the image of u is ``2 u_wall - u``;
+where they let it slide, its normal component is reversed.
 """
 
 from __future__ import annotations
@@ -36,17 +36,21 @@ DEPTH = 4.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Given:
-    """What is given of a test scenario: its first frames, its materials and what drives it."""
+    """What is given of a test scenario: its first frames, its materials and what drives
+    it.
+    """
 
     size: Size  # the split and size
     root: Path  # folder of all data sets: train may be looked at
     position: Floats  # the given frames [length], shape [frame, particle, 2]
     material: NDArray[np.int8]  # index into MATERIALS, shape [particle]
-    # velocity of each wall from frame f-1 to f, to the end of the horizon [length/frame],
-    # shape [frame, 4, 2]
+    # velocity of each wall from frame f-1 to f, to the end of the horizon
+    # [length/frame], shape [frame, 4, 2]
     walls: Floats
     area: float  # area that the particles cover at first [length^2]
-    parameters: Mapping[str, object]  # what the scenario's file states: viscosity, friction and the like
+    parameters: Mapping[
+        str, object
+    ]  # what the scenario's file states: viscosity, friction and the like
 
     @property
     def last(self) -> Floats:
@@ -84,7 +88,9 @@ class Floor:
     definition: str  # what it predicts, one sentence
     predict: Callable[[Given], Prediction]
     applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it
-    counts: bool = True  # whether it may be the best floor, which skill is measured against
+    counts: bool = (
+        True  # whether it may be the best floor, which skill is measured against
+    )
     reads_train: bool = False  # whether it looks at the scenarios of train
 
 
@@ -95,7 +101,8 @@ def fills_box(size: Size) -> bool:
 
 def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
     """Return what a scenario's file gives to a model."""
-    task, material = size.task, file.read("material")
+    task = size.task
+    material = file.read("material")
     mass = float(file.read("particle_mass")) * len(material)
     return Given(
         size=size,
@@ -109,7 +116,9 @@ def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
 
 
 def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:
-    """Return the velocity of each wall towards the first frames [length/frame], shape [frame, 4, 2]."""
+    """Return the velocity of each wall towards the first frames [length/frame], shape
+    [frame, 4, 2].
+    """
     if "wall_velocity" not in file.variables:
         return np.zeros((frames, len(WALLS), 2))
     speed = file.read("wall_velocity", slice(0, frames)).astype(np.float64)
@@ -117,7 +126,9 @@ def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:
 
 
 def linear_field(points: Floats, values: Floats) -> Field:
-    """Return the field that is linear between points, and beyond them that of the nearest one."""
+    """Return the field that is linear between points, and beyond them that of the
+    nearest one.
+    """
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import KDTree
 
@@ -133,17 +144,25 @@ def linear_field(points: Floats, values: Floats) -> Field:
     return field
 
 
-def mirrored(given: Given, points: Floats, values: Floats, walls: Floats) -> tuple[Floats, Floats]:
-    """Return points and velocities there, each [point, 2], with those that the walls reflect.
+def mirrored(
+    given: Given, points: Floats, values: Floats, walls: Floats
+) -> tuple[Floats, Floats]:
+    """Return points and velocities there, each [point, 2], with those that the walls
+    reflect.
 
-    ``walls`` are their velocities, left, right, bottom, top [length/frame], shape [4, 2].
+    ``walls`` are their velocities, left, right, bottom, top [length/frame], shape [4,
+    2].
     """
     (left, right), (bottom, top) = given.size.bounds
     depth = DEPTH * np.sqrt((right - left) * (top - bottom) / len(points))
-    places, speeds = [points], [values]
-    for motion, axis, where in zip(walls, (0, 0, 1, 1), (left, right, bottom, top), strict=True):
+    places = [points]
+    speeds = [values]
+    for motion, axis, where in zip(
+        walls, (0, 0, 1, 1), (left, right, bottom, top), strict=True
+    ):
         near = np.abs(points[:, axis] - where) < depth
-        image, speed = points[near].copy(), values[near].copy()
+        image = points[near].copy()
+        speed = values[near].copy()
         image[:, axis] = 2.0 * where - image[:, axis]
         if given.driven:
             speed = 2.0 * motion - speed

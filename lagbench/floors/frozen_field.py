@@ -4,9 +4,9 @@ With u the field of that frame, known at the middle of each particle's last step
 
     x(f+1) = x(f) + a^k u(x(f) + a^k u(x(f)) / 2),    k = f - n + 2 with n given frames,
 
-a midpoint step. a is 1 where walls drive the flow; elsewhere ``ln a`` is the slope of a line
-through the logarithms of the RMS speed of the given frames, at most 0. What is nearly steady
-needs no model: this floor tells.
+a midpoint step. a is 1 where walls drive the flow; elsewhere ``ln a`` is the slope of a
+line through the logarithms of the RMS speed of the given frames, at most 0. What is
+nearly steady needs no model: this floor tells.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mi
 
 
 def decay(position: Floats) -> float:
-    """Return the factor on the speed from frame to frame, fitted to given frames [1]."""
+    """Return the factor on the speed from frame to frame, fitted to given frames
+    [1].
+    """
     speed = np.sqrt(np.mean(np.diff(position, axis=0) ** 2, axis=(1, 2)))
     if len(speed) < 2 or not speed.all():
         return 1.0
@@ -30,7 +32,11 @@ def predict(given: Given) -> Prediction:
     middle = (given.position[-1] + given.position[-2]) / 2.0
     wall = given.walls[given.size.task.input_frames - 1]
     field = linear_field(*mirrored(given, middle, given.step, wall))
-    factor, rate = 1.0, 1.0 if given.driven else decay(given.position)
+    factor = 1.0
+    if given.driven:
+        rate = 1.0
+    else:
+        rate = decay(given.position)
     now = given.last
     for _ in given.predicted_frames:
         factor *= rate
@@ -42,7 +48,8 @@ def predict(given: Given) -> Prediction:
 FLOOR = Floor(
     name="frozen-field",
     title="Frozen field",
-    definition="The velocity field of the last given frame, held (in a box that nothing drives: decaying as"
+    definition="The velocity field of the last given frame, held (in a box that "
+    "nothing drives: decaying as"
     " the given frames do), carries the particles.",
     applies=fills_box,
     predict=predict,

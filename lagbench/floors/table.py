@@ -30,5 +30,7 @@ COUNTING = frozenset(name for name, floor in FLOORS.items() if floor.counts)
 
 
 def floors_of(size: Size) -> tuple[Floor, ...]:
-    """Return the floors of a split and size; a split of the user's own has those of its kind of box."""
+    """Return the floors of a split and size; a split of the user's own has those of its
+    kind of box.
+    """
     return tuple(floor for floor in FLOORS.values() if floor.applies(size))

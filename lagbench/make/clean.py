@@ -15,7 +15,12 @@ from lagbench.errors import WorkFailedError
 
 from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
 
-CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)  # what lagbench writes beside the subsets
+CARDS = (
+    MANIFEST_NAME,
+    CARD_NAME,
+    CROISSANT_NAME,
+    *PICTURES,
+)  # what lagbench writes beside the subsets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,23 +46,33 @@ def clean(
     Args:
         split: name of the split.
         size: name of the size; the only one that is there when None.
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
+            folder.
         leftovers: remove only temporary files of killed writers.
         dry_run: only say what would go; writes nothing, a lock neither.
         registry: where splits are described; ours when None.
 
     Raises:
         UsageError: unknown split or size.
-        WorkFailedError: another process writes the data set, or a file cannot be removed.
+        WorkFailedError: another process writes the data set, or a file cannot be
+            removed.
     """
     tier, home, _ = locate(split, size, root=root, registry=registry)
     folder = tier.folder(home)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
-    with nullcontext() if dry_run else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0):
+    with (
+        nullcontext()
+        if dry_run
+        else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0)
+    ):
         found = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
         if not leftovers:
-            ours = {folder / subset / f"{i:04d}.nc" for subset, ids in tier.subsets.items() for i in ids}
+            ours = {
+                folder / subset / f"{i:04d}.nc"
+                for subset, ids in tier.subsets.items()
+                for i in ids
+            }
             if tier.simulated:
                 ours |= {folder / name for name in CARDS}
             else:  # has no cards; its description says nothing without its data
@@ -71,14 +86,23 @@ def clean(
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
-                raise WorkFailedError("cannot remove a file", where=str(path), got=error.strerror) from error
+                raise WorkFailedError(
+                    "cannot remove a file", where=str(path), got=error.strerror
+                ) from error
         if not dry_run and not leftovers:
-            for name in (NOTES_NAME, LOCK_NAME):  # who waits for a lock that is gone takes a new one
+            for name in (
+                NOTES_NAME,
+                LOCK_NAME,
+            ):  # who waits for a lock that is gone takes a new one
                 (folder / name).unlink(missing_ok=True)
     if not dry_run and not leftovers:
         # Folders that hold nothing any more go too, up to the root folder; links stay.
         with suppress(OSError):  # somebody else was faster
-            for place in (*(child for child in folder.iterdir() if child.is_dir()), folder, *folder.parents):
+            for place in (
+                *(child for child in folder.iterdir() if child.is_dir()),
+                folder,
+                *folder.parents,
+            ):
                 if home in place.parents and not place.is_symlink():
                     with suppress(OSError):  # it holds something
                         place.rmdir()

@@ -1,11 +1,12 @@
 """Generate a data set: simulate what is missing, crash-safe, resumable, on all cores.
 
-A scenario's file appears whole or not at all, and the manifest is brought up to date after
-each, so that an interrupted generation goes on where it stopped and ends with the same bytes
-as an uninterrupted one.
+A scenario's file appears whole or not at all, and the manifest is brought up to date
+after each, so that an interrupted generation goes on where it stopped and ends with the
+same bytes as an uninterrupted one.
 
 The parent process plans, hands scenarios to workers and keeps the manifest; it never
-simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it along.
+simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it
+along.
 """
 
 from __future__ import annotations
@@ -35,7 +36,13 @@ from lagbench.data.registry import Registry, Size, Split, spell_ids
 from lagbench.data.statistics import file_moments, statistics
 from lagbench.errors import UsageError, check_installed, nearest
 from lagbench.generators.batch import SimulationJob
-from lagbench.generators.simulate import Pace, Simulated, simulate, twin_floors, twin_substeps
+from lagbench.generators.simulate import (
+    Pace,
+    Simulated,
+    simulate,
+    twin_floors,
+    twin_substeps,
+)
 from lagbench.generators.solver import Device
 from lagbench.store.copy import gather, gatherable
 from lagbench.store.publication import Publication, check_address, look_at, publication
@@ -47,12 +54,23 @@ from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
 from .inventory import compare, examine, look
-from .plan import Estimate, Scenarios, Selection, check_disk, estimate, free_bytes, note_pace, select
+from .plan import (
+    Estimate,
+    Scenarios,
+    Selection,
+    check_disk,
+    estimate,
+    free_bytes,
+    note_pace,
+    select,
+)
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-BATCH_PARTICLES = 1 << 19  # particles that a parallel device advances together at the most
+BATCH_PARTICLES = (
+    1 << 19
+)  # particles that a parallel device advances together at the most
 
 
 class Generation:
@@ -70,13 +88,22 @@ class Generation:
         scheduler: str | None = None,
         sources: Sequence[Path] = (),
     ) -> None:
-        self.size, self.root, self.device = size, root, device
+        self.size = size
+        self.root = root
+        self.device = device
         self.folder = size.folder(root)
-        self.workers, self.scheduler = workers, scheduler  # processes here, or a Dask scheduler's workers
+        self.workers = workers
+        self.scheduler = scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
-        self.store: Publication | None = None  # which the root folder is a working copy of; None if plain
-        self.manifest = merged(self.size, None)  # what the folder holds, as far as is known
-        self._hashed: list[FileEntry] = []  # files that were there and right, just hashed
+        self.store: Publication | None = (
+            None  # which the root folder is a working copy of; None if plain
+        )
+        self.manifest = merged(
+            self.size, None
+        )  # what the folder holds, as far as is known
+        self._hashed: list[
+            FileEntry
+        ] = []  # files that were there and right, just hashed
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -86,34 +113,60 @@ class Generation:
         self._paces: list[Pace] = []  # how fast scenarios were simulated here
 
     def survey(
-        self, wanted: Sequence[int], *, force: bool = False, gathered: Collection[int] | None = None
+        self,
+        wanted: Sequence[int],
+        *,
+        force: bool = False,
+        gathered: Collection[int] | None = None,
     ) -> None:
-        """Find out what is there and what is to do; with ``gathered``, what would be there, it only tells."""
+        """Find out what is there and what is to do; with ``gathered``, what would be
+        there, it only tells.
+        """
         old = read_or_empty(self.size, self.root)
-        held = self.store.held if self.store else {}
+        if self.store:
+            held = self.store.held
+        else:
+            held = {}
         local = [i for i in self.size.scenarios if i not in held]
-        # A file that came, went, or has another length than the manifest says is looked at too.
-        lengths = {i: path.stat().st_size for i in local if (path := self._path(i)).exists()}
+        # A file that came, went, or has another length than the manifest says is looked
+        # at too.
+        lengths = {
+            i: path.stat().st_size for i in local if (path := self._path(i)).exists()
+        }
         stated = {entry.scenario: entry.bytes for entry in old.files}
         suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
         self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        quick = partial(examine, self.root, self.size, quick=True, trusting=gathered is not None)
-        looks = {f"scenario {i}": partial(quick, i, manifest=old.only(i)) for i in suspects}
+        quick = partial(
+            examine, self.root, self.size, quick=True, trusting=gathered is not None
+        )
+        looks = {
+            f"scenario {i}": partial(quick, i, manifest=old.only(i)) for i in suspects
+        }
         findings = self._read(look, looks, map(self._path, suspects))
         self._hashed = [finding.entry for finding in findings if finding.entry]
         bad = set(suspects) - {entry.scenario for entry in self._hashed}
         kept = tuple(e for e in old.files if e.scenario not in bad)
         there = [*self._hashed, *held.values()]
         self.manifest = merged(self.size, old.model_copy(update={"files": kept}), there)
-        self.kept = [i for i in wanted if (i not in bad or i in (gathered or ())) and not force]
+        self.kept = [
+            i for i in wanted if (i not in bad or i in (gathered or ())) and not force
+        ]
         on_cores = self.device is Device.CPU and self.scheduler is None
-        self.to_do = estimate(self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores)
+        self.to_do = estimate(
+            self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores
+        )
 
     def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
-        """Simulate what is missing or wrong; write the manifest, compare, write cards."""
+        """Simulate what is missing or wrong; write the manifest, compare, write
+        cards.
+        """
         remove_leftovers(self.folder)
         for source in self.sources:
-            self._keep(gather(self.size, self.root, source, read_or_empty(self.size, self.root)))
+            self._keep(
+                gather(
+                    self.size, self.root, source, read_or_empty(self.size, self.root)
+                )
+            )
         self.survey(wanted, force=force)
         note_entries(self.folder, self._hashed)
         check_disk(self.root, self.to_do.bytes)
@@ -124,9 +177,15 @@ class Generation:
             # The workers are gone by now; what they had not finished goes too.
             remove_leftovers(self.folder)
         note_pace(self.size, self._paces)
-        manifest, train, measured = self.manifest, self.size.subsets["train"], self.size.measured
+        manifest = self.manifest
+        train = self.size.subsets["train"]
+        measured = self.size.measured
         # Statistics of other bits differ from datasets.yaml by right.
-        doubted = measured and manifest.identity == "bitwise" and manifest.statistics != measured.statistics
+        doubted = (
+            measured
+            and manifest.identity == "bitwise"
+            and manifest.statistics != measured.statistics
+        )
         if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
             self._bring(train)
             self._meter.begin("statistics", total=len(train), scenarios=len(train))
@@ -145,66 +204,124 @@ class Generation:
             self.store.finish(self.manifest, cards)
 
     def _read(
-        self, function: Callable[[Job, Report], Result], jobs: Mapping[str, Job], files: Iterable[Path]
+        self,
+        function: Callable[[Job, Report], Result],
+        jobs: Mapping[str, Job],
+        files: Iterable[Path],
     ) -> list[Result]:
-        """Run a function that reads files, here or by the workers; the meter counts files."""
+        """Run a function that reads files, here or by the workers; the meter counts
+        files.
+        """
 
         def count(done: int) -> None:
             self._meter.count(done, scenarios=done)
 
-        return read_many(function, jobs, files, count, workers=self.workers, scheduler=self.scheduler)
+        return read_many(
+            function, jobs, files, count, workers=self.workers, scheduler=self.scheduler
+        )
 
     def _path(self, scenario: int) -> Path:
         return self.size.path(self.root, scenario)
 
     def _simulate(self) -> None:
         """Run everything that is to do in workers, and the twins of test scenarios."""
-        with_twin = {entry.scenario for entry in self.manifest.files if entry.twin_floor}
+        with_twin = {
+            entry.scenario for entry in self.manifest.files if entry.twin_floor
+        }
         tested = self.size.subsets.get("test", ())
         twins = [i for i in self.kept if i in tested and i not in with_twin]
         self._bring(twins)
         costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
         # Scenarios of similar length share a batch.
         longest_first = sorted(costs, key=lambda i: (-costs[i], i))
-        width = 1 if self.device is Device.CPU else max(1, BATCH_PARTICLES // self.size.particles)
-        batches = [tuple(longest_first[k : k + width]) for k in range(0, len(longest_first), width)]
+        if self.device is Device.CPU:
+            width = 1
+        else:
+            width = max(1, BATCH_PARTICLES // self.size.particles)
+        batches = [
+            tuple(longest_first[k : k + width])
+            for k in range(0, len(longest_first), width)
+        ]
         tasks = [
-            self._task(f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids))
+            self._task(
+                f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids)
+            )
             for ids in batches
         ]
         tasks += map(self._twin, twins)
         if not tasks:
             return
         total = round(sum(task.cost for task in tasks))
-        total += sum(twin_substeps(self.size, i) for i in self.to_do.scenarios if i in tested)
-        self._meter.begin("simulating", total=total, scenarios=len(self.to_do.scenarios))
-        environment = ONE_THREAD if self.device is Device.CPU else {}
+        total += sum(
+            twin_substeps(self.size, i) for i in self.to_do.scenarios if i in tested
+        )
+        self._meter.begin(
+            "simulating", total=total, scenarios=len(self.to_do.scenarios)
+        )
+        if self.device is Device.CPU:
+            environment = ONE_THREAD
+        else:
+            environment = {}
         here = Pool(min(self.workers, len(tasks)), environment)
-        with here if self.scheduler is None else Cluster(self.scheduler, folder=self.folder) as team:
+        with (
+            here
+            if self.scheduler is None
+            else Cluster(self.scheduler, folder=self.folder) as team
+        ):
             for task in tasks:
                 team.submit(task)
             for event in team.events():
                 if event.kind != "done":  # it went on, or is lost
-                    self._meter.count(event.value if event.kind == "progress" else -event.value)
+                    self._meter.count(
+                        event.value if event.kind == "progress" else -event.value
+                    )
                 elif event.task.function is simulate:
-                    self._take(event.value, team, event.machine or environment_of(self.device))
+                    self._take(
+                        event.value, team, event.machine or environment_of(self.device)
+                    )
                 else:
-                    floors = {i: tuple(map(round_digits, floor)) for i, floor in event.value.items()}
-                    files = [entry for entry in self.manifest.files if entry.scenario in floors]
-                    files = [e.model_copy(update={"twin_floor": floors[e.scenario]}) for e in files]
+                    floors = {
+                        i: tuple(map(round_digits, floor))
+                        for i, floor in event.value.items()
+                    }
+                    files = [
+                        entry
+                        for entry in self.manifest.files
+                        if entry.scenario in floors
+                    ]
+                    files = [
+                        e.model_copy(update={"twin_floor": floors[e.scenario]})
+                        for e in files
+                    ]
                     self._keep(merged(self.size, self.manifest, files))
 
-    def _task(self, what: str, function: Callable[..., Any], scenarios: tuple[int, ...], cost: float) -> Task:
-        job = SimulationJob(size=self.size, scenarios=scenarios, root=self.root, device=self.device)
+    def _task(
+        self,
+        what: str,
+        function: Callable[..., Any],
+        scenarios: tuple[int, ...],
+        cost: float,
+    ) -> Task:
+        job = SimulationJob(
+            size=self.size, scenarios=scenarios, root=self.root, device=self.device
+        )
         name = f"{self.size.split} {self.size.name}, {what}"
         return Task(name=name, function=function, arguments=(job,), cost=cost)
 
     def _twin(self, scenario: int) -> Task:
-        what, cost = f"twin of scenario {scenario}", twin_substeps(self.size, scenario)
+        what = f"twin of scenario {scenario}"
+        cost = twin_substeps(self.size, scenario)
         return self._task(what, twin_floors, (scenario,), cost)
 
-    def _take(self, outcomes: Sequence[Simulated], team: Pool | Cluster, machine: Mapping[str, str]) -> None:
-        """Note simulated scenarios whose files are there, and send the twins of those of test after them."""
+    def _take(
+        self,
+        outcomes: Sequence[Simulated],
+        team: Pool | Cluster,
+        machine: Mapping[str, str],
+    ) -> None:
+        """Note simulated scenarios whose files are there, and send the twins of those
+        of test after them.
+        """
         environment = {**machine, "device": self.device.value}
         if promises_bits(environment):
             self._promised += [outcome.scenario for outcome in outcomes]
@@ -212,7 +329,10 @@ class Generation:
             self._paces += [outcome.pace for outcome in outcomes if outcome.pace]
         for outcome in outcomes:
             await_file(self._path(outcome.scenario))
-        entries = [describe_file(self.root, self.size.key(outcome.scenario)) for outcome in outcomes]
+        entries = [
+            describe_file(self.root, self.size.key(outcome.scenario))
+            for outcome in outcomes
+        ]
         note_entries(self.folder, entries)
         self._keep(merged(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
@@ -245,7 +365,9 @@ class GenerationResult:
     device: str  # where the solver ran
     workers: int  # worker processes
     simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
-    kept: tuple[int, ...]  # ids whose files were there and right (dry run: or would be gathered)
+    kept: tuple[
+        int, ...
+    ]  # ids whose files were there and right (dry run: or would be gathered)
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]
@@ -275,20 +397,21 @@ def generate(
     on_wait: Callable[[str], None] | None = None,
     registry: Registry | None = None,
 ) -> GenerationResult:
-    """Simulate the scenarios of a split that are not on disk yet, and check their hashes.
+    """Simulate the scenarios of a split that are not on disk yet, and check their
+    hashes.
 
     Args:
         split: name of the split.
         size: name of the size; mini when None, or the only one that the split has.
         subset: some subsets only.
         scenarios: some ids only, as numbers or as text such as "0,3-5".
-        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data folder. With a
-            URL (``s3://bucket/prefix``) files are written to its working copy and put into the
-            store, see docs/scaling.md.
+        root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
+            folder. With a URL (``s3://bucket/prefix``) files are written to its working
+            copy and put into the store, see docs/scaling.md.
         workers: worker processes; one per core, or one for the parallel devices.
         device: "cpu", "parallel" or "cuda"; the bits do not depend on it.
-        scheduler: address of a Dask scheduler whose workers simulate instead; they must see
-            the root folder under the same path.
+        scheduler: address of a Dask scheduler whose workers simulate instead; they must
+            see the root folder under the same path.
         gather: other root folders, from which finished scenarios are taken first.
         force: simulate anew what is there and right.
         dry_run: only say what it would take.
@@ -297,11 +420,14 @@ def generate(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split, size, subset, scenario or device, fewer than one worker, or
-            Taichi is not installed; or nothing can be gathered from a folder.
-        WorkFailedError: disk full or not writable, a scenario blew up, workers keep dying, the
-            cluster is lost or does not see the root folder; or the store refuses or does not answer.
-        DataError: the result has other hashes than datasets.yaml, or there is no such bucket.
+        UsageError: unknown split, size, subset, scenario or device, fewer than one
+            worker, or Taichi is not installed; or nothing can be gathered from a
+            folder.
+        WorkFailedError: disk full or not writable, a scenario blew up, workers keep
+            dying, the cluster is lost or does not see the root folder; or the store
+            refuses or does not answer.
+        DataError: the result has other hashes than datasets.yaml, or there is no such
+            bucket.
     """
     started = time.monotonic()
     check_address(root)
@@ -309,7 +435,9 @@ def generate(
     wanted = select(tier, subset=subset, scenarios=scenarios)
     devices = [known.value for known in Device]
     if device not in devices:
-        raise UsageError(f"no device {device!r}", where="--device", fix=nearest(device, devices))
+        raise UsageError(
+            f"no device {device!r}", where="--device", fix=nearest(device, devices)
+        )
     target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
     free = free_bytes(tier.folder(folder))
@@ -325,7 +453,9 @@ def generate(
     )
     if dry_run:
         generation.store = look_at(tier, folder)
-        there = {i for source in generation.sources for i in gatherable(tier, folder, source)}
+        there = {
+            i for source in generation.sources for i in gatherable(tier, folder, source)
+        }
         generation.survey(wanted, force=force, gathered=there)
     else:
         if scheduler is None:
@@ -346,7 +476,11 @@ def generate(
         workers=cores,
         simulated=generation.to_do.scenarios,
         kept=tuple(generation.kept),
-        missing=tuple(i for i in tier.scenarios if not manifest.entry(i) and i not in generation.kept),
+        missing=tuple(
+            i
+            for i in tier.scenarios
+            if not manifest.entry(i) and i not in generation.kept
+        ),
         bytes_needed=generation.to_do.bytes,
         bytes_free=free,
         seconds_expected=generation.to_do.seconds(cores),

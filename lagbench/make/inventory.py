@@ -1,9 +1,10 @@
-"""What a size of a split costs, which scenarios are on disk, and whether they are right, hash by hash.
+"""What a size of a split costs, which scenarios are on disk, and whether they are
+right, hash by hash.
 
-Right means: the file says what it is in the place where it stands, its parameters are those
-of the registry, its values have the hash that it states, and that hash is the one in
-datasets.yaml; where there is none yet, the one in the manifest. A file of a machine that
-promises no equal bits may differ from datasets.yaml, but not from its manifest.
+Right means: the file says what it is in the place where it stands, its parameters are
+those of the registry, its values have the hash that it states, and that hash is the one
+in datasets.yaml; where there is none yet, the one in the manifest. A file of a machine
+that promises no equal bits may differ from datasets.yaml, but not from its manifest.
 """
 
 from __future__ import annotations
@@ -47,11 +48,12 @@ class Overview:
     particles: int  # particles in one scenario
     frames: int  # recorded frames of all scenarios
     bytes: int  # disk space before compression [bytes]
-    # time to generate on all cores of this machine [s], for orientation; 0 for what cannot be simulated
+    # time to generate on all cores of this machine [s], for orientation; 0 for what
+    # cannot be simulated
     seconds: float
     measured: bool  # whether that is at a rate that this machine has measured
-    # scenario files that are there, by subset; 'lagbench verify' checks them. Of a store
-    # what its manifest names.
+    # scenario files that are there, by subset; 'lagbench verify' checks them. Of a
+    # store what its manifest names.
     present: dict[str, int]
     folder: Path  # where they are, or would be
     picture: Path | None  # picture of the data set once it is generated
@@ -60,24 +62,37 @@ class Overview:
     @property
     def state(self) -> str:
         """Whether it is on this machine: "yes", "no" or how much of it."""
-        there, wanted = sum(self.present.values()), sum(self.scenarios.values())
+        there = sum(self.present.values())
+        wanted = sum(self.scenarios.values())
         if there == wanted:
             return "yes"
-        return f"{there} of {wanted}" if there else "no"
+        if there:
+            return f"{there} of {wanted}"
+        return "no"
 
 
 def overview(size: Size, root: Path) -> Overview:
-    """Return what a size is, costs, and has below a root folder or in its store, read from names alone."""
+    """Return what a size is, costs, and has below a root folder or in its store, read
+    from names alone.
+    """
     folder = size.folder(root)
-    ids, url = size.scenarios, url_of(root)
-    expected = estimate(size, ids, drawn=2) if size.simulated else None  # to draw all would take seconds
+    ids = size.scenarios
+    url = url_of(root)
+    expected = (
+        estimate(size, ids, drawn=2) if size.simulated else None
+    )  # to draw all would take seconds
     if url is None:
         there = {i for i in ids if size.path(root, i).is_file()}
     else:
-        from lagbench.store.copy import remote_manifest  # what a store takes is not loaded for a folder
+        from lagbench.store.copy import (
+            remote_manifest,
+        )  # what a store takes is not loaded for a folder
 
         found = remote_manifest(size, url)
-        there = {entry.scenario for entry in found.files} if found else set()
+        if found:
+            there = {entry.scenario for entry in found.files}
+        else:
+            there = set()
     return Overview(
         split=size.split,
         size=size.name,
@@ -90,7 +105,9 @@ def overview(size: Size, root: Path) -> Overview:
         measured=expected is not None and expected.measured,
         present={subset: len(there & {*ids}) for subset, ids in size.subsets.items()},
         folder=folder,
-        picture=next((folder / name for name in PICTURES if (folder / name).is_file()), None),
+        picture=next(
+            (folder / name for name in PICTURES if (folder / name).is_file()), None
+        ),
         dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
     )
 
@@ -102,14 +119,20 @@ class Finding:
     scenario: int  # its id
     state: State  # whether the file is there and right
     content_sha256: str | None = None  # content hash of a good file
-    problem: str | None = None  # what is wrong, naming file and, where it can be told, variable
-    entry: FileEntry | None = None  # manifest entry of a good file, where one was asked for
+    problem: str | None = (
+        None  # what is wrong, naming file and, where it can be told, variable
+    )
+    entry: FileEntry | None = (
+        None  # manifest entry of a good file, where one was asked for
+    )
     tolerated: bool = False  # whether a good file has other bits than datasets.yaml
 
 
 def recorded_hash(size: Size, scenario: int) -> str | None:
     """Return the first 16 digits of a content hash as they are recorded, or None."""
-    return size.measured.scenario_sha256.get(scenario) if size.measured else None
+    if size.measured:
+        return size.measured.scenario_sha256.get(scenario)
+    return None
 
 
 def examine(
@@ -121,15 +144,25 @@ def examine(
     quick: bool = False,
     trusting: bool = False,
 ) -> Finding:
-    """Look at a file; ``quick`` asks for an entry and takes hashes of before, ``trusting`` the manifest's."""
+    """Look at a file; ``quick`` asks for an entry and takes hashes of before,
+    ``trusting`` the manifest's.
+    """
     key = size.key(scenario)
     path = scenario_path(root, key)
     if not path.exists():
         return Finding(scenario=scenario, state=State.MISSING)
-    claim, recorded = manifest.entry(scenario) if manifest else None, recorded_hash(size, scenario)
+    if manifest:
+        claim = manifest.entry(scenario)
+    else:
+        claim = None
+    recorded = recorded_hash(size, scenario)
     try:
-        # A manifest is the word of whoever wrote it: only what was hashed here is not hashed again.
-        noted = noted_hashes(size.folder(root))(path) if quick else None
+        # A manifest is the word of whoever wrote it: only what was hashed here is not
+        # hashed again.
+        if quick:
+            noted = noted_hashes(size.folder(root))(path)
+        else:
+            noted = None
         # Before the values: a file that changes meanwhile then fits no note.
         digest = noted[1] if noted else file_sha256(path) if quick else None
         if trusting and claim is not None and digest == claim.file_sha256:
@@ -138,8 +171,14 @@ def examine(
             _check_header(path, file.header, size, scenario)
             if noted:
                 file.check_attributes()
-        content = noted[0] if noted else check_scenario(path)
-        unchanged = claim is not None and (digest, content) == (claim.file_sha256, claim.content_sha256)
+        if noted:
+            content = noted[0]
+        else:
+            content = check_scenario(path)
+        unchanged = claim is not None and (digest, content) == (
+            claim.file_sha256,
+            claim.content_sha256,
+        )
         expected = recorded or (claim.content_sha256 if claim else None)
         differs = expected is not None and not content.startswith(expected)
         if differs and not (
@@ -152,18 +191,27 @@ def examine(
             raise DataError(
                 "the file has another content hash",
                 where=str(path),
-                expected=f"{expected} of {record_of(size) if recorded else 'the manifest'}",
+                expected=f"{expected} of "
+                f"{record_of(size) if recorded else 'the manifest'}",
                 got=content,
             )
         entry = claim
         if digest and not unchanged:
             entry = describe_file(root, key, digest=digest)
-            if claim is not None and claim.content_sha256 == content:  # packed anew, or by an earlier version
+            if (
+                claim is not None and claim.content_sha256 == content
+            ):  # packed anew, or by an earlier version
                 facts = entry.facts or claim.facts
-                entry = entry.model_copy(update={"facts": facts, "twin_floor": claim.twin_floor})
+                entry = entry.model_copy(
+                    update={"facts": facts, "twin_floor": claim.twin_floor}
+                )
     except DataError as error:
         # How to mend it depends on the split, and is said once for all files.
-        problem = str(DataError(error.what, where=error.where, expected=error.expected, got=error.got))
+        problem = str(
+            DataError(
+                error.what, where=error.where, expected=error.expected, got=error.got
+            )
+        )
         return Finding(scenario=scenario, state=State.WRONG, problem=problem)
     except OSError as error:
         problem = f"cannot read {path}: {error.strerror}"
@@ -187,7 +235,9 @@ def look(examined: Callable[[], Finding], report: Callable[[int], None]) -> Find
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
     """Return, by subset folder, the names of files that no scenario of the size has."""
     folder = size.folder(root)
-    known = {(subset, f"{i:04d}.nc") for subset, ids in size.subsets.items() for i in ids}
+    known = {
+        (subset, f"{i:04d}.nc") for subset, ids in size.subsets.items() for i in ids
+    }
     extra: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*/*.nc")):
         if (path.parent.name, path.name) not in known and not path.name.startswith("."):
@@ -195,20 +245,33 @@ def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
     return extra
 
 
-def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int) -> None:
+def _check_header(
+    path: Path, header: ScenarioHeader, size: Size, scenario: int
+) -> None:
     """Refuse a file of another scenario or simulated with other parameters."""
     key = header.key
     found = (key.split, key.size, key.major, key.scenario, key.subset)
     wanted = (size.split, size.name, size.major, scenario, size.subset_of(scenario))
     if found != wanted:
-        raise DataError("a file holds another scenario", where=str(path), expected=wanted, got=found)
+        raise DataError(
+            "a file holds another scenario", where=str(path), expected=wanted, got=found
+        )
     if not size.simulated:  # then the recorded content hash covers the parameters
         return
-    parameters = {name: plain(value) for name, value in file_parameters(size, draw(size, scenario)).items()}
+    parameters = {
+        name: plain(value)
+        for name, value in file_parameters(size, draw(size, scenario)).items()
+    }
     # What only the simulation tells is covered by the content hash.
-    stated = {name: value for name, value in header.parameters.items() if name not in OUTCOMES}
+    stated = {
+        name: value for name, value in header.parameters.items() if name not in OUTCOMES
+    }
     if parameters != stated:
-        names = sorted(n for n in parameters.keys() | stated.keys() if parameters.get(n) != stated.get(n))
+        names = sorted(
+            n
+            for n in parameters.keys() | stated.keys()
+            if parameters.get(n) != stated.get(n)
+        )
         raise DataError(
             "a file was simulated with other parameters",
             where=f"{path}, attributes {', '.join(names)}",
@@ -218,22 +281,35 @@ def _check_header(path: Path, header: ScenarioHeader, size: Size, scenario: int)
 
 def record_of(size: Size) -> str:
     """Return the name of the file that records the hashes of a split."""
-    return "datasets.yaml" if size.simulated else DESCRIPTION
+    if size.simulated:
+        return "datasets.yaml"
+    return DESCRIPTION
 
 
 def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -> str:
     """Return how the hashes of a manifest compare with datasets.yaml, in words."""
-    measured, record = size.measured, record_of(size)
+    measured = size.measured
+    record = record_of(size)
     if measured is None:
         return f"{record} holds no hash of this size yet: nothing to compare with"
     recorded = measured.scenario_sha256
-    differing = [e.scenario for e in manifest.files if not e.has_hash(recorded.get(e.scenario))]
-    tolerated = {e.scenario for e in manifest.files if may_differ(e.device, manifest.environments)}
+    differing = [
+        e.scenario for e in manifest.files if not e.has_hash(recorded.get(e.scenario))
+    ]
+    tolerated = {
+        e.scenario
+        for e in manifest.files
+        if may_differ(e.device, manifest.environments)
+    }
     tolerated -= set(promised)
     broken = [i for i in differing if i not in tolerated]
     found = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
     wanted = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
-    others = [name for name, digest in found.items() if digest is not None and digest != wanted.get(name)]
+    others = [
+        name
+        for name, digest in found.items()
+        if digest is not None and digest != wanted.get(name)
+    ]
     if broken:
         what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
         others = [f"scenarios {spell_ids(broken)}"]
@@ -242,7 +318,9 @@ def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -
     elif others:
         what = "subsets or the data set have another hash though every scenario has its own"
     else:
-        return f"equal to {record}" if manifest.complete else f"what is there is equal to {record}"
+        if manifest.complete:
+            return f"equal to {record}"
+        return f"what is there is equal to {record}"
     raise DataError(
         what,
         where=f"{size.split} {size.name}, {', '.join(others)}",
@@ -261,14 +339,22 @@ def other_bits(size: Size) -> str:
     return f"other bits than {record_of(size)} (identity: tolerance)"
 
 
-def hash_verdict(size: Size, computed: str | None, subset: str | None = None, *, tolerated: bool) -> str:
-    """Return how the hash of a subset, else of the data set, compares with the recorded one, in words."""
+def hash_verdict(
+    size: Size, computed: str | None, subset: str | None = None, *, tolerated: bool
+) -> str:
+    """Return how the hash of a subset, else of the data set, compares with the recorded
+    one, in words.
+    """
     known = size.measured
-    recorded = known and (known.subset_sha256.get(subset) if subset else known.dataset_sha256)
+    recorded = known and (
+        known.subset_sha256.get(subset) if subset else known.dataset_sha256
+    )
     if recorded is None:
         return f"no hash in {record_of(size)} yet"
     if computed is None:
         return "incomplete"
     if computed == recorded:
         return f"equal to {record_of(size)}"
-    return other_bits(size) if tolerated else unlike(size)
+    if tolerated:
+        return other_bits(size)
+    return unlike(size)

@@ -1,7 +1,8 @@
 """Metrics of particle rollouts: statistics per frame, then aggregates.
 
-A statistic is a pure function of a :class:`FramePair`; tallies of statistics add; scores are
-functions of their series over frames. :data:`METRICS` holds name, unit and direction of all.
+A statistic is a pure function of a :class:`FramePair`; tallies of statistics add;
+scores are functions of their series over frames. :data:`METRICS` holds name, unit and
+direction of all.
 """
 
 from __future__ import annotations
@@ -19,8 +20,24 @@ from .aggregate import (
     tally,
 )
 from .frame import FramePair, Scenario, Setting, Snapshot, snapshots
-from .metric import Direction, Metric, always, at_slow_frames, enough_nodes, mean, metric
-from .significance import Comparison, Standing, compare, differ, holm, sign_flip_p, standings
+from .metric import (
+    Direction,
+    Metric,
+    always,
+    at_slow_frames,
+    enough_nodes,
+    mean,
+    metric,
+)
+from .significance import (
+    Comparison,
+    Standing,
+    compare,
+    differ,
+    holm,
+    sign_flip_p,
+    standings,
+)
 from .table import CHOSEN, FAMILIES, METRICS, available, select
 
 __all__ = [

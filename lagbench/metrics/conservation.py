@@ -1,10 +1,10 @@
 """What a flow keeps: energy, momentum, density, and its place between the walls.
 
-A surrogate that damps loses energy, one that blows up gains it; more energy than the truth is
-no merit, so the ratio aims at 1 and the error counts both ways. Errors of momentum are scaled
-by the truth's sum of magnitudes, which does not vanish where the momenta of a closed flow
-cancel; where the truth comes to rest the scales have a floor. All particles of a scenario have
-one mass; it cancels, and momenta are told over it.
+A surrogate that damps loses energy, one that blows up gains it; more energy than the
+truth is no merit, so the ratio aims at 1 and the error counts both ways. Errors of
+momentum are scaled by the truth's sum of magnitudes, which does not vanish where the
+momenta of a closed flow cancel; where the truth comes to rest the scales have a floor.
+All particles of a scenario have one mass; it cancels, and momenta are told over it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,20 @@ import numpy as np
 from lagbench.data.grid import divergence
 
 from .frame import Floats, FramePair, Snapshot, dot, lengths, mean_squared_error
-from .metric import Direction, enough_nodes, floored_quotient, metric, metrics_of, quotient, total
+from .metric import (
+    Direction,
+    enough_nodes,
+    floored_quotient,
+    metric,
+    metrics_of,
+    quotient,
+    total,
+)
 from .metric import root_mean_square as over_frames_rms
 
 MOVING = 0.01
-"""Share of the truth's greatest kinetic energy from which on a frame counts as moving."""
+"""Share of the truth's greatest kinetic energy from which on a frame counts as moving.
+"""
 
 
 ENERGIES = ("energy_predicted", "energy_true")
@@ -46,12 +55,15 @@ def energy_predicted(pair: FramePair) -> float:
     return kinetic_energy(pair.prediction, pair.scenario.particle_mass)
 
 
-@metric(unit="1", direction=Direction.TARGET, perfect=1.0, source="Eq. 5.11", of=ENERGIES)
+@metric(
+    unit="1", direction=Direction.TARGET, perfect=1.0, source="Eq. 5.11", of=ENERGIES
+)
 def energy_ratio(predicted: Floats, true: Floats) -> Floats:
     """Predicted over true kinetic energy where the truth has 1 % of its peak.
 
-    Undefined in other frames: beside a truth at rest any motion is a ratio without bounds, and one
-    such frame, before a dam breaks or after all has settled, would be the mean.
+    Undefined in other frames: beside a truth at rest any motion is a ratio without
+    bounds, and one such frame, before a dam breaks or after all has settled, would be
+    the mean.
     """
     peak = np.max(true, initial=0.0, where=~np.isnan(true))
     return quotient(predicted, np.where(true >= MOVING * peak, true, 0.0))
@@ -72,14 +84,17 @@ def energy_retention_true(pair: FramePair) -> float:
 def _retained(pair: FramePair, snapshot: Snapshot) -> float:
     mass = pair.scenario.particle_mass
     given = kinetic_energy(pair.scenario.last_given, mass)
-    return kinetic_energy(snapshot, mass) / given if given > 0.0 else math.nan
+    if given > 0.0:
+        return kinetic_energy(snapshot, mass) / given
+    return math.nan
 
 
 @_error(source="design section 8", of=ENERGIES)
 def energy_error(predicted: Floats, true: Floats) -> Floats:
     """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
 
-    NaN where the truth rests in all frames. It forgives a flow that is wrong but as fast.
+    NaN where the truth rests in all frames. It forgives a flow that is wrong but as
+    fast.
     """
     return floored_quotient(np.abs(predicted - true), true)
 
@@ -96,8 +111,11 @@ def momentum(snapshot: Snapshot) -> Floats:
 
 
 def angular_momentum(snapshot: Snapshot) -> float:
-    """Return ``sum(r x u)`` about the box centre (Eq. 5.1), over the particle mass [length^2/frame]."""
-    r, u = snapshot.arms, snapshot.velocity
+    """Return ``sum(r x u)`` about the box centre (Eq. 5.1), over the particle mass
+    [length^2/frame].
+    """
+    r = snapshot.arms
+    u = snapshot.velocity
     return dot(r[:, 0], u[:, 1]) - dot(r[:, 1], u[:, 0])
 
 
@@ -132,7 +150,9 @@ def angular_momentum_scale(pair: FramePair) -> float:
     return dot(lengths(pair.truth.arms), pair.truth.speeds)
 
 
-@_error(source="section 5.2, Eq. 5.1", of=("angular_momentum_gap", "angular_momentum_scale"))
+@_error(
+    source="section 5.2, Eq. 5.1", of=("angular_momentum_gap", "angular_momentum_scale")
+)
 def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
     return floored_quotient(gap, scale)
@@ -142,10 +162,13 @@ def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
 def density_rmse(pair: FramePair) -> float:
     """Root mean squared error of density relative to rest, over all nodes.
 
-    All nodes of the grid, so that material in the wrong place shows both where it is missing
-    and where it should not be. 0 is perfect; values of a box that is filled in part are small.
+    All nodes of the grid, so that material in the wrong place shows both where it is
+    missing and where it should not be. 0 is perfect; values of a box that is filled in
+    part are small.
     """
-    return math.sqrt(mean_squared_error(pair.prediction.fields.density - pair.truth.fields.density))
+    return math.sqrt(
+        mean_squared_error(pair.prediction.fields.density - pair.truth.fields.density)
+    )
 
 
 @metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
@@ -162,7 +185,9 @@ def divergence_rms_true(pair: FramePair) -> float:
 
 def _divergence(pair: FramePair, snapshot: Snapshot) -> float:
     spacing = pair.scenario.setting.grid.spacing
-    return math.sqrt(mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes]))
+    return math.sqrt(
+        mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes])
+    )
 
 
 @_error(unit="%", source="design 2, section 4")

@@ -1,9 +1,10 @@
 """Distances between distributions of vorticity, and of energy over scales.
 
-Per node (Eqs. 5.23-5.25) the magnitudes are read as a distribution over the box: where the
-rotation is. The histogram form and Wasserstein-1 compare how much rotation there is,
-wherever it stands: a mirrored flow is perfect there. A divergence is undefined where the true
-vorticity is nothing but rounding; Wasserstein-1, an error in 1/frame, is not.
+Per node (Eqs. 5.23-5.25) the magnitudes are read as a distribution over the box: where
+the rotation is. The histogram form and Wasserstein-1 compare how much rotation there
+is, wherever it stands: a mirrored flow is perfect there. A divergence is undefined
+where the true vorticity is nothing but rounding; Wasserstein-1, an error in 1/frame, is
+not.
 """
 
 from __future__ import annotations
@@ -46,34 +47,44 @@ def kl(p: Floats, q: Floats) -> float:
 
 
 def histograms(truth: Floats, prediction: Floats) -> tuple[Floats, Floats] | None:
-    """Return the two distributions over 64 bins of the truth's range, None if that is empty.
+    """Return the two distributions over 64 bins of the truth's range, None if that is
+    empty.
 
-    The first and last bin are open: what the truth never reaches counts there, so that the
-    divergence saturates on wild predictions; :func:`wasserstein1` does not.
+    The first and last bin are open: what the truth never reaches counts there, so that
+    the divergence saturates on wild predictions; :func:`wasserstein1` does not.
     """
-    low, high = truth.min(), truth.max()
+    low = truth.min()
+    high = truth.max()
     if not low < low + (high - low) / BINS < high:
         return None
 
     def shares(values: Floats) -> Floats:
         place = (np.minimum(np.maximum(values, low), high) - low) / (high - low)
-        count = np.bincount(np.minimum((place * BINS).astype(np.intp), BINS - 1), minlength=BINS)
-        return np.asarray((count + PSEUDO_COUNT) / (len(values) + BINS * PSEUDO_COUNT), np.float64)
+        count = np.bincount(
+            np.minimum((place * BINS).astype(np.intp), BINS - 1), minlength=BINS
+        )
+        return np.asarray(
+            (count + PSEUDO_COUNT) / (len(values) + BINS * PSEUDO_COUNT), np.float64
+        )
 
     return shares(truth), shares(prediction)
 
 
 def wasserstein1(x: Floats, y: Floats) -> float:
-    """Return ``W1 = mean(|x_(i) - y_(i)|)`` over order statistics, for samples of one size.
+    """Return ``W1 = mean(|x_(i) - y_(i)|)`` over order statistics, for samples of one
+    size.
 
-    Equal to ``scipy.stats.wasserstein_distance``; monotone where a divergence saturates.
+    Equal to ``scipy.stats.wasserstein_distance``; monotone where a divergence
+    saturates.
     """
     return average(np.abs(np.sort(x) - np.sort(y)))
 
 
 def _histogram_kl(truth: Floats, prediction: Floats) -> float:
     shares = histograms(truth, prediction)
-    return math.nan if shares is None else kl(*shares)
+    if shares is None:
+        return math.nan
+    return kl(*shares)
 
 
 _distance = partial(metric, unit="nat", direction=Direction.LOWER, defined=turning)
@@ -109,22 +120,26 @@ def vorticity_w1(pair: FramePair) -> float:
 @functools.cache
 def _cosines(nodes: int) -> Floats:
     """Return the orthonormal DCT-II as a matrix, shape [wave number, node]."""
-    k, n = np.arange(nodes)[:, None], np.arange(nodes)
+    k = np.arange(nodes)[:, None]
+    n = np.arange(nodes)
     cosines = np.sqrt(2.0 / nodes) * np.cos(np.pi * k * (n + 0.5) / nodes)
     cosines[0] = math.sqrt(1.0 / nodes)
     return np.asarray(cosines, np.float64)
 
 
 def energy_spectrum(velocity: Floats) -> Floats:
-    """Return the kinetic energy of node velocities [x node, y node, 2] in shells of half waves, [shell].
+    """Return the kinetic energy of node velocities [x node, y node, 2] in shells of
+    half waves, [shell].
 
-    Cosine modes (k, l) of both components, summed over ``round(sqrt(k^2 + l^2)) = 1, 2, ...``: a
-    box with walls has no period, and cosines, unlike a Fourier series, put no jump at them (Denis,
-    Cote and Laprise, Monthly Weather Review 2002). Shell 0, the mean flow, is left out, as are the
-    corners of the wave-number plane beyond the shorter side.
+    Cosine modes (k, l) of both components, summed over
+    ``round(sqrt(k^2 + l^2)) = 1, 2, ...``: a box with walls has no period, and cosines,
+    unlike a Fourier series, put no jump at them (Denis, Cote and Laprise, Monthly
+    Weather Review 2002). Shell 0, the mean flow, is left out, as are the corners of the
+    wave-number plane beyond the shorter side.
     """
     rows, columns = velocity.shape[:2]
-    left, right = _cosines(rows), _cosines(columns)
+    left = _cosines(rows)
+    right = _cosines(columns)
     # einsum, not BLAS: the bits must not depend on the number of threads
     modes = np.einsum("ki,ijc->kjc", left, velocity)
     power = np.sum(np.einsum("lj,kjc->klc", right, modes) ** 2, axis=-1)
@@ -142,14 +157,20 @@ def energy_spectrum(velocity: Floats) -> Floats:
 def spectrum_error(pair: FramePair) -> float:
     """RMS over shells of wave numbers of log10 of predicted over true kinetic energy.
 
-    Decades: 0.3 is a factor of two in every shell. Blind to where the eddies are; sees smoothing
-    and noise at once. A ratio counts at most :data:`DECADES`, a prediction at rest exactly that.
-    NaN where the truth rests.
+    Decades: 0.3 is a factor of two in every shell. Blind to where the eddies are; sees
+    smoothing and noise at once. A ratio counts at most :data:`DECADES`, a prediction at
+    rest exactly that. NaN where the truth rests.
     """
     counted = pair.truth.fields.counted
     x, y = (np.flatnonzero(counted.any(axis=axis)) for axis in (1, 0))
-    box = slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1)  # the rectangle that holds the counted nodes
-    true, predicted = (energy_spectrum(side.fields.velocity[box]) for side in (pair.truth, pair.prediction))
+    box = (
+        slice(x[0], x[-1] + 1),
+        slice(y[0], y[-1] + 1),
+    )  # the rectangle that holds the counted nodes
+    true, predicted = (
+        energy_spectrum(side.fields.velocity[box])
+        for side in (pair.truth, pair.prediction)
+    )
     told = true > 0.0
     if not told.any():
         return math.nan

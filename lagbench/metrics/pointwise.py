@@ -1,9 +1,9 @@
 """Errors of particles: position, velocity, and all attributes standardised.
 
-The particle of the prediction is the particle of the truth: order matters, and a swapped
-pair is an error even where the picture is the same. On chaotic flows these errors saturate
-at the size of the flow; then vorticity and transport say more, and ``position_rmse_20`` stops
-while most flows can still be followed.
+The particle of the prediction is the particle of the truth: order matters, and a
+swapped pair is an error even where the picture is the same. On chaotic flows these
+errors saturate at the size of the flow; then vorticity and transport say more, and
+``position_rmse_20`` stops while most flows can still be followed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from .frame import Floats, FramePair, average, mean_absolute_error, mean_squared
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
 HORIZONS = (1, 5, 10, 20, 50)
-"""Predicted frames at which ``mse_avg`` and ``mse_end`` are taken besides the whole rollout."""
+"""Predicted frames at which ``mse_avg`` and ``mse_end`` are taken besides the whole
+rollout.
+"""
 
 SQUARED = {"length": "length^2", "length/frame": "length^2/frame^2"}
 
@@ -34,11 +36,14 @@ _error = partial(Metric, family="pointwise", direction=Direction.LOWER, perfect=
 def attribute_mse(pair: FramePair) -> float:
     """Mean squared error of standardised position and velocity.
 
-    ``L = sum((y - yhat)^2) / (N k)`` over z-scores of (x, y, u, v); the means of Eq. 4.15 cancel
-    in the difference. 0 is perfect; 1 is the error of always predicting the mean of train.
+    ``L = sum((y - yhat)^2) / (N k)`` over z-scores of (x, y, u, v); the means of Eq.
+    4.15 cancel in the difference. 0 is perfect; 1 is the error of always predicting the
+    mean of train.
     """
     std = np.array(pair.scenario.setting.attribute_std)
-    return average(np.concatenate([pair.position_square, pair.velocity_square]) / std**2)
+    return average(
+        np.concatenate([pair.position_square, pair.velocity_square]) / std**2
+    )
 
 
 @dataclass(frozen=True)
@@ -52,25 +57,43 @@ class ErrorMean:
     def __call__(self, pair: FramePair) -> float:
         """Return the mean for one frame pair."""
         error = self.error(pair)
-        return self.law(error if self.material is None else error[pair.scenario.members[self.material]])
+        return self.law(
+            error
+            if self.material is None
+            else error[pair.scenario.members[self.material]]
+        )
 
     def applies(self, pair: FramePair) -> bool:
-        """Tell whether the split has several materials and the scenario has this one."""
+        """Tell whether the split has several materials and the scenario has this
+        one.
+        """
         several = len(pair.scenario.setting.materials) > 1
-        return self.material is None or (several and self.material in pair.scenario.members)
+        return self.material is None or (
+            several and self.material in pair.scenario.members
+        )
 
 
 def _errors(quantity: str, unit: str, material: str | None) -> Iterator[Metric]:
-    whose = "all particles" if material is None else f"{material} particles"
-    suffix = "" if material is None else f"_{material}"
-    laws = {"mse": (mean_squared_error, SQUARED[unit], "3.3"), "mae": (mean_absolute_error, unit, "3.4")}
+    if material is None:
+        whose = "all particles"
+    else:
+        whose = f"{material} particles"
+    if material is None:
+        suffix = ""
+    else:
+        suffix = f"_{material}"
+    laws = {
+        "mse": (mean_squared_error, SQUARED[unit], "3.3"),
+        "mae": (mean_absolute_error, unit, "3.4"),
+    }
     for name, (law, law_unit, equation) in laws.items():
         statistic = ErrorMean(attrgetter(f"{quantity}_error"), law, material)
         yield _error(
             name=f"{quantity}_{name}{suffix}",
             unit=law_unit,
             source=f"Eq. {equation}",
-            summary=f"Mean {'squared' if name == 'mse' else 'absolute'} {quantity} error of {whose}",
+            summary=f"Mean {'squared' if name == 'mse' else 'absolute'} {quantity} "
+            f"error of {whose}",
             statistic=statistic,
             applies=statistic.applies,
         )
@@ -90,14 +113,19 @@ def _over_rollouts() -> Iterator[Metric]:
     whole = {"mse_avg": (mean, "4.17", "Mean"), "mse_end": (last, "4.18", "Last")}
     for name, (reduction, equation, word) in whole.items():
         for horizon in (None, *HORIZONS):
-            frames = "the rollout" if horizon is None else f"the first {horizon} frames"
+            if horizon is None:
+                frames = "the rollout"
+            else:
+                frames = f"the first {horizon} frames"
             yield _error(
                 name=name if horizon is None else f"{name}_{horizon}",
                 unit="1",
                 source=f"Eq. {equation}",
                 summary=f"{word} attribute_mse of {frames}",
                 of=("attribute_mse",),
-                over_frames=reduction if horizon is None else FirstFrames(horizon, reduction),
+                over_frames=reduction
+                if horizon is None
+                else FirstFrames(horizon, reduction),
                 per_frame=False,
                 horizon=horizon or 1,
             )
@@ -109,13 +137,18 @@ METRICS = (
         name="position_rmse_20",
         unit="length",
         source="design 2, section 4",
-        summary="Root mean squared position error of the first 20 frames, as LagrangeBench's MSE_20",
+        summary="Root mean squared position error of the first 20 frames, as "
+        "LagrangeBench's MSE_20",
         of=("position_mse",),
         over_frames=lambda mse: math.sqrt(FirstFrames(20)(mse)),
         per_frame=False,
         horizon=20,
     ),
-    *(m for name in (None, *MATERIALS) for m in _errors("velocity", "length/frame", name)),
+    *(
+        m
+        for name in (None, *MATERIALS)
+        for m in _errors("velocity", "length/frame", name)
+    ),
     attribute_mse,
     *_over_rollouts(),
 )

@@ -1,8 +1,8 @@
 """The one table of metrics: name, formula, unit, direction.
 
-Scorer, board, docs and plots read it. Another package adds metrics by an entry point in the
-group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of them; ours are
-registered the same way.
+Scorer, board, docs and plots read it. Another package adds metrics by an entry point in
+the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of them; ours
+are registered the same way.
 """
 
 from __future__ import annotations
@@ -38,23 +38,54 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 )
 """Our metrics by name."""
 
-STATISTICS = tuple(sorted({statistic for metric in METRICS.values() for statistic in metric.of}))
-"""Names of the statistics that they are formed from; other packages may measure more."""
+STATISTICS = tuple(
+    sorted({statistic for metric in METRICS.values() for statistic in metric.of})
+)
+"""Names of the statistics that they are formed from; other packages may measure more.
+"""
 
 CHOSEN = (
-    *("vorticity_nrmse", "vorticity_rmse", "vorticity_pearson", "stable_frames", "spectrum_error"),
-    *("vorticity_kl", "vorticity_w1", "cloud_distance", "position_rmse_20", "position_rmse"),
-    *("velocity_rmse", "mse_avg", "mse_end", "energy_ratio", "momentum_error", "angular_momentum_error"),
-    *("density_rmse", "divergence_rms", "divergence_rms_true", "outside_share", "active_frames"),
+    *(
+        "vorticity_nrmse",
+        "vorticity_rmse",
+        "vorticity_pearson",
+        "stable_frames",
+        "spectrum_error",
+    ),
+    *(
+        "vorticity_kl",
+        "vorticity_w1",
+        "cloud_distance",
+        "position_rmse_20",
+        "position_rmse",
+    ),
+    *(
+        "velocity_rmse",
+        "mse_avg",
+        "mse_end",
+        "energy_ratio",
+        "momentum_error",
+        "angular_momentum_error",
+    ),
+    *(
+        "density_rmse",
+        "divergence_rms",
+        "divergence_rms_true",
+        "outside_share",
+        "active_frames",
+    ),
     *("shape_error", "connectivity", "sliced_w2", "sinkhorn_pot"),
 )
-"""Metrics of the short tables, the one that ranks aside; a data set has some of them."""
+"""Metrics of the short tables, the one that ranks aside; a data set has some of them.
+"""
 
 
 RANKING: Mapping[Placement, str] = MappingProxyType(
     {Placement.CELL_CENTRES: "vorticity_nrmse", Placement.NODES: "cloud_distance"}
 )
-"""Metric that ranks: of vorticity where the material fills the box, of clouds where it has a surface."""
+"""Metric that ranks: of vorticity where the material fills the box, of clouds where it
+has a surface.
+"""
 
 
 def ranking_metric(size: Size) -> str:
@@ -77,7 +108,9 @@ def available() -> dict[str, Metric]:
                 )
     for metric in known.values():
         if unknown := sorted(
-            name for name in metric.of if getattr(known.get(name), "statistic", None) is None
+            name
+            for name in metric.of
+            if getattr(known.get(name), "statistic", None) is None
         ):
             raise UsageError(
                 f"metric {metric.name!r} follows from what no metric measures",
@@ -91,12 +124,17 @@ def available() -> dict[str, Metric]:
 def _load(point: EntryPoint) -> Sequence[Metric]:
     try:
         given = loaded(point)
-        found = tuple(given) if isinstance(given, Iterable) else (given,)
+        if isinstance(given, Iterable):
+            found = tuple(given)
+        else:
+            found = (given,)
     except Exception as error:  # a stranger's module: importing it may raise anything
         raise UsageError(
             "a package's metrics cannot be loaded",
             where=f"entry point {point.name} = {point.value}",
-            got=error.what if isinstance(error, LagbenchError) else f"{type(error).__name__}: {error}",
+            got=error.what
+            if isinstance(error, LagbenchError)
+            else f"{type(error).__name__}: {error}",
             fix="mend or uninstall that package",
         ) from error
     for metric in found:
@@ -116,7 +154,9 @@ def select(
     extras: Collection[str] = (),
     known: Mapping[str, Metric] | None = None,
 ) -> tuple[Metric, ...]:
-    """Return metrics and those whose statistics they follow from, in the table's order."""
+    """Return metrics and those whose statistics they follow from, in the table's
+    order.
+    """
     table = available() if known is None else known
     if names is None:
         names = [m.name for m in table.values() if m.extra is None or m.extra in extras]

@@ -1,9 +1,10 @@
 """Errors of the vorticity field at the nodes that the truth's material fills.
 
-``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.data.grid`, per frame. Undefined where
-fewer than 16 nodes can be compared. Pearson and slope are also undefined where a field is
-constant: a prediction at rest has no correlation, neither good nor bad. Nor has a field of
-rounding, whose pattern would be that of the order of sums: bodies that only fly have no vorticity.
+``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.data.grid`, per frame. Undefined
+where fewer than 16 nodes can be compared. Pearson and slope are also undefined where a
+field is constant: a prediction at rest has no correlation, neither good nor bad. Nor
+has a field of rounding, whose pattern would be that of the order of sums: bodies that
+only fly have no vorticity.
 """
 
 from __future__ import annotations
@@ -13,7 +14,14 @@ from functools import partial
 
 import numpy as np
 
-from .frame import PERCENTILES, Floats, FramePair, average, mean_absolute_error, mean_squared_error
+from .frame import (
+    PERCENTILES,
+    Floats,
+    FramePair,
+    average,
+    mean_absolute_error,
+    mean_squared_error,
+)
 from .metric import (
     Direction,
     Metric,
@@ -27,26 +35,35 @@ from .metric import (
 )
 
 STABLE_PEARSON = 0.95
-"""A rollout is stable until the vorticity correlation falls below this; at 0.8 good models saturate."""
+"""A rollout is stable until the vorticity correlation falls below this; at 0.8 good
+models saturate.
+"""
 
 CONSTANT = 1e-12
-"""A field is constant when its deviation from the mean is below this share of its size."""
+"""A field is constant when its deviation from the mean is below this share of its size.
+"""
 
 
 def _deviation(values: Floats) -> tuple[Floats, float] | None:
-    """Return values minus their mean and the sum of its squares, None where they are constant to rounding."""
+    """Return values minus their mean and the sum of its squares, None where they are
+    constant to rounding.
+    """
     deviation = values - average(values)
     squares = float((deviation**2).sum())
-    return (deviation, squares) if math.sqrt(squares) > CONSTANT * math.sqrt((values**2).sum()) else None
+    if math.sqrt(squares) > CONSTANT * math.sqrt((values**2).sum()):
+        return (deviation, squares)
+    return None
 
 
 def pearson(x: Floats, y: Floats) -> float:
-    """Return ``r = sum(dx dy) / sqrt(sum(dx^2) sum(dy^2))`` (Eq. 5.21), NaN if one is constant.
+    """Return ``r = sum(dx dy) / sqrt(sum(dx^2) sum(dy^2))`` (Eq. 5.21), NaN if one is
+    constant.
 
-    1 is perfect, 0 unrelated, -1 reversed; scale and offset do not show. The thesis's best
-    model has 0.957 at frame 54 of the cavity, its worst 0.812.
+    1 is perfect, 0 unrelated, -1 reversed; scale and offset do not show. The thesis's
+    best model has 0.957 at frame 54 of the cavity, its worst 0.812.
     """
-    one, two = _deviation(x), _deviation(y)
+    one = _deviation(x)
+    two = _deviation(y)
     if one is None or two is None:
         return math.nan
     (dx, xx), (dy, yy) = one, two
@@ -55,7 +72,9 @@ def pearson(x: Floats, y: Floats) -> float:
 
 
 def slope(x: Floats, y: Floats) -> float:
-    """Return the least-squares slope ``sum(dx dy) / sum(dx^2)`` of y on x, NaN if x is constant."""
+    """Return the least-squares slope ``sum(dx dy) / sum(dx^2)`` of y on x, NaN if x is
+    constant.
+    """
     found = _deviation(x)
     if found is None:
         return math.nan
@@ -64,11 +83,12 @@ def slope(x: Floats, y: Floats) -> float:
 
 
 def frames_before_fall(values: Floats) -> float:
-    """Return how many defined frames pass before one first lies below :data:`STABLE_PEARSON`.
+    """Return how many defined frames pass before one first lies below
+    :data:`STABLE_PEARSON`.
 
-    Undefined frames neither end the count nor count: standing still is no merit. With none
-    defined the answer is NaN. A rollout that is always defined and never falls gets the whole
-    horizon.
+    Undefined frames neither end the count nor count: standing still is no merit. With
+    none defined the answer is NaN. A rollout that is always defined and never falls
+    gets the whole horizon.
     """
     defined = values[~np.isnan(values)]
     if not defined.size:
@@ -111,15 +131,23 @@ def vorticity_square_true(pair: FramePair) -> float:
     over_frames=root_mean_square,
 )
 def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
-    """Vorticity RMSE over the scenario's RMS vorticity: no scenario counts more for being faster.
+    """Vorticity RMSE over the scenario's RMS vorticity: no scenario counts more for
+    being faster.
 
-    Per scenario ``sqrt(sum_f MSE(omega) / sum_f mean(omega_true^2))``. 0 is perfect, 1 the error of
-    a prediction at rest, sqrt(2) that of an unrelated flow of the same strength.
+    Per scenario ``sqrt(sum_f MSE(omega) / sum_f mean(omega_true^2))``. 0 is perfect, 1
+    the error of a prediction at rest, sqrt(2) that of an unrelated flow of the same
+    strength.
     """
     return np.sqrt(quotient(mse, np.full(len(mse), mean(square))))
 
 
-@metric(unit="1", direction=Direction.HIGHER, perfect=1.0, source="Eq. 5.21", defined=turning)
+@metric(
+    unit="1",
+    direction=Direction.HIGHER,
+    perfect=1.0,
+    source="Eq. 5.21",
+    defined=turning,
+)
 def vorticity_pearson(pair: FramePair) -> float:
     """Correlation of predicted and true vorticity."""
     if not pair.prediction_turns:
@@ -133,7 +161,8 @@ stable_frames = Metric(
     unit="frame",
     direction=Direction.HIGHER,
     source="design 2, section 4",
-    summary=f"Defined frames before vorticity_pearson first falls below {STABLE_PEARSON:g}",
+    summary=f"Defined frames before vorticity_pearson first falls below "
+    f"{STABLE_PEARSON:g}",
     of=("vorticity_pearson",),
     over_frames=frames_before_fall,
     per_frame=False,

@@ -3,8 +3,9 @@
 >>> tag("p", "a < b", tag("b", "!"), class_="note")
 '<p class="note">a &lt; b<b>!</b></p>'
 
-Numbers and names of metrics as readers like them: few digits, real minus signs, words. Figures and what
-stands in them: keys, tables, and panels side by side, in rows of truth, predictions and differences.
+Numbers and names of metrics as readers like them: few digits, real minus signs, words.
+Figures and what stands in them: keys, tables, and panels side by side, in rows of
+truth, predictions and differences.
 """
 
 from __future__ import annotations
@@ -18,18 +19,32 @@ from unicodedata import east_asian_width
 
 from lagbench.metrics.metric import Metric
 
-VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})  # elements of HTML without an end tag
-SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})  # elements of SVG that close themselves
+VOID = frozenset(
+    {"br", "col", "hr", "img", "link", "meta"}
+)  # elements of HTML without an end tag
+SHAPES = frozenset(
+    {"circle", "line", "path", "rect", "stop", "use"}
+)  # elements of SVG that close themselves
 
-_ESCAPES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;", ord('"'): "&quot;", ord("'"): "&#39;"}
+_ESCAPES = {
+    ord("&"): "&amp;",
+    ord("<"): "&lt;",
+    ord(">"): "&gt;",
+    ord('"'): "&quot;",
+    ord("'"): "&#39;",
+}
 _UNPRINTABLE = dict.fromkeys((*range(9), 11, 12, *range(14, 32), *range(127, 160)), "�")
 # marks that turn the direction of the text around them
-_TURNING = dict.fromkeys((1564, 8206, 8207, *range(8234, 8239), *range(8294, 8298)), "�")
+_TURNING = dict.fromkeys(
+    (1564, 8206, 8207, *range(8234, 8239), *range(8294, 8298)), "�"
+)
 _TABLE = _ESCAPES | _UNPRINTABLE | _TURNING
 
 
 class Markup(str):
-    """Text that is HTML already; only this module and :func:`tag` make it from strangers' text."""
+    """Text that is HTML already; only this module and :func:`tag` make it from
+    strangers' text.
+    """
 
     __slots__ = ()
 
@@ -37,7 +52,8 @@ class Markup(str):
 def escaped(text: object) -> Markup:
     """Return any text as HTML that shows it.
 
-    Control characters, lone surrogates and marks that turn the text direction become U+FFFD.
+    Control characters, lone surrogates and marks that turn the text direction become
+    U+FFFD.
 
     >>> escaped('<script>"&"')
     '&lt;script&gt;&quot;&amp;&quot;'
@@ -80,12 +96,16 @@ def path_data(points: Iterable[tuple[float, float]]) -> str:
             pieces[-1].append(f"{_short(x)} {_short(y)}")
         elif pieces[-1]:
             pieces.append([])
-    return "".join(f"M{p[0]}h0" if len(p) == 1 else "M" + "L".join(p) for p in pieces if p)
+    return "".join(
+        f"M{p[0]}h0" if len(p) == 1 else "M" + "L".join(p) for p in pieces if p
+    )
 
 
 def _short(value: float) -> str:
     text = f"{value:.1f}".removesuffix(".0")
-    return "0" if text == "-0" else text
+    if text == "-0":
+        return "0"
+    return text
 
 
 MISSING = "–"  # what stands where there is no number
@@ -111,7 +131,9 @@ def text(value: float, digits: int = DIGITS) -> str:
     ('0.0123', '−2.50×10⁻⁷', '1.20×10⁶', '20', '–')
     """
     if not math.isfinite(value):
-        return MISSING if math.isnan(value) else ("∞" if value > 0 else "−∞")
+        if math.isnan(value):
+            return MISSING
+        return "∞" if value > 0 else "−∞"
     if value == 0.0:
         return "0"
     if value == int(value) and abs(value) < 10.0 ** PLAIN[1]:
@@ -145,15 +167,31 @@ def decimals(values: Sequence[float], step: float) -> list[str]:
     places = max(0, -math.floor(math.log10(step) + 1e-9))
     while places < 9 and abs(round(step, places) - step) > 1e-9 * step:
         places += 1
-    return [_minus(f"{value:.{places}f}") if abs(value) > step / 1e6 else "0" for value in values]
+    return [
+        _minus(f"{value:.{places}f}") if abs(value) > step / 1e6 else "0"
+        for value in values
+    ]
 
 
 def _minus(written: str) -> str:
     return written.replace("-", "−")
 
 
-_CAPITALS = {"mse": "MSE", "mae": "MAE", "rmse": "RMSE", "nrmse": "NRMSE", "kl": "KL", "w1": "W1", "w2": "W2"}
-_OTHERS = {"pearson": "correlation", "avg": "average", "hist": "histogram", "abs": "magnitudes"}
+_CAPITALS = {
+    "mse": "MSE",
+    "mae": "MAE",
+    "rmse": "RMSE",
+    "nrmse": "NRMSE",
+    "kl": "KL",
+    "w1": "W1",
+    "w2": "W2",
+}
+_OTHERS = {
+    "pearson": "correlation",
+    "avg": "average",
+    "hist": "histogram",
+    "abs": "magnitudes",
+}
 
 
 def words(name: str, *, capital: bool = False) -> str:
@@ -162,8 +200,12 @@ def words(name: str, *, capital: bool = False) -> str:
     >>> words("vorticity_rmse"), words("mse_avg", capital=True), words("energy_error", capital=True)
     ('vorticity RMSE', 'MSE average', 'Energy error')
     """
-    written = " ".join(_CAPITALS.get(part) or _OTHERS.get(part, part) for part in name.split("_"))
-    return written[0].upper() + written[1:] if capital else written
+    written = " ".join(
+        _CAPITALS.get(part) or _OTHERS.get(part, part) for part in name.split("_")
+    )
+    if capital:
+        return written[0].upper() + written[1:]
+    return written
 
 
 def clipped(name: str, room: int = 34) -> str:
@@ -172,7 +214,9 @@ def clipped(name: str, room: int = 34) -> str:
     >>> clipped("SuperGAT with a loss of six terms", room=12)
     'SuperGAT wi…'
     """
-    ends = list(accumulate(2 if east_asian_width(letter) in "WF" else 1 for letter in name))
+    ends = list(
+        accumulate(2 if east_asian_width(letter) in "WF" else 1 for letter in name)
+    )
     if not ends or ends[-1] <= room:
         return name
     return f"{name[: sum(end < room for end in ends)]}…"
@@ -180,7 +224,9 @@ def clipped(name: str, room: int = 34) -> str:
 
 def unit(metric: Metric) -> str:
     """Return the unit in brackets with a space before it, nothing for pure numbers."""
-    return "" if metric.unit == "1" else f" [{metric.unit.replace('^2', '²')}]"
+    if metric.unit == "1":
+        return ""
+    return f" [{metric.unit.replace('^2', '²')}]"
 
 
 def quantity(metric: Metric) -> str:
@@ -212,20 +258,44 @@ def key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
     for mark, name in items:
         swatch = tag("path", d="M1 5H21", class_=f"line {mark}")
         if kind == "square":
-            swatch = tag("rect", x=5, y=0, width=12, height=10, rx=2, class_=f"bar {mark}")
-        shown = tag("svg", swatch, viewBox="0 0 22 10", class_="swatch", aria_hidden="true")
+            swatch = tag(
+                "rect", x=5, y=0, width=12, height=10, rx=2, class_=f"bar {mark}"
+            )
+        shown = tag(
+            "svg", swatch, viewBox="0 0 22 10", class_="swatch", aria_hidden="true"
+        )
         drawn.append(tag("li", shown, tag("span", name)))
     return tag("ul", *drawn, class_="key")
 
 
 def table(
-    head: Sequence[object], rows: Sequence[Sequence[object]], *, kind: str = "", label: str = ""
+    head: Sequence[object],
+    rows: Sequence[Sequence[object]],
+    *,
+    kind: str = "",
+    label: str = "",
 ) -> Markup:
-    """Return a table in a box of its own that scrolls when it is wider than the page."""
+    """Return a table in a box of its own that scrolls when it is wider than the
+    page.
+    """
     headings = tag("tr", *(tag("th", cell, scope="col") for cell in head))
-    body = [tag("tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])) for row in rows]
-    drawn = tag("table", tag("thead", headings), tag("tbody", *body), class_=kind or None)
-    return tag("div", drawn, class_="scroll", role="region", aria_label=label or None, tabindex=0)
+    body = [
+        tag(
+            "tr", tag("th", row[0], scope="row"), *(tag("td", cell) for cell in row[1:])
+        )
+        for row in rows
+    ]
+    drawn = tag(
+        "table", tag("thead", headings), tag("tbody", *body), class_=kind or None
+    )
+    return tag(
+        "div",
+        drawn,
+        class_="scroll",
+        role="region",
+        aria_label=label or None,
+        tabindex=0,
+    )
 
 
 def paragraph(*parts: object) -> Markup:
@@ -237,30 +307,59 @@ SIDE = 200  # side of the coordinates of a vector panel
 
 
 def grid(
-    columns: Sequence[object], rows: Sequence[tuple[str, Sequence[Markup]]], *, width: float = 6.6
+    columns: Sequence[object],
+    rows: Sequence[tuple[str, Sequence[Markup]]],
+    *,
+    width: float = 6.6,
 ) -> Markup:
     """Return panels in a grid that scrolls sideways on narrow screens."""
     cells = [tag("span"), *(tag("span", column, class_="time") for column in columns)]
     for name, panels in rows:
         cells += [tag("span", name, class_="side"), *panels]
     tracks = f"grid-template-columns:minmax(5.2rem,6.5rem) repeat({len(columns)},minmax({width}rem,1fr))"
-    return tag("div", tag("div", *cells, class_="panels", style=tracks), class_="scroll", tabindex=0)
+    return tag(
+        "div",
+        tag("div", *cells, class_="panels", style=tracks),
+        class_="scroll",
+        tabindex=0,
+    )
 
 
 def image(png: bytes, kind: str, alt: str, *, smooth: bool = False) -> Markup:
-    """Return a panel, of classes that tell moving walls, that shows a picture of the inside of the box."""
+    """Return a panel, of classes that tell moving walls, that shows a picture of the
+    inside of the box.
+    """
     source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
-    return tag("span", tag("img", src=source, alt=alt, class_="smooth" if smooth else None), class_=kind)
+    return tag(
+        "span",
+        tag("img", src=source, alt=alt, class_="smooth" if smooth else None),
+        class_=kind,
+    )
 
 
 def vector(drawn: Markup, kind: str, alt: str) -> Markup:
     """Return a panel of lines in coordinates from 0 to 200."""
-    svg = tag("svg", tag("title", alt), drawn, viewBox=f"0 0 {SIDE} {SIDE}", class_="flow", role="img")
+    svg = tag(
+        "svg",
+        tag("title", alt),
+        drawn,
+        viewBox=f"0 0 {SIDE} {SIDE}",
+        class_="flow",
+        role="img",
+    )
     return tag("span", svg, class_=kind)
 
 
 def ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Markup:
     """Return the key of a colour scale."""
-    low = f"−{text(limit)}" if signed else "0"
+    if signed:
+        low = f"−{text(limit)}"
+    else:
+        low = "0"
     bar = tag("span", class_=f"ramp {kind}")
-    return tag("p", join([low, bar, text(limit)], " "), tag("span", unit, class_="muted"), class_="scale")
+    return tag(
+        "p",
+        join([low, bar, text(limit)], " "),
+        tag("span", unit, class_="muted"),
+        class_="scale",
+    )

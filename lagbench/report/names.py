@@ -1,6 +1,8 @@
-"""Names of dots in a chart: where they cover nothing, in a crowd with a line to the dot.
+"""Names of dots in a chart: where they cover nothing, in a crowd with a line to the
+dot.
 
-Places are in pixels from the top left of the plot. How wide a name is drawn is estimated.
+Places are in pixels from the top left of the plot. How wide a name is drawn is
+estimated.
 """
 
 from __future__ import annotations
@@ -59,8 +61,11 @@ class Names:
         """Keep names off a line."""
         self._taken += _along(one, other)
 
-    def beside(self, names: Sequence[str], places: Sequence[Point]) -> tuple[list[Markup], list[Markup]]:
-        """Return the names of dots, empty where there is no room, and lines to those that stand aside.
+    def beside(
+        self, names: Sequence[str], places: Sequence[Point]
+    ) -> tuple[list[Markup], list[Markup]]:
+        """Return the names of dots, empty where there is no room, and lines to those
+        that stand aside.
 
         First come first, but of those that do not touch their dot the longest.
         """
@@ -73,18 +78,28 @@ class Names:
                 others = dots[:number] + dots[number + 1 :]
                 if (place := choose(names[number], places[number], others)) is not None:
                     self._taken.append(_box(names[number], place))
-                    found[number] = written(names[number], place[0], place[1], _ANCHORS[place[2]])
+                    found[number] = written(
+                        names[number], place[0], place[1], _ANCHORS[place[2]]
+                    )
             # Of those without a place the longest are the hardest to find one for.
-            order = sorted((n for n in order if n not in found), key=lambda number: -len(names[number]))
-        return [found.get(number, Markup("")) for number in range(len(names))], self._leads
+            order = sorted(
+                (n for n in order if n not in found),
+                key=lambda number: -len(names[number]),
+            )
+        return [
+            found.get(number, Markup("")) for number in range(len(names))
+        ], self._leads
 
     def _touching(self, name: str, dot: Point, others: Sequence[Box]) -> Place | None:
         """Return the first free place that touches a dot."""
         return next(self._free(name, dot, others, BESIDE), None)
 
     def _led(self, name: str, dot: Point, others: Sequence[Box]) -> Place | None:
-        """Return a place with a line to the dot, which is drawn: a short one that crosses few other dots."""
-        best, least = None, math.inf
+        """Return a place with a line to the dot, which is drawn: a short one that
+        crosses few other dots.
+        """
+        best = None
+        least = math.inf
         for place in self._free(name, dot, others, FARTHER):
             box = _box(name, place)
             near = min(max(dot[0], box[0] + 4), box[2] - 4)
@@ -93,12 +108,17 @@ class Names:
             if length >= least:
                 continue
             points = _along(dot, end)
-            lead = points[len(points) // 3 :]  # near the dots of a crowd their lines are as close
+            lead = points[
+                len(points) // 3 :
+            ]  # near the dots of a crowd their lines are as close
             if any(_meet(point, one) for point in lead for one in self._taken):
                 continue
-            length += CROSSING * sum(any(_meet(point, one) for point in lead) for one in others)
+            length += CROSSING * sum(
+                any(_meet(point, one) for point in lead) for one in others
+            )
             if length < least:
-                best, least = (place, end, lead), length
+                best = (place, end, lead)
+                least = length
         if best is None:
             return None
         place, end, lead = best
@@ -106,8 +126,12 @@ class Names:
         self._leads.append(tag("path", d=path_data([dot, end]), class_="mark"))
         return place
 
-    def _free(self, name: str, dot: Point, others: Sequence[Box], tries: Sequence[Place]) -> Iterator[Place]:
-        """Yield places of a name, tried from the middle of its dot, where it covers nothing."""
+    def _free(
+        self, name: str, dot: Point, others: Sequence[Box], tries: Sequence[Place]
+    ) -> Iterator[Place]:
+        """Yield places of a name, tried from the middle of its dot, where it covers
+        nothing.
+        """
         across, down = self._size
         for right, below, end in tries:
             place = (dot[0] + right, dot[1] + below, end)
@@ -130,11 +154,20 @@ def _box(name: str, place: Place) -> Box:
 
 def _along(one: Point, other: Point) -> list[Box]:
     """Return points of a line, as small boxes."""
-    across, down = other[0] - one[0], other[1] - one[1]
+    across = other[0] - one[0]
+    down = other[1] - one[1]
     steps = max(2, round(math.hypot(across, down) / 4))
-    points = [(one[0] + k / steps * across, one[1] + k / steps * down) for k in range(steps + 1)]
+    points = [
+        (one[0] + k / steps * across, one[1] + k / steps * down)
+        for k in range(steps + 1)
+    ]
     return [(x - 1, y - 1, x + 1, y + 1) for x, y in points]
 
 
 def _meet(one: Box, other: Box) -> bool:
-    return one[0] < other[2] and one[2] > other[0] and one[1] < other[3] and one[3] > other[1]
+    return (
+        one[0] < other[2]
+        and one[2] > other[0]
+        and one[1] < other[3]
+        and one[3] > other[1]
+    )

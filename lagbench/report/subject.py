@@ -1,4 +1,6 @@
-"""What a report is about: the entries, the task, and the frames that its pictures show."""
+"""What a report is about: the entries, the task, and the frames that its pictures
+show.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ from lagbench.submission.predictions import open_predictions
 COLOURS = 6  # series that differ in colour; further ones are dashed
 
 THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}
-"""Frame at which the thesis compares models: 54, and 35 after the last of 6 given frames."""
+"""Frame at which the thesis compares models: 54, and 35 after the last of 6 given
+frames.
+"""
 
 OTHER_FRAME = 60
 
@@ -72,10 +76,16 @@ class Subject:
     @cached_property
     def rows(self) -> tuple[Row, ...]:
         """Entries, then the floors."""
-        rows = [Row(name=e.name, kind=e.kind, scores=e.card.submission, entry=e) for e in self.entries]
+        rows = [
+            Row(name=e.name, kind=e.kind, scores=e.card.submission, entry=e)
+            for e in self.entries
+        ]
         first = self.entries[0].card.scores
         floors = [name for name in first if name != SUBMISSION]
-        rows += [Row(name=name, kind=f"floor{i}", scores=first[name]) for i, name in enumerate(floors)]
+        rows += [
+            Row(name=name, kind=f"floor{i}", scores=first[name])
+            for i, name in enumerate(floors)
+        ]
         return tuple(rows)
 
     @property
@@ -87,7 +97,8 @@ class Subject:
     @property
     def best_entry(self) -> Row:
         """The entry with the least loss in the ranking metric, the first of equals."""
-        metric, rows = self.ranking, self.rows[: len(self.entries)]
+        metric = self.ranking
+        rows = self.rows[: len(self.entries)]
         losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
         return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
 
@@ -110,33 +121,48 @@ class Subject:
     def key_frame(self) -> int:
         """The frame of interest nearest to the one at which the thesis compares."""
         wanted = THESIS_FRAMES.get(self.task.size.split, OTHER_FRAME)
-        return min(self.frames_of_interest, key=lambda frame: (abs(frame - wanted), frame))
+        return min(
+            self.frames_of_interest, key=lambda frame: (abs(frame - wanted), frame)
+        )
 
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
         """Frames of interest, the last predicted one if there are none."""
         predicted = self.task.setting.predicted_frames
-        known = sorted(set(self.task.setting.frames_of_interest).intersection(predicted))
+        known = sorted(
+            set(self.task.setting.frames_of_interest).intersection(predicted)
+        )
         return tuple(known) or (predicted[-1],)
 
     @property
     def histogram_frames(self) -> tuple[int, ...]:
-        """Frames of the distributions over time: those of interest but the key frame, or evenly spaced."""
+        """Frames of the distributions over time: those of interest but the key frame,
+        or evenly spaced.
+        """
         others = [frame for frame in self.frames_of_interest if frame != self.key_frame]
-        return tuple(others[:TIMES]) if len(others) >= TIMES else self.times
+        if len(others) >= TIMES:
+            return tuple(others[:TIMES])
+        return self.times
 
     @property
     def times(self) -> tuple[int, ...]:
-        """Frames of the pictures over time, the first and the last predicted one among them."""
+        """Frames of the pictures over time, the first and the last predicted one among
+        them.
+        """
         predicted = self.task.setting.predicted_frames
         many = len(self.frames_of_interest) >= TIMES
-        chosen = _spaced(self.frames_of_interest, TIMES - 1) if many else _spaced(predicted, TIMES)
+        if many:
+            chosen = _spaced(self.frames_of_interest, TIMES - 1)
+        else:
+            chosen = _spaced(predicted, TIMES)
         return tuple(sorted({*chosen, predicted[-1]}))
 
 
 def kind_of(number: int) -> str:
     """Return the classes of a series: six colours, then the same ones dashed."""
-    return f"s{number % COLOURS}" + (f" d{min(number // COLOURS, 3)}" if number >= COLOURS else "")
+    return f"s{number % COLOURS}" + (
+        f" d{min(number // COLOURS, 3)}" if number >= COLOURS else ""
+    )
 
 
 def _spaced(numbers: Sequence[int], count: int) -> Sequence[int]:
@@ -154,15 +180,19 @@ def subject_of(
 ) -> Subject:
     """Return the subject of a report."""
     if not cards or len(cards) != len(predictions):
-        expected, got = (
-            "one file per score card, at least one",
-            f"{len(cards)} cards, {len(predictions)} files",
+        expected = "one file per score card, at least one"
+        got = f"{len(cards)} cards, {len(predictions)} files"
+        raise UsageError(
+            "a report needs score cards and their predictions",
+            expected=expected,
+            got=got,
         )
-        raise UsageError("a report needs score cards and their predictions", expected=expected, got=got)
-    folder, header = resolve_root(root), cards[0].header
+    folder = resolve_root(root)
+    header = cards[0].header
     for card, path in zip(cards, predictions, strict=True):
         for name in SAME:
-            one, two = getattr(header, name), getattr(card.header, name)
+            one = getattr(header, name)
+            two = getattr(card.header, name)
             if one != two:
                 what = f"one report, two values of {name}"
                 fix = "report submissions to one data set together, others on their own"
@@ -172,9 +202,13 @@ def subject_of(
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))
-        for i, (name, card, path) in enumerate(zip(names, cards, predictions, strict=True))
+        for i, (name, card, path) in enumerate(
+            zip(names, cards, predictions, strict=True)
+        )
     ]
-    return Subject(task=task, title=described.split(header.split).title, entries=tuple(entries))
+    return Subject(
+        task=task, title=described.split(header.split).title, entries=tuple(entries)
+    )
 
 
 _ALONG = ((0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0))  # how walls slide
@@ -186,7 +220,8 @@ class Walls:
 
     moving: tuple[str, ...]  # names of the walls that slide
     reynolds: float | None  # Reynolds number, None where there is none
-    mark: str  # what sets the scenario apart, as in "falling circle"; empty where nothing does
+    # what sets the scenario apart, as in "falling circle"; empty where nothing does
+    mark: str
 
     @property
     def classes(self) -> str:
@@ -209,7 +244,9 @@ class Moment:
 
     @cached_property
     def true_vorticity(self) -> NDArray[np.float64]:
-        """Vorticity of the truth, NaN where it is not compared [1/frame], shape [x node, y node]."""
+        """Vorticity of the truth, NaN where it is not compared [1/frame], shape [x
+        node, y node].
+        """
         return self.truth.fields.vorticity
 
 
@@ -230,40 +267,65 @@ def open_gallery(subject: Subject) -> Gallery:
     moments: dict[tuple[int, int], Moment] = {}
     walls: dict[int, Walls] = {}
     with ExitStack() as stack:
-        files = [stack.enter_context(open_predictions(entry.predictions)) for entry in subject.entries]
+        files = [
+            stack.enter_context(open_predictions(entry.predictions))
+            for entry in subject.entries
+        ]
         for number in subject.scenarios:
             # all frames in the first scenario, and of free surfaces
-            frames = sorted({subject.key_frame, *subject.times, *subject.histogram_frames})
+            frames = sorted(
+                {subject.key_frame, *subject.times, *subject.histogram_frames}
+            )
             if number != subject.scenarios[0] and subject.full_box:
                 frames = [subject.key_frame]
             with subject.task.opened(number) as truth:
-                scenario, walls[number] = truth.scenario, _walls(truth)
+                scenario = truth.scenario
+                walls[number] = _walls(truth)
                 for frame in frames:
-                    before, now = truth.file.read("position", slice(frame - 1, frame + 1))
-                    true, pairs = scenario.snapshot(now, before), []
+                    before, now = truth.file.read(
+                        "position", slice(frame - 1, frame + 1)
+                    )
+                    true = scenario.snapshot(now, before)
+                    pairs = []
                     for file in files:
                         if frame == scenario.setting.input_frames:
-                            before, now = scenario.given[-1], file.frames(number, frame, 1)[0]
+                            before = scenario.given[-1]
+                            now = file.frames(number, frame, 1)[0]
                         else:
                             before, now = file.frames(number, frame - 1, 2)
-                        pairs.append(FramePair(scenario, frame, true, scenario.snapshot(now, before)))
-                    moments[number, frame] = Moment(scenario=number, frame=frame, pairs=tuple(pairs))
+                        pairs.append(
+                            FramePair(
+                                scenario, frame, true, scenario.snapshot(now, before)
+                            )
+                        )
+                    moments[number, frame] = Moment(
+                        scenario=number, frame=frame, pairs=tuple(pairs)
+                    )
     return Gallery(moments, walls)
 
 
 def limit_of(fields: Sequence[NDArray[np.float64]]) -> float:
     """Return the magnitude of full colour: what almost all nodes stay below."""
     values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
-    top = float(np.percentile(values, TOP)) if values.size else 0.0
-    return top if np.isfinite(top) and top > 0.0 else 1.0
+    if values.size:
+        top = float(np.percentile(values, TOP))
+    else:
+        top = 0.0
+    if np.isfinite(top) and top > 0.0:
+        return top
+    return 1.0
 
 
 def _walls(truth: OpenScenario) -> Walls:
     file = truth.file
     speed = np.zeros((4, 2))
     if "wall_velocity" in file.variables:
-        speed = np.abs(np.asarray(file.read("wall_velocity"), np.float64)).max(axis=0) * _ALONG
-    parameters, reynolds = file.header.parameters, file.header.parameters.get("reynolds_number")
+        speed = (
+            np.abs(np.asarray(file.read("wall_velocity"), np.float64)).max(axis=0)
+            * _ALONG
+        )
+    reynolds = file.header.parameters.get("reynolds_number")
+    parameters = file.header.parameters
     marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
     if "frequency" in parameters:
         marks.append(f"frequency {parameters['frequency']}")

@@ -1,14 +1,16 @@
 """The score card: what the scorer says of one submission, and its form as scores.json.
 
-It holds no time, host or path, and reductions run in id order: the same predictions give the
-same bytes. Numbers have nine significant digits; what is undefined is null.
+It holds no time, host or path, and reductions run in id order: the same predictions
+give the same bytes. Numbers have nine significant digits; what is undefined is null.
 
-Skill: how much better than the best floor, ``1 - score / score of the best floor``, over the ranking
-metric. The best floor has the least mean over its own scenarios, among those that count (see
-:mod:`lagbench.floors`); the ratio is over the scenarios that both have. 1 is perfect, 0 says that
-nothing was learned, below 0 it is worse than not learning.
+Skill: how much better than the best floor, ``1 - score / score of the best floor``,
+over the ranking metric. The best floor has the least mean over its own scenarios, among
+those that count (see :mod:`lagbench.floors`); the ratio is over the scenarios that both
+have. 1 is perfect, 0 says that nothing was learned, below 0 it is worse than not
+learning.
 
-Scores as a scores.json tells them, which may come from anybody: checked before they are used.
+Scores as a scores.json tells them, which may come from anybody: checked before they are
+used.
 """
 
 from __future__ import annotations
@@ -26,7 +28,13 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.errors import UnreadableFileError, check_regular
-from lagbench.metrics.aggregate import LARGEST, Score, Tally, bootstrap_interval, mean_over_seeds
+from lagbench.metrics.aggregate import (
+    LARGEST,
+    Score,
+    Tally,
+    bootstrap_interval,
+    mean_over_seeds,
+)
 from lagbench.metrics.frame import Setting
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import Comparison, compare
@@ -57,47 +65,63 @@ class Skill:
     metric: str  # name of the ranking metric
     floor: str  # name of the best floor
     value: float  # 1 - score / score of that floor
-    # 95 %: scenarios, those of the floor with them, and seeds are resampled; NaN of few scenarios
+    # 95 %: scenarios, those of the floor with them, and seeds are resampled; NaN of few
+    # scenarios
     interval: tuple[float, float]
     std: float = math.nan  # sample standard deviation over seeds; NaN for one
 
     def __str__(self) -> str:
-        """Return the value, its interval where it has one, and the floor, as in a table."""
+        """Return the value, its interval where it has one, and the floor, as in a
+        table.
+        """
         low, high = self.interval
-        interval = "" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]"
+        if math.isnan(low):
+            interval = ""
+        else:
+            interval = f" [{low:.3f}, {high:.3f}]"
         return f"{self.value:.3f}{interval} over {self.floor}"
 
 
 def best_floor(floors: Mapping[str, Score]) -> str | None:
-    """Return which of the floors that count has the least mean; None where none has one above 0."""
+    """Return which of the floors that count has the least mean; None where none has one
+    above 0.
+    """
     known = {name: score.mean for name, score in floors.items() if score.mean > 0.0}
-    return min(known, key=lambda name: known[name]) if known else None
+    if known:
+        return min(known, key=lambda name: known[name])
+    return None
 
 
 def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
     """Return the skill of a method beside the scores of the floors in the same metric.
 
-    The interval is that of the ratio of means r = A / B, by the linear part of its logarithm: with
-    e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the score of seed s and b_i that of
-    the floor in scenario i, it is 1 - r exp(e). So it never passes 1, and is one point where the ratio is
-    the same everywhere. Two seeds say little: its lower end may lie far down.
+    The interval is that of the ratio of means r = A / B, by the linear part of its
+    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
+    score of seed s and b_i that of the floor in scenario i, it is 1 - r exp(e). So it
+    never passes 1, and is one point where the ratio is the same everywhere. Two seeds
+    say little: its lower end may lie far down.
 
     Args:
         seeds: score of each seed, over the same scenarios.
         floors: scores of the floors that count, by name.
 
     Returns:
-        None without a floor that counts, without a scenario that both have, and for a metric of
-        which less is not better.
+        None without a floor that counts, without a scenario that both have, and for a
+        metric of which less is not better.
     """
-    name, metric, scenarios = best_floor(floors), seeds[0].metric, seeds[0].scenarios
+    name = best_floor(floors)
+    metric = seeds[0].metric
+    scenarios = seeds[0].scenarios
     if name is None or metric.direction is not Direction.LOWER:
         return None
-    theirs = dict(zip(floors[name].scenarios, floors[name].values.tolist(), strict=True))
+    theirs = dict(
+        zip(floors[name].scenarios, floors[name].values.tolist(), strict=True)
+    )
     base = np.array([theirs.get(i, math.nan) for i in scenarios])
     own = np.stack([score.values for score in seeds])
     both = ~np.isnan(base) & ~np.isnan(own).all(axis=0)
-    own, base = own[:, both], base[both]
+    own = own[:, both]
+    base = base[both]
     if not base.any():
         return None
     scale = float(np.mean(base))
@@ -110,7 +134,9 @@ def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
         floor=name,
         value=1.0 - ratio,
         interval=(1.0 - ratio * math.exp(high), 1.0 - ratio * math.exp(low)),
-        std=float(np.std(np.mean(with_all, axis=1) / scale, ddof=1)) if len(with_all) > 1 else math.nan,
+        std=float(np.std(np.mean(with_all, axis=1) / scale, ddof=1))
+        if len(with_all) > 1
+        else math.nan,
     )
 
 
@@ -127,16 +153,19 @@ class Preview:
 
     scenario: int  # id of the scenario
     map_frames: tuple[int, ...]  # frames of interest and the last one
-    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y node]
+    # at the compared nodes, NaN elsewhere [1/frame], shape [side, map frame, x node, y
+    # node]
     vorticity: NDArray[np.float32]
-    # shares of 64 bins over the truth's range of omega, NaN where there is none [1], shape
-    # [side, map frame, bin]
+    # shares of 64 bins over the truth's range of omega, NaN where there is none [1],
+    # shape [side, map frame, bin]
     histogram: NDArray[np.float32]
     histogram_range: NDArray[np.float32]  # that range [1/frame], shape [map frame, 2]
     film_frames: tuple[int, ...]
     particles: tuple[int, ...]  # numbers of the particles in the film
     material: NDArray[np.int8]  # their materials, shape [film particle]
-    film: NDArray[np.float32]  # their positions [length], shape [side, film frame, film particle, 2]
+    film: NDArray[
+        np.float32
+    ]  # their positions [length], shape [side, film frame, film particle, 2]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -147,11 +176,14 @@ class ScoreCard:
     predictions_sha256: str  # content hash of the predicted positions
     setting: Setting  # the task, as metrics see it
     ranking: str  # name of the metric that ranks
-    # statistics by row and scenario: of the submission, and of floors that were measured beside it
+    # statistics by row and scenario: of the submission, and of floors that were
+    # measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
-    scores: Mapping[str, Mapping[str, Score]]  # scores by row (submission, then floors) and metric
-    # how much better than the best floor, as scored: it does not follow a replaced `scores`; None where no
-    # floor that counts has a score
+    scores: Mapping[
+        str, Mapping[str, Score]
+    ]  # scores by row (submission, then floors) and metric
+    # how much better than the best floor, as scored: it does not follow a replaced
+    # `scores`; None where no floor that counts has a score
     skill: Skill | None
     flags: tuple[Flag, ...]  # what a reader should know
     warnings: tuple[Finding, ...]  # findings of the validation that do not reject
@@ -159,8 +191,11 @@ class ScoreCard:
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 
     def __repr__(self) -> str:
-        """Return whose card it is, the ranking metric and the skill; the values are too many."""
-        header, mean = self.header, self.submission[self.ranking].mean
+        """Return whose card it is, the ranking metric and the skill; the values are too
+        many.
+        """
+        header = self.header
+        mean = self.submission[self.ranking].mean
         whose = f"{header.method!r} on {header.split} {header.size}"
         return f"<{type(self).__name__}: {whose}, {self.ranking} {mean:.4g}, skill {self.skill}>"
 
@@ -172,7 +207,9 @@ class ScoreCard:
     @property
     def reported_frames(self) -> tuple[int, ...]:
         """Frames of interest, and the last one."""
-        return tuple(sorted(self.setting.slow_frames.intersection(self.setting.predicted_frames)))
+        return tuple(
+            sorted(self.setting.slow_frames.intersection(self.setting.predicted_frames))
+        )
 
     @property
     def submission(self) -> Mapping[str, Score]:
@@ -189,15 +226,22 @@ class ScoreCard:
 
     def as_json(self) -> dict[str, Any]:
         """Return the card as what scores.json holds."""
-        header, setting = self.header, self.setting
+        header = self.header
+        setting = self.setting
         used = [score.metric for score in self.submission.values()]
         floors = [row for row in self.scores if row != SUBMISSION]
         return {
             "lagbench_scores": FORMAT,
             **{name: getattr(header, name) for name in IDENTITY},
             "predictions_sha256": self.predictions_sha256,
-            **{name: getattr(header, name) for name in LABELS if getattr(header, name) is not None},
-            "diverged_at": {str(i): frame for i, frame in sorted(header.diverged_at.items())},
+            **{
+                name: getattr(header, name)
+                for name in LABELS
+                if getattr(header, name) is not None
+            },
+            "diverged_at": {
+                str(i): frame for i, frame in sorted(header.diverged_at.items())
+            },
             "task": {
                 "input_frames": setting.input_frames,
                 "horizon": setting.horizon,
@@ -213,7 +257,9 @@ class ScoreCard:
             },
             "against": {row: _comparison(self.against(row)) for row in floors},
             "flags": {flag.name: _flag(flag) for flag in self.flags},
-            "warnings": [{"check": f.check, "what": f.what, "got": f.got} for f in self.warnings],
+            "warnings": [
+                {"check": f.check, "what": f.what, "got": f.got} for f in self.warnings
+            ],
         }
 
     def _score(self, score: Score, row: str) -> dict[str, Any]:
@@ -224,7 +270,9 @@ class ScoreCard:
             "undefined": list(score.undefined),
         }
         if score.metric.per_frame:
-            said["at"] = {str(frame): _at(score, frame, row) for frame in self.reported_frames}
+            said["at"] = {
+                str(frame): _at(score, frame, row) for frame in self.reported_frames
+            }
         return said
 
 
@@ -234,7 +282,8 @@ def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]
     >>> told_apart(["gns", "gat", "gns"])
     ['gns (1)', 'gat', 'gns (2)']
     """
-    count, seen = Counter([*methods, *taken]), Counter[str]()
+    count = Counter([*methods, *taken])
+    seen = Counter[str]()
     names = []
     for method in methods:
         seen[method] += 1
@@ -248,7 +297,9 @@ def digits(value: float) -> float | None:
     >>> digits(2 / 3)
     0.666666667
     """
-    return round_digits(value) if math.isfinite(value) else None
+    if math.isfinite(value):
+        return round_digits(value)
+    return None
 
 
 def _at(score: Score, frame: int, row: str) -> dict[str, Any]:
@@ -308,7 +359,9 @@ MAX_BYTES = 64 << 20
 class PublishedScores:
     """What a scores.json says, as far as another submission can be compared with it."""
 
-    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    identity: Mapping[
+        str, str
+    ]  # split, size, version and hash of the data set, and the method
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     # scores by row and metric, over the horizon; values per frame are not in the file
@@ -320,7 +373,14 @@ def read_scores(path: Path) -> PublishedScores:
     check_regular(path, longest=MAX_BYTES, fix="`lagbench score` writes it")
     try:
         return parse_scores(json.loads(path.read_bytes()))
-    except (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+    ) as error:
         raise unreadable_scores(path, error) from error
     except RecursionError as error:
         # its own trace is a thousand frames long and says no more
@@ -328,7 +388,9 @@ def read_scores(path: Path) -> PublishedScores:
 
 
 def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is not the scores.json or scores.nc that its name promises."""
+    """Return the error for a file that is not the scores.json or scores.nc that its
+    name promises.
+    """
     return UnreadableFileError(
         f"not a scores{path.suffix} of lagbench",
         where=str(path),
@@ -339,9 +401,13 @@ def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
 
 
 def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
-    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a scores.json."""
+    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a
+    scores.json.
+    """
     if held["lagbench_scores"] != FORMAT:
-        raise ValueError(f"layout {str(held['lagbench_scores'])[:MAX_NAME]!r}, not {FORMAT}")
+        raise ValueError(
+            f"layout {str(held['lagbench_scores'])[:MAX_NAME]!r}, not {FORMAT}"
+        )
     ids = tuple(_integer(i, "an id") for i in held["task"]["scenarios"])
     if len(set(ids)) < len(ids):
         raise ValueError("scenario ids that occur twice")
@@ -351,26 +417,41 @@ def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
         predictions_sha256=printable(held, "predictions_sha256"),
         ranking=printable(held, "ranking_metric"),
         scores={
-            row: {n: _read_score(known[n], ids, said) for n, said in scores.items() if n in known}
+            row: {
+                n: _read_score(known[n], ids, said)
+                for n, said in scores.items()
+                if n in known
+            }
             for row, scores in held["rows"].items()
         },
     )
 
 
 def printable(held: Mapping[str, Any], name: str) -> str:
-    """Return text under the rule for attributes of predictions: it goes to terminals as it is."""
+    """Return text under the rule for attributes of predictions: it goes to terminals as
+    it is.
+    """
     text = held[name]
-    if not isinstance(text, str) or not text.strip() or len(text) > MAX_NAME or not text.isprintable():
+    if (
+        not isinstance(text, str)
+        or not text.strip()
+        or len(text) > MAX_NAME
+        or not text.isprintable()
+    ):
         raise ValueError(f"{name} is not printable text of 1 to {MAX_NAME} characters")
     return text
 
 
 def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -> Score:
     values = _floats(said["values"])
-    undefined = tuple(_integer(count, "a number of frames") for count in said["undefined"])
+    undefined = tuple(
+        _integer(count, "a number of frames") for count in said["undefined"]
+    )
     for numbers in (values, undefined):
         if len(numbers) != len(ids):
-            raise ValueError(f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios")
+            raise ValueError(
+                f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios"
+            )
     return Score(
         metric=metric,
         scenarios=ids,
@@ -382,7 +463,11 @@ def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -
 
 
 def _integer(number: object, what: str) -> int:
-    if not isinstance(number, int) or isinstance(number, bool) or not 0 <= number < 2**31:
+    if (
+        not isinstance(number, int)
+        or isinstance(number, bool)
+        or not 0 <= number < 2**31
+    ):
         raise ValueError(f"{what} is no integer from 0 to 2^31 - 1")
     return int(number)
 
@@ -392,6 +477,8 @@ def _floats(values: Iterable[float | None]) -> list[float]:
     found = [math.nan if value is None else float(value) for value in held]
     if any(isinstance(value, bool) for value in held):
         raise ValueError("a value that is no number")
-    if any(abs(value) > float(f"{LARGEST:.9g}") for value in found):  # as rounded in the file
+    if any(
+        abs(value) > float(f"{LARGEST:.9g}") for value in found
+    ):  # as rounded in the file
         raise ValueError(f"a value beyond {LARGEST:.3g}, which scores do not exceed")
     return found

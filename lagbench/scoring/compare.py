@@ -1,8 +1,9 @@
 """Compare two methods over the test scenarios: ``lagbench compare A B``.
 
-The scenarios are the sample, paired by id; so are seeds, where a side is a folder of several.
-Six scenarios are needed before 5 % can be reached; with fewer no significance is claimed and
-the intervals speak alone. With one seed on each side these weights are compared, not methods.
+The scenarios are the sample, paired by id; so are seeds, where a side is a folder of
+several. Six scenarios are needed before 5 % can be reached; with fewer no significance
+is claimed and the intervals speak alone. With one seed on each side these weights are
+compared, not methods.
 """
 
 from __future__ import annotations
@@ -31,7 +32,15 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
 from lagbench.submission.format import MAX_NAME
 
-from .card import JSON_NAME, SUBMISSION, PublishedScores, digits, parse_scores, read_scores, told_apart
+from .card import (
+    JSON_NAME,
+    SUBMISSION,
+    PublishedScores,
+    digits,
+    parse_scores,
+    read_scores,
+    told_apart,
+)
 from .score import score
 from .score_file import NETCDF_NAME
 from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
@@ -47,7 +56,9 @@ class Contestant:
     """One side of a comparison."""
 
     name: str  # what the user called it
-    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    identity: Mapping[
+        str, str
+    ]  # split, size, version and hash of the data set, and the method
     predictions: tuple[str, ...]  # content hash of the predicted positions, by seed
     ranking: str  # name of the metric that ranks
     scores: Mapping[str, tuple[Score, ...]]  # of each seed, by metric
@@ -61,7 +72,9 @@ class MetricComparison:
     metric: Metric
     first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
-    undefined: tuple[int, int]  # frames of either side without a value, which are left out of its mean
+    undefined: tuple[
+        int, int
+    ]  # frames of either side without a value, which are left out of its mean
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
@@ -73,13 +86,17 @@ class ComparisonResult:
     size: str  # of both
     first: str  # method of the first, told apart from that of the second
     second: str  # method of the second, likewise, or the name of the floor
-    namesakes: bool  # whether both methods have one name, so that a number tells them apart
+    namesakes: (
+        bool  # whether both methods have one name, so that a number tells them apart
+    )
     same_predictions: bool  # whether both hold the same positions
     ranking: str  # name of the metric that ranks
     scenarios: int  # how many both have in that metric
     seeds: tuple[int, int]  # of either side
     floor: bool  # whether the second is a floor, which has no seeds
-    metrics: Mapping[str, MetricComparison]  # the ranking one first; observables are left out
+    metrics: Mapping[
+        str, MetricComparison
+    ]  # the ranking one first; observables are left out
 
     def __repr__(self) -> str:
         """Return who is compared and the verdict; the values are too many."""
@@ -88,29 +105,43 @@ class ComparisonResult:
 
     @property
     def verdict(self) -> str:
-        """What the ranking metric says, in one sentence that claims no more than it may."""
+        """What the ranking metric says, in one sentence that claims no more than it
+        may.
+        """
         test = self.metrics[self.ranking].test
         if self.same_predictions:
             return "both hold the same predictions"
         if self.scenarios < FEWEST_SCENARIOS:
             said = f"{self.scenarios} scenarios: no significance is claimed under {FEWEST_SCENARIOS}"
             few = self.scenarios < FEWEST_FOR_INTERVAL
-            return said + (f", no interval under {FEWEST_FOR_INTERVAL}" if few else "; read the intervals")
+            return said + (
+                f", no interval under {FEWEST_FOR_INTERVAL}"
+                if few
+                else "; read the intervals"
+            )
         if not test.significant:
             return f"{self.ranking}: no difference at 5 % ({self._sample})"
-        better = self.first if test.difference < 0.0 else self.second
+        if test.difference < 0.0:
+            better = self.first
+        else:
+            better = self.second
         return f"{self.ranking}: {better} is better ({self._sample})"
 
     @property
     def _sample(self) -> str:
         p, one, two = self.metrics[self.ranking].test.p, *self.seeds
         if self.floor:
-            what = f"{one} seeds" if one > 1 else "one seed: these weights, not the method"
+            if one > 1:
+                what = f"{one} seeds"
+            else:
+                what = "one seed: these weights, not the method"
         elif one == two == 1:
             what = "one seed each: these weights, not the methods"
         else:
             what = f"{one} and {two} seeds"
-            what += ": of one seed its weights, not the method" if 1 in self.seeds else ""
+            what += (
+                ": of one seed its weights, not the method" if 1 in self.seeds else ""
+            )
         return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
 
     def as_json(self) -> dict[str, Any]:
@@ -129,7 +160,16 @@ class ComparisonResult:
             }
             for name, found in self.metrics.items()
         }
-        fields = ("split", "size", "first", "second", "same_predictions", "ranking", "scenarios", "verdict")
+        fields = (
+            "split",
+            "size",
+            "first",
+            "second",
+            "same_predictions",
+            "ranking",
+            "scenarios",
+            "verdict",
+        )
         held = {name: getattr(self, name) for name in fields}
         return {**held, "seeds": list(self.seeds), "metrics": metrics}
 
@@ -146,19 +186,21 @@ def compare(
     """Compare two methods on the same split, size and data set.
 
     Args:
-        first: a scores.json, a folder that holds one, a folder whose folders hold those of the
-            seeds of a method; a scores.nc, or a leaderboard's score file, of several seeds without
-            their numbers, as in ``leaderboard/scores/cavity/full/neuralmpm.nc``; or a predictions.nc,
-            which is then scored.
-        second: another; or the name of a floor, which stands in the first's scores: in a scores.nc
-            the best one, in the ranking metric.
+        first: a scores.json, a folder that holds one, a folder whose folders hold those
+            of the seeds of a method; a scores.nc, or a leaderboard's score file, of
+            several seeds without their numbers, as in
+            ``leaderboard/scores/cavity/full/neuralmpm.nc``; or a predictions.nc, which
+            is then scored.
+        second: another; or the name of a floor, which stands in the first's scores: in
+            a scores.nc the best one, in the ranking metric.
         metrics: metrics to compare; by default all that judge.
         root: folder of all data sets, where predictions are to be scored.
         workers: worker processes for that.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: an unknown metric or floor, or the two belong to different splits or sizes.
+        UsageError: an unknown metric or floor, or the two belong to different splits or
+            sizes.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
@@ -166,11 +208,16 @@ def compare(
     bare = plain and not os.path.lexists(second)  # the name of a floor
     if str(first) in FLOORS and not os.path.lexists(first):
         fix = f"give the floor last: lagbench compare {'PREDICTIONS' if bare else second} {first}"
-        raise UsageError("a floor stands in the scores of a submission", got=str(first), fix=fix)
+        raise UsageError(
+            "a floor stands in the scores of a submission", got=str(first), fix=fix
+        )
     for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
         check_regular(path)  # before what is there is scored
     one = _contestant(first, root, workers, registry)
-    floor = str(second) if bare and str(second) in one.floors else None
+    if bare and str(second) in one.floors:
+        floor = str(second)
+    else:
+        floor = None
     if floor is None and bare:
         if str(second) in FLOORS:
             raise UsageError(
@@ -178,17 +225,24 @@ def compare(
                 where=str(first),
                 expected=str(second),
                 got=f"scores of {', '.join(one.floors) or 'no floor'}",
-                fix="a scores.nc holds the best floor only: compare predictions.nc or scores.json",
+                fix="a scores.nc holds the best floor only: compare predictions.nc or "
+                "scores.json",
             )
-        floors = f"{nearest(str(second), one.floors)}; or " if one.floors else ""
+        if one.floors:
+            floors = f"{nearest(str(second), one.floors)}; or "
+        else:
+            floors = ""
         fix = f"{floors}name scores, predictions or a folder of them"
         raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)
-    two = _contestant(second, root, workers, registry) if floor is None else _floor(one, floor)
+    if floor is None:
+        two = _contestant(second, root, workers, registry)
+    else:
+        two = _floor(one, floor)
     between = f"{one.name} and {two.name}"
     _check_same(between, one.identity, two.identity)
-    if floor is None and 0 < len(shared := set(one.predictions) & set(two.predictions)) < max(
-        len(one.predictions), len(two.predictions)
-    ):
+    if floor is None and 0 < len(
+        shared := set(one.predictions) & set(two.predictions)
+    ) < max(len(one.predictions), len(two.predictions)):
         raise UsageError(
             "both sides have predictions of their own and the same ones",
             where=between,
@@ -198,11 +252,21 @@ def compare(
         )
     judged = _judged(one, two)
     methods = one.identity["method"], two.identity["method"]
-    names = told_apart(methods) if floor is None else [*told_apart(methods[:1], taken=(floor,)), floor]
-    metrics = (metrics,) if isinstance(metrics, str) else metrics
+    if floor is None:
+        names = told_apart(methods)
+    else:
+        names = [*told_apart(methods[:1], taken=(floor,)), floor]
+    if isinstance(metrics, str):
+        metrics = (metrics,)
+    else:
+        metrics = metrics
     for name in metrics:
         if name not in judged:
-            raise UsageError(f"no metric {name!r} to compare by", where="--metric", fix=nearest(name, judged))
+            raise UsageError(
+                f"no metric {name!r} to compare by",
+                where="--metric",
+                fix=nearest(name, judged),
+            )
     wanted = {one.ranking, *(metrics or judged)}
     order = sorted(wanted, key=lambda name: (name != one.ranking, judged.index(name)))
     found = {name: _compared(one.scores[name], two.scores[name]) for name in order}
@@ -222,26 +286,41 @@ def compare(
 
 
 def _contestant(
-    source: str | Path, root: str | Path | None, workers: int | None, registry: Registry | None
+    source: str | Path,
+    root: str | Path | None,
+    workers: int | None,
+    registry: Registry | None,
 ) -> Contestant:
-    """Return a method with the scores of its seeds, and the floors beside the first of them."""
+    """Return a method with the scores of its seeds, and the floors beside the first of
+    them.
+    """
     held = []
     for path in _seeds_of(Path(source)):
-        found = read_scores(path) if path.suffix == ".json" else _read(path, root, workers, registry)
+        if path.suffix == ".json":
+            found = read_scores(path)
+        else:
+            found = _read(path, root, workers, registry)
         if SUBMISSION not in found.scores:
             raise _incomplete(
-                str(path), f"a row {SUBMISSION!r}", ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME]
+                str(path),
+                f"a row {SUBMISSION!r}",
+                ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME],
             )
         held.append(found)
-    first, own = held[0], [one.scores[SUBMISSION] for one in held]
+    first = held[0]
+    own = [one.scores[SUBMISSION] for one in held]
     name, *names = (f"{source} ({one.identity['method']})" for one in held)
     for other, one in zip(names, held[1:], strict=True):
-        _check_same(f"{name} and {other}", first.identity, one.identity, more=("method",))
+        _check_same(
+            f"{name} and {other}", first.identity, one.identity, more=("method",)
+        )
     predictions = tuple(one.predictions_sha256 for one in held)
     if len(set(predictions)) < len(held):
         expected = "another seed of the method in each folder"
         fix = "one file stands for one training: leave copies out"
-        raise UsageError("the same predictions twice", where=str(source), expected=expected, fix=fix)
+        raise UsageError(
+            "the same predictions twice", where=str(source), expected=expected, fix=fix
+        )
     common = [name for name in own[0] if all(name in scores for scores in own)]
     return Contestant(
         name=str(source),
@@ -249,12 +328,15 @@ def _contestant(
         predictions=predictions,
         ranking=first.ranking,
         scores={name: tuple(scores[name] for scores in own) for name in common},
-        floors={row: scores for row, scores in first.scores.items() if row != SUBMISSION},
+        floors={
+            row: scores for row, scores in first.scores.items() if row != SUBMISSION
+        },
     )
 
 
 def _seeds_of(path: Path) -> list[Path]:
-    """Return the score files of a folder: its own, or those of its folders; of a file the path itself.
+    """Return the score files of a folder: its own, or those of its folders; of a file
+    the path itself.
 
     What is not there may be the name that a leaderboard's files of several seeds share.
     """
@@ -263,17 +345,28 @@ def _seeds_of(path: Path) -> list[Path]:
         with suppress(OSError):  # the working folder is gone
             place = Path(os.path.abspath(path))
         on_a_board = path.suffix == ".nc" and place.parts[-4:-3] == ("scores",)
-        shared = sorted(path.parent.glob("*.nc")) if on_a_board and not os.path.lexists(path) else []
+        if on_a_board and not os.path.lexists(path):
+            shared = sorted(path.parent.glob("*.nc"))
+        else:
+            shared = []
         name = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
         return [file for file in shared if name.fullmatch(file.stem)] or [path]
-    for folders in ([path], sorted(inner for inner in path.iterdir() if inner.is_dir())):
-        files = [[folder / name for name in (JSON_NAME, NETCDF_NAME)] for folder in folders]
-        if found := [file for one in files if (file := next(filter(os.path.isfile, one), None))]:
+    for folders in (
+        [path],
+        sorted(inner for inner in path.iterdir() if inner.is_dir()),
+    ):
+        files = [
+            [folder / name for name in (JSON_NAME, NETCDF_NAME)] for folder in folders
+        ]
+        if found := [
+            file for one in files if (file := next(filter(os.path.isfile, one), None))
+        ]:
             return found
     raise UnreadableFileError(
         "no scores in the folder",
         where=str(path),
-        expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a method's seeds",
+        expected=f"{JSON_NAME} or {NETCDF_NAME}, or folders that hold one each, of a "
+        f"method's seeds",
         fix="`lagbench score` writes them; or name a predictions.nc",
     )
 
@@ -283,12 +376,20 @@ def _read(
 ) -> PublishedScores:
     real = path.resolve()
     large = (length := real.stat().st_size) > MAX_SCORE_BYTES
-    reason = f"{length} bytes, more than scores take" if large else unreadable_in_child([real]).get(real)
+    reason = (
+        f"{length} bytes, more than scores take"
+        if large
+        else unreadable_in_child([real]).get(real)
+    )
     if reason is None:
         return published(real)
     try:
         # through JSON, so that its digits are those of a scores.json
-        return parse_scores(score(path, root=root, workers=workers, registry=registry, write=False).as_json())
+        return parse_scores(
+            score(
+                path, root=root, workers=workers, registry=registry, write=False
+            ).as_json()
+        )
     except (UnreadableFileError, ChecksFailedError) as error:
         with real.open("rb") as stream:
             head = stream.read(MAX_SCORE_BYTES)
@@ -297,7 +398,8 @@ def _read(
         raise UnreadableFileError(
             "neither scores nor predictions",
             where=str(path),
-            expected="what `lagbench score` or `lagbench submit` wrote, or a predictions.nc",
+            expected="what `lagbench score` or `lagbench submit` wrote, or a "
+            "predictions.nc",
             got=f"as scores: {reason}; as predictions: {error.what}, {error.got}",
             fix=AGAIN,
         ) from error
@@ -306,27 +408,47 @@ def _read(
 def _floor(beside: Contestant, name: str) -> Contestant:
     identity = {**beside.identity, "method": name}
     scores = {metric: (score,) for metric, score in beside.floors[name].items()}
-    return replace(beside, name=name, identity=identity, predictions=("",), scores=scores)
+    return replace(
+        beside, name=name, identity=identity, predictions=("",), scores=scores
+    )
 
 
 def _check_same(
-    where: str, one: Mapping[str, str], two: Mapping[str, str], *, more: tuple[str, ...] = ()
+    where: str,
+    one: Mapping[str, str],
+    two: Mapping[str, str],
+    *,
+    more: tuple[str, ...] = (),
 ) -> None:
     for key in (*SAME, *more):
         if (first := one[key]) != (second := two[key]):
             kind = DataError if key == "dataset_sha256" else UsageError
             fix = "compare submissions to the same split, size and data set"
-            fix += ", and keep the seeds of each method in a folder of its own" if more else ""
+            fix += (
+                ", and keep the seeds of each method in a folder of its own"
+                if more
+                else ""
+            )
             what = f"the two submissions differ in {key}"
             raise kind(what, where=where, expected=first, got=second, fix=fix)
 
 
 def _judged(one: Contestant, two: Contestant) -> list[str]:
-    """Return the names of the metrics to compare by, the ranking one of the first among them."""
-    judging = [name for name, held in one.scores.items() if held[0].metric.direction is not Direction.NONE]
+    """Return the names of the metrics to compare by, the ranking one of the first among
+    them.
+    """
+    judging = [
+        name
+        for name, held in one.scores.items()
+        if held[0].metric.direction is not Direction.NONE
+    ]
     for side, names in ((one, judging), (two, two.scores)):
         if one.ranking not in names:
-            raise _incomplete(side.name, f"values of a ranking metric that judges, {one.ranking!r}", None)
+            raise _incomplete(
+                side.name,
+                f"values of a ranking metric that judges, {one.ranking!r}",
+                None,
+            )
     return [name for name in judging if name in two.scores]
 
 
@@ -336,7 +458,14 @@ def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileErr
 
 
 def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
-    one, two = (mean(mean_over_seeds([score.values for score in side])) for side in (first, second))
-    lost, gone = (sum(sum(score.undefined) for score in side) for side in (first, second))
+    one, two = (
+        mean(mean_over_seeds([score.values for score in side]))
+        for side in (first, second)
+    )
+    lost, gone = (
+        sum(sum(score.undefined) for score in side) for side in (first, second)
+    )
     test = compare_scores(first, second)
-    return MetricComparison(metric=first[0].metric, first=one, second=two, undefined=(lost, gone), test=test)
+    return MetricComparison(
+        metric=first[0].metric, first=one, second=two, undefined=(lost, gone), test=test
+    )

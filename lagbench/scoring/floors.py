@@ -1,8 +1,9 @@
 """The scores of floors: shipped with the package, or measured where they are not.
 
-:func:`measure` is what the shipped ones come from (``python -m lagbench.scoring.record``) and
-what they are checked against. A scenario that is measured is kept under the root folder, so that
-an interrupted measurement goes on where it stopped.
+:func:`measure` is what the shipped ones come from
+(``python -m lagbench.scoring.record``) and what they are checked against. A scenario
+that is measured is kept under the root folder, so that an interrupted measurement goes
+on where it stopped.
 """
 
 from __future__ import annotations
@@ -33,16 +34,22 @@ from .scenario import measure_rows, predicted_by
 from .task import ScoredTask, load_scored_task
 
 TOLERANCE = 1e-4
-"""Relative difference up to which shipped and measured values are equal: libraries round differently."""
+"""Relative difference up to which shipped and measured values are equal: libraries
+round differently.
+"""
 
 
 def measurable(size: Size, root: Path) -> tuple[str, ...]:
-    """Return the names of the floors that scoring measures where none are shipped: those that count."""
+    """Return the names of the floors that scoring measures where none are shipped:
+    those that count.
+    """
     return tuple(floor.name for floor in _possible(size, root) if floor.counts)
 
 
 def _possible(size: Size, root: Path) -> list[Floor]:
-    """Return the floors of a size; what looks at train only where all of train is there."""
+    """Return the floors of a size; what looks at train only where all of train is
+    there.
+    """
     trained = _has(size, root, "train")
     return [floor for floor in floors_of(size) if trained or not floor.reads_train]
 
@@ -54,9 +61,15 @@ def _has(size: Size, root: Path, subset: str) -> bool:
 
 
 def measured_sizes(
-    root: Path, *, split: str | None = None, name: str | None = None, registry: Registry | None = None
+    root: Path,
+    *,
+    split: str | None = None,
+    name: str | None = None,
+    registry: Registry | None = None,
 ) -> list[Size]:
-    """Return the sizes of our splits whose test subset lies under a root, or those that are named."""
+    """Return the sizes of our splits whose test subset lies under a root, or those that
+    are named.
+    """
     described = registry or load()
     sizes = [
         described.size(one, tier)
@@ -69,10 +82,16 @@ def measured_sizes(
 def measured_again(
     size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
 ) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the shipped floors of a data set again: which were measured, and what differs in them."""
+    """Measure the shipped floors of a data set again: which were measured, and what
+    differs in them.
+    """
     names = tuple(floor.name for floor in _possible(size, root))
-    known = {name: held for name, held in (shipped(size) or {}).items() if name in names}
-    return names, differences(known, measure(size, root, floors=names, progress=progress))
+    known = {
+        name: held for name, held in (shipped(size) or {}).items() if name in names
+    }
+    return names, differences(
+        known, measure(size, root, floors=names, progress=progress)
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +111,9 @@ class FloorTallies:
 
     scenario: int  # id of the scenario
     tallies: Mapping[str, Tally]  # statistics by name of the floor
-    seconds_per_frame: Mapping[str, float]  # CPU time of the prediction, median over frames [s]
+    seconds_per_frame: Mapping[
+        str, float
+    ]  # CPU time of the prediction, median over frames [s]
 
 
 def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
@@ -104,10 +125,14 @@ def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
     with job.task.opened(job.scenario) as truth:
         given = given_in(truth.file, job.task.size, job.task.truth.root)
         rows = {
-            name: snapshots(truth.scenario, _timed(predicted_by(FLOORS[name], given), taken))
+            name: snapshots(
+                truth.scenario, _timed(predicted_by(FLOORS[name], given), taken)
+            )
             for name, taken in seconds.items()
         }
-        tallies, _ = measure_rows(truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report)
+        tallies, _ = measure_rows(
+            truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report
+        )
     medians = {name: float(np.median(taken)) for name, taken in seconds.items()}
     found = FloorTallies(job.scenario, tallies, medians)
     if job.keep is not None:
@@ -115,7 +140,9 @@ def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
     return found
 
 
-def _timed(frames: Iterator[NDArray[np.float32]], seconds: list[float]) -> Iterator[NDArray[np.float32]]:
+def _timed(
+    frames: Iterator[NDArray[np.float32]], seconds: list[float]
+) -> Iterator[NDArray[np.float32]]:
     """Yield frames; add the CPU time that each took."""
     while True:
         start = time.process_time()
@@ -129,27 +156,41 @@ def _timed(frames: Iterator[NDArray[np.float32]], seconds: list[float]) -> Itera
 def _keep(found: FloorTallies, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     first, *_ = tallies = list(found.tallies.values())
-    held: dict[str, Any] = {"floors": list(found.tallies), "names": first.names, "frames": first.frames}
-    held |= {part: [getattr(tally, part) for tally in tallies] for part in ("total", "weight", "undefined")}
+    held: dict[str, Any] = {
+        "floors": list(found.tallies),
+        "names": first.names,
+        "frames": first.frames,
+    }
+    held |= {
+        part: [getattr(tally, part) for tally in tallies]
+        for part in ("total", "weight", "undefined")
+    }
     with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
         np.savez(file, **held, seconds_per_frame=list(found.seconds_per_frame.values()))
 
 
 def _kept(job: FloorJob, path: Path) -> FloorTallies:
     with np.load(path, allow_pickle=False) as held:
-        names, frames = tuple(held["names"].tolist()), tuple(held["frames"].tolist())
+        names = tuple(held["names"].tolist())
+        frames = tuple(held["frames"].tolist())
         sums = zip(held["total"], held["weight"], held["undefined"], strict=True)
         floors = held["floors"].tolist()
         return FloorTallies(
             job.scenario,
-            {name: Tally(names, frames, *parts) for name, parts in zip(floors, sums, strict=True)},
+            {
+                name: Tally(names, frames, *parts)
+                for name, parts in zip(floors, sums, strict=True)
+            },
             dict(zip(floors, held["seconds_per_frame"].tolist(), strict=True)),
         )
 
 
 def kept_in(size: Size, root: Path) -> Path:
     """Return the folder in which an interrupted measurement of a data set is kept."""
-    sha256 = size.measured.dataset_sha256 if size.measured else "unrecorded"
+    if size.measured:
+        sha256 = size.measured.dataset_sha256
+    else:
+        sha256 = "unrecorded"
     return root / ".floors" / f"{size.split}-{size.name}-{sha256[:16]}"
 
 
@@ -162,13 +203,18 @@ def measure(
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, FloorScores]:
-    """Return the scores of floors of a data set, by default all, those of single frames by scenario.
+    """Return the scores of floors of a data set, by default all, those of single frames
+    by scenario.
 
-    The test subset must be there, and train for ``analog``. With ``resume`` what is measured is kept under
-    the root, and what is kept there is taken.
+    The test subset must be there, and train for ``analog``. With ``resume`` what is
+    measured is kept under the root, and what is kept there is taken.
     """
     task = load_scored_task(size, root)
-    names = tuple(floor.name for floor in floors_of(size) if floors is None or floor.name in floors)
+    names = tuple(
+        floor.name
+        for floor in floors_of(size)
+        if floors is None or floor.name in floors
+    )
     jobs = {
         f"floors on scenario {i}": FloorJob(
             task=task,
@@ -180,15 +226,21 @@ def measure(
         for i in task.scenarios
     }
     meter = Meter(progress)
-    meter.begin("measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs))
+    meter.begin(
+        "measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs)
+    )
     found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
     floors_scores = {}
     for name in names:
-        scores = aggregate(select(), {held.scenario: held.tallies[name] for held in found})
+        scores = aggregate(
+            select(), {held.scenario: held.tallies[name] for held in found}
+        )
         floors_scores[name] = FloorScores(
             name=name,
             scores=scores,
-            seconds_per_frame=float(np.median([held.seconds_per_frame[name] for held in found])),
+            seconds_per_frame=float(
+                np.median([held.seconds_per_frame[name] for held in found])
+            ),
             correlation=correlation_of(scores),
         )
     return floors_scores
@@ -197,14 +249,22 @@ def measure(
 def differences(
     expected: Mapping[str, FloorScores], found: Mapping[str, FloorScores]
 ) -> dict[str, tuple[str, ...]]:
-    """Return by floor the metrics whose values per scenario differ, those that one lacks included."""
+    """Return by floor the metrics whose values per scenario differ, those that one
+    lacks included.
+    """
     near = partial(np.allclose, rtol=TOLERANCE, atol=1e-12, equal_nan=True)
     unlike = {}
     for name in {**expected, **found}:
-        one, two = (held[name].scores if name in held else {} for held in (expected, found))
+        one, two = (
+            held[name].scores if name in held else {} for held in (expected, found)
+        )
         unlike[name] = tuple(
             metric
             for metric in {**one, **two}
-            if not (metric in one and metric in two and near(one[metric].values, two[metric].values))
+            if not (
+                metric in one
+                and metric in two
+                and near(one[metric].values, two[metric].values)
+            )
         )
     return {name: metrics for name, metrics in unlike.items() if metrics}

@@ -3,11 +3,12 @@
 usage: python -m lagbench.scoring.record [--split cavity] [--size mini] [--root FOLDER]
            [--workers 2] [--floor analog ...] [--solver]
 
-All splits and sizes whose data are there, or those named. With --floor only these are measured
-anew, from the start; the others, and all costs, stay as they are. Without it what is measured is
-kept under the root folder scenario by scenario: an interrupted run goes on where it stopped. Last
-the solver itself is timed (``lagbench bench solver``); with --solver nothing else is done. What is
-shipped is checked by ``lagbench leaderboard check --root FOLDER``.
+All splits and sizes whose data are there, or those named. With --floor only these are
+measured anew, from the start; the others, and all costs, stay as they are. Without it
+what is measured is kept under the root folder scenario by scenario: an interrupted run
+goes on where it stopped. Last the solver itself is timed (``lagbench bench solver``);
+with --solver nothing else is done. What is shipped is checked by
+``lagbench leaderboard check --root FOLDER``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,12 @@ from pathlib import Path
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.floors.shipped import FOLDER, shipped_path, write_shipped, write_solver_seconds
+from lagbench.floors.shipped import (
+    FOLDER,
+    shipped_path,
+    write_shipped,
+    write_solver_seconds,
+)
 from lagbench.floors.table import FLOORS, floors_of
 
 from .floors import kept_in, measure, measured_sizes
@@ -31,19 +37,34 @@ from .task import load_scored_task
 
 
 def record(
-    size: Size, root: Path, *, workers: int = 1, folder: Path = FOLDER, floors: Collection[str] | None = None
+    size: Size,
+    root: Path,
+    *,
+    workers: int = 1,
+    folder: Path = FOLDER,
+    floors: Collection[str] | None = None,
 ) -> Path:
-    """Measure the floors of a data set, or some of them, and write them to the folder of shipped scores.
+    """Measure the floors of a data set, or some of them, and write them to the folder
+    of shipped scores.
 
     Raises:
-        DataError: the data set is not recorded in datasets.yaml, or its files are missing.
+        DataError: the data set is not recorded in datasets.yaml, or its files are
+            missing.
         UsageError: the data set has none of these floors.
     """
     whole = floors is None
-    if not whole and not {floor.name for floor in floors_of(size)}.intersection(floors or ()):
-        raise UsageError("the data set has no such floor", where=f"{size.split} {size.name}", got=floors)
+    if not whole and not {floor.name for floor in floors_of(size)}.intersection(
+        floors or ()
+    ):
+        raise UsageError(
+            "the data set has no such floor",
+            where=f"{size.split} {size.name}",
+            got=floors,
+        )
     if size.measured is None:
-        raise DataError("the data set has no recorded hash", where=f"{size.split} {size.name}")
+        raise DataError(
+            "the data set has no recorded hash", where=f"{size.split} {size.name}"
+        )
     setting = load_scored_task(size, root).setting
     path = write_shipped(
         size,
@@ -64,8 +85,12 @@ def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
     command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
-        raise WorkFailedError("the solver could not be timed", got=done.stderr.strip()[-300:])
-    return write_solver_seconds(size, json.loads(done.stdout)["seconds_per_frame"], folder)
+        raise WorkFailedError(
+            "the solver could not be timed", got=done.stderr.strip()[-300:]
+        )
+    return write_solver_seconds(
+        size, json.loads(done.stdout)["seconds_per_frame"], folder
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -88,7 +113,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not options.floor:
                 time_solver(size)
             path = shipped_path(size)
-            sys.stdout.write(f"{size.split} {size.name}: {path.name}, {path.stat().st_size} bytes\n")
+            sys.stdout.write(
+                f"{size.split} {size.name}: {path.name}, {path.stat().st_size} bytes\n"
+            )
             sys.stdout.flush()
     except LagbenchError as error:
         sys.stderr.write(f"record: {error}\n")

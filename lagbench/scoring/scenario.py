@@ -1,7 +1,7 @@
 """One scenario of a submission against the truth: the unit of work that is spread.
 
-The truth's snapshots and fields are formed once for the submission and the floors beside it;
-memory is that of a few frames, whatever the horizon.
+The truth's snapshots and fields are formed once for the submission and the floors
+beside it; memory is that of a few frames, whatever the horizon.
 
 The few pictures of a submission that a board page draws, taken while it is scored.
 """
@@ -36,11 +36,13 @@ class PreviewRecorder:
     """Takes the pictures of one scenario, its ``preview``, frame pair by frame pair."""
 
     def __init__(self, number: int, scenario: Scenario) -> None:
-        setting, frames = scenario.setting, scenario.setting.predicted_frames
+        frames = scenario.setting.predicted_frames
+        setting = scenario.setting
         maps = tuple(sorted(setting.slow_frames.intersection(frames)))
         film_frames = _spaced(frames, FRAMES)
         particles = _spaced(range(len(scenario.material)), PARTICLES)
-        shape, nan = (2, len(maps), setting.grid.nodes, setting.grid.nodes), np.float32(np.nan)
+        shape = (2, len(maps), setting.grid.nodes, setting.grid.nodes)
+        nan = np.float32(np.nan)
         self.preview = Preview(
             scenario=number,
             map_frames=maps,
@@ -57,22 +59,28 @@ class PreviewRecorder:
         """Look at a frame; most are not pictured."""
         made = self.preview
         if pair.frame in made.film_frames:
-            i, shown = made.film_frames.index(pair.frame), list(made.particles)
+            i = made.film_frames.index(pair.frame)
+            shown = list(made.particles)
             made.film[0, i] = pair.truth.position[shown]
             made.film[1, i] = np.clip(pair.prediction.position[shown], -1e6, 1e6)
         if pair.frame in made.map_frames and pair.node_count:
             i = made.map_frames.index(pair.frame)
-            truth, prediction = pair.true_vorticity, pair.predicted_vorticity
+            truth = pair.true_vorticity
+            prediction = pair.predicted_vorticity
             made.vorticity[0, i][pair.nodes] = truth
             made.vorticity[1, i][pair.nodes] = np.clip(prediction, -1e30, 1e30)
-            shares = histograms(truth, prediction) if pair.truth_turns else None
+            if pair.truth_turns:
+                shares = histograms(truth, prediction)
+            else:
+                shares = None
             if shares is not None:
                 made.histogram[:, i] = shares
                 made.histogram_range[i] = np.min(truth), np.max(truth)
 
 
 def _spaced(numbers: range, count: int) -> tuple[int, ...]:
-    """Return evenly spaced members of a range, first and last included; all if there are few.
+    """Return evenly spaced members of a range, first and last included; all if there
+    are few.
 
     >>> _spaced(range(6, 16), 4)
     (6, 9, 12, 15)
@@ -105,29 +113,43 @@ class ScenarioScores:
     preview: Preview | None  # pictures, if they were asked for
 
 
-_selected = functools.cache(select)  # the search through installed packages takes as long as some frames
+_selected = functools.cache(
+    select
+)  # the search through installed packages takes as long as some frames
 
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     """Score one scenario of a submission and of the floors that are to be measured."""
-    number, metrics = job.scenario, _selected(job.metrics)
+    number = job.scenario
+    metrics = _selected(job.metrics)
     try:
         with (
             job.task.opened(number) as truth,
             open_predictions(job.predictions, checked=job.anatomy) as predictions,
         ):
             scenario = truth.scenario
-            frames = (frame for _, block in predictions.blocks(number) for frame in block)
+            frames = (
+                frame for _, block in predictions.blocks(number) for frame in block
+            )
             rows = {SUBMISSION: snapshots(scenario, frames)}
             for name in job.floors:
                 given = given_in(truth.file, job.task.size, job.task.truth.root)
                 rows[name] = snapshots(scenario, predicted_by(FLOORS[name], given))
-            photographer = PreviewRecorder(number, scenario) if job.pictured else None
-            tallies, trace = measure_rows(scenario, truth.snapshots(), rows, metrics, photographer, report)
+            if job.pictured:
+                photographer = PreviewRecorder(number, scenario)
+            else:
+                photographer = None
+            tallies, trace = measure_rows(
+                scenario, truth.snapshots(), rows, metrics, photographer, report
+            )
     except Exception as error:
-        error.add_note(f"scenario {number}")  # beside what a package's metric or our own code raises there
+        error.add_note(
+            f"scenario {number}"
+        )  # beside what a package's metric or our own code raises there
         raise
-    return ScenarioScores(number, tallies, trace, photographer.preview if photographer else None)
+    return ScenarioScores(
+        number, tallies, trace, photographer.preview if photographer else None
+    )
 
 
 def predicted_by(floor: Floor, given: Given) -> Prediction:
@@ -147,7 +169,8 @@ def measure_rows(
 ) -> tuple[dict[str, Tally], Trace]:
     """Measure rows of predictions of one scenario side by side, frame by frame."""
     frames = scenario.setting.predicted_frames
-    tracer, first = Tracer(scenario), next(iter(rows))
+    tracer = Tracer(scenario)
+    first = next(iter(rows))
     measured: dict[str, dict[int, dict[str, float]]] = {name: {} for name in rows}
     for frame, true, *predicted in zip(frames, truth, *rows.values(), strict=True):
         for name, snapshot in zip(rows, predicted, strict=True):
@@ -159,5 +182,8 @@ def measure_rows(
                     photographer.add(pair)
         report(1)
     names = [m.name for m in metrics if m.statistic is not None]
-    tallies = {name: as_stored(Tally.of(names, frames, values)) for name, values in measured.items()}
+    tallies = {
+        name: as_stored(Tally.of(names, frames, values))
+        for name, values in measured.items()
+    }
     return tallies, tracer.result()

@@ -1,4 +1,6 @@
-"""Score a predictions.nc: validate, measure, aggregate, put beside the floors, flag, write."""
+"""Score a predictions.nc: validate, measure, aggregate, put beside the floors, flag,
+write.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,9 @@ PREDICTIONS = "predictions.nc"
 """The usual name of a submission; its scores lie beside it."""
 
 WORTH_WORKERS = 1_000_000
-"""Particles times predicted frames below which starting worker processes costs more than it gains."""
+"""Particles times predicted frames below which starting worker processes costs more
+than it gains.
+"""
 
 
 def score(
@@ -59,8 +63,8 @@ def score(
     Args:
         predictions: a predictions.nc.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        output_dir: folder for the two files; by default that of a predictions.nc, and beside a file of
-            another name the folder of that name.
+        output_dir: folder for the two files; by default that of a predictions.nc, and
+            beside a file of another name the folder of that name.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
         extras: extras whose metrics are wanted too, as in ("transport",).
@@ -68,51 +72,78 @@ def score(
         examined: told what the validation found, before anything is raised for it.
         registry: where splits are described; ours when None.
         write: whether to write the two files.
-        validated: what :func:`lagbench.validate` with ``require_truth`` said of this very file and
-            root, if it was asked before; the file is not validated again.
+        validated: what :func:`lagbench.validate` with ``require_truth`` said of this
+            very file and root, if it was asked before; the file is not validated again.
 
     Returns:
         The score card; ``files`` names what was written.
 
     Raises:
-        UsageError: an extra that brings no metrics, or that is not installed; scores of another method
-            lie where these would go.
+        UsageError: an extra that brings no metrics, or that is not installed; scores of
+            another method lie where these would go.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
-        DataError: they were made from another data set, or the test subset is missing or damaged.
-        WorkFailedError: a worker or the cluster was lost, the disk is full, or the folder
-            cannot be written to, which is seen before the work.
+        DataError: they were made from another data set, or the test subset is missing
+            or damaged.
+        WorkFailedError: a worker or the cluster was lost, the disk is full, or the
+            folder cannot be written to, which is seen before the work.
     """
     metrics = _chosen(extras)
-    path, holder = Path(predictions).absolute(), resolve_root(root)
+    path = Path(predictions).absolute()
+    holder = resolve_root(root)
     described = rooted(holder, registry)
-    folder = scores_folder(Path(predictions)) if output_dir is None else Path(output_dir)
-    result = validated or validate(path, root=holder, require_truth=True, registry=described)
+    if output_dir is None:
+        folder = scores_folder(Path(predictions))
+    else:
+        folder = Path(output_dir)
+    result = validated or validate(
+        path, root=holder, require_truth=True, registry=described
+    )
     if result.path != path:
-        raise UsageError("the validation is of another file", where=str(path), got=result.path)
+        raise UsageError(
+            "the validation is of another file", where=str(path), got=result.path
+        )
     if examined is not None:
         examined(result)
     result.check()
     if write:
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
-        header, anatomy, content = opened.header, opened.anatomy, result.sha256 or opened.content_sha256()
+        header = opened.header
+        anatomy = opened.anatomy
+        content = result.sha256 or opened.content_sha256()
     if write:
         _check_own(folder / JSON_NAME, header)
     task = load_scored_task(described.size(header.split, header.size), holder)
     known = shipped(task.size) or {}
     floors = () if known else measurable(task.size, holder)
     outcomes = _outcomes(
-        task, path, anatomy, tuple(m.name for m in metrics), floors, workers, scheduler, Meter(progress)
+        task,
+        path,
+        anatomy,
+        tuple(m.name for m in metrics),
+        floors,
+        workers,
+        scheduler,
+        Meter(progress),
     )
     tallies = {
-        row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes} for row in outcomes[0].tallies
+        row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes}
+        for row in outcomes[0].tallies
     }
-    scores: dict[str, Mapping[str, Score]] = {row: aggregate(metrics, held) for row, held in tallies.items()}
+    scores: dict[str, Mapping[str, Score]] = {
+        row: aggregate(metrics, held) for row, held in tallies.items()
+    }
     scores |= {name: floor.scores for name, floor in known.items()}
     ranking = ranking_metric(task.size)
-    floored = {row: held[ranking] for row, held in scores.items() if row in COUNTING and ranking in held}
-    preview = next(outcome.preview for outcome in outcomes if outcome.preview is not None)
+    floored = {
+        row: held[ranking]
+        for row, held in scores.items()
+        if row in COUNTING and ranking in held
+    }
+    preview = next(
+        outcome.preview for outcome in outcomes if outcome.preview is not None
+    )
     card = ScoreCard(
         header=header,
         predictions_sha256=content,
@@ -125,7 +156,9 @@ def score(
         warnings=(*result.warnings, *_undefined(task, tallies[SUBMISSION])),
         preview=preview,
     )
-    return _written(card, folder) if write else card
+    if write:
+        return _written(card, folder)
+    return card
 
 
 def scores_folder(predictions: Path) -> Path:
@@ -135,7 +168,9 @@ def scores_folder(predictions: Path) -> Path:
     ('runs', 'runs/gns')
     """
     usual = predictions.name == PREDICTIONS
-    return predictions.parent if usual else predictions.parent / predictions.stem
+    if usual:
+        return predictions.parent
+    return predictions.parent / predictions.stem
 
 
 def _check_own(path: Path, header: Header) -> None:
@@ -159,7 +194,9 @@ def _check_own(path: Path, header: Header) -> None:
 
 
 def _undefined(task: ScoredTask, held: Mapping[int, Tally]) -> Iterator[Finding]:
-    """Warn where the vorticity of all scenarios, or of any where it ranks, has too few nodes throughout."""
+    """Warn where the vorticity of all scenarios, or of any where it ranks, has too few
+    nodes throughout.
+    """
     lost = [i for i, tally in held.items() if not _has_nodes(tally)]
     if lost and (ranking_metric(task.size) == OF_NODES or len(lost) == len(held)):
         yield few_nodes(task, lost)
@@ -173,8 +210,11 @@ def _has_nodes(tally: Tally) -> bool:
 
 
 def _written(card: ScoreCard, folder: Path) -> ScoreCard:
-    json_path, netcdf_path = folder / JSON_NAME, folder / NETCDF_NAME
-    with atomic_path(json_path, option="--output") as temporary:  # both, or neither where the disk is full
+    json_path = folder / JSON_NAME
+    netcdf_path = folder / NETCDF_NAME
+    with atomic_path(
+        json_path, option="--output"
+    ) as temporary:  # both, or neither where the disk is full
         temporary.write_bytes(spell(card))
         write_statistics(card, netcdf_path)
     return card.at(json_path, netcdf_path)
@@ -183,10 +223,17 @@ def _written(card: ScoreCard, folder: Path) -> ScoreCard:
 def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
     """Return the metrics to measure; refuse an extra that brings none."""
     known = {metric.extra for metric in available().values() if metric.extra}
-    extras = (extras,) if isinstance(extras, str) else extras
+    if isinstance(extras, str):
+        extras = (extras,)
+    else:
+        extras = extras
     for extra in extras:
         if extra not in known:
-            raise UsageError(f"no extra {extra!r} with metrics", where="--extras", fix=nearest(extra, known))
+            raise UsageError(
+                f"no extra {extra!r} with metrics",
+                where="--extras",
+                fix=nearest(extra, known),
+            )
     return select(extras=extras)
 
 
@@ -201,7 +248,8 @@ def _outcomes(
     meter: Meter,
 ) -> list[ScenarioScores]:
     """Return what was measured of every scenario, by ascending id."""
-    ids, horizon = task.scenarios, task.setting.horizon
+    ids = task.scenarios
+    horizon = task.setting.horizon
     jobs = {
         f"scenario {i}": ScenarioJob(
             task=task,
@@ -216,17 +264,28 @@ def _outcomes(
     }
     if workers is None:
         worth = len(ids) * horizon * task.size.particles >= WORTH_WORKERS
-        workers = available_cores() if worth else 1
+        if worth:
+            workers = available_cores()
+        else:
+            workers = 1
     meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
-    return run_all(score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count)
+    return run_all(
+        score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count
+    )
 
 
 def _flags(
-    task: ScoredTask, outcomes: Sequence[ScenarioScores], scores: Mapping[str, Mapping[str, Score]]
+    task: ScoredTask,
+    outcomes: Sequence[ScenarioScores],
+    scores: Mapping[str, Mapping[str, Score]],
 ) -> tuple[Flag, ...]:
     traces = [outcome.trace for outcome in outcomes]
     error, still = (
         np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
         for row in (SUBMISSION, extrapolation.PERSISTENCE.name)
     )
-    return copy_suspect(traces), below_twin_floor(error, still, task.twin_floor), physics(traces)
+    return (
+        copy_suspect(traces),
+        below_twin_floor(error, still, task.twin_floor),
+        physics(traces),
+    )

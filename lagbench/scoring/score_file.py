@@ -1,10 +1,10 @@
 """scores.nc: the statistics of a submission per scenario and frame, and its preview.
 
-Every score of the submission follows from it: ``read_statistics(path).scores()`` gives the
-digits of scores.json. Statistics are float32 and NaN where undefined, those of long rollouts
-rounded to 11 significant bits (see :func:`as_stored`), so that no full size takes
-more than 1 MB; ``measured`` tells which were measured at all. What the best floor scores in
-the ranking metric stands beside them, so that the skill can be formed again.
+Every score of the submission follows from it: ``read_statistics(path).scores()`` gives
+the digits of scores.json. Statistics are float32 and NaN where undefined, those of long
+rollouts rounded to 11 significant bits (see :func:`as_stored`), so that no full size
+takes more than 1 MB; ``measured`` tells which were measured at all. What the best floor
+scores in the ranking metric stands beside them, so that the skill can be formed again.
 """
 
 from __future__ import annotations
@@ -23,12 +23,24 @@ from lagbench.floors.table import COUNTING
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 
-from .card import FORMAT, IDENTITY, SUBMISSION, Preview, ScoreCard, Skill, printable, skill, unreadable_scores
+from .card import (
+    FORMAT,
+    IDENTITY,
+    SUBMISSION,
+    Preview,
+    ScoreCard,
+    Skill,
+    printable,
+    skill,
+    unreadable_scores,
+)
 
 NETCDF_NAME = "scores.nc"
 
 INDEX = 4096
-"""About what HDF5 takes for the index of chunks; smaller variables are not compressed [bytes]."""
+"""About what HDF5 takes for the index of chunks; smaller variables are not compressed
+[bytes].
+"""
 
 LEVELS = 65534
 """Greatest packed value of a preview; 65535 stands for what is missing."""
@@ -37,9 +49,18 @@ FILM_RANGE = (-0.5, 1.5)
 """Positions in the preview are clipped to this range [length]."""
 
 _PREVIEW: Mapping[str, tuple[tuple[str, ...], str]] = {
-    "vorticity": (("side", "map_frame", "x_node", "y_node"), "vorticity per frame; side: truth, prediction"),
-    "histogram": (("side", "map_frame", "bin"), "shares of 64 vorticity bins over the truth's range"),
-    "film": (("side", "film_frame", "film_particle", "space"), "particle positions [length]"),
+    "vorticity": (
+        ("side", "map_frame", "x_node", "y_node"),
+        "vorticity per frame; side: truth, prediction",
+    ),
+    "histogram": (
+        ("side", "map_frame", "bin"),
+        "shares of 64 vorticity bins over the truth's range",
+    ),
+    "film": (
+        ("side", "film_frame", "film_particle", "space"),
+        "particle positions [length]",
+    ),
 }
 
 
@@ -52,16 +73,21 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
 
     with atomic_path(path, option=option) as temporary:
         try:
-            with netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:  # closing it writes most of it
+            with netCDF4.Dataset(
+                temporary, "w", format="NETCDF4"
+            ) as file:  # closing it writes most of it
                 _define(file, card)
         except (OSError, RuntimeError) as error:
             fix = f"free disk space, or name a folder that you may write to: {option}"
-            raise WorkFailedError("cannot write scores", where=str(path), got=error, fix=fix) from error
+            raise WorkFailedError(
+                "cannot write scores", where=str(path), got=error, fix=fix
+            ) from error
 
 
 def _define(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     tallies = [card.tallies[SUBMISSION][i] for i in card.scenarios]
-    names, frames = tallies[0].names, tallies[0].frames
+    names = tallies[0].names
+    frames = tallies[0].frames
     file.setncatts(
         {
             "lagbench_scores": FORMAT,
@@ -78,8 +104,12 @@ def _define(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
         values = card.scores[card.skill.floor][card.ranking].values
         _store(file, "best_floor_value", ("scenario",), values)
     dims = ("statistic", "scenario", "frame")
-    values = np.stack([np.stack([tally.series(name) for tally in tallies]) for name in names])
-    measured = np.stack([np.stack([tally.measured(name) for tally in tallies]) for name in names])
+    values = np.stack(
+        [np.stack([tally.series(name) for tally in tallies]) for name in names]
+    )
+    measured = np.stack(
+        [np.stack([tally.measured(name) for tally in tallies]) for name in names]
+    )
     _store(file, "value", dims, values.astype(np.float32))
     _store(file, "measured", dims, measured.astype(np.int8))
     _define_preview(file.createGroup("preview"), card.preview)
@@ -113,10 +143,16 @@ def _packed(
     """Return values as uint16 and the CF attributes that unpack them."""
     wide = values.astype(np.float64)
     known = wide[np.isfinite(wide)]
-    low, high = limits or ((float(known.min()), float(known.max())) if known.size else (0.0, 1.0))
+    low, high = limits or (
+        (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    )
     scale = (high - low) / LEVELS or 1.0
     steps = np.where(np.isfinite(wide), np.rint((wide - low) / scale), LEVELS + 1)
-    attributes = {"scale_factor": scale, "add_offset": low, "_FillValue": np.uint16(LEVELS + 1)}
+    attributes = {
+        "scale_factor": scale,
+        "add_offset": low,
+        "_FillValue": np.uint16(LEVELS + 1),
+    }
     return steps.astype(np.uint16), attributes
 
 
@@ -153,16 +189,22 @@ def _store(
 class StoredScores:
     """What a scores.nc holds beside its preview."""
 
-    identity: Mapping[str, str]  # split, size, version and hash of the data set, and the method
+    identity: Mapping[
+        str, str
+    ]  # split, size, version and hash of the data set, and the method
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     tallies: Mapping[int, Tally]  # statistics of the submission by scenario
-    best_floor: str | None = None  # name of the best floor; None where none that counts has a score
+    best_floor: str | None = (
+        None  # name of the best floor; None where none that counts has a score
+    )
     # what it scores in the ranking metric, NaN where undefined, shape [scenario]
     best_floor_values: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 
     def skill(self) -> Skill | None:
-        """Return how much better than the best floor; None where none that counts has a score."""
+        """Return how much better than the best floor; None where none that counts has a
+        score.
+        """
         ours = self._scored(self.ranking).get(self.ranking)
         if self.best_floor is None or ours is None:
             return None
@@ -170,12 +212,19 @@ class StoredScores:
         return skill([ours], {self.best_floor: floor})
 
     def scores(self) -> dict[str, Score]:
-        """Return the scores of all installed metrics whose statistics are here, by name."""
+        """Return the scores of all installed metrics whose statistics are here, by
+        name.
+        """
         return self._scored(*available())
 
     def _scored(self, *wanted: str) -> dict[str, Score]:
-        names, known = set(next(iter(self.tallies.values())).names), available()
-        metrics = [known[name] for name in wanted if name in known and names.issuperset(known[name].of)]
+        names = set(next(iter(self.tallies.values())).names)
+        known = available()
+        metrics = [
+            known[name]
+            for name in wanted
+            if name in known and names.issuperset(known[name].of)
+        ]
         return aggregate(metrics, self.tallies)
 
 
@@ -192,13 +241,22 @@ def read_statistics(path: Path) -> StoredScores:
             frames = tuple(file["frame"][:].tolist())
             scenarios = file["scenario"][:].tolist()
             named = {*IDENTITY, "predictions_sha256", "ranking_metric", "best_floor"}
-            held = {name: file.getncattr(name) for name in named.intersection(file.ncattrs())}
-            floor, of_floor = held.get("best_floor"), np.empty(0)
+            held = {
+                name: file.getncattr(name)
+                for name in named.intersection(file.ncattrs())
+            }
+            floor = held.get("best_floor")
+            of_floor = np.empty(0)
             if floor is not None:
                 of_floor = np.asarray(file["best_floor_value"][:], np.float64)
-                if floor not in COUNTING or of_floor.shape != (len(scenarios),) or np.isinf(of_floor).any():
+                if (
+                    floor not in COUNTING
+                    or of_floor.shape != (len(scenarios),)
+                    or np.isinf(of_floor).any()
+                ):
                     raise ValueError("not the scores of a floor")
-            values, measured = file["value"][:].astype(np.float64), file["measured"][:]
+            values = file["value"][:].astype(np.float64)
+            measured = file["measured"][:]
             return StoredScores(
                 identity={name: printable(held, name) for name in IDENTITY},
                 predictions_sha256=printable(held, "predictions_sha256"),
@@ -215,11 +273,18 @@ def read_statistics(path: Path) -> StoredScores:
 
 
 def _tally(
-    names: tuple[str, ...], frames: tuple[int, ...], values: NDArray[np.float64], measured: NDArray[np.int8]
+    names: tuple[str, ...],
+    frames: tuple[int, ...],
+    values: NDArray[np.float64],
+    measured: NDArray[np.int8],
 ) -> Tally:
     if values.shape != (len(names), len(frames)):
-        raise ValueError(f"{values.shape} values of {len(names)} statistics at {len(frames)} frames")
+        raise ValueError(
+            f"{values.shape} values of {len(names)} statistics at {len(frames)} frames"
+        )
     undefined = np.isnan(values) & (measured != 0)
     weight = ~np.isnan(values) & (measured != 0)
     total = np.where(weight, values, 0.0)
-    return Tally(names, frames, total, weight.astype(np.int64), undefined.astype(np.int64))
+    return Tally(
+        names, frames, total, weight.astype(np.int64), undefined.astype(np.int64)
+    )

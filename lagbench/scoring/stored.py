@@ -1,9 +1,10 @@
-"""Read a score file of a stranger: bounded, self-contained, of the shape that the task has.
+"""Read a score file of a stranger: bounded, self-contained, of the shape that the task
+has.
 
-HDF5 lets a file show the bytes of other files as its own (external links, external storage,
-virtual data sets) and unpack a few bytes to gigabytes. Both are refused by looking at the
-headers, before a value is read. HDF5 is also C code that believes what it reads, so strangers'
-files are first read in a child process under limits.
+HDF5 lets a file show the bytes of other files as its own (external links, external
+storage, virtual data sets) and unpack a few bytes to gigabytes. Both are refused by
+looking at the headers, before a value is read. HDF5 is also C code that believes what
+it reads, so strangers' files are first read in a child process under limits.
 """
 
 from __future__ import annotations
@@ -28,26 +29,44 @@ from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import in_child
 
-from .card import FRAMES, PARTICLES, SUBMISSION, Preview, PublishedScores, unreadable_scores
+from .card import (
+    FRAMES,
+    PARTICLES,
+    SUBMISSION,
+    Preview,
+    PublishedScores,
+    unreadable_scores,
+)
 from .score_file import FILM_RANGE, StoredScores, read_statistics
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
-MAX_UNPACKED = 32 << 20  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
+MAX_UNPACKED = (
+    32 << 20
+)  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
 
 MAX_STATISTICS = 500
 
 GROUP = "preview"
 STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
-"""What a score file may hold: plain numbers of its own, in one group beside the root."""
+"""What a score file may hold: plain numbers of its own, in one group beside the root.
+"""
 
-CPU_SECONDS = 10.0  # computing time of the child for every 50 files, its start aside [s]
+CPU_SECONDS = (
+    10.0  # computing time of the child for every 50 files, its start aside [s]
+)
 
 FILES_PER_PART = 50
 
-MOST_STOPS = 5  # files that may stop a child before the rest is left unread: each costs a child's whole time
-WALL_SECONDS = 600.0  # time for every 50 files together [s]; a busy machine may need minutes
+# files that may stop a child before the rest is left unread: each costs a child's whole
+# time
+MOST_STOPS = 5
+WALL_SECONDS = (
+    600.0  # time for every 50 files together [s]; a busy machine may need minutes
+)
 
-UNREAD = "not read, because too many others had to be stopped or took all the time allowed"
+UNREAD = (
+    "not read, because too many others had to be stopped or took all the time allowed"
+)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,7 +81,9 @@ class Stored:
 def reported_frames(size: Size) -> tuple[int, ...]:
     """Return the frames of interest and the last one, absolute."""
     frames = tuple(frames_to_predict(size))
-    return tuple(sorted({*size.task.frames_of_interest, frames[-1]}.intersection(frames)))
+    return tuple(
+        sorted({*size.task.frames_of_interest, frames[-1]}.intersection(frames))
+    )
 
 
 def read_stored(path: Path, size: Size | None = None) -> Stored:
@@ -71,7 +92,11 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
         raise UnreadableFileError(
             "not a score file", where=str(path), expected="a regular file", got="a link"
         )
-    check_regular(path, longest=MAX_SCORE_BYTES, fix="`lagbench submit` writes it beside the entry")
+    check_regular(
+        path,
+        longest=MAX_SCORE_BYTES,
+        fix="`lagbench submit` writes it beside the entry",
+    )
     try:
         with opened(path) as file:
             check_structure(file, path, STRUCTURE)
@@ -108,10 +133,15 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
 
 
 def published(path: Path) -> PublishedScores:
-    """Return what a score file says as a scores.json would; of the floors it has the best, in one metric."""
+    """Return what a score file says as a scores.json would; of the floors it has the
+    best, in one metric.
+    """
     stored = read_stored(path).scores
     ours = {
-        name: replace(score, values=np.array([round_digits(value) for value in score.values.tolist()]))
+        name: replace(
+            score,
+            values=np.array([round_digits(value) for value in score.values.tolist()]),
+        )
         for name, score in stored.scores().items()
     }
     rows = {SUBMISSION: ours}
@@ -129,10 +159,16 @@ def published(path: Path) -> PublishedScores:
 def _unpacked(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
     """Return packed values, NaN where missing, and the step of the packing."""
     attributes: dict[str, Any] = dict(variable.attrs)
-    scale, offset = (float(np.ravel(attributes[name])[0]) for name in ("scale_factor", "add_offset"))
+    scale, offset = (
+        float(np.ravel(attributes[name])[0]) for name in ("scale_factor", "add_offset")
+    )
     fill = int(np.ravel(attributes["_FillValue"])[0])
     steps = variable[...]
-    if steps.dtype != np.uint16 or not np.isfinite([scale, offset]).all() or scale <= 0.0:
+    if (
+        steps.dtype != np.uint16
+        or not np.isfinite([scale, offset]).all()
+        or scale <= 0.0
+    ):
         raise ValueError(f"{variable.name} is not packed as it should be")
     values = np.where(steps == fill, np.nan, steps * scale + offset)
     return values.astype(np.float32), scale
@@ -143,7 +179,9 @@ def _integers(variable: h5py.Dataset) -> tuple[int, ...]:
 
 
 def _check_shapes(preview: Preview) -> None:
-    maps, frames, particles = len(preview.map_frames), len(preview.film_frames), len(preview.particles)
+    maps = len(preview.map_frames)
+    frames = len(preview.film_frames)
+    particles = len(preview.particles)
     nodes = preview.vorticity.shape[-1]
     shapes = {
         "vorticity": (preview.vorticity.shape, (2, maps, nodes, nodes)),
@@ -158,12 +196,15 @@ def _check_shapes(preview: Preview) -> None:
     if frames > FRAMES or particles > PARTICLES or not np.isfinite(preview.film).all():
         raise ValueError("the film is longer than films are, or has holes")
     low, high = FILM_RANGE
-    if preview.film.size and (preview.film.min() < low - 1e-3 or preview.film.max() > high + 1e-3):
+    if preview.film.size and (
+        preview.film.min() < low - 1e-3 or preview.film.max() > high + 1e-3
+    ):
         raise ValueError("the film leaves its range")
 
 
 def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
-    frames, ids = tuple(frames_to_predict(size)), tuple(sorted(size.subsets["test"]))
+    frames = tuple(frames_to_predict(size))
+    ids = tuple(sorted(size.subsets["test"]))
     found = next(iter(scores.tallies.values())).frames
     if tuple(sorted(scores.tallies)) != ids or found != frames:
         raise ValueError(f"other scenarios or frames than {size.split} {size.name} has")
@@ -171,7 +212,9 @@ def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
         raise ValueError("another ranking metric or another pictured scenario")
     task = size.task
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
-    if preview.vorticity.shape[-1] != grid.nodes or preview.map_frames != reported_frames(size):
+    if preview.vorticity.shape[
+        -1
+    ] != grid.nodes or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
     shown = preview.film_frames
     if not set(shown).issubset(frames) or shown != tuple(sorted(shown)):
@@ -181,19 +224,25 @@ def _check_task(scores: StoredScores, preview: Preview, size: Size) -> None:
 def unreadable_in_child(paths: Sequence[Path]) -> dict[Path, str]:
     """Return the files that cannot be read, and why.
 
-    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at most and
-    within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files, whatever the files do.
+    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at
+    most and within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files,
+    whatever the files do.
     """
     found: dict[Path, str] = {}
-    left, stops = list(paths), 0
+    left = list(paths)
+    stops = 0
     parts = 1 + len(paths) // FILES_PER_PART
     end = time.monotonic() + WALL_SECONDS * parts
     while left:
         if stops == MOST_STOPS or time.monotonic() >= end:
             return found | dict.fromkeys(left, UNREAD)
         room = end - time.monotonic()
-        said, stopped = in_child(READ, [str(path) for path in left], seconds=CPU_SECONDS * parts, wall=room)
-        found |= {path: why for path, why in zip(left, said, strict=False) if why is not None}
+        said, stopped = in_child(
+            READ, [str(path) for path in left], seconds=CPU_SECONDS * parts, wall=room
+        )
+        found |= {
+            path: why for path, why in zip(left, said, strict=False) if why is not None
+        }
         if len(said) < len(left):
             found[left[len(said)]] = f"reading it had to be stopped: {stopped}"
             stops += 1

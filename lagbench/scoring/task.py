@@ -1,7 +1,7 @@
 """The test subset as metrics see it: what submissions are scored on.
 
-Scoring needs the files of ``test`` only; what follows from ``train`` stands in datasets.yaml
-or, for a data set that is not recorded there, in its manifest.
+Scoring needs the files of ``test`` only; what follows from ``train`` stands in
+datasets.yaml or, for a data set that is not recorded there, in its manifest.
 """
 
 from __future__ import annotations
@@ -26,7 +26,9 @@ from lagbench.store.copy import bring
 from lagbench.submission.truth import Truth
 
 BLOCK_BYTES = 1 << 20
-"""True positions are read in blocks of about this size: a call for each frame costs more than its bytes."""
+"""True positions are read in blocks of about this size: a call for each frame costs
+more than its bytes.
+"""
 
 
 @dataclass(frozen=True)
@@ -37,24 +39,31 @@ class OpenScenario:
     file: ScenarioFile
 
     def snapshots(self) -> Iterator[Snapshot]:
-        """Yield the true snapshots of the predicted frames, a block in memory at a time."""
+        """Yield the true snapshots of the predicted frames, a block in memory at a
+        time.
+        """
         return snapshots(self.scenario, self._frames())
 
     def _frames(self) -> Iterator[NDArray[np.float32]]:
         numbers = self.scenario.setting.predicted_frames
         step = max(1, BLOCK_BYTES // (8 * len(self.scenario.material)))
         for first in numbers[::step]:
-            yield from self.file.read("position", slice(first, min(first + step, numbers.stop)))
+            yield from self.file.read(
+                "position", slice(first, min(first + step, numbers.stop))
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """The test subset of one split and size; while a model is trained, the valid subset."""
+    """The test subset of one split and size; while a model is trained, the valid
+    subset.
+    """
 
     truth: Truth  # its files
     setting: Setting  # the split and size, as metrics see it
     density: float  # rest density [mass/length^2]
-    # position RMSE of the nudged twin per predicted frame [length]; empty where it is recorded nowhere
+    # position RMSE of the nudged twin per predicted frame [length]; empty where it is
+    # recorded nowhere
     twin_floor: tuple[float, ...] = ()
 
     @property
@@ -92,12 +101,17 @@ def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredT
     truth.check()
     scenarios = sorted(size.subsets[subset])
     present = set().union(*(_materials(truth, scenario) for scenario in scenarios))
-    manifest = None if size.measured else read_manifest(root, size.split, size.name, size.major)
+    if size.measured:
+        manifest = None
+    else:
+        manifest = read_manifest(root, size.split, size.name, size.major)
     task = size.task
     return ScoredTask(
         truth=truth,
         density=float(size.value("density")),
-        twin_floor=size.measured.twin_floor if size.measured else _floor(manifest, scenarios),
+        twin_floor=size.measured.twin_floor
+        if size.measured
+        else _floor(manifest, scenarios),
         setting=Setting(
             grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
             input_frames=task.input_frames,
@@ -112,18 +126,30 @@ def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredT
 
 
 def _active_frames(file: ScenarioFile) -> int | None:
-    """Return how many predicted frames pass until the truth rests, None where the file does not say."""
+    """Return how many predicted frames pass until the truth rests, None where the file
+    does not say.
+    """
     stated = file.header.parameters.get("active_frames")
     if stated is None or (isinstance(stated, int | np.integer) and stated >= 0):
-        return None if stated is None else int(stated)
-    raise DataError("active_frames is no number of frames", where=str(file.path), expected=">= 0", got=stated)
+        if stated is None:
+            return None
+        return int(stated)
+    raise DataError(
+        "active_frames is no number of frames",
+        where=str(file.path),
+        expected=">= 0",
+        got=stated,
+    )
 
 
 def _materials(truth: Truth, scenario: int) -> set[str]:
-    """Return the materials of a scenario after checking that its file is long enough."""
+    """Return the materials of a scenario after checking that its file is long
+    enough.
+    """
     needed = truth.size.task.input_frames + truth.size.task.horizon
     with truth.open(scenario) as file:
-        frames, material = file.header.frames, file.read("material")
+        frames = file.header.frames
+        material = file.read("material")
     if frames < needed:
         where = str(truth.path(scenario))
         what = f"a {truth.subset} scenario is too short"
@@ -131,7 +157,9 @@ def _materials(truth: Truth, scenario: int) -> set[str]:
     return {MATERIALS[value] for value in np.unique(material).tolist()}
 
 
-def _attribute_std(size: Size, root: Path, manifest: Manifest | None) -> tuple[float, float, float, float]:
+def _attribute_std(
+    size: Size, root: Path, manifest: Manifest | None
+) -> tuple[float, float, float, float]:
     """Return the standard deviations of x, y, u, v over train."""
     known: Mapping[str, tuple[float, ...]] = manifest.statistics if manifest else {}
     if size.measured:
@@ -141,7 +169,8 @@ def _attribute_std(size: Size, root: Path, manifest: Manifest | None) -> tuple[f
     except (KeyError, ValueError):
         raise DataError(
             "the statistics of train are recorded nowhere",
-            where=f"datasets.yaml, and the manifest of {size.split} {size.name} in {root}",
+            where=f"datasets.yaml, and the manifest of {size.split} {size.name} "
+            f"in {root}",
             expected="position_std and velocity_std, two numbers each",
             got=", ".join(known) or "nothing",
             fix=remedy(size, root=root),

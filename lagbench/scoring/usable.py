@@ -1,7 +1,9 @@
-"""Whether a data set can be scored: what the metric that ranks needs of it, and how to mend it.
+"""Whether a data set can be scored: what the metric that ranks needs of it, and how to
+mend it.
 
-Our own splits can be. Those that users bring may have too few particles for their score grid, test
-scenarios that differ in particles, or a truth at rest, beside which there is no skill.
+Our own splits can be. Those that users bring may have too few particles for their score
+grid, test scenarios that differ in particles, or a truth at rest, beside which there is
+no skill.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ OF_NODES = "vorticity_nrmse"
 
 
 def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
-    """Return how many nodes scenarios without any vorticity cover, and a grid of which all cover enough."""
+    """Return how many nodes scenarios without any vorticity cover, and a grid of which
+    all cover enough.
+    """
     setting = task.setting
     counts = [covered_nodes(_clouds(task, i)[0], setting.grid) for i in scenarios]
     cells = fitting_cells(
@@ -37,20 +41,31 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
     if cells is None:
         fix = "more particles: they cover enough nodes of no grid"
     else:
-        word = "coarser" if cells < setting.grid.cells else "finer"
-        described = Path(task.size.split) / DESCRIPTION  # no path of this machine: scores.json repeats it
+        if cells < setting.grid.cells:
+            word = "coarser"
+        else:
+            word = "finer"
+        described = (
+            Path(task.size.split) / DESCRIPTION
+        )  # no path of this machine: scores.json repeats it
         local = (task.truth.root / described).is_file()
-        here = f"cells: {cells} under score_grid in {described.as_posix()}, or " if local else ""
+        if local:
+            here = f"cells: {cells} under score_grid in {described.as_posix()}, or "
+        else:
+            here = ""
         fix = f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
-    least, most = min(counts), max(counts)
+    least = min(counts)
+    most = max(counts)
     return Finding(
         check="undefined",
         severity=Severity.WARNING,
         what="the vorticity has no value in any frame",
         where=f"score grid of {setting.grid.cells} cells",
         expected=f"{MINIMUM_NODES} nodes with particles enough around them",
-        got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios undefined:"
-        f" {least if least == most else f'{least} to {most}'} nodes counted, {MINIMUM_NODES} needed",
+        got=f"{len(counts)} of {len(task.scenarios)} {task.truth.subset} scenarios "
+        f"undefined:"
+        f" {least if least == most else f'{least} to {most}'} nodes counted, "
+        f"{MINIMUM_NODES} needed",
         fix=fix,
     )
 
@@ -59,17 +74,24 @@ def _clouds(task: ScoredTask, scenario: int) -> tuple[Cloud, Cloud]:
     """Return the particles of the first and the last predicted frame."""
     frames = task.setting.predicted_frames
     with task.opened(scenario) as opened:
-        first, last = (opened.file.read("position", slice(f, f + 1))[0] for f in (frames[0], frames[-1]))
+        first, last = (
+            opened.file.read("position", slice(f, f + 1))[0]
+            for f in (frames[0], frames[-1])
+        )
         return Cloud(first, opened.scenario.area), Cloud(last, opened.scenario.area)
 
 
 def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]:
-    """Yield why predictions of a data set could not be scored or validated, with what mends it.
+    """Yield why predictions of a data set could not be scored or validated, with what
+    mends it.
 
-    Only the first and last frames that are to be predicted are read, beside what checks the files.
+    Only the first and last frames that are to be predicted are read, beside what checks
+    the files.
     """
     for subset in ("test", "valid") if validated else ("test",):
-        counts, moves, sparse = set(), False, []
+        counts = set()
+        moves = False
+        sparse = []
         try:
             task = load_scored_task(size, root, subset=subset)
             for i in task.scenarios:
@@ -77,23 +99,36 @@ def unusable(size: Size, root: Path, *, validated: bool = True) -> Iterator[str]
                     before = opened.scenario.last_given.position
                 clouds = _clouds(task, i)
                 counts.add(len(before))
-                moves |= any(not np.array_equal(before, cloud.position) for cloud in clouds)
-                if all(covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES for cloud in clouds):
+                moves |= any(
+                    not np.array_equal(before, cloud.position) for cloud in clouds
+                )
+                if all(
+                    covered_nodes(cloud, task.setting.grid) < MINIMUM_NODES
+                    for cloud in clouds
+                ):
                     sparse.append(i)
             if len(counts) > 1 and subset == "test":
                 yield (
-                    f"test scenarios have {min(counts)} to {max(counts)} particles: predictions need one"
-                    " number; put those of one number into test: lagbench adopt with folders train, valid and"
+                    f"test scenarios have {min(counts)} to {max(counts)} particles: "
+                    f"predictions need one"
+                    " number; put those of one number into test: lagbench adopt with "
+                    "folders train, valid and"
                     " test"
                 )
             if not moves:
                 yield (
-                    f"nothing moves in {subset}: no floor has an error to be better than; other trajectories"
+                    f"nothing moves in {subset}: no floor has an error to be better "
+                    f"than; other trajectories"
                     f" for {subset}: lagbench adopt with folders train, valid and test"
                 )
             elif sparse and ranking_metric(task.size) == OF_NODES:
                 found = few_nodes(task, sparse)
                 yield f"{found.got}; {found.fix}"
-        except LagbenchError as error:  # the training itself may do without what is missing here
-            fix = f"; {error.fix}" if error.fix else ""
+        except (
+            LagbenchError
+        ) as error:  # the training itself may do without what is missing here
+            if error.fix:
+                fix = f"; {error.fix}"
+            else:
+                fix = ""
             yield f"{error.what}: expected {error.expected}, got {error.got}{fix}"

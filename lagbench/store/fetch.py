@@ -1,7 +1,8 @@
-"""Fetch objects of a store: resumed by range, bounded in length and time, checked before they get their name.
+"""Fetch objects of a store: resumed by range, bounded in length and time, checked
+before they get their name.
 
-Whatever a store does wrong has an error of its own, see :mod:`.objects`. A broken line is tried
-again from where it broke; a lie leaves nothing of that object.
+Whatever a store does wrong has an error of its own, see :mod:`.objects`. A broken line
+is tried again from where it broke; a lie leaves nothing of that object.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ from .objects import (
 
 CONNECTIONS = 4  # objects that are fetched side by side
 BLOCK = 1 << 18  # bytes read at a time
-LEAST_RATE = 4096.0  # bytes per second below which a store is refused, each object by itself
+LEAST_RATE = (
+    4096.0  # bytes per second below which a store is refused, each object by itself
+)
 PATIENCE = 60.0  # seconds of waiting over which the rate is measured
 ATTEMPTS = 5  # attempts in a row that bring nothing before we give up
 MOST_ATTEMPTS = 100  # attempts at one object at all, however little each brings
@@ -61,7 +64,9 @@ class Wanted:
 
 
 def partial_name(target: Path) -> Path:
-    """Return the temporary name of a file that is fetched; a later attempt goes on from it."""
+    """Return the temporary name of a file that is fetched; a later attempt goes on from
+    it.
+    """
     return target.with_name(f".{target.name}.download{SUFFIX}")
 
 
@@ -77,14 +82,20 @@ def fetch_text(url: str, *, limit: int, remedy: str) -> bytes:
 
 
 def fetch_scenarios(
-    wanted: Mapping[int, Wanted], report: Callable[[int], None], *, connections: int = CONNECTIONS
+    wanted: Mapping[int, Wanted],
+    report: Callable[[int], None],
+    *,
+    connections: int = CONNECTIONS,
 ) -> Generator[tuple[int, NotInStoreError | None], None, None]:
-    """Fetch scenarios side by side; yield each as its file has its name, or why the store has none.
+    """Fetch scenarios side by side; yield each as its file has its name, or why the
+    store has none.
 
-    Hold the lock of the data set, and close the iterator: that stops what is under way. ``report`` is
-    told the bytes that arrive. After a broken line temporary files stay, to go on from; after a lie none.
+    Hold the lock of the data set, and close the iterator: that stops what is under way.
+    ``report`` is told the bytes that arrive. After a broken line temporary files stay,
+    to go on from; after a lie none.
     """
-    stop, lock = threading.Event(), threading.Lock()
+    stop = threading.Event()
+    lock = threading.Lock()
 
     def count(arrived: int) -> None:
         if stop.is_set():
@@ -121,8 +132,11 @@ class _StoppedError(Exception):
 
 
 def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
-    """Fetch one object under its temporary name, going on where an earlier attempt stopped."""
-    partial, pace = partial_name(wanted.target), Pace(wanted.url)
+    """Fetch one object under its temporary name, going on where an earlier attempt
+    stopped.
+    """
+    partial = partial_name(wanted.target)
+    pace = Pace(wanted.url)
 
     def attempt() -> None:
         report(0)
@@ -159,25 +173,39 @@ def saving(partial: Path) -> Iterator[None]:
         partial.unlink(missing_ok=True)
         raise
     except OSError as error:
-        got, fix = error.strerror or error, "--root names another folder"
-        raise WorkFailedError("cannot write there", where=str(partial), got=got, fix=fix) from error
+        got = error.strerror or error
+        fix = "--root names another folder"
+        raise WorkFailedError(
+            "cannot write there", where=str(partial), got=got, fix=fix
+        ) from error
 
 
 def insist(
-    attempt: Callable[[], T], url: str, partial: Path | None = None, place: Callable[[], int] = lambda: 0
+    attempt: Callable[[], T],
+    url: str,
+    partial: Path | None = None,
+    place: Callable[[], int] = lambda: 0,
 ) -> T:
-    """Attempt until it succeeds, or attempts bring a partial file, or a place, no further."""
+    """Attempt until it succeeds, or attempts bring a partial file, or a place, no
+    further.
+    """
 
     def held() -> int:
-        return partial.stat().st_size if partial and partial.exists() else place()
+        if partial and partial.exists():
+            return partial.stat().st_size
+        return place()
 
-    failures, restarted = 0, False
+    failures = 0
+    restarted = False
     for _ in range(MOST_ATTEMPTS):
         before = held()
         try:
             return attempt()
         except BrokenError as broken:
-            failures = 0 if held() > before else failures + 1
+            if held() > before:
+                failures = 0
+            else:
+                failures = failures + 1
             if failures >= ATTEMPTS or (broken.stale and restarted):
                 raise broken.error from None
             if broken.stale and partial:
@@ -194,10 +222,13 @@ class Pace:
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self._arrived, self._waited = 0, 0.0
+        self._arrived = 0
+        self._waited = 0.0
 
     def count(self, arrived: int, seconds: float) -> None:
-        """Count bytes and the time that they took; refuse a store that sends too little."""
+        """Count bytes and the time that they took; refuse a store that sends too
+        little.
+        """
         self._arrived += arrived
         self._waited += seconds
         if self._waited < PATIENCE:
@@ -210,28 +241,53 @@ class Pace:
                 got=f"{self._arrived} bytes in {self._waited:.0f} s",
                 fix=FIX_LINE,
             )
-        self._arrived, self._waited = 0, 0.0
+        self._arrived = 0
+        self._waited = 0.0
 
 
 def received(
-    answer: Answer, pace: Pace, *, limit: int, length: int | None = None, begins: bytes = b"", remedy: str
+    answer: Answer,
+    pace: Pace,
+    *,
+    limit: int,
+    length: int | None = None,
+    begins: bytes = b"",
+    remedy: str,
 ) -> Iterator[bytes]:
-    """Yield what a store sends; refuse a page, another length than is known, and more than can be."""
+    """Yield what a store sends; refuse a page, another length than is known, and more
+    than can be.
+    """
 
-    def refused(kind: type[DataError], what: str, expected: str, got: str | None = None) -> DataError:
+    def refused(
+        kind: type[DataError], what: str, expected: str, got: str | None = None
+    ) -> DataError:
         return kind(what, where=pace.url, expected=expected, got=got, fix=remedy)
 
-    place, blocks = answer.start, _blocks(answer, pace)
+    place = answer.start
+    blocks = _blocks(answer, pace)
     block = next(blocks, b"")
     if answer.page or (place == 0 and not block.startswith(begins[: len(block)])):
         text = " ".join(block[:200].decode("utf-8", "replace").split())
         expected = "a netCDF4 file or a manifest; a page may ask to log in"
-        raise refused(NotDataError, "the store sent something else than data", expected, ascii(text[:80]))
+        raise refused(
+            NotDataError,
+            "the store sent something else than data",
+            expected,
+            ascii(text[:80]),
+        )
     total = answer.total
     if total is not None and (total > limit or total != (length or total)):
         expected = f"{length or f'at most {limit}'} bytes"
-        raise refused(WrongLengthError, "the store announces another length", expected, f"{total} bytes")
-    most = limit if length is None else length
+        raise refused(
+            WrongLengthError,
+            "the store announces another length",
+            expected,
+            f"{total} bytes",
+        )
+    if length is None:
+        most = limit
+    else:
+        most = length
     while block:
         place += len(block)
         if place > most:
@@ -241,9 +297,16 @@ def received(
         block = next(blocks, b"")
     if total is not None and place < total:
         what = "an object ends before the length that the store announces"
-        raise BrokenError(refused(TruncatedError, what, f"{total} bytes", f"{place} bytes"))
+        raise BrokenError(
+            refused(TruncatedError, what, f"{total} bytes", f"{place} bytes")
+        )
     if length is not None and place != length:
-        raise refused(TruncatedError, "an object ends too early", f"{length} bytes", f"{place} bytes")
+        raise refused(
+            TruncatedError,
+            "an object ends too early",
+            f"{length} bytes",
+            f"{place} bytes",
+        )
 
 
 def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
@@ -255,8 +318,11 @@ def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
             block = answer.read(BLOCK)
         except Exception as error:
             pace.count(0, time.monotonic() - started)
-            what, got = "the connection to the store broke", f"{type(error).__name__}: {error}"
-            raise BrokenError(ConnectionLostError(what, where=pace.url, got=got, fix=FIX_LINE)) from error
+            what = "the connection to the store broke"
+            got = f"{type(error).__name__}: {error}"
+            raise BrokenError(
+                ConnectionLostError(what, where=pace.url, got=got, fix=FIX_LINE)
+            ) from error
         pace.count(len(block), time.monotonic() - started)
         yield block
 
@@ -266,7 +332,10 @@ def accept(wanted: Wanted) -> None:
     partial = partial_name(wanted.target)
     try:
         # The bytes first: HDF5 is best not given what a bad line has garbled.
-        if wanted.file_sha256 is not None and file_sha256(partial) != wanted.file_sha256:
+        if (
+            wanted.file_sha256 is not None
+            and file_sha256(partial) != wanted.file_sha256
+        ):
             raise DataError("its bytes are not those of the store's manifest")
         with opened(partial) as file:
             check_structure(file, partial, Structure(texts=True))

@@ -1,8 +1,9 @@
 """Objects by URL: open one from an offset on, list, read and put whole ones.
 
-HTTP comes from the standard library, because resuming is what no downloader at hand does (pooch
-and fsspec start over); ``s3://``, ``file://`` and the rest are file systems of fsspec. What is the
-store's lie is a DataError, what is the line's fault a WorkFailedError.
+HTTP comes from the standard library, because resuming is what no downloader at hand
+does (pooch and fsspec start over); ``s3://``, ``file://`` and the rest are file systems
+of fsspec. What is the store's lie is a DataError, what is the line's fault a
+WorkFailedError.
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ from pathlib import Path
 from typing import IO, Any
 
 from lagbench.atomic import atomic_path, write_atomically
-from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError, require
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    require,
+)
 
 TIMEOUT = 30.0  # how long a store may be silent [s]
 HTTP = ("http://", "https://")
@@ -32,7 +39,9 @@ LOCAL = ("file://", "local://")
 FIX_LINE = "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: it goes on"
 
 _BUSY = {408, 425, 429, 500, 502, 503, 504}
-_LENGTH = re.compile(r"\d{1,18}")  # no object has more bytes, and Python reads no endless number
+_LENGTH = re.compile(
+    r"\d{1,18}"
+)  # no object has more bytes, and Python reads no endless number
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
 
 _systems: dict[tuple[object, ...], Any] = {}
@@ -73,7 +82,9 @@ class WrongContentError(DataError):
 class BrokenError(Exception):
     """An attempt that ended early; another may go on from there."""
 
-    def __init__(self, error: WorkFailedError | DataError, *, stale: bool = False) -> None:
+    def __init__(
+        self, error: WorkFailedError | DataError, *, stale: bool = False
+    ) -> None:
         super().__init__(str(error))
         self.error = error  # what to raise when no other attempt is made
         self.stale = stale  # whether what is there already has to go first
@@ -107,21 +118,30 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
         if not parts.hostname:
             raise ValueError("it names no host")
         # Percent-encoded, but for what is encoded already.
-        path, query = (urllib.parse.quote(p, safe=string.punctuation) for p in (parts.path, parts.query))
+        path, query = (
+            urllib.parse.quote(p, safe=string.punctuation)
+            for p in (parts.path, parts.query)
+        )
         address = parts._replace(path=path, query=query).geturl()
-        response = _OPENER.open(urllib.request.Request(address, headers=headers), timeout=TIMEOUT)
+        response = _OPENER.open(
+            urllib.request.Request(address, headers=headers), timeout=TIMEOUT
+        )
     except urllib.error.HTTPError as error:
         with closing(error):
             raise _refusal_of_status(error, url, offset, remedy) from None
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
-        what, expected = "not the address of a store", "http://host/path"
+        what = "not the address of a store"
+        expected = "http://host/path"
         raise UsageError(what, where=url, expected=expected, got=str(error)) from error
     except (OSError, http.client.HTTPException) as error:
         got = f"{type(error).__name__}: {getattr(error, 'reason', error)}"
         fix = "repeat the command later: it goes on where it stopped"
-        silent = StoreUnreachableError("the store does not answer", where=url, got=got, fix=fix)
+        silent = StoreUnreachableError(
+            "the store does not answer", where=url, got=got, fix=fix
+        )
         raise BrokenError(silent) from error
-    start, total = 0, response.headers.get("Content-Length")
+    start = 0
+    total = response.headers.get("Content-Length")
     if response.status == http.client.PARTIAL_CONTENT:
         match = _RANGE.fullmatch(response.headers.get("Content-Range", ""))
         if offset and (match is None or int(match[1]) != offset):
@@ -129,21 +149,27 @@ def _open_http(url: str, offset: int, remedy: str) -> Answer:
             return _open_http(url, 0, remedy)
         start, total = (offset, match[3]) if match else (0, None)
     return Answer(
-        # read() would wait for a whole block, and so for ever where a byte comes now and then.
+        # read() would wait for a whole block, and so for ever where a byte comes now
+        # and then.
         read=response.read1,
         close=response.close,
         start=start,
         total=int(total) if total is not None and _LENGTH.fullmatch(total) else None,
-        page=response.headers.get_content_type() in ("text/html", "application/xhtml+xml"),
+        page=response.headers.get_content_type()
+        in ("text/html", "application/xhtml+xml"),
     )
 
 
-def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, remedy: str) -> Exception:
+def _refusal_of_status(
+    error: urllib.error.HTTPError, url: str, offset: int, remedy: str
+) -> Exception:
     """Return the error that an HTTP status means."""
     code = error.code
     if code in (404, 410):
         got = f"HTTP status {code}"
-        return NotInStoreError("the store does not have the object", where=url, got=got, fix=remedy)
+        return NotInStoreError(
+            "the store does not have the object", where=url, got=got, fix=remedy
+        )
     if code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
         truncated = TruncatedError(
             "an object ends before the length that the store announced",
@@ -155,7 +181,9 @@ def _refusal_of_status(error: urllib.error.HTTPError, url: str, offset: int, rem
         return BrokenError(truncated, stale=True)
     got = f"HTTP status {code}: {str(error.reason)[:200]!a}"
     refused = StoreUnreachableError("the store refuses", where=url, got=got, fix=remedy)
-    return BrokenError(refused) if code in _BUSY else refused
+    if code in _BUSY:
+        return BrokenError(refused)
+    return refused
 
 
 class _Redirections(urllib.request.HTTPRedirectHandler):
@@ -172,7 +200,9 @@ class _Redirections(urllib.request.HTTPRedirectHandler):
         try:
             return super().http_error_302(req, fp, code, msg, headers)
         except (ValueError, http.client.InvalidURL) as error:
-            raise NotDataError("the store leads to no address", where=req.full_url, got=str(error)) from error
+            raise NotDataError(
+                "the store leads to no address", where=req.full_url, got=str(error)
+            ) from error
 
     http_error_301 = http_error_303 = http_error_307 = http_error_308 = http_error_302
 
@@ -196,15 +226,21 @@ def _open_fsspec(url: str, offset: int, remedy: str) -> Answer:
         system, path = _file_system(url)
         total = system.info(path)["size"]
         stream = system.open(path, "rb")
-        start = offset if offset <= total else 0
+        if offset <= total:
+            start = offset
+        else:
+            start = 0
         stream.seek(start)
     except LagbenchError:
         raise
     except FileNotFoundError:
-        raise NotInStoreError("the store does not have the object", where=url, fix=remedy) from None
+        raise NotInStoreError(
+            "the store does not have the object", where=url, fix=remedy
+        ) from None
     except Exception as error:  # file systems raise what their libraries raise
         refused = _refusal(error, url)
-        # botocore has tried its own errors again by itself, and no right comes with time.
+        # botocore has tried its own errors again by itself, and no right comes with
+        # time.
         again = isinstance(error, OSError) and not isinstance(error, PermissionError)
         if again and isinstance(refused, WorkFailedError):
             raise BrokenError(refused) from error
@@ -213,20 +249,28 @@ def _open_fsspec(url: str, offset: int, remedy: str) -> Answer:
 
 
 class Objects:
-    """The folder of one data set version in a store of fsspec; names are relative to it.
+    """The folder of one data set version in a store of fsspec; names are relative to
+    it.
 
     A root that is no such store is a UsageError.
     """
 
     def __init__(self, root: str, folder: str) -> None:
-        self.root, self.url = root, f"{root}/{folder}"  # the store; ``<split>/<size>/v<MAJOR>`` in it
+        self.root = root
+        self.url = f"{root}/{folder}"  # the store; ``<split>/<size>/v<MAJOR>`` in it
         if root.startswith(HTTP):
-            raise UsageError("nothing can be written over HTTP", where=root, fix="name another --root")
+            raise UsageError(
+                "nothing can be written over HTTP",
+                where=root,
+                fix="name another --root",
+            )
         with _refusals(self.url):
             self._system, self._path = _file_system(self.url)
 
     def sizes(self) -> dict[str, int]:
-        """Return the length of every object by name [bytes]; a missing bucket is a DataError."""
+        """Return the length of every object by name [bytes]; a missing bucket is a
+        DataError.
+        """
         with _refusals(self.url):
             try:
                 found = self._system.find(self._path, detail=True)
@@ -234,7 +278,11 @@ class Objects:
                 check_bucket(self.root)
                 return {}
         prefix = self._path.rstrip("/") + "/"
-        return {p.removeprefix(prefix): int(i["size"]) for p, i in found.items() if p.startswith(prefix)}
+        return {
+            p.removeprefix(prefix): int(i["size"])
+            for p, i in found.items()
+            if p.startswith(prefix)
+        }
 
     def read(self, name: str) -> bytes | None:
         """Return a small object; None where it is not there."""
@@ -253,7 +301,9 @@ class Objects:
                 self._system.pipe_file(self._at(name), data)
 
     def put(self, name: str, source: Path) -> None:
-        """Put a file as an object, whole or not at all: after a fault the old one is there, or none."""
+        """Put a file as an object, whole or not at all: after a fault the old one is
+        there, or none.
+        """
         with _refusals(self.url):
             if self.url.startswith(LOCAL):
                 # On a file system a put is not atomic by itself.
@@ -281,7 +331,8 @@ def _bucket(url: str) -> str:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """Return the file system of fsspec that an address belongs to, and the address within it.
+    """Return the file system of fsspec that an address belongs to, and the address
+    within it.
 
     Nothing is remembered of what it holds: what other machines do must be seen at once.
     """
@@ -292,11 +343,18 @@ def _file_system(url: str) -> tuple[Any, str]:
     scheme = url.split("://", 1)[0]
     if scheme not in fsspec.available_protocols():
         expected = "s3://bucket/prefix, or another that fsspec knows; file:///path for a folder"
-        raise UsageError("no such kind of address", where=url, expected=expected, got=scheme)
+        raise UsageError(
+            "no such kind of address", where=url, expected=expected, got=scheme
+        )
     # Another endpoint or other credentials are another system, also within one process.
-    key = (scheme, *sorted(item for item in os.environ.items() if item[0].startswith("AWS_")))
+    key = (
+        scheme,
+        *sorted(item for item in os.environ.items() if item[0].startswith("AWS_")),
+    )
     if key not in _systems:
-        _systems[key], _ = fsspec.core.url_to_fs(url, use_listings_cache=False, skip_instance_cache=True)
+        _systems[key], _ = fsspec.core.url_to_fs(
+            url, use_listings_cache=False, skip_instance_cache=True
+        )
     system = _systems[key]
     return system, system._strip_protocol(url)
 
@@ -316,18 +374,29 @@ def _refusal(error: Exception, url: str) -> LagbenchError:
     """Return the error of ours that an exception of a file system means."""
     got = f"{type(error).__name__}: {str(error)[:300]}"
     if isinstance(error, ImportError):
-        return UsageError("this kind of address needs another package", where=url, got=got, fix=str(error))
+        return UsageError(
+            "this kind of address needs another package",
+            where=url,
+            got=got,
+            fix=str(error),
+        )
     if isinstance(error, FileNotFoundError):
         fix = "create the bucket, or correct the address: --root or LAGBENCH_ROOT"
-        return DataError("there is no such bucket", where=url, got=_bucket(url), fix=fix)
+        return DataError(
+            "there is no such bucket", where=url, got=_bucket(url), fix=fix
+        )
     refused = isinstance(error, PermissionError)
     if url.startswith(S3):
         from botocore import exceptions as boto  # type: ignore[import-untyped]
 
-        refused |= isinstance(error, (boto.NoCredentialsError, boto.PartialCredentialsError))
+        refused |= isinstance(
+            error, (boto.NoCredentialsError, boto.PartialCredentialsError)
+        )
         refused |= isinstance(error, (boto.ProfileNotFound, boto.TokenRetrievalError))
     if refused:
         keys = "AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
         fix = f"see that {keys} may read it, and write to it"
         return StoreUnreachableError("the store refuses", where=url, got=got, fix=fix)
-    return StoreUnreachableError("the store does not answer or fails", where=url, got=got, fix=FIX_LINE)
+    return StoreUnreachableError(
+        "the store does not answer or fails", where=url, got=got, fix=FIX_LINE
+    )

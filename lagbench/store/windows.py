@@ -1,4 +1,6 @@
-"""Windows of scenarios as NumPy arrays: consecutive frames, in memory that the split's size leaves alone."""
+"""Windows of scenarios as NumPy arrays: consecutive frames, in memory that the split's
+size leaves alone.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
-OPEN_FILES = 128  # files that a store keeps open, about 0.6 MB each; our splits train on up to 63
+# files that a store keeps open, about 0.6 MB each; our splits train on up to 63
+OPEN_FILES = 128
 
 
 class _Open(NamedTuple):
@@ -43,14 +46,19 @@ class _Open(NamedTuple):
 
 
 class FrameStore:
-    """Read frames of scenario files; those used last stay in memory, up to a fixed number of bytes.
+    """Read frames of scenario files; those used last stay in memory, up to a fixed
+    number of bytes.
 
-    Files are opened by the process that reads them and never written, so a store may be sent to
-    worker processes: each has a cache of its own.
+    Files are opened by the process that reads them and never written, so a store may be
+    sent to worker processes: each has a cache of its own.
     """
 
-    def __init__(self, size: Size, paths: Mapping[int, Path], *, cache_bytes: int = CACHE_BYTES) -> None:
-        self._size, self._paths, self.cache_bytes = size, dict(paths), cache_bytes
+    def __init__(
+        self, size: Size, paths: Mapping[int, Path], *, cache_bytes: int = CACHE_BYTES
+    ) -> None:
+        self._size = size
+        self._paths = dict(paths)
+        self.cache_bytes = cache_bytes
         self._forget()
 
     def _forget(self) -> None:
@@ -61,7 +69,11 @@ class FrameStore:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave open files and cached frames behind when sent to another process."""
-        return {"size": self._size, "paths": self._paths, "cache_bytes": self.cache_bytes}
+        return {
+            "size": self._size,
+            "paths": self._paths,
+            "cache_bytes": self.cache_bytes,
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Start with nothing open and nothing cached."""
@@ -73,9 +85,12 @@ class FrameStore:
         The arrays are those of the cache: copy them, never write to them.
         """
         self._own()
-        found = {frame: self._frames.get((scenario, frame)) for frame in range(start, stop)}
+        found = {
+            frame: self._frames.get((scenario, frame)) for frame in range(start, stop)
+        }
         lacking = [frame for frame, values in found.items() if values is None]
-        # Consecutive frames, which are equally far from their places in the list, are read at once.
+        # Consecutive frames, which are equally far from their places in the list, are
+        # read at once.
         for _, run in groupby(enumerate(lacking), lambda item: item[1] - item[0]):
             numbers = [frame for _, frame in run]
             found.update(self._read(scenario, numbers[0], numbers[-1] + 1))
@@ -90,9 +105,11 @@ class FrameStore:
         return list(held.values())
 
     def constants(self, scenario: int) -> tuple[NDArray[np.int8], Floats | None]:
-        """Return material, shape [particle], and wall velocity [length/s], [frame, wall, 2].
+        """Return material, shape [particle], and wall velocity [length/s], [frame,
+        wall, 2].
 
-        Material is 0, liquid, in files without it; wall velocity is None where no wall moves.
+        Material is 0, liquid, in files without it; wall velocity is None where no wall
+        moves.
         """
         self._own()
         return self._opened(scenario)[2:]
@@ -102,14 +119,18 @@ class FrameStore:
         if os.getpid() != self._process:
             self._forget()
 
-    def _read(self, scenario: int, first: int, last: int) -> Iterator[tuple[int, Floats]]:
+    def _read(
+        self, scenario: int, first: int, last: int
+    ) -> Iterator[tuple[int, Floats]]:
         with self._naming(scenario):
             values = self._opened(scenario).position[first:last]
         # Copies, so that each frame's memory is free when it leaves the cache.
         return ((first + i, frame.copy()) for i, frame in enumerate(values))
 
     def _opened(self, scenario: int) -> _Open:
-        """Return an open file that is what the registry says; of too many the longest unused is closed."""
+        """Return an open file that is what the registry says; of too many the longest
+        unused is closed.
+        """
         if scenario not in self._open:
             with self._naming(scenario):
                 self._open[scenario] = self._checked(scenario)
@@ -124,77 +145,118 @@ class FrameStore:
 
         from lagbench.data.scenario import variables
 
-        size, path = self._size, self._paths[scenario]
+        size = self._size
+        path = self._paths[scenario]
         if not path.is_file():
-            raise DataError("a scenario file is missing", where=str(path), fix=self._remedy(scenario))
+            raise DataError(
+                "a scenario file is missing",
+                where=str(path),
+                fix=self._remedy(scenario),
+            )
         # Frames are cached here: HDF5 need not keep chunks too.
         file = h5py.File(path, "r", rdcc_nbytes=0)
-        values, held = variables(file), file.attrs
+        values = variables(file)
+        held = file.attrs
         position = values["position"]
         # netCDF4 stores ASCII text as bytes.
         split, tier, version, content = (
             text.decode() if isinstance(text := held[name], bytes) else str(text)
             for name in ("split", "size", "version", "content_sha256")
         )
-        found = (split, tier, major_of(version), int(np.asarray(held["scenario"]).item()), len(position))
-        expected = (size.split, size.name, size.major, scenario, size.frame_count(scenario))
-        digest = size.measured.scenario_sha256.get(scenario, "") if size.measured else ""
+        found = (
+            split,
+            tier,
+            major_of(version),
+            int(np.asarray(held["scenario"]).item()),
+            len(position),
+        )
+        expected = (
+            size.split,
+            size.name,
+            size.major,
+            scenario,
+            size.frame_count(scenario),
+        )
+        if size.measured:
+            digest = size.measured.scenario_sha256.get(scenario, "")
+        else:
+            digest = ""
         if found != expected or not content.startswith(digest):
             file.close()
             raise DataError(
                 "a scenario file is not that of the registry",
                 where=str(path),
-                expected=f"(split, size, version, id, frames) = {expected}, content hash {digest or 'any'}",
+                expected=f"(split, size, version, id, frames) = {expected}, content "
+                f"hash {digest or 'any'}",
                 got=f"{found}, content hash {content[:16]}",
                 fix=self._remedy(scenario),
             )
-        material, walls = values.get("material"), values.get("wall_velocity")
-        kinds = np.zeros(position.shape[1], np.int8) if material is None else material[...]
+        material = values.get("material")
+        walls = values.get("wall_velocity")
+        if material is None:
+            kinds = np.zeros(position.shape[1], np.int8)
+        else:
+            kinds = material[...]
         return _Open(file, position, kinds, None if walls is None else walls[...])
 
     @contextmanager
     def _naming(self, scenario: int) -> Iterator[None]:
-        """Turn whatever HDF5 raises on damaged bytes into a DataError naming the file."""
+        """Turn whatever HDF5 raises on damaged bytes into a DataError naming the
+        file.
+        """
         try:
             yield
         except LagbenchError:
             raise
-        except Exception as error:  # no list of types holds: damage surfaces as nearly any of them
-            if isinstance(error, OSError) and error.errno in (errno.EMFILE, errno.ENFILE):
+        except (
+            Exception
+        ) as error:  # no list of types holds: damage surfaces as nearly any of them
+            if isinstance(error, OSError) and error.errno in (
+                errno.EMFILE,
+                errno.ENFILE,
+            ):
                 raise WorkFailedError(
                     "the system opens no more files",
                     where=str(self._paths[scenario]),
                     got=f"{len(self._open)} scenario files are open",
-                    fix="allow more, as by `ulimit -n 4096`, or open fewer data sets at a time",
+                    fix="allow more, as by `ulimit -n 4096`, or open fewer data sets "
+                    "at a time",
                 ) from error
-            got, fix = f"{type(error).__name__}: {error}", self._remedy(scenario)
+            got = f"{type(error).__name__}: {error}"
+            fix = self._remedy(scenario)
             raise damaged(self._paths[scenario], got, fix=fix) from error
 
     def _remedy(self, scenario: int) -> str:
         root = self._paths[scenario].parents[4]
-        return remedy(self._size, f"--subset {self._size.subset_of(scenario)}", root=root)
+        return remedy(
+            self._size, f"--subset {self._size.subset_of(scenario)}", root=root
+        )
 
 
 class Window(NamedTuple):
     """Consecutive frames of one scenario."""
 
-    position: NDArray[np.float32]  # particle positions [length], shape [particle, frame, 2]
+    position: NDArray[
+        np.float32
+    ]  # particle positions [length], shape [particle, frame, 2]
     material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
-    # velocity of the walls [length/s], shape [frame, wall, 2]: what acts on the way to each frame, those to
-    # predict included; None in a split without moving walls
+    # velocity of the walls [length/s], shape [frame, wall, 2]: what acts on the way to
+    # each frame, those to predict included; None in a split without moving walls
     wall_velocity: NDArray[np.float32] | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
-    # particle positions in the scenario's first frame [length], shape [particle, 2]; None unless asked for
+    # particle positions in the scenario's first frame [length], shape [particle, 2];
+    # None unless asked for
     origin: NDArray[np.float32] | None = None
 
 
 class WindowReader:
-    """All windows of ``history + future`` consecutive frames of a data set's subsets, by number.
+    """All windows of ``history + future`` consecutive frames of a data set's subsets,
+    by number.
 
-    Files are opened by the process that reads from them, at most 128 at a time; decompressed
-    frames are kept up to `cache_bytes` in each process. Stored data are never changed: every
-    window is a copy. `windows` says what the arguments are.
+    Files are opened by the process that reads from them, at most 128 at a time;
+    decompressed frames are kept up to `cache_bytes` in each process. Stored data are
+    never changed: every window is a copy. `windows` says what the arguments are.
     """
 
     def __init__(
@@ -213,8 +275,11 @@ class WindowReader:
         entry, folder, _ = locate(split, size, root=root, registry=registry)
         names = (subset,) if isinstance(subset, str) else tuple(subset)
         paths = scenario_files(entry, folder, names)
-        self.size = entry  # what the registry publishes: bounds, task, parameters, statistics of train
-        self.history = entry.task.input_frames if history is None else history  # frames that a model is given
+        # what the registry publishes: bounds, task, parameters, statistics of train
+        self.size = entry
+        self.history = (
+            entry.task.input_frames if history is None else history
+        )  # frames that a model is given
         self.future = future  # frames after them
         self.length = self.history + future  # frames in a window
         self.origin = origin  # whether windows hold the scenario's first frame too
@@ -234,7 +299,8 @@ class WindowReader:
                 fix=f"leave history out for the task's {entry.task.input_frames}",
             )
         if not frames or cache_bytes < 0:
-            what, expected = "no windows can be read like that", "a subset at least, and cache_bytes >= 0"
+            what = "no windows can be read like that"
+            expected = "a subset at least, and cache_bytes >= 0"
             got = f"{len(frames)} scenarios, cache_bytes {cache_bytes}"
             raise UsageError(what, where=where, expected=expected, got=got)
         if not len(self):
@@ -255,13 +321,19 @@ class WindowReader:
     def gravity(self) -> float:
         """Downward acceleration [length/s^2]; 0 in a split that states none."""
         stated = self.size.parameters.get("gravity")
-        return float(stated.value or 0.0) if stated else 0.0
+        if stated:
+            return float(stated.value or 0.0)
+        return 0.0
 
     @property
     def viscosity(self) -> float | None:
-        """Kinematic viscosity of the liquid [length^2/s]; None where scenarios differ: it is not given."""
+        """Kinematic viscosity of the liquid [length^2/s]; None where scenarios differ:
+        it is not given.
+        """
         stated = self.size.parameters.get("liquid_viscosity")
-        return None if stated is None or stated.value is None else float(stated.value)
+        if stated is None or stated.value is None:
+            return None
+        return float(stated.value)
 
     def place(self, index: int) -> tuple[int, int]:
         """Return scenario id and first frame of a window."""
@@ -277,7 +349,10 @@ class WindowReader:
         scenario, frame = self.place(index)
         frames = self.store.frames(scenario, frame, frame + self.length)
         material, walls = self.store.constants(scenario)
-        part = None if walls is None else walls[frame : frame + self.length]
+        if walls is None:
+            part = None
+        else:
+            part = walls[frame : frame + self.length]
         window = window_of(frames, material, part, scenario, frame)
         if not self.origin:
             return window
@@ -306,10 +381,11 @@ def windows(
 ) -> Windows:
     """Open all windows of consecutive frames as NumPy arrays, without PyTorch.
 
-    ``data[i]`` has ``position`` [length], float32, shape [particle, frame, 2]; ``material``, int8,
-    shape [particle]; ``wall_velocity`` [length/s], float32, shape [frame, wall, 2], or None; the
-    ids ``scenario`` and ``frame``. ``data.size`` holds what is published of the data set.
-    `lagbench.torch.WindowDataset` gives the same windows as tensors.
+    ``data[i]`` has ``position`` [length], float32, shape [particle, frame, 2];
+    ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
+    [frame, wall, 2], or None; the ids ``scenario`` and ``frame``. ``data.size`` holds
+    what is published of the data set. `lagbench.torch.WindowDataset` gives the same
+    windows as tensors.
 
     Args:
         split: name of the split, or path of a local split's folder.
@@ -319,8 +395,10 @@ def windows(
         history: frames that a model is given; those of the task by default.
         future: frames after them.
         registry: what describes the data set; ours by default.
-        cache_bytes: frames kept decompressed [bytes]; with less, reading is slower, never different.
-        origin: whether windows hold the positions in the scenario's first frame too, as ``origin``.
+        cache_bytes: frames kept decompressed [bytes]; with less, reading is slower,
+            never different.
+        origin: whether windows hold the positions in the scenario's first frame too, as
+            ``origin``.
 
     Raises:
         UsageError: unknown split, size or subset, or no scenario is long enough.

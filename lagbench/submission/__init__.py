@@ -1,11 +1,13 @@
-"""Submissions: predictions.nc, its writer, its reader, and the checks that it must pass.
+"""Submissions: predictions.nc, its writer, its reader, and the checks that it must
+pass.
 
 >>> from lagbench import submission
 >>> submission.DIMS
 ('scenario', 'frame', 'particle', 'space')
 
-``write`` makes a file from arrays, ``template`` one to fill, ``validate`` says what is wrong
-with one, ``open_predictions`` reads one in bounded memory. docs/predictions.md has the format.
+``write`` makes a file from arrays, ``template`` one to fill, ``validate`` says what is
+wrong with one, ``open_predictions`` reads one in bounded memory. docs/predictions.md
+has the format.
 """
 
 from __future__ import annotations

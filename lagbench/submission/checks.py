@@ -1,4 +1,6 @@
-"""Checks on the predicted positions: finite, frozen, where they lie, how far they jump."""
+"""Checks on the predicted positions: finite, frozen, where they lie, how far they
+jump.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ class Survey:
     off_grid: int = 0  # positions outside the unit box
     farthest: float = 0.0  # largest distance outside the box along an axis [length]
     first_outside: tuple[int, int] | None = None  # frame and particle
-    lost: tuple[int, int] | None = None  # frame and particle of the first beyond MAX_DISTANCE
+    lost: tuple[int, int] | None = (
+        None  # frame and particle of the first beyond MAX_DISTANCE
+    )
     jump_at: tuple[int, int] | None = None  # frame and particle of the largest jump
     settled: int = 0  # frame that is repeated from there to the end
     _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
@@ -51,8 +55,12 @@ class Survey:
         return math.sqrt(self._jump_square)
 
     def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
-        """Take in consecutive frames [length], shape [frame, particle, space], the first one by number."""
-        if not (block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL):  # NaN too
+        """Take in consecutive frames [length], shape [frame, particle, space], the
+        first one by number.
+        """
+        if not (
+            block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL
+        ):  # NaN too
             wrong = ~np.isfinite(block) | (block == FILL)
             if wrong.any():
                 if self.first_bad is None:
@@ -64,7 +72,8 @@ class Survey:
         self.values += block.size
         self._add_places(first, block, size)
         if self._last is None:
-            self._first, self.settled = (first, block[:1].copy()), first
+            self._first = (first, block[:1].copy())
+            self.settled = first
             self._add_steps(first + 1, block)
         else:
             self._add_steps(first, np.concatenate([self._last, block]))
@@ -81,7 +90,10 @@ class Survey:
         low, high = np.array(size.bounds, np.float64).T
         self.positions += block[..., 0].size
         sides = zip(np.moveaxis(block, -1, 0), low, high, strict=True)
-        if all(left - x.min() <= slack and x.max() - right <= slack for x, left, right in sides):
+        if all(
+            left - x.min() <= slack and x.max() - right <= slack
+            for x, left, right in sides
+        ):
             return  # nearly always, and 20 times as fast; NaN goes on
         beyond = np.fmax(low - block, block - high).max(axis=-1)
         far = beyond > slack
@@ -91,7 +103,9 @@ class Survey:
                 self.first_outside = (first + frame, particle)
             self.outside += int(np.count_nonzero(far))
             self.farthest = max(self.farthest, float(beyond[far].max()))
-            self.off_grid += int(np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1)))
+            self.off_grid += int(
+                np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1))
+            )
             if self.lost is None and self.farthest > MAX_DISTANCE:
                 frame, particle = (int(i[0]) for i in np.nonzero(beyond > MAX_DISTANCE))
                 self.lost = (first + frame, particle)
@@ -103,9 +117,13 @@ class Survey:
         self._add_jumps(first, joined)
 
     def _add_jumps(self, first: int, joined: NDArray[np.floating]) -> None:
-        """Take in the steps between consecutive frames, of which the first leads to ``first``."""
+        """Take in the steps between consecutive frames, of which the first leads to
+        ``first``.
+        """
         before = joined[0].astype(np.float64)
-        for frame, there in enumerate(joined[1:]):  # a frame fits the cache, a block does not
+        for frame, there in enumerate(
+            joined[1:]
+        ):  # a frame fits the cache, a block does not
             after = there.astype(np.float64)
             squares = squared_lengths(after - before)
             before = after
@@ -139,21 +157,32 @@ def check_finite(surveys: list[Survey], out: Findings) -> None:
     if not bad:
         return
     frame, particle, axis = bad[0].first_bad or (0, 0, 0)
-    count, unwritten = sum(one.bad for one in bad), sum(one.unwritten for one in bad)
-    fix = "freeze a diverging rollout at its last finite frame and name it in diverged_at"
+    count = sum(one.bad for one in bad)
+    unwritten = sum(one.unwritten for one in bad)
+    fix = (
+        "freeze a diverging rollout at its last finite frame and name it in diverged_at"
+    )
     out.error(
         "finite",
-        f"{count} values are no numbers" if unwritten < count else f"{count} values were never written",
-        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle {particle}, {'xy'[axis]}",
+        f"{count} values are no numbers"
+        if unwritten < count
+        else f"{count} values were never written",
+        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle "
+        f"{particle}, {'xy'[axis]}",
         expected="finite positions everywhere",
-        got=f"{count} of {sum(one.values for one in surveys)} values in {len(bad)} scenarios"
+        got=f"{count} of {sum(one.values for one in surveys)} values in {len(bad)} "
+        f"scenarios"
         + (f", {unwritten} of them netCDF's fill value" if unwritten else ""),
         fix="write every frame of every scenario" if unwritten == count else fix,
     )
 
 
-def check_frozen(predictions: Predictions, surveys: list[Survey], out: Findings) -> None:
-    """Report rollouts that go on moving after the frame at which they are said to be frozen."""
+def check_frozen(
+    predictions: Predictions, surveys: list[Survey], out: Findings
+) -> None:
+    """Report rollouts that go on moving after the frame at which they are said to be
+    frozen.
+    """
     for one in surveys:
         mark = predictions.header.diverged_at.get(one.scenario)
         if mark is not None and one.settled > mark:
@@ -161,14 +190,18 @@ def check_frozen(predictions: Predictions, surveys: list[Survey], out: Findings)
                 "diverged_at",
                 "the rollout moves after it was frozen",
                 where=f"scenario {one.scenario}, frame {one.settled}",
-                expected=f"the positions of frame {mark} from there on, as 'diverged_at' says",
+                expected=f"the positions of frame {mark} from there on, as "
+                f"'diverged_at' says",
                 got=f"another position in frame {one.settled} than in the one before",
-                fix="freeze a diverging rollout at its last finite frame, or leave 'diverged_at' out",
+                fix="freeze a diverging rollout at its last finite frame, or leave "
+                "'diverged_at' out",
             )
 
 
 def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
-    """Flag positions more than a solver cell outside the box; refuse those beyond ten boxes."""
+    """Flag positions more than a solver cell outside the box; refuse those beyond ten
+    boxes.
+    """
     out.made("in_domain")
     bad = [one for one in surveys if one.first_outside]
     if not bad:
@@ -179,27 +212,40 @@ def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
         out.error(
             "in_domain",
             "positions lie far beyond the box: one of them would ruin every mean",
-            where=f"first in scenario {lost.scenario}, frame {frame}, particle {particle}",
-            expected=f"at most {MAX_DISTANCE:g} lengths of the unit box outside the walls",
+            where=f"first in scenario {lost.scenario}, frame {frame}, particle "
+            f"{particle}",
+            expected=f"at most {MAX_DISTANCE:g} lengths of the unit box outside "
+            f"the walls",
             got=f"up to {max(one.farthest for one in bad):.3g} outside",
-            fix="freeze a diverging rollout before that and name the frame in diverged_at",
+            fix="freeze a diverging rollout before that and name the frame in "
+            "diverged_at",
         )
         return
     frame, particle = bad[0].first_outside or (0, 0)
-    share = sum(one.outside for one in bad) / max(1, sum(one.positions for one in surveys))
+    share = sum(one.outside for one in bad) / max(
+        1, sum(one.positions for one in surveys)
+    )
     out.warning(
         "in_domain",
         f"{share:.2%} of the positions lie outside the box",
-        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle {particle}",
-        expected=f"x in {size.bounds[0]}, y in {size.bounds[1]}, up to a solver cell beyond",
+        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle "
+        f"{particle}",
+        expected=f"x in {size.bounds[0]}, y in {size.bounds[1]}, up to a solver "
+        f"cell beyond",
         got=f"up to {max(one.farthest for one in bad):.3g} outside;"
-        f" {sum(one.off_grid for one in bad)} positions are outside the unit box and carry no grid weight",
-        fix="positions are in lengths of the unit box, the walls' places are the split's bounds",
+        f" {sum(one.off_grid for one in bad)} positions are outside the unit box and "
+        f"carry no grid weight",
+        fix="positions are in lengths of the unit box, the walls' places are the "
+        "split's bounds",
     )
 
 
-def check_jumps(surveys: list[Survey], starts: Mapping[int, Start], truth: Truth, out: Findings) -> None:
-    """Flag particles that jump much farther in a frame than any particle of the truth."""
+def check_jumps(
+    surveys: list[Survey], starts: Mapping[int, Start], truth: Truth, out: Findings
+) -> None:
+    """Flag particles that jump much farther in a frame than any particle of the
+    truth.
+    """
     for one in surveys:
         start = starts[one.scenario]
         one.follow(start.given)
@@ -209,20 +255,27 @@ def check_jumps(surveys: list[Survey], starts: Mapping[int, Start], truth: Truth
             out.warning(
                 "max_displacement",
                 "a particle jumps",
-                where=f"scenario {one.scenario}, from frame {frame - 1} to {frame}, particle {particle}",
-                expected=f"at most {limit:.3g}, {JUMP:g} times the truth's largest displacement in a frame",
+                where=f"scenario {one.scenario}, from frame {frame - 1} to {frame}, "
+                f"particle {particle}",
+                expected=f"at most {limit:.3g}, {JUMP:g} times the truth's largest "
+                f"displacement in a frame",
                 got=f"{one.jump:.3g}",
-                fix="check the rollout for instability, and that particles keep their order",
+                fix="check the rollout for instability, and that particles keep "
+                "their order",
             )
     out.made("max_displacement")
 
 
 def outside_share(opened: Predictions, size: Size) -> float:
-    """Return the share of positions that lie more than a solver cell outside the box."""
+    """Return the share of positions that lie more than a solver cell outside the
+    box.
+    """
     low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
-    found, count = 0, 0
+    found = 0
+    count = 0
     for scenario in opened.header.scenarios:
         for _, block in opened.blocks(scenario):
             beyond = ((block < low) | (block > high)).any(axis=-1)
-            found, count = found + int(beyond.sum()), count + beyond.size
+            found = found + int(beyond.sum())
+            count = count + beyond.size
     return round_digits(found / max(1, count), 4)

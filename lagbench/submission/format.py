@@ -1,7 +1,8 @@
-"""What a predictions.nc is: its names, what its headers say, and the checks on its layout.
+"""What a predictions.nc is: its names, what its headers say, and the checks on its
+layout.
 
-No data set is needed here. What is wrong is recorded, not raised; only a file that HDF5 cannot
-read at all raises.
+No data set is needed here. What is wrong is recorded, not raised; only a file that HDF5
+cannot read at all raises.
 """
 
 from __future__ import annotations
@@ -67,7 +68,8 @@ MAX_NAME = 200
 """Longest required attribute [characters]."""
 
 MAX_COORDINATE = 20_000
-"""Most entries of a coordinate that are read; ids and frame numbers have four digits."""
+"""Most entries of a coordinate that are read; ids and frame numbers have four digits.
+"""
 
 MAX_COORDINATE_CHUNK = 1 << 26
 """Largest chunk of a coordinate that is read [bytes]."""
@@ -78,17 +80,30 @@ PACKING = ("scale_factor", "add_offset")
 ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
     "scenario": {"long_name": "scenario id", "units": "1"},
     "frame": {"long_name": "absolute frame number", "units": "1"},
-    "position": {"long_name": "predicted particle position in lengths of the unit box", "units": "1"},
-    "velocity": {"long_name": "predicted particle velocity in box lengths per second", "units": "s-1"},
-    "diverged_at": {"long_name": "first frame of a frozen rollout, -1 where none is", "units": "1"},
+    "position": {
+        "long_name": "predicted particle position in lengths of the unit box",
+        "units": "1",
+    },
+    "velocity": {
+        "long_name": "predicted particle velocity in box lengths per second",
+        "units": "s-1",
+    },
+    "diverged_at": {
+        "long_name": "first frame of a frozen rollout, -1 where none is",
+        "units": "1",
+    },
 }
 """Attributes of each variable, as we write them."""
 
 _START = "start from what `lagbench template` writes, or use lagbench.submission.write"
-WRITE = "write it with lagbench.submission.write, or fill what `lagbench template` writes"
+WRITE = (
+    "write it with lagbench.submission.write, or fill what `lagbench template` writes"
+)
 """How to get a right file."""
 
-_WRITE = "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
+_WRITE = (
+    "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
+)
 _SURROGATES = re.compile("[\ud800-\udfff]")  # what no UTF-8 has
 _KINDS = {str: "text", int: "an integer", float: "a positive number"}
 
@@ -110,8 +125,12 @@ class Header:
     seed: int | None  # seed of the training
     parameters: int | None  # trainable parameters of the model
     training: str | None  # what the model was trained on, in words
-    diverged_at: Mapping[int, int]  # scenario id to the absolute frame from which it is frozen
-    solver_seconds_per_frame: float | None = None  # of our solver on one core of the same machine [s]
+    diverged_at: Mapping[
+        int, int
+    ]  # scenario id to the absolute frame from which it is frozen
+    solver_seconds_per_frame: float | None = (
+        None  # of our solver on one core of the same machine [s]
+    )
     budget: Budget | None = None  # what the training took
 
 
@@ -119,11 +138,17 @@ class Header:
 class Anatomy:
     """A file as its headers describe it."""
 
-    links: Mapping[str, str]  # entry of the root group to what it is; the first MAX_LINKS of them
+    links: Mapping[
+        str, str
+    ]  # entry of the root group to what it is; the first MAX_LINKS of them
     link_count: int
-    attributes: Mapping[str, object]  # attribute of the format to its value, None where it is missing
+    attributes: Mapping[
+        str, object
+    ]  # attribute of the format to its value, None where it is missing
     arrays: Mapping[str, Array]  # variables of the format that a hard link leads to
-    packing: Mapping[str, object]  # scale_factor and add_offset of ``position``, where it has them
+    packing: Mapping[
+        str, object
+    ]  # scale_factor and add_offset of ``position``, where it has them
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
     length: int  # length of the file [bytes]
 
@@ -148,23 +173,36 @@ def fits(name: str, value: object) -> bool:
     (True, False, True, False)
     """
     if name in REQUIRED:
-        text = value if isinstance(value, str) else ""
+        if isinstance(value, str):
+            text = value
+        else:
+            text = ""
         return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
-    if isinstance(value, bool) or (isinstance(value, int) and not -(2**63) <= value < 2**64):
+    if isinstance(value, bool) or (
+        isinstance(value, int) and not -(2**63) <= value < 2**64
+    ):
         return False
-    if isinstance(value, str) and (len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value) or "\0" in value):
+    if isinstance(value, str) and (
+        len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value) or "\0" in value
+    ):
         return False  # HDF5 stores UTF-8, up to the first NUL
     if OPTIONAL[name] is float:
         return isinstance(value, (int, float)) and 0 < value < math.inf
     if name == "budget":
         return isinstance(value, str) and budget_in(value) is not None
-    return isinstance(value, OPTIONAL[name]) and not (name == "parameters" and int(value) < 0)
+    return isinstance(value, OPTIONAL[name]) and not (
+        name == "parameters" and int(value) < 0
+    )
 
 
 def require_fit(name: str, value: object) -> None:
     """Refuse a value that an attribute may not have, before it is written."""
     if not fits(name, value):
-        raise UsageError(f"the label {name!r} does not fit", expected=kind_of(name), got=quoted(value))
+        raise UsageError(
+            f"the label {name!r} does not fit",
+            expected=kind_of(name),
+            got=quoted(value),
+        )
 
 
 def dissect(file: h5py.File, path: Path) -> Anatomy:
@@ -174,16 +212,23 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
         links, count = members_of(file["/"])
         names = ("lagbench_format", *REQUIRED, *OPTIONAL)
         attributes = {name: attribute_of(file["/"], name) for name in names}
-    arrays, integers, packing = {}, {}, {}
+    arrays = {}
+    integers = {}
+    packing = {}
     for name in ("position", *INTEGERS):
         if links.get(name) == "variable":
             with reading(path, name):
                 dataset = file[name]
                 array = describe(dataset)
-                arrays[name] = array if array.shape else replace(array, shape=None)
+                if array.shape:
+                    arrays[name] = array
+                else:
+                    arrays[name] = replace(array, shape=None)
                 if name == "position":
                     found = {key: attribute_of(dataset, key) for key in PACKING}
-                    packing = {key: value for key, value in found.items() if value is not None}
+                    packing = {
+                        key: value for key, value in found.items() if value is not None
+                    }
                 elif (
                     array.shape is not None
                     and len(array.shape) == 1
@@ -211,31 +256,50 @@ def header_of(anatomy: Anatomy) -> Header:
     labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
     for name, kind in OPTIONAL.items():
         value = anatomy.attributes[name]
-        value = float(value) if kind is float and isinstance(value, int) else value
-        labels[name] = value if isinstance(value, kind) else None
-    labels["budget"] = budget_in(labels["budget"]) if labels["budget"] else None
+        if kind is float and isinstance(value, int):
+            value = float(value)
+        else:
+            value = value
+        if isinstance(value, kind):
+            labels[name] = value
+        else:
+            labels[name] = None
+    if labels["budget"]:
+        labels["budget"] = budget_in(labels["budget"])
+    else:
+        labels["budget"] = None
     return Header(
         **labels,
         scenarios=scenarios,
         frames=anatomy.integers["frame"],
         particles=(anatomy.arrays["position"].shape or ())[2],
-        diverged_at={i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0},
+        diverged_at={
+            i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0
+        },
     )
 
 
 def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
-    """Refuse a file of ours that holds no predictions: all that could be said of it would mislead."""
+    """Refuse a file of ours that holds no predictions: all that could be said of it
+    would mislead.
+    """
     if {"position", "scenario"} <= anatomy.links.keys():
         return
     for name, what in OTHERS.items():
         if name in anatomy.links:
             raise UnreadableFileError(
-                "a file of another kind", where=str(path), expected="predictions", got=what, fix=_START
+                "a file of another kind",
+                where=str(path),
+                expected="predictions",
+                got=what,
+                fix=_START,
             )
 
 
 def check_format(anatomy: Anatomy, out: Findings) -> bool:
-    """Check links, variables, storage and attributes; tell whether the values can be read."""
+    """Check links, variables, storage and attributes; tell whether the values can be
+    read.
+    """
     out.made("format")
     for name, kind in anatomy.links.items():
         if kind.endswith("link"):
@@ -248,14 +312,27 @@ def check_format(anatomy: Anatomy, out: Findings) -> bool:
                 fix="store the values themselves",
             )
     if anatomy.link_count > MAX_LINKS:
-        most, count = f"at most {MAX_LINKS}", anatomy.link_count
-        out.error("format", "too many variables", where="/", expected=most, got=count, fix=_START)
+        most = f"at most {MAX_LINKS}"
+        count = anatomy.link_count
+        out.error(
+            "format",
+            "too many variables",
+            where="/",
+            expected=most,
+            got=count,
+            fix=_START,
+        )
     known = [quoted(other) for other in anatomy.links][:10]
     for name in ("position", "scenario", "frame"):
         kind = anatomy.links.get(name, "")
         if kind != "variable" and not kind.endswith("link"):
-            fix, got = _START if kind else nearest(quoted(name), known), kind or ", ".join(known) or "nothing"
-            what, expected = f"no variable {name!r}", f"a variable {name!r}"
+            if kind:
+                fix = _START
+            else:
+                fix = nearest(quoted(name), known)
+            got = kind or ", ".join(known) or "nothing"
+            what = f"no variable {name!r}"
+            expected = f"a variable {name!r}"
             out.error("format", what, where="/", expected=expected, got=got, fix=fix)
     for name, array in anatomy.arrays.items():
         problem = storage_problem(array, length=anatomy.length)
@@ -266,8 +343,18 @@ def check_format(anatomy: Anatomy, out: Findings) -> bool:
             f"one dimension of at most {MAX_COORDINATE} integers",
             f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
         )
-        fix = _WRITE if problem else _START
-        out.error("format", what, where=f"variable {name!r}", expected=expected, got=got, fix=fix)
+        if problem:
+            fix = _WRITE
+        else:
+            fix = _START
+        out.error(
+            "format",
+            what,
+            where=f"variable {name!r}",
+            expected=expected,
+            got=got,
+            fix=fix,
+        )
     readable = not out.failed("format")
     _check_attributes(anatomy, out)
     return readable
@@ -276,17 +363,24 @@ def check_format(anatomy: Anatomy, out: Findings) -> bool:
 def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
     for name, value in anatomy.attributes.items():
         if name == "lagbench_format":
-            expected, right = str(FORMAT), not isinstance(value, (str, Odd)) and value == FORMAT
+            expected = str(FORMAT)
+            right = not isinstance(value, (str, Odd)) and value == FORMAT
         elif name in REQUIRED:
-            expected, right = kind_of(name), fits(name, value)
+            expected = kind_of(name)
+            right = fits(name, value)
         else:
-            expected, right = f"{kind_of(name)}, or no such attribute", value is None or fits(name, value)
+            expected = f"{kind_of(name)}, or no such attribute"
+            right = value is None or fits(name, value)
         if right:
             continue
-        got = value.reason if isinstance(value, Odd) else quoted(value)
+        if isinstance(value, Odd):
+            got = value.reason
+        else:
+            got = quoted(value)
         out.error(
             "format",
-            f"the attribute {name!r} {'is missing' if value is None else 'cannot be used'}",
+            f"the attribute {name!r} "
+            f"{'is missing' if value is None else 'cannot be used'}",
             where="global attributes",
             expected=expected,
             got="no such attribute" if value is None else got,
@@ -303,23 +397,51 @@ def check_dims(anatomy: Anatomy, out: Findings) -> bool:
     out.made("dims")
     where = "variable 'position'"
     if array.dims != DIMS:
-        got = ", ".join(quoted(name) if name else "one without a name" for name in array.dims) or "none"
-        expected, fix = ", ".join(DIMS), _START
+        got = (
+            ", ".join(
+                quoted(name) if name else "one without a name" for name in array.dims
+            )
+            or "none"
+        )
+        expected = ", ".join(DIMS)
+        fix = _START
         if sorted(array.dims) == sorted(DIMS):
             fix = "transpose it"
         elif len(array.dims) == len(DIMS) - 1:
             fix = "add the leading dimension 'scenario', also for a single scenario"
         elif not any(array.dims):
-            fix = "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
-        out.error("dims", "the dimensions are others", where=where, expected=expected, got=got, fix=fix)
+            fix = (
+                "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
+            )
+        out.error(
+            "dims",
+            "the dimensions are others",
+            where=where,
+            expected=expected,
+            got=got,
+            fix=fix,
+        )
         return False
     rows = {name: anatomy.integers.get(name) for name in ("scenario", "frame")}
-    counted = [f"as many as {name!r}" if held is None else len(held) for name, held in rows.items()]
+    counted = [
+        f"as many as {name!r}" if held is None else len(held)
+        for name, held in rows.items()
+    ]
     lengths = (*counted, array.shape[2], SPACE)
     if array.shape != lengths:
         swapped = array.shape[2] == SPACE and array.shape[3] > SPACE
-        fix = "particle and space seem to be swapped: transpose them" if swapped else _START
-        out.error("dims", "the lengths do not fit", where=where, expected=lengths, got=array.shape, fix=fix)
+        if swapped:
+            fix = "particle and space seem to be swapped: transpose them"
+        else:
+            fix = _START
+        out.error(
+            "dims",
+            "the lengths do not fit",
+            where=where,
+            expected=lengths,
+            got=array.shape,
+            fix=fix,
+        )
         return False
     return True
 
@@ -334,9 +456,19 @@ def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
     where = "variable 'position'"
     if array.kind != "float32":
         fix = "store positions as float32: positions.astype('float32')"
-        out.error("dtype", "the type is another", where=where, expected="float32", got=array.kind, fix=fix)
+        out.error(
+            "dtype",
+            "the type is another",
+            where=where,
+            expected="float32",
+            got=array.kind,
+            fix=fix,
+        )
     if anatomy.packing:
-        said = {n: v.reason if isinstance(v, Odd) else quoted(v) for n, v in anatomy.packing.items()}
+        said = {
+            n: v.reason if isinstance(v, Odd) else quoted(v)
+            for n, v in anatomy.packing.items()
+        }
         out.error(
             "dtype",
             "the values are packed, and are not unpacked here",
@@ -349,9 +481,12 @@ def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
 
 
 def check_marks(anatomy: Anatomy, out: Findings) -> None:
-    """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per scenario."""
+    """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per
+    scenario.
+    """
     array = anatomy.arrays.get("diverged_at")
-    marks, frames = anatomy.integers.get("diverged_at"), anatomy.integers.get("frame")
+    marks = anatomy.integers.get("diverged_at")
+    frames = anatomy.integers.get("frame")
     if array is not None and (marks is None or frames is None):
         out.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
         return
@@ -359,13 +494,16 @@ def check_marks(anatomy: Anatomy, out: Findings) -> None:
     if array is None or marks is None or frames is None:
         return
     where = "variable 'diverged_at'"
-    if array.dims != ("scenario",) or len(marks) != len(anatomy.integers.get("scenario", ())):
+    if array.dims != ("scenario",) or len(marks) != len(
+        anatomy.integers.get("scenario", ())
+    ):
         out.error(
             "diverged_at",
             "it is not told per scenario",
             where=where,
             expected="one value per scenario, on the dimension 'scenario'",
-            got=f"{len(marks)} on {quoted(array.dims[0]) if any(array.dims) else 'one without a name'}",
+            got=f"{len(marks)} on "
+            f"{quoted(array.dims[0]) if any(array.dims) else 'one without a name'}",
             fix="store it beside 'scenario', or leave it out",
         )
     wrong = sorted(set(marks) - {NEVER, *frames})
@@ -374,7 +512,8 @@ def check_marks(anatomy: Anatomy, out: Findings) -> None:
             "diverged_at",
             "a rollout is frozen at no predicted frame",
             where=where,
-            expected=f"absolute numbers of predicted frames, {NEVER} for a rollout that did not diverge",
+            expected=f"absolute numbers of predicted frames, {NEVER} for a rollout "
+            f"that did not diverge",
             got=", ".join(map(str, wrong[:5])),
             fix=f"name the first frozen frame, or {NEVER}",
         )

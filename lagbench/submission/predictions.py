@@ -39,13 +39,17 @@ BLOCK_BYTES = 1 << 20
 class Predictions:
     """An open predictions.nc; use it as a context manager."""
 
-    def __init__(self, path: Path, anatomy: Anatomy, position: h5py.Dataset, stack: ExitStack) -> None:
+    def __init__(
+        self, path: Path, anatomy: Anatomy, position: h5py.Dataset, stack: ExitStack
+    ) -> None:
         self.path = path
         self.anatomy = anatomy
         self.header: Header = header_of(anatomy)
         self._position = position
         self._stack = stack
-        self._row = {scenario: row for row, scenario in enumerate(self.header.scenarios)}
+        self._row = {
+            scenario: row for row, scenario in enumerate(self.header.scenarios)
+        }
 
     def __enter__(self) -> Self:
         """Return the predictions themselves."""
@@ -60,7 +64,8 @@ class Predictions:
         self._stack.close()
 
     def frames(self, scenario: int, start: int, count: int) -> NDArray[np.float32]:
-        """Return consecutive frames of a scenario; the order of scenarios does not matter.
+        """Return consecutive frames of a scenario; the order of scenarios does not
+        matter.
 
         Args:
             scenario: id of the scenario.
@@ -68,20 +73,32 @@ class Predictions:
             count: how many stored frames to read from there.
 
         Returns:
-            Positions [length], shape [frame, particle, space], in the machine's byte order.
+            Positions [length], shape [frame, particle, space], in the machine's byte
+            order.
 
         Raises:
             UsageError: the file has no such scenario or frames.
             UnreadableFileError: the file is damaged there.
         """
         numbers = self.header.frames
-        first = numbers.index(start) if start in numbers else -1
-        if scenario not in self._row or first < 0 or count < 0 or first + count > len(numbers):
-            what, got = "the file has no such frames", f"scenario {scenario}, {count} frames from {start}"
+        if start in numbers:
+            first = numbers.index(start)
+        else:
+            first = -1
+        if (
+            scenario not in self._row
+            or first < 0
+            or count < 0
+            or first + count > len(numbers)
+        ):
+            what = "the file has no such frames"
+            got = f"scenario {scenario}, {count} frames from {start}"
             expected = f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}"
             raise UsageError(what, where=str(self.path), expected=expected, got=got)
         with reading(self.path, "position"):
-            values: NDArray[Any] = self._position[self._row[scenario], first : first + count]
+            values: NDArray[Any] = self._position[
+                self._row[scenario], first : first + count
+            ]
             return np.ascontiguousarray(values, dtype=np.float32)
 
     def blocks(self, scenario: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
@@ -112,25 +129,33 @@ class Predictions:
         return hasher.hexdigest()
 
     def hasher(self) -> ContentHasher:
-        """Return the content hash as far as the header goes; blocks follow by ascending scenario id."""
+        """Return the content hash as far as the header goes; blocks follow by ascending
+        scenario id.
+        """
         header = self.header
         ids = sorted(header.scenarios)
         identity = {name: getattr(header, name) for name in REQUIRED}
-        hasher = ContentHasher({**identity, "scenarios": ids, "frames": list(header.frames)})
+        hasher = ContentHasher(
+            {**identity, "scenarios": ids, "frames": list(header.frames)}
+        )
         shape = (len(ids), len(header.frames), header.particles, SPACE)
         hasher.declare("position", np.dtype(np.float32), DIMS, shape)
         return hasher
 
 
-def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Predictions:
+def open_predictions(
+    path: str | Path, *, checked: Anatomy | None = None
+) -> Predictions:
     """Open a predictions.nc without trusting it.
 
-    Only the layout of the file is checked here, not its agreement with a data set: that is
-    `lagbench.validate`, which also guards against files that make HDF5 loop or crash.
+    Only the layout of the file is checked here, not its agreement with a data set: that
+    is `lagbench.validate`, which also guards against files that make HDF5 loop or
+    crash.
 
     Args:
         path: the file.
-        checked: the anatomy of this very file when it was opened before: one as long is not checked again.
+        checked: the anatomy of this very file when it was opened before: one as long is
+            not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -140,15 +165,20 @@ def open_predictions(path: str | Path, *, checked: Anatomy | None = None) -> Pre
     with ExitStack() as stack:
         file = stack.enter_context(opened(path, fix=WRITE))
         if checked is None or checked.length != path.stat().st_size:
-            checked, out = dissect(file, path), Findings()
+            checked = dissect(file, path)
+            out = Findings()
             for check in (check_format, check_dims, check_dtype, check_marks):
                 check(checked, out)
             out.result(path).check()
         return attach(file, path, checked, stack)
 
 
-def attach(file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack) -> Predictions:
-    """Return the predictions of an open file whose layout has been checked; they take over the stack."""
+def attach(
+    file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack
+) -> Predictions:
+    """Return the predictions of an open file whose layout has been checked; they take
+    over the stack.
+    """
     with reading(path, "position"):
         # just the chunk cache that reading in order needs
         size, kept = cache_of(anatomy.arrays["position"])

@@ -1,4 +1,6 @@
-"""Checks that a file answers the task: split, data set, scenarios, frames, particles."""
+"""Checks that a file answers the task: split, data set, scenarios, frames,
+particles.
+"""
 
 from __future__ import annotations
 
@@ -41,14 +43,19 @@ def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | N
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
         got=f"{quoted(split)}, {quoted(size)}",
-        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: --root FOLDER",
+        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: "
+        f"--root FOLDER",
     )
     return None
 
 
 def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> None:
-    """Check that the predictions were made from the data set that the registry means."""
-    version, got = (anatomy.attributes[name] for name in ("dataset_version", "dataset_sha256"))
+    """Check that the predictions were made from the data set that the registry
+    means.
+    """
+    version, got = (
+        anatomy.attributes[name] for name in ("dataset_version", "dataset_sha256")
+    )
     if not isinstance(version, str) or not isinstance(got, str):
         out.skip("the file does not name its data set", "dataset")
         return
@@ -80,13 +87,16 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_sha256'",
             expected=expected or "64 hex digits",
             got=quoted(got),
-            fix=f"{remake}; whether it is what lies here, says lagbench verify --split {size.split}"
+            fix=f"{remake}; whether it is what lies here, says lagbench verify "
+            f"--split {size.split}"
             f" --size {size.name} --root {spelled(root)}",
         )
 
 
 def dataset_hash_of(size: Size, root: Path) -> str | None:
-    """Return the hash of a data set: the registry's, else that of a complete local one."""
+    """Return the hash of a data set: the registry's, else that of a complete local
+    one.
+    """
     return (size.measured or read_or_empty(size, root)).dataset_sha256
 
 
@@ -118,7 +128,9 @@ def check_scenarios(anatomy: Anatomy, size: Size, out: Findings) -> None:
 
 def _numbers(ids: Sequence[int]) -> str:
     """Return numbers for a message; negative ones would read as ranges."""
-    return spell_numbers(ids) if min(ids) >= 0 else quoted(list(ids[:20]))
+    if min(ids) >= 0:
+        return spell_numbers(ids)
+    return quoted(list(ids[:20]))
 
 
 def check_frames(anatomy: Anatomy, size: Size, out: Findings) -> None:
@@ -134,7 +146,8 @@ def check_frames(anatomy: Anatomy, size: Size, out: Findings) -> None:
             "frames",
             "the frames are not those to predict",
             where="coordinate 'frame'",
-            expected=f"{spell_numbers(expected)} (absolute numbers, {len(expected)} of them)",
+            expected=f"{spell_numbers(expected)} (absolute numbers, {len(expected)} "
+            f"of them)",
             got=f"{_numbers(got) if got else 'none'} ({len(got)})",
             fix=guess_frames(got, expected),
         )
@@ -159,12 +172,13 @@ def check_particles(anatomy: Anatomy, size: Size, out: Findings) -> bool:
             where="variable 'position', dimension 'particle'",
             expected=size.particles,
             got=array.shape[2],
-            fix=f"predict every particle of {size.split} {size.name}, in the order of the given frames",
+            fix=f"predict every particle of {size.split} {size.name}, in the order of "
+            f"the given frames",
         )
     return array.shape[2] == size.particles
 
 
-# --- guesses, so that a message can say what may have happened ------------------------------
+# --- guesses, so that a message can say what may have happened ------------------------
 
 
 def spell_numbers(numbers: Sequence[int]) -> str:
@@ -174,12 +188,15 @@ def spell_numbers(numbers: Sequence[int]) -> str:
     '6-8,10'
     """
     text = spell_ids(numbers)
-    return text if len(text) <= MAX_SPELLED else f"{text[: MAX_SPELLED - 3]}... ({len(numbers)} numbers)"
+    if len(text) <= MAX_SPELLED:
+        return text
+    return f"{text[: MAX_SPELLED - 3]}... ({len(numbers)} numbers)"
 
 
 def guess_frames(got: Sequence[int], expected: range) -> str:
     """Return what seems to have happened to the frame numbers."""
-    given, count = expected.start, len(expected)
+    given = expected.start
+    count = len(expected)
     if not got:
         return "there are no frames"
     number, times = Counter(got).most_common(1)[0]
@@ -189,9 +206,13 @@ def guess_frames(got: Sequence[int], expected: range) -> str:
         return "seems to hold the right frames in another order: store them ascending"
     steps = {b - a for a, b in pairwise(got)}
     if len(steps) == 1 and (step := min(steps)) > 1:
-        ending = "th" if step % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(step % 10, "th")
+        if step % 100 in (11, 12, 13):
+            ending = "th"
+        else:
+            ending = {1: "st", 2: "nd", 3: "rd"}.get(step % 10, "th")
         return f"seems to skip: it holds every {step}{ending} frame only"
-    first, last = got[0], got[-1]
+    first = got[0]
+    last = got[-1]
     if steps and steps != {1}:
         if missing := sorted(set(expected) - set(got)):
             return f"lacks the frames {spell_numbers(missing)}"
@@ -199,12 +220,16 @@ def guess_frames(got: Sequence[int], expected: range) -> str:
     if first in (0, 1) and len(got) == count:
         return f"seems to count from the first predicted frame, whose absolute number is {given}"
     if first < given and last == given + count - 1:
-        return f"seems to start at the input frames: leave out the frames before {given}"
+        return (
+            f"seems to start at the input frames: leave out the frames before {given}"
+        )
     if first == given and last < given + count - 1:
         return f"stops too early: the last frame is {given + count - 1}"
     if first == given:
         return f"goes on too long: leave out the frames after {given + count - 1}"
-    return f"seems to be shifted by {first - given} frames" if len(got) == count else "holds other frames"
+    if len(got) == count:
+        return f"seems to be shifted by {first - given} frames"
+    return "holds other frames"
 
 
 def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) -> str:
@@ -212,6 +237,8 @@ def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) ->
     for subset, ids in subsets.items():
         if subset != "test" and set(got) <= set(ids):
             return f"these are scenarios of {subset}"
-    if list(got) == list(range(len(subsets["test"]))) or list(got) == list(range(1, len(got) + 1)):
+    if list(got) == list(range(len(subsets["test"]))) or list(got) == list(
+        range(1, len(got) + 1)
+    ):
         return "seems to count the scenarios: store their ids"
     return "name the scenarios by their ids"

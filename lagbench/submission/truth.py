@@ -1,4 +1,6 @@
-"""The scenarios that predictions are held against: hashed before use, read a few frames at a time."""
+"""The scenarios that predictions are held against: hashed before use, read a few frames
+at a time.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ BLOCK = 16
 
 
 class Truth:
-    """The test subset of a data set under a root folder; while a model is trained, its valid subset."""
+    """The test subset of a data set under a root folder; while a model is trained, its
+    valid subset.
+    """
 
     def __init__(self, size: Size, root: Path, subset: str = "test") -> None:
         self.size = size
@@ -37,7 +41,8 @@ class Truth:
         missing = [i for i in ids if not self.path(i).is_file()]
         if missing:
             raise DataError(
-                f"{len(missing)} of {len(ids)} {self.subset} scenarios are not generated",
+                f"{len(missing)} of {len(ids)} {self.subset} scenarios are not "
+                f"generated",
                 where=str(self.path(ids[0]).parent),
                 expected=f"scenarios {spell_ids(ids)}",
                 got=f"missing: {spell_ids(missing)}",
@@ -46,28 +51,51 @@ class Truth:
 
     def check(self) -> None:
         """Hash the values of every scenario, or find that this machine has done so."""
-        known, new = noted_hashes(self.folder), {}
+        known = noted_hashes(self.folder)
+        new = {}
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        fix = f"{self._remedy()}; {verify} --root {spelled(self.root)} says what is wrong"
-        recorded = None if self.size.measured else read_or_empty(self.size, self.root)
+        fix = (
+            f"{self._remedy()}; {verify} --root {spelled(self.root)} says what is wrong"
+        )
+        if self.size.measured:
+            recorded = None
+        else:
+            recorded = read_or_empty(self.size, self.root)
         for scenario in sorted(self.size.subsets[self.subset]):
-            path, entry = self.path(scenario), recorded.entry(scenario) if recorded else None
+            path = self.path(scenario)
+            if recorded:
+                entry = recorded.entry(scenario)
+            else:
+                entry = None
             # what is known of the content hash: its first digits, all, or nothing
-            expected = entry.content_sha256 if entry else self._hash(scenario)
+            if entry:
+                expected = entry.content_sha256
+            else:
+                expected = self._hash(scenario)
             try:
                 found = known(path)
                 if found is None:
                     new[path] = check_scenario(path)
-                content = found[0] if found else new[path]
+                if found:
+                    content = found[0]
+                else:
+                    content = new[path]
             except OSError as error:
                 what = f"cannot read a {self.subset} scenario"
-                raise DataError(what, where=str(path), got=error.strerror, fix=fix) from error
+                raise DataError(
+                    what, where=str(path), got=error.strerror, fix=fix
+                ) from error
             except DataError as error:
-                where, wanted = error.where or str(path), error.expected
-                raise DataError(error.what, where=where, expected=wanted, got=error.got, fix=fix) from error
+                where = error.where or str(path)
+                wanted = error.expected
+                raise DataError(
+                    error.what, where=where, expected=wanted, got=error.got, fix=fix
+                ) from error
             if not content.startswith(expected):
                 what = f"a {self.subset} scenario has another content hash"
-                raise DataError(what, where=str(path), expected=expected, got=content, fix=fix)
+                raise DataError(
+                    what, where=str(path), expected=expected, got=content, fix=fix
+                )
         note(self.folder, new)
 
     def _remedy(self) -> str:
@@ -79,10 +107,16 @@ class Truth:
 
     def open(self, scenario: int) -> ScenarioFile:
         """Open a scenario; check that it is the one that the registry means."""
-        path, key = self.path(scenario), self.size.key(scenario)
+        path = self.path(scenario)
+        key = self.size.key(scenario)
         file = read_scenario(path)
         header = file.header
-        found = (header.key.split, header.key.size, header.key.major, header.key.scenario)
+        found = (
+            header.key.split,
+            header.key.size,
+            header.key.major,
+            header.key.scenario,
+        )
         expected = (key.split, key.size, key.major, scenario)
         short = self._hash(scenario)
         if found == expected and header.content_sha256.startswith(short):
@@ -97,11 +131,14 @@ class Truth:
         )
 
     def given(self, scenario: int) -> NDArray[np.float32]:
-        """Return the frames given to a model [length], shape [frame, particle, space]."""
+        """Return the frames given to a model [length], shape [frame, particle,
+        space].
+        """
         return self._frames(scenario, 0, self.size.task.input_frames)
 
     def around_start(self, scenario: int) -> NDArray[np.float32]:
-        """Return the last given frame and the first two to be predicted, or the only one.
+        """Return the last given frame and the first two to be predicted, or the only
+        one.
 
         Positions [length], shape [2 or 3, particle, space].
         """
@@ -116,18 +153,28 @@ class Truth:
                 return frames
             what = f"a {self.subset} scenario has other frames or particles than the registry says"
             expected = f"at least {stop} frames of {self.size.particles} particles"
-            raise DataError(what, where=str(self.path(scenario)), expected=expected, got=frames.shape)
+            raise DataError(
+                what,
+                where=str(self.path(scenario)),
+                expected=expected,
+                got=frames.shape,
+            )
 
     def largest_displacement(self, scenario: int, *, enough: float) -> float:
-        """Return the largest distance that a particle moves from one frame to the next [length].
+        """Return the largest distance that a particle moves from one frame to the next
+        [length].
 
-        Reading stops as soon as one of at least ``enough`` [length] is found, which is then returned.
+        Reading stops as soon as one of at least ``enough`` [length] is found, which is
+        then returned.
         """
-        task, largest = self.size.task, 0.0
+        task = self.size.task
+        largest = 0.0
         with self.open(scenario) as file:
             last = min(file.header.frames, task.input_frames + task.horizon)
             for start in range(0, last - 1, BLOCK):
-                frames = file.read("position", slice(start, min(start + BLOCK + 1, last)))
+                frames = file.read(
+                    "position", slice(start, min(start + BLOCK + 1, last))
+                )
                 largest = max(largest, float(np.sqrt(np.max(squared_steps(frames)))))
                 if largest >= enough:
                     break
@@ -135,16 +182,24 @@ class Truth:
 
     def _hash(self, scenario: int) -> str:
         measured = self.size.measured
-        return measured.scenario_sha256.get(scenario, "") if measured else ""
+        if measured:
+            return measured.scenario_sha256.get(scenario, "")
+        return ""
 
 
 def squared_steps(frames: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the squared distances of particles between frames [length^2], shape [frame - 1, particle]."""
+    """Return the squared distances of particles between frames [length^2], shape [frame
+    - 1, particle].
+    """
     return squared_lengths(np.diff(frames.astype(np.float64), axis=0))
 
 
 def squared_lengths(steps: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the squared lengths of vectors, shape [..., particle]; the vectors are overwritten."""
+    """Return the squared lengths of vectors, shape [..., particle]; the vectors are
+    overwritten.
+    """
     steps *= steps
-    squares: NDArray[np.float64] = steps[..., 0] + steps[..., 1]  # ten times as fast as a sum over the axis
+    squares: NDArray[np.float64] = (
+        steps[..., 0] + steps[..., 1]
+    )  # ten times as fast as a sum over the axis
     return squares

@@ -1,8 +1,9 @@
-"""Validate a predictions.nc: every named check, all findings together, in a child with limits.
+"""Validate a predictions.nc: every named check, all findings together, in a child with
+limits.
 
-HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes changed at
-random four made HDF5 2.0 loop. What loops, crashes or asks for too much ends a child process; the
-parent says so and goes on.
+HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes
+changed at random four made HDF5 2.0 loop. What loops, crashes or asks for too much ends
+a child process; the parent says so and goes on.
 """
 
 from __future__ import annotations
@@ -35,17 +36,25 @@ from .format import (
 )
 from .predictions import attach
 from .start import check_start, read_starts
-from .task_checks import check_dataset, check_frames, check_particles, check_scenarios, check_split
+from .task_checks import (
+    check_dataset,
+    check_frames,
+    check_particles,
+    check_scenarios,
+    check_split,
+)
 from .truth import Truth
 
 CPU_SECONDS = 5.0
-"""Computing time for a small file, the start of the child aside [s]; a sound one takes 2 on a busy core."""
+"""Computing time for a small file, the start of the child aside [s]; a sound one takes
+2 on a busy core.
+"""
 
 WALL_SECONDS = 600.0
 """Time for a child and a small file [s]; only a child that waits gets that far.
 
-What computes too long is stopped by the kernel, which counts computing time: on a machine that is
-busy with other work a sound file may take minutes.
+What computes too long is stopped by the kernel, which counts computing time: on a
+machine that is busy with other work a sound file may take minutes.
 """
 
 BYTES_PER_SECOND = 20e6
@@ -59,11 +68,14 @@ TASK = ("dataset", "scenarios", "frames", "particles")
 def seconds_for(path: Path) -> float:
     """Return the time beyond that of a small file that a file is given [s].
 
-    A sparse file claims any length; what it occupies, where the system tells it, is what has to be read.
+    A sparse file claims any length; what it occupies, where the system tells it, is
+    what has to be read.
     """
     status = path.stat()
     blocks: int | None = getattr(status, "st_blocks", None)
-    return (status.st_size if blocks is None else min(status.st_size, 512 * blocks)) / BYTES_PER_SECOND
+    return (
+        status.st_size if blocks is None else min(status.st_size, 512 * blocks)
+    ) / BYTES_PER_SECOND
 
 
 def validate(
@@ -78,25 +90,32 @@ def validate(
 
     Args:
         path: the file.
-        root: folder of all data sets, else LAGBENCH_ROOT, else the user data folder; the checks
-            ``start``, ``discontinuous_start`` and ``max_displacement`` need the test subset there.
-        require_truth: whether a missing test subset is an error of the check ``dataset``, as it
-            is for scoring; else those checks are skipped and say so.
-        isolated: whether to look at the file in a child process with limits on memory and time.
-            Without it a malicious file can stop this process.
+        root: folder of all data sets, else LAGBENCH_ROOT, else the user data folder;
+            the checks ``start``, ``discontinuous_start`` and ``max_displacement`` need
+            the test subset there.
+        require_truth: whether a missing test subset is an error of the check
+            ``dataset``, as it is for scoring; else those checks are skipped and say so.
+        isolated: whether to look at the file in a child process with limits on memory
+            and time. Without it a malicious file can stop this process.
         registry: where splits are described; ours when None.
 
     Returns:
-        What was found; ``result.check()`` raises unless the file is valid. ``lagbench.score``
-        takes it, so that nothing is read twice.
+        What was found; ``result.check()`` raises unless the file is valid.
+        ``lagbench.score`` takes it, so that nothing is read twice.
     """
-    folder, file = resolve_root(root), Path(path).absolute()
-    known, look = rooted(folder, registry), _isolated if isolated else _examine
+    folder = resolve_root(root)
+    file = Path(path).absolute()
+    known = rooted(folder, registry)
+    if isolated:
+        look = _isolated
+    else:
+        look = _examine
     result = look(file, folder, known, require_truth=require_truth)
     if result.split is None or result.size is None or "split" not in result.passed:
         return result
     size = known.size(result.split, result.size)
-    # Only the file says which test subset it needs; the child that reads it fetches nothing.
+    # Only the file says which test subset it needs; the child that reads it fetches
+    # nothing.
     from lagbench.store.copy import bring
 
     if bring(size, folder, size.subsets["test"]):
@@ -114,35 +133,51 @@ def validate(
         return dataclasses.replace(
             result,
             findings=tuple(sorted(findings, key=lambda f: CHECKS.index(f.check))),
-            passed=tuple(check for check in result.passed if check not in ("dataset", *TRUE)),
-            skipped={**result.skipped, **dict.fromkeys(TRUE, f"{error.what}: {error.where}")},
+            passed=tuple(
+                check for check in result.passed if check not in ("dataset", *TRUE)
+            ),
+            skipped={
+                **result.skipped,
+                **dict.fromkeys(TRUE, f"{error.what}: {error.where}"),
+            },
         )
     return result
 
 
-def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
-    """Examine a file in a child process; whatever stops the child fails the check ``readable``."""
+def _isolated(
+    path: Path, root: Path, registry: Registry, *, require_truth: bool
+) -> ValidationResult:
+    """Examine a file in a child process; whatever stops the child fails the check
+    ``readable``.
+    """
     request = {
         "path": str(path),
         "root": str(root),
         "require_truth": require_truth,
         "sizes": {
-            split: {name: registry.size(split, name).model_dump_json() for name in found.sizes}
+            split: {
+                name: registry.size(split, name).model_dump_json()
+                for name in found.sizes
+            }
             for split, found in registry.splits.items()
         },
     }
     try:
         check_file(path, fix=WRITE)
         extra = seconds_for(path)
-        seconds, wall = CPU_SECONDS + extra, WALL_SECONDS + extra
-        values, stopped = in_child(f"{__name__}.{examine.__name__}", [request], seconds=seconds, wall=wall)
+        seconds = CPU_SECONDS + extra
+        wall = WALL_SECONDS + extra
+        values, stopped = in_child(
+            f"{__name__}.{examine.__name__}", [request], seconds=seconds, wall=wall
+        )
         if not values:
             raise UnreadableFileError(
                 "reading the file had to be stopped",
                 where=str(path),
                 expected="a file that HDF5 reads within the limits",
                 got=stopped,
-                fix="the file is damaged or made to do harm; write it again with lagbench.submission.write",
+                fix="the file is damaged or made to do harm; write it again with "
+                "lagbench.submission.write",
             )
     except UnreadableFileError as error:
         out = Findings()
@@ -150,8 +185,12 @@ def _isolated(path: Path, root: Path, registry: Registry, *, require_truth: bool
         out.skip("the file cannot be read", *CHECKS)
         return out.result(path)
     said = values[0]
-    findings = tuple(Finding(**{**f, "severity": Severity(f["severity"])}) for f in said["findings"])
-    return ValidationResult(**{**said, "path": path, "findings": findings, "passed": tuple(said["passed"])})
+    findings = tuple(
+        Finding(**{**f, "severity": Severity(f["severity"])}) for f in said["findings"]
+    )
+    return ValidationResult(
+        **{**said, "path": path, "findings": findings, "passed": tuple(said["passed"])}
+    )
 
 
 class _Sizes(RootedRegistry):
@@ -166,20 +205,34 @@ class _Sizes(RootedRegistry):
         if split in self.sent and name in self.sent[split]:
             return Size.model_validate_json(self.sent[split][name], strict=False)
         if split in self.sent:
-            raise UsageError(f"split {split!r} has no size {name!r}", fix=nearest(name, self.sent[split]))
+            raise UsageError(
+                f"split {split!r} has no size {name!r}",
+                fix=nearest(name, self.sent[split]),
+            )
         if split not in self.local_names():
-            raise UsageError(f"no split {split!r}", fix=nearest(split, [*self.sent, *self.local_names()]))
+            raise UsageError(
+                f"no split {split!r}",
+                fix=nearest(split, [*self.sent, *self.local_names()]),
+            )
         return super().size(split, name)
 
 
 def examine(request: Mapping[str, Any]) -> Mapping[str, Any]:
     """Make all checks in this process, for a parent."""
-    path, root = Path(request["path"]), Path(request["root"])
-    result = _examine(path, root, _Sizes(request["sizes"], root), require_truth=request["require_truth"])
+    path = Path(request["path"])
+    root = Path(request["root"])
+    result = _examine(
+        path,
+        root,
+        _Sizes(request["sizes"], root),
+        require_truth=request["require_truth"],
+    )
     return dataclasses.asdict(result) | {"path": str(path)}
 
 
-def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool) -> ValidationResult:
+def _examine(
+    path: Path, root: Path, registry: Registry, *, require_truth: bool
+) -> ValidationResult:
     out = Findings()
     names: dict[str, str] = {}
     content = None
@@ -187,21 +240,33 @@ def _examine(path: Path, root: Path, registry: Registry, *, require_truth: bool)
         with opened(path, fix=WRITE) as file:
             anatomy = dissect(file, path)
             refuse_other_kinds(anatomy, path)
-            texts = {name: anatomy.attributes[name] for name in ("split", "size", "method")}
-            names = {name: text for name, text in texts.items() if isinstance(text, str)}
+            texts = {
+                name: anatomy.attributes[name] for name in ("split", "size", "method")
+            }
+            names = {
+                name: text for name, text in texts.items() if isinstance(text, str)
+            }
             out.made("readable")
             size = _check_layout_and_task(anatomy, registry, root, out)
             if size is not None:
-                content = _check_values(file, path, anatomy, Truth(size, root), require_truth, out)
+                content = _check_values(
+                    file, path, anatomy, Truth(size, root), require_truth, out
+                )
     except UnreadableFileError as error:
         out.raised("readable", error)
         out.skip("the file cannot be read", *CHECKS)
     return out.result(path, sha256=content, **names)
 
 
-def _check_layout_and_task(anatomy: Anatomy, registry: Registry, root: Path, out: Findings) -> Size | None:
-    """Make the checks that need no values; return the size if the values can be looked at."""
-    stored, laid_out, typed = (check(anatomy, out) for check in (check_format, check_dims, check_dtype))
+def _check_layout_and_task(
+    anatomy: Anatomy, registry: Registry, root: Path, out: Findings
+) -> Size | None:
+    """Make the checks that need no values; return the size if the values can be looked
+    at.
+    """
+    stored, laid_out, typed = (
+        check(anatomy, out) for check in (check_format, check_dims, check_dtype)
+    )
     check_marks(anatomy, out)
     size = check_split(anatomy, registry, out)
     if size is None:
@@ -211,18 +276,31 @@ def _check_layout_and_task(anatomy: Anatomy, registry: Registry, root: Path, out
     check_scenarios(anatomy, size, out)
     check_frames(anatomy, size, out)
     sized = check_particles(anatomy, size, out)
-    # Frames far beyond the horizon would make the work as long as the file claims to be.
-    bounded = len(anatomy.integers.get("frame", ())) <= 2 * (size.task.input_frames + size.task.horizon)
+    # Frames far beyond the horizon would make the work as long as the file claims to
+    # be.
+    bounded = len(anatomy.integers.get("frame", ())) <= 2 * (
+        size.task.input_frames + size.task.horizon
+    )
     if stored and laid_out and typed and sized and bounded:
         return size
-    out.skip(f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed", *VALUES)
+    out.skip(
+        f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed",
+        *VALUES,
+    )
     return None
 
 
 def _check_values(
-    file: h5py.File, path: Path, anatomy: Anatomy, truth: Truth, require_truth: bool, out: Findings
+    file: h5py.File,
+    path: Path,
+    anatomy: Anatomy,
+    truth: Truth,
+    require_truth: bool,
+    out: Findings,
 ) -> str | None:
-    """Make the checks that read positions; return the content hash where all were read."""
+    """Make the checks that read positions; return the content hash where all were
+    read.
+    """
     with ExitStack() as stack:
         predictions = attach(file, path, anatomy, stack)
         surveys, content = survey(predictions, truth.size)

@@ -1,12 +1,14 @@
 """The workers of a Dask cluster, used like the :class:`.Pool` of this machine.
 
-The scheduler runs what a lost worker held on another one. A lost scheduler ends the work with an
-error; results that have arrived by then are not lost. A task runs in the worker itself, which must
-have one thread: Taichi and HDF5 want a process for themselves. How far a task is comes as Dask events.
+The scheduler runs what a lost worker held on another one. A lost scheduler ends the
+work with an error; results that have arrived by then are not lost. A task runs in the
+worker itself, which must have one thread: Taichi and HDF5 want a process for
+themselves. How far a task is comes as Dask events.
 
-A cluster writes a data set to one folder on storage that all its machines share. A mark with a
-random word shows that a worker's folder of that path is the client's. Network file systems remember
-for a while that a file was missing; listing its folder makes them look again.
+A cluster writes a data set to one folder on storage that all its machines share. A mark
+with a random word shows that a worker's folder of that path is the client's. Network
+file systems remember for a while that a file was missing; listing its folder makes them
+look again.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed
 """Loggers that print when a cluster is lost."""
 
 
-# --- a folder that several machines write to -----------------------------------------------
+# --- a folder that several machines write to ------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,8 @@ def marked(folder: Path) -> Iterator[Mark]:
 def await_file(path: Path) -> None:
     """Wait until a file that another machine has written is seen here."""
     if not _appears(path, PATIENCE):
-        what, expected = "a worker's file does not appear", f"a file within {PATIENCE:.0f} s"
+        what = "a worker's file does not appear"
+        expected = f"a file within {PATIENCE:.0f} s"
         fix = "name a folder on storage that all machines share, then run the same command again"
         raise WorkFailedError(what, where=str(path), expected=expected, fix=fix)
 
@@ -100,7 +103,9 @@ def _appears(path: Path, patience: float, *, holding: str | None = None) -> bool
     while True:
         _look_again(path.parent)
         # Another machine may see the name before the content.
-        if path.is_file() and (holding is None or path.read_text(encoding="utf-8") == holding):
+        if path.is_file() and (
+            holding is None or path.read_text(encoding="utf-8") == holding
+        ):
             return True
         if time.monotonic() > end:
             return False
@@ -112,7 +117,7 @@ def _look_again(folder: Path) -> None:
         os.listdir(folder)
 
 
-# --- in a worker ---------------------------------------------------------------------------
+# --- in a worker ----------------------------------------------------------------------
 
 _STOPPED: set[str] = set()  # clients whose tasks are void
 
@@ -123,18 +128,30 @@ class Client:
 
     name: str  # topic of the events that tell of its tasks
     version: str  # its version of lagbench
-    mark: Mark | None = None  # what shows that the worker sees its folder; None where none is needed
+    mark: Mark | None = (
+        None  # what shows that the worker sees its folder; None where none is needed
+    )
 
     def check(self, worker: str, *, threads: int) -> None:
         """Refuse a worker that could not make the client's bits."""
-        where, own = f"worker {worker}", version("lagbench")
+        where = f"worker {worker}"
+        own = version("lagbench")
         if self.version != own:
             fix = "install the same version on every worker"
             what = "a worker runs another version of lagbench"
-            raise WorkFailedError(what, where=where, expected=self.version, got=own, fix=fix)
+            raise WorkFailedError(
+                what, where=where, expected=self.version, got=own, fix=fix
+            )
         if threads != 1:
-            what, fix = "a worker runs several tasks in one process", f"start the workers with `{WORKERS}`"
-            raise WorkFailedError(what, where=where, expected="1 thread", got=f"{threads} threads", fix=fix)
+            what = "a worker runs several tasks in one process"
+            fix = f"start the workers with `{WORKERS}`"
+            raise WorkFailedError(
+                what,
+                where=where,
+                expected="1 thread",
+                got=f"{threads} threads",
+                fix=fix,
+            )
         if self.mark is not None:
             self.mark.check(worker)
 
@@ -153,12 +170,14 @@ def run_task(task: Task, number: int, client: Client) -> Done:
 
     worker = get_worker()
     client.check(worker.address, threads=worker.state.nthreads)
-    units, told = 0, time.monotonic()
+    units = 0
+    told = time.monotonic()
 
     def report(done: int) -> None:
         nonlocal units, told
         units += done
-        # Dask cannot stop a thread: a task ends itself when nobody waits for it any more.
+        # Dask cannot stop a thread: a task ends itself when nobody waits for it any
+        # more.
         if client.name in _STOPPED:
             raise WorkFailedError("the client is gone", where=task.name)
         if time.monotonic() - told >= TELL_SECONDS:
@@ -179,7 +198,7 @@ def stop(client: str) -> None:
     _STOPPED.add(client)
 
 
-# --- at the client -------------------------------------------------------------------------
+# --- at the client --------------------------------------------------------------------
 
 
 class Cluster:
@@ -187,7 +206,8 @@ class Cluster:
 
     def __init__(self, address: str, *, folder: Path | None = None) -> None:
         self.address = address  # that of the scheduler
-        self.folder = folder  # what the workers must share with this machine; None where they write nothing
+        # what the workers must share with this machine; None where they write nothing
+        self.folder = folder
         self._numbers = itertools.count()
         self._pending: dict[int, tuple[Task, Any]] = {}
         self._seen: dict[int, int] = {}
@@ -197,33 +217,60 @@ class Cluster:
         """Connect, and mark the shared folder."""
         with ExitStack() as stack:
             self._dask = stack.enter_context(_connected(self.address))
-            mark = None if self.folder is None else stack.enter_context(marked(self.folder))
-            self._client = Client(f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark)
-            self._dask.subscribe_topic(self._client.name, lambda event: self._heard.put(tuple(event[1])))
+            if self.folder is None:
+                mark = None
+            else:
+                mark = stack.enter_context(marked(self.folder))
+            self._client = Client(
+                f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark
+            )
+            self._dask.subscribe_topic(
+                self._client.name, lambda event: self._heard.put(tuple(event[1]))
+            )
             self._stack = stack.pop_all()
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         """Make the workers drop what they hold, and disconnect."""
-        pending, self._pending = [future for _, future in self._pending.values()], {}
+        pending = [future for _, future in self._pending.values()]
+        self._pending = {}
         try:
             if pending and self._dask.status == "running":
-                with contextlib.suppress(Exception):  # what cannot be reached is lost anyway
+                with contextlib.suppress(
+                    Exception
+                ):  # what cannot be reached is lost anyway
                     self._dask.cancel(pending)
-                    self._dask.run(stop, self._client.name, on_error="ignore", callback_timeout=STOP_SECONDS)
+                    self._dask.run(
+                        stop,
+                        self._client.name,
+                        on_error="ignore",
+                        callback_timeout=STOP_SECONDS,
+                    )
         finally:
             self._stack.__exit__(kind, error, trace)
 
     def submit(self, task: Task) -> None:
         """Send a task to the scheduler; also while :meth:`events` runs."""
         number = next(self._numbers)
-        options = {"key": f"{self._client.name}-{number}", "priority": round(task.cost), "pure": False}
-        self._pending[number] = task, self._dask.submit(run_task, task, number, self._client, **options)
+        options = {
+            "key": f"{self._client.name}-{number}",
+            "priority": round(task.cost),
+            "pure": False,
+        }
+        self._pending[number] = (
+            task,
+            self._dask.submit(run_task, task, number, self._client, **options),
+        )
 
     def events(self) -> Iterator[Event]:
-        """Yield news until all tasks are done; lost work counts as negative progress."""
+        """Yield news until all tasks are done; lost work counts as negative
+        progress.
+        """
         looked = alive = time.monotonic()
         while self._pending:
             with contextlib.suppress(queue.Empty):
@@ -231,17 +278,26 @@ class Cluster:
                     number, units = self._heard.get_nowait()
                     if number in self._pending:
                         yield self._counted(number, self._pending[number][0], units)
-            ended = [number for number, (_, future) in self._pending.items() if future.done()]
+            ended = [
+                number for number, (_, future) in self._pending.items() if future.done()
+            ]
             for number in ended:
                 task, future = self._pending.pop(number)
                 done = _fetch(task.name, future)
                 yield self._counted(number, task, done.units)
-                yield Event(task=task, kind="done", value=done.value, machine=done.machine)
+                yield Event(
+                    task=task, kind="done", value=done.value, machine=done.machine
+                )
             now = time.monotonic()
             if now - looked >= LOOK_SECONDS:
                 looked = now
-                with contextlib.suppress(OSError):  # the connection may break after the status was set
-                    if self._dask.status == "running" and self._dask.scheduler_info()["workers"]:
+                with contextlib.suppress(
+                    OSError
+                ):  # the connection may break after the status was set
+                    if (
+                        self._dask.status == "running"
+                        and self._dask.scheduler_info()["workers"]
+                    ):
                         alive = now
             if self._dask.status in ("closed", "failed") or now - alive > LOST_SECONDS:
                 raise _lost(f"{self._dask.status}, no worker for {now - alive:.0f} s")
@@ -249,18 +305,25 @@ class Cluster:
                 time.sleep(POLL_SECONDS)
 
     def _counted(self, number: int, task: Task, units: int) -> Event:
-        """Return the progress since the last news; another worker may have begun anew."""
-        before, self._seen[number] = self._seen.get(number, 0), units
+        """Return the progress since the last news; another worker may have begun
+        anew.
+        """
+        before = self._seen.get(number, 0)
+        self._seen[number] = units
         return Event(task=task, kind="progress", value=units - before)
 
 
 @contextmanager
 def _connected(address: str) -> Iterator[Any]:
-    """Connect, with Dask's logs kept off the terminal: what matters of them becomes an error of ours.
+    """Connect, with Dask's logs kept off the terminal: what matters of them becomes an
+    error of ours.
 
-    After an error they stay off: a client that lost its scheduler logs until the process ends.
+    After an error they stay off: a client that lost its scheduler logs until the
+    process ends.
     """
-    distributed = require("distributed", extra="cluster")  # its import sets the levels of its loggers
+    distributed = require(
+        "distributed", extra="cluster"
+    )  # its import sets the levels of its loggers
     levels = {name: logging.getLogger(name).level for name in LOGGERS}
     for name in LOGGERS:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
@@ -268,7 +331,9 @@ def _connected(address: str) -> Iterator[Any]:
         if not address.startswith(("ucx://", "inproc://")):
             # A client whose address cannot be one is 40 s in closing.
             distributed.comm.addressing.get_address_host_port(address)
-        client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = distributed.Client(
+            address, timeout=CONNECT_SECONDS, set_as_default=False
+        )
     except (OSError, ValueError) as error:
         bad = isinstance(error, ValueError)
         raise (UsageError if bad else WorkFailedError)(
@@ -308,10 +373,13 @@ def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
         what = "workers of the Dask cluster died again and again"
         fix = "give the workers more memory, or leave --scheduler out"
         raise WorkFailedError(what, where=name, got=str(error), fix=fix) from error
-    except Exception as error:  # whatever a worker raises that cannot even read the task
+    except (
+        Exception
+    ) as error:  # whatever a worker raises that cannot even read the task
         if future.status != "error":
             raise _lost(error) from error
-        what, got = "a worker of the Dask cluster cannot do the work", f"{type(error).__name__}: {error}"
+        what = "a worker of the Dask cluster cannot do the work"
+        got = f"{type(error).__name__}: {error}"
         fix = "install the same version of lagbench with its extras on every worker"
         raise WorkFailedError(what, where=name, got=got, fix=fix) from error
     return done

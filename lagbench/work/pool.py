@@ -1,8 +1,9 @@
-"""Worker processes that take tasks, are replaced when killed, and die with their parent.
+"""Worker processes that take tasks, are replaced when killed, and die with their
+parent.
 
 Each worker is a fresh interpreter that talks over a socket pair. Unlike
-``multiprocessing`` it never imports the caller's ``__main__`` (a script without a guard, a
-notebook or standard input may call :func:`lagbench.generate`), and unlike
+``multiprocessing`` it never imports the caller's ``__main__`` (a script without a
+guard, a notebook or standard input may call :func:`lagbench.generate`), and unlike
 ``concurrent.futures`` one killed worker costs one attempt of one task, not the pool.
 """
 
@@ -31,7 +32,9 @@ from lagbench.errors import LagbenchError, UsageError, WorkFailedError, package_
 from .machine import available_cores
 
 AVAILABLE = os.name == "posix"
-"""Whether workers can be started here: they inherit a socket, which Windows cannot hand on."""
+"""Whether workers can be started here: they inherit a socket, which Windows cannot hand
+on.
+"""
 
 ATTEMPTS = 3  # times that a task is tried when the worker under it dies
 
@@ -47,17 +50,26 @@ _BOOT = (
 
 
 def worker_count(wanted: int | None, *, default: int | None = None) -> int:
-    """Return how many workers to start: those wanted, else the default, else one per core."""
+    """Return how many workers to start: those wanted, else the default, else one per
+    core.
+    """
     if wanted is None:
         return default or available_cores()
     if wanted < 1:
-        raise UsageError("there is no work without a worker", where="--workers", expected=">= 1", got=wanted)
+        raise UsageError(
+            "there is no work without a worker",
+            where="--workers",
+            expected=">= 1",
+            got=wanted,
+        )
     return wanted
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """Something to run in a worker: ``function(*arguments, report)``, all of it picklable."""
+    """Something to run in a worker: ``function(*arguments, report)``, all of it
+    picklable.
+    """
 
     name: str  # what messages call it, as in "cavity tiny scenario 3"
     function: Callable[..., Any]  # importable by its name from a module
@@ -70,8 +82,8 @@ class Event:
     """News from a worker."""
 
     task: Task  # the task concerned
-    # "progress" (value: units done since the last news), "lost" (its worker died and it starts anew; value:
-    # units that were done in vain) or "done" (value: its result)
+    # "progress" (value: units done since the last news), "lost" (its worker died and it
+    # starts anew; value: units that were done in vain) or "done" (value: its result)
     kind: str
     value: Any  # see 'kind'
     # what identity says of another machine that did it; None for this one
@@ -103,21 +115,29 @@ class Pool:
     # variables added to the environment of the workers
     environment: Mapping[str, str] = field(default_factory=dict)
     _workers: list[_Worker] = field(default_factory=list, init=False)
-    _waiting: list[tuple[float, int, _Attempt]] = field(default_factory=list, init=False)
+    _waiting: list[tuple[float, int, _Attempt]] = field(
+        default_factory=list, init=False
+    )
     _number: Iterator[int] = field(default_factory=itertools.count, init=False)
 
     def __post_init__(self) -> None:
         """Refuse a pool in which no task could ever run."""
         if not AVAILABLE:
-            raise WorkFailedError("this system cannot start workers", fix="on Windows use WSL")
+            raise WorkFailedError(
+                "this system cannot start workers", fix="on Windows use WSL"
+            )
         self.size = worker_count(self.size)
 
     def __enter__(self) -> Self:
         """Return the pool itself."""
         return self
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Let idle workers end by themselves, then kill; after an error kill at once."""
+    def __exit__(
+        self, kind: object, error: BaseException | None, trace: object
+    ) -> None:
+        """Let idle workers end by themselves, then kill; after an error kill at
+        once.
+        """
         if error is None:  # what Taichi compiled is then kept for the next time
             idle = [worker for worker in self._workers if worker.attempt is None]
             for worker in idle:
@@ -137,15 +157,23 @@ class Pool:
         while self._waiting or any(worker.attempt for worker in self._workers):
             idle = [worker for worker in self._workers if worker.attempt is None]
             while self._waiting and (idle or len(self._workers) < self.size):
-                worker = idle.pop() if idle else self._start()
+                if idle:
+                    worker = idle.pop()
+                else:
+                    worker = self._start()
                 _, _, attempt = heapq.heappop(self._waiting)
-                worker.attempt, worker.progress = attempt, 0
+                worker.attempt = attempt
+                worker.progress = 0
                 try:
-                    worker.channel.send_bytes(pickle.dumps((attempt.task.function, attempt.task.arguments)))
+                    worker.channel.send_bytes(
+                        pickle.dumps((attempt.task.function, attempt.task.arguments))
+                    )
                 except OSError:  # it died while idle
                     self._bury(worker, attempt)
             busy = [worker for worker in self._workers if worker.attempt]
-            news = wait([worker.channel for worker in busy])  # one that died has some too
+            news = wait(
+                [worker.channel for worker in busy]
+            )  # one that died has some too
             for worker in busy:
                 if worker.channel in news and worker.attempt is not None:
                     yield self._receive(worker, worker.attempt)
@@ -156,7 +184,8 @@ class Pool:
 
     def close(self) -> None:
         """Kill the workers and wait until they are gone."""
-        workers, self._workers = self._workers, []
+        workers = self._workers
+        self._workers = []
         for worker in workers:
             worker.process.kill()
         for worker in workers:
@@ -170,7 +199,14 @@ class Pool:
         ours, theirs = socket.socketpair()
         with theirs:
             process = subprocess.Popen(
-                [sys.executable, "-P", "-c", _BOOT, str(theirs.fileno()), json.dumps(sys.path)],
+                [
+                    sys.executable,
+                    "-P",
+                    "-c",
+                    _BOOT,
+                    str(theirs.fileno()),
+                    json.dumps(sys.path),
+                ],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
@@ -196,14 +232,19 @@ class Pool:
         raise value
 
     def _bury(self, worker: _Worker, attempt: _Attempt) -> Event:
-        """Forget a dead worker; queue its task again unless it was tried often enough."""
+        """Forget a dead worker; queue its task again unless it was tried often
+        enough.
+        """
         self._workers.remove(worker)
         worker.process.kill()
         code = worker.process.wait()
         worker.channel.close()
         again = _Attempt(attempt.task, attempt.deaths + 1)
         if again.deaths >= ATTEMPTS:
-            got = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit status {code}"
+            if code < 0:
+                got = f"killed by {signal.Signals(-code).name}"
+            else:
+                got = f"exit status {code}"
             what = f"a worker process died {ATTEMPTS} times"
             fix = "free memory or take fewer workers: --workers 1"
             raise WorkFailedError(what, where=again.task.name, got=got, fix=fix)
@@ -216,7 +257,9 @@ def crashed(error: Exception) -> WorkFailedError:
     if (place := package_at_fault(error)) is not None:
         fix = "mend or uninstall that package"
         got = ", ".join([repr(error), *getattr(error, "__notes__", ())])
-        return WorkFailedError("a package failed in a worker", where=place, got=got, fix=fix)
+        return WorkFailedError(
+            "a package failed in a worker", where=place, got=got, fix=fix
+        )
     last = "".join(traceback.format_exception(error, limit=-6))
     return WorkFailedError("a worker crashed", got=f"{error!r}\n{last}")
 
@@ -238,12 +281,19 @@ def serve(descriptor: int) -> None:
     while (message := inbox.get()) != _FAREWELL:
         try:
             function, arguments = pickle.loads(message)
-            reply = ("done", function(*arguments, lambda units: channel.send(("progress", units))))
+            reply = (
+                "done",
+                function(*arguments, lambda units: channel.send(("progress", units))),
+            )
         except LagbenchError as error:
             reply = ("error", error)
         except Exception as error:
             reply = ("error", crashed(error))
         channel.send(reply)
-    if (taichi := sys.modules.get("taichi")) is not None:  # it keeps what it compiled only if asked to end
-        with contextlib.suppress(Exception):  # where it cannot, the next run compiles again
+    if (
+        taichi := sys.modules.get("taichi")
+    ) is not None:  # it keeps what it compiled only if asked to end
+        with contextlib.suppress(
+            Exception
+        ):  # where it cannot, the next run compiles again
             taichi.reset()

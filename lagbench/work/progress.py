@@ -23,12 +23,16 @@ class Progress:
     scenarios_done: int  # scenarios that are finished
     scenarios: int  # scenarios to finish; 0 where nobody knows
     seconds: float  # time since the start [s]
-    before: int = 0  # scenarios that an earlier run had finished; they took none of that time
+    before: int = (
+        0  # scenarios that an earlier run had finished; they took none of that time
+    )
 
     @property
     def rate(self) -> float:
         """Scenarios finished per second since the start [1/s]."""
-        return (self.scenarios_done - self.before) / self.seconds if self.seconds > 0.0 else 0.0
+        if self.seconds > 0.0:
+            return (self.scenarios_done - self.before) / self.seconds
+        return 0.0
 
 
 class Meter:
@@ -37,13 +41,20 @@ class Meter:
     def __init__(self, listener: Callable[[Progress], None] | None = None) -> None:
         self._listener = listener
         self.stage = ""  # what happens now
-        self._state = Progress(stage="", done=0, total=0, scenarios_done=0, scenarios=0, seconds=0.0)
+        self._state = Progress(
+            stage="", done=0, total=0, scenarios_done=0, scenarios=0, seconds=0.0
+        )
         self._started = time.monotonic()
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
         """Start a stage with counts at zero, or at what an earlier run had done."""
         self.stage = stage
-        counts = {"done": done, "total": total, "scenarios_done": done, "scenarios": scenarios}
+        counts = {
+            "done": done,
+            "total": total,
+            "scenarios_done": done,
+            "scenarios": scenarios,
+        }
         self._state = Progress(stage=stage, **counts, seconds=0.0, before=done)
         self._started = time.monotonic()
         self.count()
@@ -51,8 +62,11 @@ class Meter:
     def count(self, units: int = 0, *, scenarios: int = 0) -> None:
         """Add units of work (negative where work was lost) and finished scenarios."""
         old = self._state
-        done, finished = old.done + units, old.scenarios_done + scenarios
+        done = old.done + units
+        finished = old.scenarios_done + scenarios
         seconds = time.monotonic() - self._started
-        self._state = replace(old, stage=self.stage, done=done, scenarios_done=finished, seconds=seconds)
+        self._state = replace(
+            old, stage=self.stage, done=done, scenarios_done=finished, seconds=seconds
+        )
         if self._listener is not None:
             self._listener(self._state)

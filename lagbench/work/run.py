@@ -1,7 +1,8 @@
-"""Run jobs here, in worker processes, or on a Dask cluster; results come in the order of the jobs.
+"""Run jobs here, in worker processes, or on a Dask cluster; results come in the order
+of the jobs.
 
-A job that a lost worker held is run again; that changes no result, so neither does where the
-jobs ran.
+A job that a lost worker held is run again; that changes no result, so neither does
+where the jobs ran.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from .pool import Pool, Report, Task
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-WORTH_WORKERS = 1 << 30  # bytes of files below which starting processes to read them costs more than it gains
+WORTH_WORKERS = (
+    1 << 30
+)  # bytes of files below which starting processes to read them costs more than it gains
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""Environment of workers: threads of NumPy and HDF5 would only take the cores from the others.
+"""Environment of workers: threads of NumPy and HDF5 would only take the cores from the
+others.
 
 A Dask worker has it from Dask.
 """
@@ -33,7 +37,9 @@ def run_all(
     scheduler: str | None = None,
     report: Report = lambda _: None,
 ) -> list[Result]:
-    """Run a function on jobs and return the results in the order of the jobs; here where no workers start."""
+    """Run a function on jobs and return the results in the order of the jobs; here
+    where no workers start.
+    """
     if scheduler is not None:
         return _with(Cluster(scheduler), function, jobs, report)
     if workers > 1 and len(jobs) > 1 and pool.AVAILABLE:
@@ -50,7 +56,9 @@ def read_many(
     workers: int = 1,
     scheduler: str | None = None,
 ) -> list[Result]:
-    """Run a function that reads files: here where they hold little, else by the workers."""
+    """Run a function that reads files: here where they hold little, else by the
+    workers.
+    """
     if sum(path.stat().st_size for path in files if path.exists()) < WORTH_WORKERS:
         return run_all(function, jobs, report=report)
     return run_all(function, jobs, workers=workers, scheduler=scheduler, report=report)

@@ -6,8 +6,12 @@ from lagbench.metrics import Direction, FramePair, Metric, enough_nodes
 
 
 def enstrophy_error(pair: FramePair) -> float:
-    """Return ``|Z_pred - Z_true|`` with ``Z = mean(omega^2) / 2`` over the counted nodes."""
-    z_pred, z_true = (np.mean(w**2) / 2 for w in (pair.predicted_vorticity, pair.true_vorticity))
+    """Return ``|Z_pred - Z_true|`` with ``Z = mean(omega^2) / 2`` over the counted
+    nodes.
+    """
+    z_pred, z_true = (
+        np.mean(w**2) / 2 for w in (pair.predicted_vorticity, pair.true_vorticity)
+    )
     return abs(z_pred - z_true)
 
 

@@ -7,7 +7,9 @@ from lagbench.baselines.operators.operator import Losses, Operator
 
 
 class Sage(Operator):
-    """Mean of the neighbours (Hamilton et al. 2017); edges come in by their sum in ``node``."""
+    """Mean of the neighbours (Hamilton et al. 2017); edges come in by their sum in
+    ``node``.
+    """
 
     method = "GNS + SAGEConv"
 
@@ -16,7 +18,12 @@ class Sage(Operator):
         self.conv = SAGEConv(inputs, latent)
 
     def forward(
-        self, node: Tensor, edge_index: Tensor, edge: Tensor, *, generator: Generator | None = None
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: Generator | None = None,
     ) -> tuple[Tensor, Losses]:
         """Return what each node gathers, and no loss of its own."""
         return self.conv(node, edge_index), {}

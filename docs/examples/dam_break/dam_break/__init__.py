@@ -21,8 +21,11 @@ def solver_parameters(size: Size) -> FreeSurfaceParameters:
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw the column's width and height; only ``rng.random`` may be used."""
     low, _ = free_surface_walls(size)
-    width, height = uniform(rng, 0.2, 0.4), uniform(rng, 0.4, 0.7)
-    column = body_at(Rectangle(width, height), low + 0.01 + width / 2, low + 0.01 + height / 2)
+    width = uniform(rng, 0.2, 0.4)
+    height = uniform(rng, 0.4, 0.7)
+    column = body_at(
+        Rectangle(width, height), low + 0.01 + width / 2, low + 0.01 + height / 2
+    )
     return InitialState(
         position=seeds(rng, column, size.particles),
         velocity=np.zeros((size.particles, 2)),
