@@ -144,9 +144,8 @@ def wall_permutation(matrix: Tensor) -> Tensor:
     there, wall here].
     """
     normals = _NORMALS.to(matrix)
-    there = _turned(
-        matrix[..., None, :, :], normals
-    )  # normals of the images, shape [..., wall, 2]
+    # normals of the images, shape [..., wall, 2]
+    there = _turned(matrix[..., None, :, :], normals)
     return ((normals[:, None] * there[..., None, :, :]).sum(dim=-1) > 0.5).to(matrix)
 
 

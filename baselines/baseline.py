@@ -231,9 +231,8 @@ class Facts:
     version: str  # semantic version of the split
     dataset_sha256: str  # hash of the data set
     particles: Count  # particles in one scenario
-    bounds: tuple[
-        Pair, Pair
-    ]  # box that holds the particles, (low, high) along x and y [length]
+    # box that holds the particles, (low, high) along x and y [length]
+    bounds: tuple[Pair, Pair]
     radius: Positive  # connectivity radius [length]
     input_frames: Count  # frames given at the start of a test scenario
     horizon: Count  # frames to predict after them

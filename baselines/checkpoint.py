@@ -45,9 +45,8 @@ from .baseline import Baseline, Facts
 from .catalogue import find
 from .facts import facts_of
 
-SPARE = (
-    2**20
-)  # numbers that a model may have beside those of its file: buffers that are not stored
+# numbers that a model may have beside those of its file: buffers that are not stored
+SPARE = 2**20
 
 
 def check_footprint(
@@ -115,9 +114,8 @@ FORMAT = 1
 KEY = "lagbench_checkpoint"
 SAFE = "a checkpoint that lagbench train wrote"
 RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"  # in a file of weights to start from
-_FOREIGN = re.compile(
-    r"GLOBAL ([\w.]+)"
-)  # how torch's refusal names what a pickle would call
+# how torch's refusal names what a pickle would call
+_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,9 +126,8 @@ class Checkpoint:
     options: Mapping[str, Any]  # options of the model, plain values
     facts: Facts  # public figures of the data set that it was trained on
     weights: Mapping[str, Tensor]  # parameters and buffers by name
-    training: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # what training has done so far, plain values
+    # what training has done so far, plain values
+    training: Mapping[str, Any] = field(default_factory=dict)
     # state of the optimiser; None in a file that is for predictions only
     optimizer: Mapping[str, Any] | None = None
 

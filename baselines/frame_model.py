@@ -91,9 +91,8 @@ def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
 class FrameWindow:
     """The state of a rollout: what :meth:`FrameModel.next_state` is given."""
 
-    state: (
-        Tensor  # the last standardised states [1], shape [window, frame, particle, 4]
-    )
+    # the last standardised states [1], shape [window, frame, particle, 4]
+    state: Tensor
     material: Tensor  # material of each particle, shape [window, particle]
 
 
@@ -206,9 +205,8 @@ class FrameNetworkOptions(baseline.Options):
 
     # the next state, or its change in units of the change's deviation over train
     target: Target = Target.STATE
-    material: bool = (
-        False  # give the material as a fifth, constant feature of every particle
-    )
+    # give the material as a fifth, constant feature of every particle
+    material: bool = False
     # of the noise on the states that training gives to the network [standardised]
     noise_std: float = Field(default=0.0, ge=0, allow_inf_nan=False)
 
@@ -250,9 +248,8 @@ class FrameNetwork(FrameModel):
         """
         if not self.options.material:
             return window.state
-        constant = (
-            window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
-        )  # 0 ... 3 to -1 ... 1
+        # 0 ... 3 to -1 ... 1
+        constant = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
         constant = constant[:, None, :, None].expand(-1, window.state.shape[1], -1, -1)
         return torch.cat([window.state, constant], dim=-1)
 

@@ -33,9 +33,9 @@ Bounds = tuple[tuple[float, float], tuple[float, float]]
 
 # cells are wider than the radius by this share, more than rounding can move a particle
 MARGIN = 1e-6
-FAR = (
-    1 << 20
-)  # cells that are told apart on either side of the origin; what lies beyond shares the last
+# cells that are told apart on either side of the origin; what lies beyond shares the
+# last
+FAR = 1 << 20
 
 
 @torch.no_grad()
@@ -132,9 +132,8 @@ def edge_numbers(xp: Any, x: Any, window: Any, radius: float, self_edges: bool) 
     past = xp.searchsorted(key, key + (stride + 2))
     start = xp.concatenate([own + 1, beside])
     count = xp.concatenate([above - (own + 1), past - beside])
-    run = repeat(
-        xp.arange(len(count), device=x.device), count
-    )  # the one repeat: a GPU is waited for at each
+    # the one repeat: a GPU is waited for at each
+    run = repeat(xp.arange(len(count), device=x.device), count)
     if len(own):
         i = run % len(own)
     else:
@@ -174,9 +173,8 @@ def nearest_edges(
     window = window[kept]
     if not len(x):
         return np.empty(0, np.int64)
-    apart = np.column_stack(
-        [x, 4.0 * radius * window]
-    )  # no two windows within the radius of each other
+    # no two windows within the radius of each other
+    apart = np.column_stack([x, 4.0 * radius * window])
     # itself is one of those found, but where more than that lie at its very place
     beyond = radius * (1.0 + MARGIN)
     _, found = KDTree(apart).query(
@@ -284,9 +282,8 @@ class NodeFeatures(nn.Module):
         self.acceleration = acceleration
         self.bounds = bounds  # of the box, (low, high) along x and y [length]
         self.reach = reach  # how far a wall is seen [length]
-        self.moving_walls = (
-            moving_walls  # whether the velocities of the walls are features too
-        )
+        # whether the velocities of the walls are features too
+        self.moving_walls = moving_walls
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
 
     @property

@@ -43,10 +43,8 @@ from .recipe import ANY, LATER, Recipe, recipe_for, recipe_names
 # state of a training whose validations brought nothing new; it is over
 STOPPED_EARLY = "stopped early"
 MOST_RECORD = 4 << 20  # longest training.json that is read [bytes]
-OVER = (
-    "finished",
-    STOPPED_EARLY,
-)  # states of a training that is not to be gone on with
+# states of a training that is not to be gone on with
+OVER = "finished", STOPPED_EARLY
 
 
 @dataclass
@@ -123,9 +121,8 @@ class RunFolder:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.checkpoint = path / "checkpoint.pt"  # the last state, to go on from
-        self.weights = (
-            path / "weights.pt"
-        )  # the best weights in bfloat16, to predict from
+        # the best weights in bfloat16, to predict from
+        self.weights = path / "weights.pt"
         self.record = path / "training.json"  # what the training did and cost
         self.logs = path / "tensorboard"  # folder of TensorBoard's files
 
@@ -153,9 +150,8 @@ class RunFolder:
                 raise taken
             if self.weights not in left:  # it failed before there was anything to keep
                 return None
-            said = (
-                self._recorded()
-            )  # no training can go on from these weights, and none may replace them
+            # no training can go on from these weights, and none may replace them
+            said = self._recorded()
             over = said.get("recipe") == asked and said.get("state") in OVER
             if over:
                 instead = "predict from its weights"

@@ -39,19 +39,15 @@ class LSTM(FrameNetwork):
 
         in_training = FrameNetworkOptions.in_training | {"dropout", "density_weight"}
 
-        latent: PositiveInt = (
-            1250  # length of the latent vector of a frame and width of both LSTM layers
-        )
-        encoder: tuple[
-            PositiveInt, ...
-        ] = ()  # widths of pointwise layers before the latent one
+        # length of the latent vector of a frame and width of both LSTM layers
+        latent: PositiveInt = 1250
+        # widths of pointwise layers before the latent one
+        encoder: tuple[PositiveInt, ...] = ()
         decoder: tuple[PositiveInt, ...] = (
             1250,
         )  # widths of hidden layers after the second LSTM layer
-        dropout: tuple[Share, Share] = (
-            0.2,
-            0.1,
-        )  # after the first and after the second LSTM layer
+        # after the first and after the second LSTM layer
+        dropout: tuple[Share, Share] = 0.2, 0.1
         # of the density term in the loss. The thesis states none; with 1 the gradient
         # within a cell drowns that of the positions, which then are not learned.
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)

@@ -63,9 +63,8 @@ class TrainingModule(LightningModule):
         # raw loss terms of the last step, and their weighted sum as 'total'
         self.terms: dict[str, Tensor] = {}
         self._rate = options.learning_rate * processes
-        self._loader = (
-            loader  # returns the batches of a process, by its rank among so many
-        )
+        # returns the batches of a process, by its rank among so many
+        self._loader = loader
         self._resumed = optimizer
 
     @property
@@ -257,9 +256,8 @@ class TrainingCallback(Callback):
             and not self.ledger.validation
         ):
             self._validate(trainer, _of(module), self.validation)
-            self._store(
-                trainer, _of(module)
-            )  # weights without a checkpoint could not be gone on with
+            # weights without a checkpoint could not be gone on with
+            self._store(trainer, _of(module))
 
     def on_train_batch_end(
         self,

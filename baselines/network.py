@@ -237,9 +237,8 @@ class LayerNorm(nn.LayerNorm):
         )
 
 
-PIECE = (
-    8192  # edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache
-)
+# edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache
+PIECE = 8192
 
 
 def edge_map(
@@ -318,9 +317,8 @@ class Recomputed(torch.autograd.Function):
         return None, None, of_edge, of_sender, of_receiver, *of_weights
 
 
-LARGEST_KEPT = (
-    24e6  # edge tensors above this size on a CPU are recomputed, not kept [byte]
-)
+# edge tensors above this size on a CPU are recomputed, not kept [byte]
+LARGEST_KEPT = 24e6
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:

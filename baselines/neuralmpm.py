@@ -89,29 +89,24 @@ class NeuralMPMOptions(Options):
     width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
     velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
     bundle: int = Field(default=4, ge=1)  # frames that one call predicts
-    calls: int = Field(
-        default=2, ge=1
-    )  # calls that training unrolls; gradients pass through all
+    # calls that training unrolls; gradients pass through all
+    calls: int = Field(default=2, ge=1)
     # most calls before those, without gradients: training sees what rollouts come to
     pushforward: int = Field(default=0, ge=0)
     # each frame the gap to the true path is to close by 1/recovery of it: a third is
     # left after so many frames; None asks for true velocities alone
     recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
-    smoothing: float = Field(
-        default=0.2, ge=0.0, le=1.0
-    )  # share s of the grid's velocity per frame
-    noise_std: float = Field(
-        default=1e-4, ge=0.0, allow_inf_nan=False
-    )  # on the last velocity [length/frame]
-    context: int = Field(
-        default=0, ge=0
-    )  # numbers read off the given frames and kept, such as a viscosity
+    # share s of the grid's velocity per frame
+    smoothing: float = Field(default=0.2, ge=0.0, le=1.0)
+    # on the last velocity [length/frame]
+    noise_std: float = Field(default=1e-4, ge=0.0, allow_inf_nan=False)
+    # numbers read off the given frames and kept, such as a viscosity
+    context: int = Field(default=0, ge=0)
     materials: tuple[int, ...] = (
         0,
     )  # materials that have density and velocity of their own
-    wall_velocity: bool = (
-        False  # whether the velocity of the walls in the coming frames is a channel
-    )
+    # whether the velocity of the walls in the coming frames is a channel
+    wall_velocity: bool = False
     # whether particles are damped towards the velocity of all materials together: one
     # grid carries them all
     mixture: bool = False
@@ -127,9 +122,8 @@ class NeuralMPMOptions(Options):
     # the same of those on which matter is pushed out of where it is denser than it was
     # anywhere at first
     density: Grids = ()
-    symmetry: Symmetry = (
-        Symmetry.NONE
-    )  # images that training windows are replaced by at random
+    # images that training windows are replaced by at random
+    symmetry: Symmetry = Symmetry.NONE
     # whether calls of rollouts, not of training, are means over those images, at as
     # many times the cost
     average: bool = False
@@ -444,9 +438,8 @@ class NeuralMPM(Baseline):
             [3 * len(self.options.materials) * frames], dim=1
         )
         stress = STIFF * stress.reshape(-1, 3 * frames, *self.grid.shape)
-        shared = self.grid.stencil(
-            state.position, state.sample
-        )  # one layer for all materials
+        # one layer for all materials
+        shared = self.grid.stencil(state.position, state.sample)
         mass = self.grid.spread(shared, torch.ones_like(state.position[:, :1]), windows)
         filled = self.grid.gather(shared, mass / self.unit) / FULL
         load = filled.clamp(max=1.0).square()  # a surface bears less

@@ -66,14 +66,12 @@ class PredictionResult:
     # 'processor' on one CPU thread, where other work on the machine then does not
     # count; 'wall' on a GPU and on several threads
     clock: str
-    solver_seconds_per_frame: (
-        float | None
-    )  # of our solver on one core of this machine [s]
+    # of our solver on one core of this machine [s]
+    solver_seconds_per_frame: float | None
     device: str  # processor and threads, or GPU
     parameters: int  # trained numbers of the model
-    diverged: Mapping[
-        int, int
-    ]  # scenario id to the absolute frame from which its rollout is frozen
+    # scenario id to the absolute frame from which its rollout is frozen
+    diverged: Mapping[int, int]
 
 
 def predict(
@@ -222,9 +220,8 @@ def check_replaceable(output: Path) -> None:
     """Refuse to write predictions, and what they cost beside them, over files that are
     something else.
     """
-    cost = (
-        output if output.is_dir() else output.with_suffix(".json")
-    )  # a folder may have no name of its own
+    # a folder may have no name of its own
+    cost = output if output.is_dir() else output.with_suffix(".json")
     if cost.is_dir():
         fix = f"name a file, as in -o {cost / 'predictions.nc'}"
         raise UsageError(

@@ -37,9 +37,8 @@ TINY = 1e-16  # square of a cluster's moment [length^4] below which it has no di
 # least share of a node's spline inside the box that divides its weight; in reach none
 # is less
 LEAST = 4e-4
-MOST_EXCESS = (
-    1.0  # excess of density beyond which matter is pushed no farther at once [1]
-)
+# excess of density beyond which matter is pushed no farther at once [1]
+MOST_EXCESS = 1.0
 
 
 @dataclass(frozen=True)

@@ -44,16 +44,13 @@ class Schedule(Settings):
     before.
     """
 
-    kind: Literal["constant", "cosine", "exponential"] = (
-        "constant"  # its name; a recipe may give it alone
-    )
+    # its name; a recipe may give it alone
+    kind: Literal["constant", "cosine", "exponential"] = "constant"
     factor: float = Field(default=0.1, gt=0, le=1)  # of the exponential decay
-    every: int = Field(
-        default=5_000_000, gt=0
-    )  # steps in which it decays by the factor
-    floor: float = Field(
-        default=0.01, ge=0, le=1
-    )  # share of the rate that the cosine ends at
+    # steps in which it decays by the factor
+    every: int = Field(default=5_000_000, gt=0)
+    # share of the rate that the cosine ends at
+    floor: float = Field(default=0.01, ge=0, le=1)
 
     def at(self, step: int, *, steps: int, warmup: int = 0) -> float:
         """Return the factor on the learning rate at a step, counted from 0.
@@ -74,9 +71,8 @@ class Schedule(Settings):
         )
 
 
-VALIDATION_SHARE = (
-    0.15  # share of a training's processor time that validations may take
-)
+# share of a training's processor time that validations may take
+VALIDATION_SHARE = 0.15
 
 STEP_COST = 1.5
 """Processor time to train on a frame over that to roll one out.
@@ -90,9 +86,8 @@ class TrainingOptions(Settings):
     """Options of a training; recipes fill them."""
 
     steps: int | None = Field(default=None, gt=0)  # optimiser steps; or give 'epochs'
-    epochs: float | None = Field(
-        default=None, gt=0, allow_inf_nan=False
-    )  # passes over all windows
+    # passes over all windows
+    epochs: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     batch: int = Field(default=2, gt=0)  # windows of a step, in every process
     # of Adam, times the number of processes (thesis section 5.7.3)
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
@@ -133,9 +128,8 @@ class TrainingOptions(Settings):
     # steps between checkpoints; a twentieth of all by default
     checkpoint_every: int | None = Field(default=None, gt=0)
     log_every: int = Field(default=10, gt=0)  # steps between entries in TensorBoard
-    seed: int = Field(
-        default=0, ge=0, lt=2**63
-    )  # seed of weights, order of windows, and noise
+    # seed of weights, order of windows, and noise
+    seed: int = Field(default=0, ge=0, lt=2**63)
 
     @model_validator(mode="before")
     @classmethod

@@ -43,12 +43,10 @@ class Rollout:
     """Predicted positions of one window."""
 
     scenario: int  # scenario id
-    position: (
-        Tensor  # positions [length], float32, on the CPU, shape [frame, particle, 2]
-    )
-    diverged_at: (
-        int | None
-    )  # absolute frame from which the positions are frozen; None where none is
+    # positions [length], float32, on the CPU, shape [frame, particle, 2]
+    position: Tensor
+    # absolute frame from which the positions are frozen; None where none is
+    diverged_at: int | None
 
 
 @torch.no_grad()
@@ -222,9 +220,8 @@ class Validation:
     """The scenarios that a training is validated on; calling it validates."""
 
     task: ScoredTask  # the valid subset
-    frames: Mapping[
-        int, int
-    ]  # frames to predict, by scenario id: later ones do not count
+    # frames to predict, by scenario id: later ones do not count
+    frames: Mapping[int, int]
     compiled: bool = False  # whether the training compiles layers
 
     @property
@@ -270,9 +267,8 @@ class Validation:
                             for frame, guess, true in states
                         )
                         measured = tally(pairs, select([self.metric]), frames)
-                        tallies[rollout.scenario] = as_stored(
-                            measured
-                        )  # rounded as score files hold them
+                        # rounded as score files hold them
+                        tallies[rollout.scenario] = as_stored(measured)
         found = score(METRICS[self.metric], tallies)
         if found is None:
             return math.nan

@@ -78,9 +78,8 @@ class State:
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")
 GRID_TERMS = ("density", "divergence", "vorticity")
-TERMS = (
-    PARTICLE_TERMS + GRID_TERMS
-)  # the terms of Eq. 5.35, in its order but for positions
+# the terms of Eq. 5.35, in its order but for positions
+TERMS = PARTICLE_TERMS + GRID_TERMS
 
 
 class LossNorm(enum.StrEnum):
@@ -217,15 +216,13 @@ class GraphNetworkOptions(Options):
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
     # own steps that the loss is averaged over; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
-    wall_velocity: bool = (
-        False  # whether the velocities of moving walls in the next frame are features
-    )
+    # whether the velocities of moving walls in the next frame are features
+    wall_velocity: bool = False
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect
     # beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
-    symmetry: Symmetry = (
-        Symmetry.NONE
-    )  # images that training windows are replaced by at random
+    # images that training windows are replaced by at random
+    symmetry: Symmetry = Symmetry.NONE
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
     # neighbours that a particle hears at most, the nearest; all within the radius when

@@ -36,16 +36,13 @@ class Start:
     """Weights to start from."""
 
     path: Path  # their file
-    facts: (
-        Facts  # public figures of the data at hand, in the units that the weights know
-    )
+    # public figures of the data at hand, in the units that the weights know
+    facts: Facts
     weights: Mapping[str, Tensor]
-    options: Mapping[
-        str, Any
-    ]  # options of the model that they are of, without those of its training
-    record: Mapping[
-        str, Any
-    ]  # what records say of them: recipe, sha256, and what they took
+    # options of the model that they are of, without those of its training
+    options: Mapping[str, Any]
+    # what records say of them: recipe, sha256, and what they took
+    record: Mapping[str, Any]
 
     def fill(self, model: Baseline) -> None:
         """Copy the weights into a model; refuse those of another network or of another

@@ -35,9 +35,8 @@ class Rest:
     grid: ParticleGrid  # where displacements are averaged
     position: Tensor  # X [length], shape [particle, 2]
     stencil: Stencil  # nodes around them
-    count: (
-        Tensor  # sums of the weights at the nodes [1], shape [layer, 1, x node, y node]
-    )
+    # sums of the weights at the nodes [1], shape [layer, 1, x node, y node]
+    count: Tensor
     # offsets of the nodes, weighted, times the inverse of their spread [1/length],
     # shape [particle, 9, 2]
     lever: Tensor

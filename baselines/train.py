@@ -84,14 +84,12 @@ class TrainingResult:
     step: int  # optimiser steps made
     steps: int  # steps of the whole training
     parameters: int  # trainable parameters
-    loss: dict[
-        str, float
-    ]  # raw loss terms of the last step, and their weighted sum 'total'
+    # raw loss terms of the last step, and their weighted sum 'total'
+    loss: dict[str, float]
     windows_seen: int  # training windows of all steps
     epochs: float  # the same over the windows of the training subsets
-    metric: (
-        str | None
-    )  # what was validated by, lower is better; None without a validation
+    # what was validated by, lower is better; None without a validation
+    metric: str | None
     best_value: float | None  # its least value
     best_step: int | None
     device: str  # processor or GPU
@@ -271,9 +269,8 @@ class StepBatches(Sampler[list[int]]):
             (start, min(start + options.opening_frames, stop))
             for start, stop in pairwise(sampler.data.starts)
         )
-        self.openings = np.concatenate(
-            [np.arange(*each) for each in ends]
-        )  # those others
+        # those others
+        self.openings = np.concatenate([np.arange(*each) for each in ends])
 
     def __len__(self) -> int:
         """Return the number of steps."""

@@ -171,9 +171,8 @@ class StableVAR(Fitted):
 
         in_training = frozenset({"ridge"})
 
-        rank: PositiveInt = (
-            200  # principal directions kept; all there are if they are fewer
-        )
+        # principal directions kept; all there are if they are fewer
+        rank: PositiveInt = 200
         # added to the variance of each direction [standardised^2]
         ridge: float = Field(default=0.1, ge=0, allow_inf_nan=False)
 
@@ -269,9 +268,8 @@ def solve(blocks: LaggedRows) -> LeastSquares:
             lambda: _gram((x for x, _ in blocks), shape[0])
         )
         found = divided(_products(blocks, shape))
-        residual = partial(
-            blas.dgemm, -1.0, found, trans_a=True, beta=1.0
-        )  # (Y - X B)' of a block
+        # (Y - X B)' of a block
+        residual = partial(blas.dgemm, -1.0, found, trans_a=True, beta=1.0)
         found += divided(
             _products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape)
         )
@@ -354,9 +352,8 @@ def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float
     )
 
 
-OVERSAMPLING = (
-    20  # directions beyond those wanted, which the last wanted ones need to converge
-)
+# directions beyond those wanted, which the last wanted ones need to converge
+OVERSAMPLING = 20
 # multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
 ITERATIONS = 8
 

@@ -37,16 +37,16 @@ from lagbench.board.entry import (
 )
 from lagbench.board.entry_file import spell
 from lagbench.board.folder import Folder, score_paths
-from lagbench.board.ranking import combine, summarise, write_floors
+from lagbench.board.ranking import combine, summarise, write_references
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
 from lagbench.metrics.aggregate import as_stored
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
+from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.scoring.card import (
     FRAMES,
     PARTICLES,
@@ -128,7 +128,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
     for card, path in zip(cards, paths, strict=True):
         path.parent.mkdir(parents=True, exist_ok=True)
         write_statistics(card, path)
-    write_floors(cards[0], Folder(target))
+    write_references(cards[0], Folder(target))
     files = tuple(
         ScoredFile(
             sha256=file_sha256(path),
@@ -196,7 +196,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     rows = {SUBMISSION: quality}
-    rows |= {name: 3.0 + i for i, name in enumerate(FLOORS)}
+    rows |= {name: 3.0 + i for i, name in enumerate(REFERENCES)}
     task = size.task
     frames = tuple(frames_to_predict(size))
     ranking = ranking_metric(size)

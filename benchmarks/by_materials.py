@@ -22,8 +22,8 @@ from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
 from lagbench.draw.tables import markdown
 from lagbench.errors import LagbenchError, nearest
-from lagbench.floors import shipped
 from lagbench.metrics.table import ranking_metric
+from lagbench.references import shipped
 from lagbench.scoring.stored import published
 
 BOARD = Path(__file__).parent.parent / "leaderboard"

@@ -21,9 +21,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from lagbench.data.registry import Size, load
-from lagbench.floors import FloorScores, shipped
-from lagbench.floors.table import COUNTING
 from lagbench.metrics.table import ranking_metric
+from lagbench.references import ReferenceScores, shipped
+from lagbench.references.table import COUNTING
 from lagbench.scoring.card import best_floor
 
 FALLEN = 0.8
@@ -73,7 +73,7 @@ def main() -> int:
     return 1
 
 
-def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
+def _print_floors(size: Size, floors: Mapping[str, ReferenceScores]) -> None:
     ranking = ranking_metric(size)
     best = best_floor(
         {name: floors[name].scores[ranking] for name in COUNTING.intersection(floors)}
@@ -94,7 +94,9 @@ def _print_floors(size: Size, floors: Mapping[str, FloorScores]) -> None:
         )
 
 
-def _asks_enough(size: Size, floors: Mapping[str, FloorScores], *, each: bool) -> bool:
+def _asks_enough(
+    size: Size, floors: Mapping[str, ReferenceScores], *, each: bool
+) -> bool:
     """Print how often the frozen field fails; a correlation that is undefined has
     failed.
     """
@@ -115,7 +117,7 @@ def _asks_enough(size: Size, floors: Mapping[str, FloorScores], *, each: bool) -
     return size.name not in ACCEPTED or (below >= SHARE and strong)
 
 
-def _print_active(size: Size, floors: Mapping[str, FloorScores]) -> None:
+def _print_active(size: Size, floors: Mapping[str, ReferenceScores]) -> None:
     """Print for how many of the predicted frames the truth of a free surface moves."""
     if "free-flight" in floors:
         active = floors["free-flight"].scores["active_frames"].values

@@ -120,9 +120,8 @@ def main() -> int:
     """Print both tables."""
     with tempfile.TemporaryDirectory() as folder:
         root = str(Path(folder, "data"))
-        os.environ["LAGBENCH_CACHE"] = (
-            folder  # a generation notes there how fast it was
-        )
+        # a generation notes there how fast it was
+        os.environ["LAGBENCH_CACHE"] = folder
         predictions = str(Path(folder, "p.nc"))
         where = ["--split", "cavity", "--size", "tiny", "--root", root]
         commands = {

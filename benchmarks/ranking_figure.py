@@ -101,9 +101,8 @@ def full_box(rng: np.random.Generator) -> dict[str, FramePair]:
     }
     sides = {}
     for name, predicted in wrong.items():
-        y = np.clip(
-            x + 10.0 * (predicted(x) - u), 0.0, 1.0
-        )  # where ten such frames would lead
+        # where ten such frames would lead
+        y = np.clip(x + 10.0 * (predicted(x) - u), 0.0, 1.0)
         sides[name] = y, predicted(y)
     sides["particles permuted"] = x[order], u[order]
     return {

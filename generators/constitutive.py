@@ -20,9 +20,8 @@ import taichi as ti
 
 from .transfer import Value, bounded
 
-EXPONENT_MAX = (
-    4.0  # largest magnitude for which the error bound of :func:`exponential` holds
-)
+# largest magnitude for which the error bound of :func:`exponential` holds
+EXPONENT_MAX = 4.0
 # smallest trial stretch that enters the plastic volume, an inverted particle's too
 STRETCH_MIN = 0.1
 _STRETCH_EPSILON = 1e-6

@@ -21,9 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import WorkFailedError
 
-QUANTUM = (
-    2.0**-20
-)  # grain of everything that enters the solver; multiples below 16 are exact in float32
+# grain of everything that enters the solver; multiples below 16 are exact in float32
+QUANTUM = 2.0**-20
 _LARGEST = 16.0
 _PRECISE = Context(prec=50)
 

@@ -34,9 +34,8 @@ class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
     x: _Field  # particle positions [length], and two zeros
-    carried: (
-        _Field  # what particles spread: v_x, v_y and two numbers that are 1 at first
-    )
+    # what particles spread: v_x, v_y and two numbers that are 1 at first
+    carried: _Field
     slope_x: _Field  # d/dx of the velocity, first, at the particles
     slope_y: _Field  # d/dy of the same
     fill: _Field  # m / (rho dx^2), shape [scenario]

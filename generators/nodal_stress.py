@@ -78,9 +78,8 @@ class NodalStress:
         self.width = p.grid + 1
         self.dt = p.dt
         self.least = (p.wall + 0.5 + _INSET) * dx  # smallest coordinate of a particle
-        self.most = (
-            p.grid - p.wall - 0.5 - _INSET
-        ) * dx  # largest coordinate of a particle
+        # largest coordinate of a particle
+        self.most = (p.grid - p.wall - 0.5 - _INSET) * dx
         self.speed_bound = dx / p.dt  # the CFL bound dx/dt [length/s]
         self.velocity_scale = fixed_point_scale(p.particles, _REACH * self.speed_bound)
         self.count_scale = fixed_point_scale(p.particles, JACOBIAN_BOUND)
@@ -91,32 +90,26 @@ class NodalStress:
         self.gradient = 4.0 * self.inv_dx
         self.shift = -p.shift * dx * dx
         self.shift_bound = 0.1 * dx
-        self.x = ti.Vector.field(
-            4, ti.f32
-        )  # particle positions [length], and two zeros
+        # particle positions [length], and two zeros
+        self.x = ti.Vector.field(4, ti.f32)
         self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
-        self.slope_x = ti.Vector.field(
-            4, ti.f32
-        )  # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
+        # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
+        self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
         # largest abs(v_x), abs(v_y), J and -J of each particle since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
-        self.here = ti.Vector.field(
-            4, ti.f32
-        )  # nodal v_x, v_y, r, Jbar at the particles
-        self.push = ti.Vector.field(
-            4, ti.f32
-        )  # nodal dt a at the particles, and two zeros
+        # nodal v_x, v_y, r, Jbar at the particles
+        self.here = ti.Vector.field(4, ti.f32)
+        # nodal dt a at the particles, and two zeros
+        self.push = ti.Vector.field(4, ti.f32)
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
-        self.moved = ti.Vector.field(
-            4, ti.f32
-        )  # the same after the forces of the last substep
+        # the same after the forces of the last substep
+        self.moved = ti.Vector.field(4, ti.f32)
         self.gain = ti.Vector.field(2, ti.f32)  # dt a
-        self.peak = ti.field(
-            ti.f32
-        )  # largest absolute velocity component since the advance began
+        # largest absolute velocity component since the advance began
+        self.peak = ti.field(ti.f32)
         self.total = ti.Vector.field(2, ti.f64)  # sum over time of the nodal velocities
         self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]

@@ -85,9 +85,8 @@ class ParticleStress:
         self.least = (self.low + _INSET) * self.dx
         self.most = (self.high - _INSET) * self.dx
         self.speed_bound = self.dx / p.dt  # the CFL bound dx/dt [length/s]
-        self.reach_bound = (
-            _REACH * self.speed_bound
-        )  # of abs(v) + abs(A o), what sums have room for
+        # of abs(v) + abs(A o), what sums have room for
+        self.reach_bound = _REACH * self.speed_bound
         self.velocity_scale = fixed_point_scale(p.particles, self.reach_bound)
         self.count_scale = fixed_point_scale(p.particles, max(1.0, p.jacobian_max))
         self.velocity_unit = 1.0 / self.velocity_scale
@@ -101,35 +100,30 @@ class ParticleStress:
         self.snow = lame(p.snow_modulus, p.snow_poisson)
         self.yield_low = 1.0 - p.snow_compression
         self.yield_high = 1.0 + p.snow_stretch
-        self.x = ti.Vector.field(
-            4, ti.f32
-        )  # particle positions [length], and two zeros
-        self.carried = ti.Vector.field(
-            4, ti.f32
-        )  # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
+        # particle positions [length], and two zeros
+        self.x = ti.Vector.field(4, ti.f32)
+        # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
+        self.carried = ti.Vector.field(4, ti.f32)
         # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
-        self.f = ti.Matrix.field(
-            2, 2, ti.f32
-        )  # deformation gradients of the solids [1]
+        # deformation gradients of the solids [1]
+        self.f = ti.Matrix.field(2, 2, ti.f32)
         # Material, J of liquid or plastic Jp of snow (1 in other solids), and two zeros
         self.matter = ti.Vector.field(4, ti.f32)
         # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
         # advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil
-        self.a_x = ti.Vector.field(
-            4, ti.f32
-        )  # first column of A, scaled, and two zeros
+        # first column of A, scaled, and two zeros
+        self.a_x = ti.Vector.field(4, ti.f32)
         self.a_y = ti.Vector.field(4, ti.f32)  # second column
         self.here = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar at the particle
         self.sums = ti.Vector.field(4, ti.i64)  # n v_x, n v_y, n, n J
         self.node = ti.Vector.field(4, ti.f32)  # v_x, v_y, r, Jbar
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
-        self.friction = ti.field(
-            ti.f32
-        )  # Coulomb friction of the walls, shape [scenario]
+        # Coulomb friction of the walls, shape [scenario]
+        self.friction = ti.field(ti.f32)
         carried = (
             self.x,
             self.carried,

@@ -33,9 +33,8 @@ _NOTICE = (
     "# Written by `python -m lagbench.generators.record`; do not edit below this line."
 )
 _SHORT = 16
-_PER_LINE = (110 - 10) // len(
-    "-1.00000000e-05, "
-)  # numbers of a list in a line of at most 110 characters
+# numbers of a list in a line of at most 110 characters
+_PER_LINE = (110 - 10) // len("-1.00000000e-05, ")
 
 
 def measured_values(manifest: Manifest) -> Measured:

@@ -213,9 +213,8 @@ def seeds(rng: RandomSource, body: Body, count: int) -> Array:
     """
     shift = rng.random((2,))
     side = 2.0 * max(body.shape.reach)
-    block = min(
-        4 * count, 1 << 16
-    )  # at once: a million particles take no memory beside their own
+    # at once: a million particles take no memory beside their own
+    block = min(4 * count, 1 << 16)
     found = [np.empty((0, 2))]
     missing = count
     start = 1

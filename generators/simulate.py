@@ -44,9 +44,8 @@ OUTCOMES = ("active_frames",)
 # frames on the way to which kernels are compiled: one is read out, then one is advanced
 # to
 COMPILING = 2
-_FILE_NAMES = {
-    "reynolds": "reynolds_number"
-}  # drawn parameters that files call by their CF-like long name
+# drawn parameters that files call by their CF-like long name
+_FILE_NAMES = {"reynolds": "reynolds_number"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,9 +57,8 @@ class Facts:
     kinetic_energy_last: float  # the same at the last frame
     kinetic_energy_max: float  # the largest of any frame
     kinetic_energy_mean: float  # the mean over frames
-    energy_last_over_max: (
-        float  # last over largest; small where the motion has died down
-    )
+    # last over largest; small where the motion has died down
+    energy_last_over_max: float
     max_speed: float  # largest velocity component at any substep [length/s]
     cfl: float  # cells that this speed crosses per substep [1]
     jacobian_min: float  # smallest J of any particle at any substep [1]
@@ -155,9 +153,8 @@ def simulate(
     batch = Batch(job, report)
     size = job.size
     masses = [_particle_mass(size, state) for state in batch.states]
-    kinetic: list[list[float]] = [
-        [] for _ in masses
-    ]  # energies by scenario, frame by frame
+    # energies by scenario, frame by frame
+    kinetic: list[list[float]] = [[] for _ in masses]
     begun = clock()
     with ExitStack() as stack:
         pairs = zip(job.scenarios, batch.states, strict=True)

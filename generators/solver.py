@@ -94,9 +94,8 @@ def build(
     """
     module, name = _IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
-    importlib.import_module(
-        ".backend", package
-    )  # before Taichi itself, which it keeps quiet
+    # before Taichi itself, which it keeps quiet
+    importlib.import_module(".backend", package)
     implementation = getattr(importlib.import_module(module, package), name)
     return cast(
         "Solver",

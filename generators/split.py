@@ -48,20 +48,16 @@ class ClosedBoxParameters:
     grid: int  # cells across the unit box; the grid has grid + 1 nodes a side
     dt: float  # substep [s]
     wall: int  # index of the ghost node layer outside the low walls
-    no_slip: (
-        bool  # whether the walls hold the fluid (cavity) or let it slide (curl noise)
-    )
+    # whether the walls hold the fluid (cavity) or let it slide (curl noise)
+    no_slip: bool
     density: float  # rest density rho [mass/length^2]
     modulus: float  # bulk modulus E [mass/s^2]; the speed of sound is sqrt(E/rho)
-    velocity_relaxation: (
-        float  # lambda, share of the grid velocity mixed into v_p per substep [1]
-    )
-    jacobian_relaxation: (
-        float  # kappa, share of the nodal J mixed into J_p per substep [1]
-    )
-    density_coupling: (
-        float  # theta, pull of J_p towards the grid density per substep [1]
-    )
+    # lambda, share of the grid velocity mixed into v_p per substep [1]
+    velocity_relaxation: float
+    # kappa, share of the nodal J mixed into J_p per substep [1]
+    jacobian_relaxation: float
+    # theta, pull of J_p towards the grid density per substep [1]
+    density_coupling: float
     shift: float  # beta, strength of the particle shift [1]
     substeps_per_frame: int = 1  # substeps for which one row of a wall program acts
 
@@ -81,26 +77,22 @@ class FreeSurfaceParameters:
     density: float  # rest density rho of every material [mass/length^2]
     liquid_modulus: float  # bulk modulus K of the liquid [mass/s^2]
     liquid_viscosity: float  # kinematic viscosity nu of the liquid [length^2/s]
-    jacobian_relaxation: (
-        float  # kappa, share of the nodal J mixed into J_p per substep [1]
-    )
-    density_coupling: (
-        float  # theta, pull of J_p towards the grid density per substep [1]
-    )
+    # kappa, share of the nodal J mixed into J_p per substep [1]
+    jacobian_relaxation: float
+    # theta, pull of J_p towards the grid density per substep [1]
+    density_coupling: float
     jacobian_min: float  # lower bound of the liquid's J [1]
     jacobian_max: float  # upper bound of the liquid's J [1]
     jelly_modulus: float = 30.0  # Young's modulus of jelly [mass/s^2]
     jelly_poisson: float = 0.3  # Poisson's ratio of jelly [1]
     rope_modulus: float = 100.0  # Young's modulus of rope [mass/s^2]
     rope_poisson: float = 0.3  # Poisson's ratio of rope [1]
-    elastic_damping: float = (
-        0.002  # kinematic damping eta of jelly and rope [length^2/s]
-    )
+    # kinematic damping eta of jelly and rope [length^2/s]
+    elastic_damping: float = 0.002
     snow_modulus: float = 40.0  # Young's modulus of snow [mass/s^2]
     snow_poisson: float = 0.2  # Poisson's ratio of snow [1]
-    snow_compression: float = (
-        2.5e-2  # critical compression theta_c (Stomakhin 2013) [1]
-    )
+    # critical compression theta_c (Stomakhin 2013) [1]
+    snow_compression: float = 2.5e-2
     snow_stretch: float = 4.5e-3  # critical stretch theta_s (Stomakhin 2013) [1]
     snow_hardening: float = 10.0  # hardening exponent xi in exp(xi (1 - Jp)) [1]
     snow_hardening_min: float = 0.05  # lower cap of the hardening factor [1]

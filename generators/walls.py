@@ -18,15 +18,12 @@ class Walls:
     def __init__(self, *, grid: int, wall: int, no_slip: bool) -> None:
         """Set the indices; the field ``speed`` is the caller's to place."""
         self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
-        self.edge = (
-            wall + 1,
-            grid - wall - 1,
-        )  # low and high index of the interior nodes
+        # low and high index of the interior nodes
+        self.edge = wall + 1, grid - wall - 1
         self.span = grid - 2 * wall
         self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
-        self.tangential = (
-            -1 if no_slip else 1
-        )  # sign with which a wall mirrors a tangential component
+        # sign with which a wall mirrors a tangential component
+        self.tangential = -1 if no_slip else 1
         # tangential velocity of each wall [length/s], order of WALLS; shape [scenario]
         self.speed = ti.Vector.field(4, ti.f32)
 

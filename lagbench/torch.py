@@ -280,9 +280,8 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
             got = getattr(position, "shape", None) or type(position).__name__
             raise UsageError(what, where="roll_out, step", expected=shape, got=got)
         given = given.followed_by(position)
-        predicted.append(
-            given.position[:, -1]
-        )  # a copy: the model may use the memory of its answer again
+        # a copy: the model may use the memory of its answer again
+        predicted.append(given.position[:, -1])
     return torch.stack(predicted, dim=1)
 
 

@@ -24,9 +24,9 @@ from lagbench.board.entry import (
 from lagbench.board.model import (
     Board,
     Curve,
-    Floor,
     Histogram,
     Pictures,
+    ReferenceRow,
     Row,
     Tab,
     Value,
@@ -71,7 +71,7 @@ GONE: tuple[dict[str, Any], ...] = (
 )
 """What the last two of eight entries or more have become."""
 
-FLOORS = ("held-still", "straight-on")
+REFERENCES = ("held-still", "straight-on")
 COLUMNS = {
     "box": (
         "vorticity_rmse",
@@ -161,7 +161,7 @@ def make_tab(
         energy=world.banded(3.1e-3 * (1 - 0.3 * world.share), 0.1),
         truth=world.truth,
         rows=(*ranked, *gone),
-        floors=tuple(world.floor(name) for name in FLOORS),
+        floors=tuple(world.floor(name) for name in REFERENCES),
     )
 
 
@@ -194,12 +194,12 @@ class _World:
             high=(1 + width) * mean,
         )
 
-    def floor(self, name: str) -> Floor:
+    def floor(self, name: str) -> ReferenceRow:
         """Return a floor."""
-        return Floor(
+        return ReferenceRow(
             name=name,
             definition=f"What {name} says.",
-            **self.scores(name, 6.0, name == FLOORS[0]),
+            **self.scores(name, 6.0, name == REFERENCES[0]),
         )
 
     def scores(self, name: str, bad: float, still: bool) -> dict[str, Any]:

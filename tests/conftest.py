@@ -166,7 +166,7 @@ def quick(home: Path) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def floors_once() -> Iterator[None]:
+def references_once() -> Iterator[None]:
     """Measure the floors of a data set once, unless by workers: they are most of what a
     score costs.
     """
@@ -213,9 +213,8 @@ def stored_once() -> Iterator[None]:
     @functools.cache
     def statistics(_: str, path: Path) -> StoredScores:
         stored = read_statistics(path)
-        object.__setattr__(
-            stored, "scores", functools.cache(stored.scores)
-        )  # no test of tables adds metrics
+        # no test of tables adds metrics
+        object.__setattr__(stored, "scores", functools.cache(stored.scores))
         return stored
 
     def read(path: Path, size: Size | None = None) -> Stored:

@@ -37,9 +37,8 @@ def s3_server() -> Iterator[str]:
     server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()
     host, port = server.get_host_and_port()
-    bucket = (
-        f"data-{uuid.uuid4().hex[:8]}"  # all servers of a process share what they hold
-    )
+    # all servers of a process share what they hold
+    bucket = f"data-{uuid.uuid4().hex[:8]}"
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {
             **CREDENTIALS,

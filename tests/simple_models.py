@@ -311,11 +311,12 @@ def counted(widths: Sequence[int]) -> int:
 
 
 RADIUS = 0.0625  # a power of two: distances over it round nowhere
+# runs in milliseconds
 SMALL: dict[str, object] = {
     "latent": 16,
     "layers": 2,
     "noise_std": 0.0,
-}  # runs in milliseconds
+}
 
 
 def facts(**changes: object) -> Facts:

@@ -83,9 +83,8 @@ def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
     path = write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=2)
     image = paint(path, Panel.MATERIAL, 0)
     assert tuple(image[64, 64]) == tuple(style.rgb(style.MATERIAL_COLOURS[0]))
-    rim = image[
-        64 - int(0.35 * 128), 60:68
-    ]  # 0.35 above the middle: the second material
+    # 0.35 above the middle: the second material
+    rim = image[64 - int(0.35 * 128), 60:68]
     assert (rim == style.rgb(style.MATERIAL_COLOURS[1])).all(axis=-1).any()
 
 

@@ -37,7 +37,7 @@ from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.metrics.table import available
 from lagbench.scoring import score
 
-FLOOR = "floors/cavity/tiny/persistence.nc"
+PREDICTOR = "floors/cavity/tiny/persistence.nc"
 
 
 @pytest.fixture
@@ -162,7 +162,7 @@ def test_what_is_said_beside_the_numbers_is_compared(
     """
     said = {"diverged_at": {0: 7}, "flags": [{"name": "physics"}]}
     own.edit("noisy", lambda held: held["score"]["files"][0].update(said))
-    with netCDF4.Dataset(own.folder / FLOOR, "r+") as file:
+    with netCDF4.Dataset(own.folder / PREDICTOR, "r+") as file:
         file.set_auto_maskandscale(False)
         scale("position_mse", 2.0)(file)
     got = [finding.got for finding in rescored(own, predictions).findings]
@@ -330,7 +330,7 @@ CHANGES: dict[str, tuple[Callable[[BoardBench], object], str, str]] = {
         LISTED,
         "changed",
     ),
-    "floors changed": (lambda b: (b.folder / FLOOR).unlink(), FLOOR, "removed"),
+    "floors changed": (lambda b: (b.folder / PREDICTOR).unlink(), PREDICTOR, "removed"),
 }
 
 

@@ -31,7 +31,7 @@ from browser import (
 from PIL import Image
 
 from lagbench.board.columns import columns_of, presets_of, value_of, written
-from lagbench.board.model import Board, Floor, Row, Tab
+from lagbench.board.model import Board, ReferenceRow, Row, Tab
 from lagbench.board.page import render
 from lagbench.metrics import METRICS, Direction
 
@@ -319,7 +319,7 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
     tab = board.tabs[0]
     go(page, tab)
     columns = columns_of(tab, board.metrics)
-    shown = [row for row in tab.lines if isinstance(row, Floor) or row.active]
+    shown = [row for row in tab.lines if isinstance(row, ReferenceRow) or row.active]
     shown.sort(key=lambda row: row.values[tab.ranking].mean)
     for name, keys in presets_of(tab, columns).items():
         run(

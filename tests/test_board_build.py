@@ -27,8 +27,8 @@ from lagbench.board.ranking import combine
 from lagbench.board.show import as_plain, chosen_data_sets, tables
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
-from lagbench.floors.table import FLOORS
 from lagbench.metrics import METRICS, Score, bootstrap_interval
+from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.stored import read_stored
@@ -91,7 +91,7 @@ def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> 
     """
     floors = {floor.name: floor for floor in board.tabs[0].floors}
     assert set(floors) == set(card.scores) - {SUBMISSION}
-    assert set(floors) < set(FLOORS)
+    assert set(floors) < set(REFERENCES)
     for name, floor in floors.items():
         assert set(floor.values) == set(card.scores[name])
         for metric, score in card.scores[name].items():

@@ -25,7 +25,7 @@ from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
 
 NOISY = f"{SCORES}/noisy.nc"
-FLOOR = "floors/cavity/tiny/persistence.nc"
+PREDICTOR = "floors/cavity/tiny/persistence.nc"
 
 
 @pytest.fixture
@@ -240,12 +240,12 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
     "readable: YAML with aliases": text("a: &a [x]\nb: *a\n"),
     "place: place": lambda b: b.entry("noisy").rename(b.folder / PLACE / "other.yaml"),
     "floor: unknown floor": lambda b: shutil.copyfile(
-        b.folder / FLOOR, b.folder / "floors/cavity/tiny/ceiling.nc"
+        b.folder / PREDICTOR, b.folder / "floors/cavity/tiny/ceiling.nc"
     ),
-    "floor: broken floor": text("CDF", FLOOR),
+    "floor: broken floor": text("CDF", PREDICTOR),
     "floor: floor of another split": lambda b: (
         (b.folder / "floors/fluid/tiny").mkdir(parents=True),
-        shutil.copy(b.folder / FLOOR, b.folder / "floors/fluid/tiny"),
+        shutil.copy(b.folder / PREDICTOR, b.folder / "floors/fluid/tiny"),
     ),
 }
 """What somebody may write into an entry, then what may happen to files: the checks that

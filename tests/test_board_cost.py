@@ -18,7 +18,7 @@ from lagbench.__main__ import app
 from lagbench.board.cost import Mark, draw, front, marks_of
 from lagbench.board.model import Tab
 from lagbench.data.registry import load
-from lagbench.floors import shipped, solver_seconds
+from lagbench.references import shipped, solver_seconds
 from lagbench.report.chart import close_logarithmic
 
 

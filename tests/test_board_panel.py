@@ -153,9 +153,8 @@ def test_map_shows_the_field(page: Page, board: Board) -> None:
         "[...document.querySelector('#panel canvas').getContext('2d').getImageData(0, "
         "0, 16, 16).data]"
     )
-    pixels = (
-        np.array(data).reshape(16, 16, 4)[::-1].transpose(1, 0, 2)
-    )  # [x node, y node]
+    # [x node, y node]
+    pixels = np.array(data).reshape(16, 16, 4)[::-1].transpose(1, 0, 2)
     truth = board.tabs[0].truth.vorticity
     field = truth[0]
     limit = np.nanmax(np.abs(field))
@@ -299,9 +298,8 @@ def test_fifty_entries_are_there_within_a_second(
         encoding="utf-8",
     )
     page = running.open(path, width=1280)
-    page.call(
-        "Performance.enable", timeDomain="threadTicks"
-    )  # the clock of a busy machine says nothing
+    # the clock of a busy machine says nothing
+    page.call("Performance.enable", timeDomain="threadTicks")
     restored(page, "#tab=cavity-full")
     told = {
         one["name"]: one["value"]

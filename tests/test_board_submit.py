@@ -25,7 +25,7 @@ from lagbench.errors import (
     UsageError,
     WorkFailedError,
 )
-from lagbench.floors import floors_of
+from lagbench.references import references_of
 from lagbench.scoring.stored import read_stored
 from lagbench.submission import open_predictions
 
@@ -337,7 +337,7 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert set(before) == {
         f"{floor.name}.nc"
-        for floor in floors_of(own.data.size)
+        for floor in references_of(own.data.size)
         if floor.counts and not floor.reads_train
     }
     first = min(before)

@@ -194,9 +194,8 @@ def test_a_later_entry_takes_its_files_along(own: BoardBench, first: Path) -> No
     for weights in ((), (file,)):  # those of the board, told or not, keep their record
         again = submitted(own, first, weights=weights, replace=True)
         assert (lying(own), again.removed, found(own)) == (before, (), set())
-    (
-        first / "training.json"
-    ).unlink()  # new weights without a record leave none of the old
+    # new weights without a record leave none of the old
+    (first / "training.json").unlink()
     assert submitted(own, first, replace=True).removed == (file.with_suffix(".json"),)
     assert (list(lying(own)), found(own)) == (["drift_0.pt"], set())
     later = submitted(own, trained(own, 0, share=0.3), weights=(), replace=True)

@@ -18,11 +18,11 @@ from lagbench.cli.machine import SolverBench
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.floors import floors_of
+from lagbench.references import references_of
 
 Run = Callable[..., Result]
 
-FLOORS = [floor.name for floor in floors_of(load().size(SPLIT, SIZE))]
+REFERENCES = [floor.name for floor in references_of(load().size(SPLIT, SIZE))]
 
 
 @pytest.fixture
@@ -46,9 +46,8 @@ def only_one(
     small = file["splits"][SPLIT]
     large = {**small, "sizes": {"full": small["sizes"]["full"]}}
     path = tmp_path / "datasets.yaml"
-    path.write_text(
-        json.dumps({**file, "splits": {"large": large, SPLIT: small}})
-    )  # JSON is YAML
+    # JSON is YAML
+    path.write_text(json.dumps({**file, "splits": {"large": large, SPLIT: small}}))
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.width=4"))
@@ -120,7 +119,7 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(
     assert result.exit_code == 0, result.output
     page = root / "leaderboard" / "index.html"
     assert f"leaderboard page: {page}" in result.stdout.splitlines()
-    assert all(name in page.read_text() for name in (*FLOORS, "NeuralMPM, 2 steps"))
+    assert all(name in page.read_text() for name in (*REFERENCES, "NeuralMPM, 2 steps"))
     assert list(Path.cwd().iterdir()) == []
     entry = yaml.safe_load(
         (root / f"leaderboard/submissions/{SPLIT}/{SIZE}/neuralmpm.yaml").read_text()

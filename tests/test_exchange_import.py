@@ -88,11 +88,12 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
     kept = import_split(
         source, format="gns-npz", output=tmp_path / "a", allow_pickle=True
     )
+    # None says nothing: metadata do
     options: dict[str, Any] = {
         "horizon": 3,
         "radius": None,
         "bounds": None,
-    }  # None says nothing: metadata do
+    }
     own = import_split(
         source, format="gns-npz", output=tmp_path / "b", allow_pickle=True, **options
     )

@@ -147,9 +147,8 @@ def test_twin_floor_and_physics_by_hand() -> None:
     honest = below_twin_floor(np.array([5e-5, 1e-3, 1e-2, 0.4]), persistence, twin)
     assert honest.raised is False
     assert below_twin_floor(persistence, persistence, ()).raised is None
-    trace = pickle.loads(
-        pickle.dumps(trace_of(rollout(), rollout(speed=0.012)))
-    )  # as workers send it
+    # as workers send it
+    trace = pickle.loads(pickle.dumps(trace_of(rollout(), rollout(speed=0.012))))
     assert set(trace.shifted) == set(SHIFTS)
     rest = made([1, 2, 3])
     for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):

@@ -45,9 +45,8 @@ def test_longer_scenarios_are_those_that_still_move() -> None:
     """
     size = load().size("fluid", "full")
     known = [i for i in size.subsets["train"] if i not in FIXED]
-    judged = random.Random(turn()).sample(
-        known, len(known) // 3
-    )  # other neighbours at every turn
+    # other neighbours at every turn
+    judged = random.Random(turn()).sample(known, len(known) // 3)
     ranked = sorted(judged, key=lambda i: _share_left(size, i), reverse=True)
     counts = [size.frame_count(i) for i in ranked]
     assert counts == sorted(counts, reverse=True)

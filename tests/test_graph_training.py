@@ -124,9 +124,8 @@ def test_a_linear_flow_costs_what_its_gradient_says(name: str) -> None:
     Nodes at the rim of the grid average over half a stencil, so that only inner ones
     are exact.
     """
-    axis = (
-        torch.arange(128).double() + 0.5
-    ) / 128  # particles fill the unit box evenly
+    # particles fill the unit box evenly
+    axis = (torch.arange(128).double() + 0.5) / 128
     points = torch.cartesian_prod(axis, axis)
     x, y = (points - 0.5).T
     flow = 0.002 * torch.stack([-y, x] if name == "vorticity" else [x, y], dim=1)

@@ -163,9 +163,8 @@ def test_transfer_equals_the_sum_over_all_pairs(
         [rng.random((40, 2)), [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [0.5, 1.0]]]
     )
     u = rng.normal(size=x.shape)
-    along = spline(
-        (grid.axis[:, None, None] - x) / grid.spacing
-    )  # [node, particle, axis]
+    # [node, particle, axis]
+    along = spline((grid.axis[:, None, None] - x) / grid.spacing)
     weight = np.einsum("ip,kp->ikp", along[..., 0], along[..., 1])
     sums = gridding.transfer(x, u, grid)
     np.testing.assert_allclose(sums.weight, weight.sum(axis=-1), atol=1e-13)

@@ -24,7 +24,7 @@ LAYERS = (
     ("generators", "metrics", "draw", "tensors", "torch"),
     ("submission",),
     ("make",),
-    ("floors",),
+    ("references",),
     ("exchange", "scoring"),
     ("report", "baselines"),
     ("board",),
@@ -142,9 +142,8 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
     """A folder named lagbench beside a script, the clone, does not hide the installed
     package.
     """
-    (tmp_path / "lagbench" / "docs").mkdir(
-        parents=True
-    )  # the clone: no package by itself
+    # the clone: no package by itself
+    (tmp_path / "lagbench" / "docs").mkdir(parents=True)
     script = tmp_path / "script.py"
     script.write_text(
         "import lagbench; print(lagbench.list_splits()[0])", encoding="utf-8"
@@ -204,10 +203,11 @@ def test_light_things_stay_light(code: str, forbidden: set[str]) -> None:
             ]
         )
     command = [sys.executable, "-c", code + "\nimport sys\nprint(*sys.modules)"]
+    # files that are there would be read
     empty = {
         **os.environ,
         "LAGBENCH_ROOT": str(PACKAGE / "none"),
-    }  # files that are there would be read
+    }
     done = subprocess.run(
         command, env=empty, capture_output=True, text=True, check=True
     )

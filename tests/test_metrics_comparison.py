@@ -257,9 +257,8 @@ def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
     and 1.
     """
     assert holm(p) == pytest.approx(multipletests(p, method="holm")[1].tolist())
-    *others, claimed_none = holm(
-        [*p, math.nan]
-    )  # NaN is not counted as a comparison and stays
+    # NaN is not counted as a comparison and stays
+    *others, claimed_none = holm([*p, math.nan])
     assert others == holm(p)
     assert math.isnan(claimed_none)
 
@@ -276,9 +275,8 @@ def test_comparison_over_common_scenarios() -> None:
     )
     assert (found.p, found.significant) == (2.0**-5, True)
     assert compare(one, score_of(math.nan, 1.0)).scenarios == (1,)
-    five = compare(
-        score_of(*[1.0] * 5), score_of(*[2.0] * 5)
-    )  # its smallest p would be 0.0625
+    # its smallest p would be 0.0625
+    five = compare(score_of(*[1.0] * 5), score_of(*[2.0] * 5))
     assert math.isnan(five.p)
     assert (five.significant, five.difference) == (False, -1.0)
 

@@ -161,9 +161,8 @@ def test_the_way_back_is_asked_for(after: float) -> None:
     model = surrogate(smoothing=0.0, recovery=4.0)
     behind = (after - given) * np.arange(4.0)
     wanted = after + np.minimum(behind / 4.0, 3.0 * model.change)
-    expected = (
-        (wanted - given) ** 2 / 2
-    ).mean() / model.change**2  # nothing moves along y
+    # nothing moves along y
+    expected = ((wanted - given) ** 2 / 2).mean() / model.change**2
     with torch.no_grad():
         assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
 

@@ -155,9 +155,8 @@ def test_fields_of_solid_body_rotation(swirl: Path) -> None:
         assert recording.area == pytest.approx(np.pi * 0.4**2)
         for frame in (0, 3):
             scene = recording.scene(frame)
-            middle = scene.fields.vorticity[
-                3:5, 3:5
-            ]  # clear of the rim on the 8 x 8 grid
+            # clear of the rim on the 8 x 8 grid
+            middle = scene.fields.vorticity[3:5, 3:5]
             np.testing.assert_allclose(middle, 2.0 * OMEGA, rtol=0.02)
             per_second = 2.0 * OMEGA / recording.size.frame_interval
             np.testing.assert_allclose(scene.vorticity[3:5, 3:5], per_second, rtol=0.02)

@@ -152,9 +152,8 @@ def test_the_file_is_valid_and_says_what_made_it(
     """The file passes every check, and holds cost, device, seed, parameters and
     training.
     """
-    result = run(
-        method="my drift", training={"best_step": 4}
-    )  # of a state that is not the best
+    # of a state that is not the best
+    result = run(method="my drift", training={"best_step": 4})
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
     found = said(result.path)
@@ -185,9 +184,8 @@ def test_a_rollout_is_frozen_where_it_diverges(
     assert np.isfinite(position).all()
     assert (position[:, 4:] == position[:, 3:4]).all()
     assert (position[:, 3] != position[:, 2]).any()
-    never = run(
-        model={"explode_at": 1}, name="never.nc"
-    )  # stays at the last given frame
+    # stays at the last given frame
+    never = run(model={"explode_at": 1}, name="never.nc")
     for row, position in enumerate(given.values()):
         assert (written(never.path)[row] == position[5].astype(np.float32)).all()
     assert set(never.diverged.values()) == {6}
@@ -542,9 +540,8 @@ def test_nothing_else_is_replaced(
         check_replaceable(Path())
     run(name="predictions.nc")
     run(name="predictions.nc")
-    (tmp_path / "predictions.json").write_text(
-        '{"seconds_per_frame": 1.0}'
-    )  # as scores have it too
+    # as scores have it too
+    (tmp_path / "predictions.json").write_text('{"seconds_per_frame": 1.0}')
     with pytest.raises(UsageError):
         run(name="predictions.nc")
 

@@ -56,9 +56,8 @@ def test_the_readme_program_beats_the_best_floor(tmp_path: Path) -> None:
     its interval.
     """
     (program,) = blocks(README, "python")
-    lagbench.generate(
-        "cavity", "mini", subset="train,test", root=tmp_path
-    )  # valid is not opened
+    # valid is not opened
+    lagbench.generate("cavity", "mini", subset="train,test", root=tmp_path)
     printed = run_program(program, tmp_path, tmp_path)
     assert printed.strip().endswith("over persistence")
     assert "\r" not in printed

@@ -481,9 +481,8 @@ def test_side_by_side_as_one_after_the_other(
         assert (
             make_runs(asked, runs, workers=workers) == 4
         )  # there are no data of fluid
-        here = (
-            capsys.readouterr().err
-        )  # what other processes say does not pass through this one
+        # what other processes say does not pass through this one
+        here = capsys.readouterr().err
         assert ("cavity tiny mlp-1" in here) == (workers == 1)
         folders = [
             asked.folder(split, model.name, seed) for split, model, seed in runs[1:]

@@ -18,14 +18,19 @@ from score_bench import ScoreBench, right, still, straight
 
 from lagbench.data.registry import Measured, Size
 from lagbench.errors import DataError, UsageError
-from lagbench.floors import FLOORS, floors_of, shipped
-from lagbench.floors.shipped import shipped_path, write_shipped, write_solver_seconds
-from lagbench.floors.table import COUNTING
 from lagbench.metrics import METRICS, Score
-from lagbench.scoring import floors as floors_of_scoring
+from lagbench.references import REFERENCES, references_of, shipped
+from lagbench.references.shipped import (
+    shipped_path,
+    write_shipped,
+    write_solver_seconds,
+)
+from lagbench.references.table import COUNTING
+from lagbench.scoring import references as references_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import SUBMISSION, ScoreCard, best_floor, skill
-from lagbench.scoring.floors import (
+from lagbench.scoring.record import record
+from lagbench.scoring.references import (
     differences,
     kept_in,
     measurable,
@@ -33,7 +38,6 @@ from lagbench.scoring.floors import (
     measured_again,
     measured_sizes,
 )
-from lagbench.scoring.record import record
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.tables import card_tables
 
@@ -153,7 +157,7 @@ def test_seeds_widen_the_interval_of_skill() -> None:
 
 
 @pytest.fixture(scope="module")
-def measured_floors(bench: ScoreBench) -> dict[str, Any]:
+def measured_references(bench: ScoreBench) -> dict[str, Any]:
     """All floors of it, measured once."""
     return measure(bench.size, bench.root)
 
@@ -167,13 +171,13 @@ def recorded(size: Size, sha256: str = "a" * 64) -> Size:
 
 
 def test_shipped_scores_are_the_measured_ones(
-    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+    bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
 ) -> None:
     """Written and read again they are equal to five digits, curves to three; another
     data set has none.
     """
-    found = measured_floors
-    assert list(found) == [floor.name for floor in floors_of(bench.size)]
+    found = measured_references
+    assert list(found) == [floor.name for floor in references_of(bench.size)]
     size = recorded(bench.size)
     frames = (15, 25)
     path = write_shipped(
@@ -205,18 +209,18 @@ def test_shipped_scores_are_the_measured_ones(
 
 
 def test_one_floor_measured_anew_leaves_the_others(
-    bench: ScoreBench, measured_floors: dict[str, Any], tmp_path: Path
+    bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
 ) -> None:
     """Its scores change; order, the others, its cost and the solver's stay, which one
     run has measured.
     """
     size = recorded(bench.size)
     known = {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
-    path = write_shipped(size, measured_floors, **known)
+    path = write_shipped(size, measured_references, **known)
     write_solver_seconds(size, 0.5, tmp_path)
     before = json.loads(path.read_text())
     other = replace(
-        measured_floors["persistence"], name="analog", seconds_per_frame=9.0
+        measured_references["persistence"], name="analog", seconds_per_frame=9.0
     )
     write_shipped(size, {"analog": other}, partial=True, **known)
     after = json.loads(path.read_text())
@@ -253,7 +257,7 @@ def test_a_floor_that_a_data_set_lacks_is_not_measured(
 
 def test_a_forged_shipped_score_is_found(
     bench: ScoreBench,
-    measured_floors: dict[str, Any],
+    measured_references: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -261,7 +265,7 @@ def test_a_forged_shipped_score_is_found(
     that is left out.
     """
     found = {
-        name: measured_floors[name] for name in ("persistence", "constant-velocity")
+        name: measured_references[name] for name in ("persistence", "constant-velocity")
     }
     size = recorded(bench.size)
     path = write_shipped(
@@ -278,10 +282,12 @@ def test_a_forged_shipped_score_is_found(
     assert [
         size.name for size in measured_sizes(bench.root, registry=bench.registry)
     ] == [bench.size.name]
-    held = dict(measured_floors)
-    monkeypatch.setattr(floors_of_scoring, "shipped", lambda size: held)
+    held = dict(measured_references)
+    monkeypatch.setattr(references_of_scoring, "shipped", lambda size: held)
     assert measured_again(bench.size, bench.root) == (tuple(held), {})
-    monkeypatch.setattr(floors_of_scoring, "measure", lambda *_, **__: measured_floors)
+    monkeypatch.setattr(
+        references_of_scoring, "measure", lambda *_, **__: measured_references
+    )
     still = held["persistence"]
     score = still.scores["position_rmse"]
     forged = {
@@ -319,7 +325,7 @@ def test_an_interrupted_measurement_goes_on(
 
 def test_scoring_takes_what_is_shipped(
     bench: ScoreBench,
-    measured_floors: dict[str, Any],
+    measured_references: dict[str, Any],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -328,7 +334,7 @@ def test_scoring_takes_what_is_shipped(
     """
     path = bench.submit(tmp_path / "predictions.nc", straight)
     measured = bench.evaluate(path)
-    monkeypatch.setattr(scoring, "shipped", lambda size: measured_floors)
+    monkeypatch.setattr(scoring, "shipped", lambda size: measured_references)
     card = bench.evaluate(path)
     assert list(card.tallies) == [SUBMISSION]
     assert set(measured.tallies) == {SUBMISSION, *measurable(bench.size, bench.root)}
@@ -345,7 +351,7 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert standing.skill.value <= 0.0
     said = standing.as_json()["skill"]
     assert said["floor"] == standing.skill.floor
-    assert FLOORS[said["floor"]].counts
+    assert REFERENCES[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
     assert (again.floor, again.value) == (standing.skill.floor, standing.skill.value)

@@ -138,9 +138,8 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
     assert collate([more[3], more[40]]).origin[PARTICLES[0] :].equal(more[40].origin)
     with pytest.raises(UsageError):
         collate([more[3], data[40]])
-    both = train(
-        subset=["test", "train"]
-    )  # windows of several subsets follow each other
+    # windows of several subsets follow each other
+    both = train(subset=["test", "train"])
     assert len(both) == WINDOWS + 2 * 20
     assert [both.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
 

@@ -87,9 +87,8 @@ class SuperGAT(Operator):
         pairs = unlinked_pairs(edge_index, len(node), count, generator)
         gathered = self.scale * self.conv(node, edge_index, pairs)
         loss = self.conv.get_attention_loss()
-        self.conv.att_x = self.conv.att_y = (
-            None  # They would hold the whole graph of gradients.
-        )
+        # They would hold the whole graph of gradients.
+        self.conv.att_x = self.conv.att_y = None
         return gathered, {"link": loss}
 
 

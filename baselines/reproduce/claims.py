@@ -35,9 +35,8 @@ class Claim:
     rivals: tuple[str, ...] = ()  # models to compare it with; empty for all
     question: str = ""
     metrics: tuple[str, ...] = ()  # judged beside the ranking one, over the horizon
-    at_key_frame: tuple[
-        str, ...
-    ] = ()  # judged at the frame at which the thesis compares models
+    # judged at the frame at which the thesis compares models
+    at_key_frame: tuple[str, ...] = ()
 
 
 _CLAIMS = {

@@ -64,9 +64,8 @@ class Rollouts:
     scenario: Scenario  # what holds in all its frames, as metrics see it
     recording: Recording  # the same as pictures see it
     file: ScenarioFile
-    predictions: Mapping[
-        str, Predictions
-    ]  # by model, in the order in which they were asked for
+    # by model, in the order in which they were asked for
+    predictions: Mapping[str, Predictions]
     _truth: dict[int, Snapshot] = field(default_factory=dict)
 
     def position(self, name: str | None, frame: int) -> Floats:
@@ -264,9 +263,8 @@ class Figure:
     cases: tuple[int, ...] = (
         0,
     )  # scenarios of the thesis: T0, T1, ...; ids on the free surface
-    frames: tuple[
-        int, ...
-    ] = ()  # absolute; empty for the frame at which the thesis compares models
+    # absolute; empty for the frame at which the thesis compares models
+    frames: tuple[int, ...] = ()
     # show the whole rollout: pictures spread over it, errors over the horizon
     whole: bool = False
     panels: tuple[str, ...] = ()  # kinds of picture, one each
@@ -291,9 +289,8 @@ class Sheet:
 
     notes: tuple[str, ...] = ()  # sentences; one paragraph each
     tables: tuple[Table, ...] = ()
-    pictures: Mapping[str, bytes] = field(
-        default_factory=dict
-    )  # PNG files by what is added to their name
+    # PNG files by what is added to their name
+    pictures: Mapping[str, bytes] = field(default_factory=dict)
 
     @property
     def text(self) -> str:

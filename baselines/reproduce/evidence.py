@@ -25,11 +25,11 @@ import numpy as np
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UnreadableFileError
-from lagbench.floors.shipped import shipped, shipped_path
-from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
+from lagbench.references.shipped import shipped, shipped_path
+from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 
@@ -80,9 +80,8 @@ class Seeded:
 
     seed: int | None  # None for what has none
     scores: Mapping[str, Score]  # by metric
-    record: Mapping[
-        str, Any
-    ]  # what training.json or else the entry says of it; empty where none does
+    # what training.json or else the entry says of it; empty where none does
+    record: Mapping[str, Any]
     path: Path  # file of the scores
 
     @property
@@ -209,14 +208,12 @@ class Sources:
     """Where evidence lies."""
 
     board: Path | None = BOARD  # the leaderboard's folder; None to use runs alone
-    weights: Path = (
-        WEIGHTS  # folder of committed weights and what their trainings recorded
-    )
+    # folder of committed weights and what their trainings recorded
+    weights: Path = WEIGHTS
     runs: Path | None = None  # folder of runs; None to use committed files alone
     studies: Path = STUDIES  # folder of committed results that are no entries
-    recipe: str | None = (
-        None  # variant of the recipes whose runs to read; None for the size's own
-    )
+    # variant of the recipes whose runs to read; None for the size's own
+    recipe: str | None = None
     registry: Registry | None = None  # where splits are described; ours when None
     left_out: frozenset[Path] = frozenset()  # folders of runs that are not to be read
 
@@ -268,9 +265,8 @@ class Evidence:
         """
         self.size = sources.size(split, size)
         self.methods: dict[str, Method] = {}  # by name, floors among them
-        self.stale: list[
-            Path
-        ] = []  # score files of another version of the data, which are left out
+        # score files of another version of the data, which are left out
+        self.stale: list[Path] = []
         self._weights = sources.weights / split / size
         for name, path in sources.entries(split, size).items():
             entry = read_yaml(path)
@@ -350,7 +346,9 @@ class Evidence:
     @property
     def floors(self) -> dict[str, Method]:
         """The floors that were scored."""
-        return {name: method for name, method in self.methods.items() if name in FLOORS}
+        return {
+            name: method for name, method in self.methods.items() if name in REFERENCES
+        }
 
     @property
     def models(self) -> dict[str, Method]:
@@ -358,7 +356,7 @@ class Evidence:
         return {
             name: self.methods[name]
             for name in sorted(self.methods)
-            if name not in FLOORS
+            if name not in REFERENCES
         }
 
     def order(self, names: Collection[str] | None = None) -> list[str]:

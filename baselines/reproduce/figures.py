@@ -223,10 +223,11 @@ def residuals(plan: Plan, figure: Figure) -> Sheet:
     return Sheet(notes=(figure.said,), tables=(table,), pictures={"": picture})
 
 
+# below which SuperGAT's vorticity MSE stays up to a frame [1/frame^2]
 BOUNDS = {
     40: 0.0002,
     80: 0.0004,
-}  # below which SuperGAT's vorticity MSE stays up to a frame [1/frame^2]
+}
 
 
 def model_curves(plan: Plan, figure: Figure) -> Sheet:

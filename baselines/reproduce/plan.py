@@ -46,14 +46,12 @@ class Plan:
     weights: Path = WEIGHTS  # folder of committed weights
     studies: Path = COMMITTED  # folder of committed results that are no entries
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
-    recipe: str | None = (
-        None  # variant of the recipes, as in short; None for the size's own
-    )
+    # variant of the recipes, as in short; None for the size's own
+    recipe: str | None = None
     settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
     device: str = "auto"
-    threads: int | None = (
-        None  # of a training on the CPU; one per core by default, one with workers
-    )
+    # of a training on the CPU; one per core by default, one with workers
+    threads: int | None = None
     registry: Registry | None = None  # where splits are described; ours when None
     # folders of runs that could not be made, or are not those that were asked for:
     # nothing of them is shown

@@ -20,9 +20,9 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.draw.tables import Table, markdown
 from lagbench.errors import LagbenchError
-from lagbench.floors.table import FLOORS
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
+from lagbench.references.table import REFERENCES
 from lagbench.scoring.tables import ARROWS
 
 from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
@@ -355,7 +355,7 @@ def _horizon(evidence: Evidence) -> str:
     rows = []
     for name in evidence.order():
         method = evidence.methods[name]
-        if name in FLOORS:
+        if name in REFERENCES:
             seeds = "floor"
         else:
             seeds = str(len(method.seeds))

@@ -160,9 +160,8 @@ def vorticity(plan: Plan, figure: Figure) -> Sheet:
     frame = key_frame(evidence.size)
     first = scenario_of(evidence.size, 0)
     names = [name for name in figure.models if name in evidence.methods]
-    cubic: dict[
-        int, dict[str, Mapping[str, float]]
-    ] = {}  # errors by scenario and model, the thesis's way
+    # errors by scenario and model, the thesis's way
+    cubic: dict[int, dict[str, Mapping[str, float]]] = {}
     for i in plan.test_subset(figure.split).scenarios:
         with opened(plan, figure.split, i, figure.models) as shown:
             found = {}

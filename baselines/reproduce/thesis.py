@@ -209,18 +209,15 @@ SIZES = ("mini", "full")  # sizes that are reported; ``tiny`` is for tests
 class Model:
     """A baseline, or a variant of one, that results speak of."""
 
-    name: (
-        str  # as in gns-novorticity; it names folders of runs and entries of the board
-    )
+    # as in gns-novorticity; it names folders of runs and entries of the board
+    name: str
     label: str  # what tables call it
     colour: str = MUTED
     varied: str = ""  # baseline of which it is a variant
-    settings: tuple[
-        str, ...
-    ] = ()  # changes to the recipe, as in model.loss.vorticity=0
-    recipe: str | None = (
-        None  # variant of the recipe, as in change; None for the size's own
-    )
+    # changes to the recipe, as in model.loss.vorticity=0
+    settings: tuple[str, ...] = ()
+    # variant of the recipe, as in change; None for the size's own
+    recipe: str | None = None
     # model whose weights its entry runs with these settings, empty for its own; a
     # reproduction trains anew
     weights: str = ""
@@ -375,9 +372,8 @@ _MODELS = (
     Model("var-stable", "stable VAR", "#b0569a"),
 )
 
-ROSTER: Mapping[str, Model] = MappingProxyType(
-    {model.name: model for model in _MODELS}
-)  # models by name
+# models by name
+ROSTER: Mapping[str, Model] = MappingProxyType({model.name: model for model in _MODELS})
 
 _EVERYWHERE = ("neuralmpm", *OPERATORS, *FRAME_MODELS, "var", "var-stable")
 _ABLATIONS = ("supergat-unlinked", "supergat-unsummed", "gns-novorticity")
@@ -415,10 +411,11 @@ def colour(name: str) -> str:
     return MUTED
 
 
+# scenes repeat with the id: four families, six pairs
 _FAMILIES = {
     "fluid": 4,
     "multimaterial": 6,
-}  # scenes repeat with the id: four families, six pairs
+}
 
 _KEY_FRAMES = {"cavity": 54, "curl-noise": 40}
 """Frames at which the thesis compares models: 54; and 35 after the last of six given

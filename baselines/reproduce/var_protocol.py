@@ -59,16 +59,13 @@ class ProtocolResult:
     peak_gb: float  # largest resident memory of the process [GB]
     condition: float  # condition number of the regressors
     floor: float  # as LeastSquares has it
-    fit_mse: (
-        float  # mean squared error of one step over the frames fitted [standardised^2]
-    )
+    # mean squared error of one step over the frames fitted [standardised^2]
+    fit_mse: float
     forecast_frames: int  # frames forecast
-    forecast_mse: (
-        float  # mean over them [standardised^2]; infinite once a forecast overflows
-    )
-    mse_at: dict[
-        int, float
-    ]  # mean squared error of single frames of the forecast, by frame [standardised^2]
+    # mean over them [standardised^2]; infinite once a forecast overflows
+    forecast_mse: float
+    # mean squared error of single frames of the forecast, by frame [standardised^2]
+    mse_at: dict[int, float]
     # factor per frame by which the last frames of the forecast grow; above 1 it
     # diverges
     growth: float

@@ -194,12 +194,10 @@ REYNOLDS = tuple(_U)  # Reynolds numbers U L / nu that are tabulated here
 class CentreLines:
     """Velocities on the two centre lines."""
 
-    u: NDArray[
-        np.float64
-    ]  # u/U at (1/2, Y) [1], shape [15]; NaN where there is no value
-    v: NDArray[
-        np.float64
-    ]  # v/U at (X, 1/2) [1], shape [15]; NaN where there is no value
+    # u/U at (1/2, Y) [1], shape [15]; NaN where there is no value
+    u: NDArray[np.float64]
+    # v/U at (X, 1/2) [1], shape [15]; NaN where there is no value
+    v: NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,8 @@ _LEAST_GRID = 16
 _VISCOUS_LIMIT = 0.2
 _ACOUSTIC_LIMIT = 0.5
 _MACH_LIMIT = 1.0 / 3.0
-_LARGEST_FREQUENCY = (
-    14  # beyond it velocity gradients outgrow what :func:`.draws.quantise` holds
-)
+# beyond it velocity gradients outgrow what :func:`.draws.quantise` holds
+_LARGEST_FREQUENCY = 14
 
 
 class Case(enum.StrEnum):
@@ -62,9 +61,8 @@ class Experiment:
     substeps: int  # solver steps
     dt: float  # substep [s]
     lid_speed: float  # speed of the top wall [length/s]; 0 in curl noise
-    lid_off_after: (
-        int | None
-    )  # substep after which the lid stands still, None for never
+    # substep after which the lid stands still, None for never
+    lid_off_after: int | None
     frequency: int  # Perlin lattice cells across the box; 0 in the cavity
     seed: int  # seed of the particle lattice and of the stirring
 
@@ -292,9 +290,8 @@ class Check:
     substep: int  # when
     jacobian_min: float  # smallest J of any particle [1]
     jacobian_max: float  # largest J of any particle [1]
-    jacobian_min_outside_lid_corners: (
-        float  # the same without the 5 x 5 cells at either end of a lid [1]
-    )
+    # the same without the 5 x 5 cells at either end of a lid [1]
+    jacobian_min_outside_lid_corners: float
     jacobian_max_outside_lid_corners: float  # likewise [1]
     empty_cells: int  # cells without a particle
     particles_per_cell_min: int  # particles in the emptiest cell
@@ -309,9 +306,8 @@ class Result:
     """What a run has shown so far."""
 
     experiment: Experiment  # the settings
-    checks: list[Check] = dataclasses.field(
-        default_factory=list
-    )  # one per check, in time order
+    # one per check, in time order
+    checks: list[Check] = dataclasses.field(default_factory=list)
     # substep of each record of the energy, 0 first
     frame_substeps: list[int] = dataclasses.field(default_factory=list)
     # E = sum m v_p^2 / 2 at each of them [mass length^2/s^2]
@@ -383,9 +379,8 @@ def run(
     state = initial_state(experiment)
     box = diagnostics.box_of(parameters)
     mass = parameters.density * state.area / experiment.particles
-    inside = slice(
-        parameters.wall + 1, parameters.grid - parameters.wall
-    )  # nodes between the walls
+    # nodes between the walls
+    inside = slice(parameters.wall + 1, parameters.grid - parameters.wall)
     threads = 1 if device is Device.CPU else None
     solver = cast("ClosedBox", build(parameters, device=device, threads=threads))
     # The first substep compiles; loading again starts afresh, and no compilation is

@@ -33,8 +33,8 @@ from lagbench.submission.findings import Finding
 
 from .entry import Entry, Prediction, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
-from .findings import FLOORS_ANEW, finding
-from .folder import FLOORS, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
+from .findings import REFERENCES_ANEW, finding
+from .folder import REFERENCES, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 from .ranking import scored_file
 
 TOLERANCE = 1e-6
@@ -42,9 +42,8 @@ TOLERANCE = 1e-6
 the last bits.
 """
 
-FILM_STEP = (
-    FILM_RANGE[1] - FILM_RANGE[0]
-) / LEVELS  # step of packed film positions [length]
+# step of packed film positions [length]
+FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
 
 
 @dataclass(frozen=True)
@@ -73,21 +72,20 @@ class Rescoring:
         """
         where = str(path)
         try:
-            card = self.card(
-                path
-            )  # the scorer alone opens them, after its checks in a child process
+            # the scorer alone opens them, after its checks in a child process
+            card = self.card(path)
         except (UnreadableFileError, ChecksFailedError) as error:
             got = f"{error.what}: {error.got}"
             fix = "lagbench validate says what is wrong"
             yield finding("rescored", where, got, expected="valid predictions", fix=fix)
             return
-        for inner in self.folder.floor_files(card.header.split, card.header.size):
+        for inner in self.folder.reference_files(card.header.split, card.header.size):
             if inner.stem not in card.tallies or inner.stem == SUBMISSION:
                 continue
             kept = read_stored(self.folder.path / inner).scores
             same = kept.identity["dataset_sha256"] == card.header.dataset_sha256
             if same and (unlike := _unlike(card.tallies[inner.stem], kept)[0]):
-                yield finding("rescored", inner, _listed(unlike), fix=FLOORS_ANEW)
+                yield finding("rescored", inner, _listed(unlike), fix=REFERENCES_ANEW)
         known = [
             (entry, made, inner, said)
             for entry in self.entries
@@ -229,10 +227,8 @@ def _listed(names: Sequence[str]) -> str:
     return f"other {', '.join(names[:5])}{more}"
 
 
-KEYS = (
-    "status",
-    "superseded_by",
-)  # keys of an entry that decide whether and how it stands on the board
+# keys of an entry that decide whether and how it stands on the board
+KEYS = "status", "superseded_by"
 
 
 def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Finding]:
@@ -269,7 +265,7 @@ def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Find
         verb = {"A": "added", "D": "removed", "T": "replaced by a link"}.get(
             how[:1], "changed"
         )
-        if path == Path(VERIFIED) or path.parts[0] == FLOORS:
+        if path == Path(VERIFIED) or path.parts[0] == REFERENCES:
             if path == Path(VERIFIED):
                 touched = not _only_own_lines_left(folder, start, own)
             else:

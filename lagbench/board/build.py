@@ -23,8 +23,6 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
-from lagbench.floors.shipped import FloorScores, solver_seconds
-from lagbench.floors.table import COUNTING, FLOORS
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -34,6 +32,8 @@ from lagbench.metrics.significance import (
     standings,
 )
 from lagbench.metrics.table import METRICS
+from lagbench.references.shipped import ReferenceScores, solver_seconds
+from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.report.html import tag
 from lagbench.scoring.card import Preview, skill
 from lagbench.scoring.stored import Stored, read_stored, reported_frames
@@ -43,10 +43,10 @@ from .entry import Cost, Entry, Status, Verification
 from .entry_file import read_entry, read_verified, schema_bytes, verification_of
 from .findings import CHECKS
 from .folder import PAGE, SCHEMA, Folder
-from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab, Value
+from .model import Board, Curve, Histogram, Pictures, ReferenceRow, Row, Tab, Value
 from .page import LINKS, render
 from .payload import spaced
-from .ranking import Combined, combine, is_current, read_floors
+from .ranking import Combined, combine, is_current, read_references
 
 COLUMNS = (
     *(
@@ -164,7 +164,7 @@ def collect(
                 continue
             size = described.size(split, name)
             if (split, name) in found:
-                floors = read_floors(place, size)
+                floors = read_references(place, size)
                 tabs.append(
                     _tab(size, about.title, found[split, name], floors, verified)
                 )
@@ -179,7 +179,7 @@ def _tab(
     size: Size,
     title: str,
     found: Sequence[_Held],
-    floors: Sequence[FloorScores],
+    floors: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
 ) -> Tab:
     # maps of truth and prediction share one packing: an explosion leaves nothing of the
@@ -240,7 +240,7 @@ def _row(
     size: Size,
     standing: Standing | None,
     verified: Verification | None,
-    floors: Sequence[FloorScores],
+    floors: Sequence[ReferenceScores],
 ) -> Row:
     preview = held.stored[0].preview
     ranking = held.stored[0].scores.ranking
@@ -282,15 +282,15 @@ def _row(
     )
 
 
-def _floor(held: FloorScores, size: Size, ranking: str) -> Floor:
+def _floor(held: ReferenceScores, size: Size, ranking: str) -> ReferenceRow:
     energy = held.scores.get(ENERGIES[1])
-    about = FLOORS[held.name]
+    about = REFERENCES[held.name]
     cost = Cost.model_construct(
         seconds_per_frame=held.seconds_per_frame,
         device="one core, where the floors were measured",
         solver_seconds_per_frame=solver_seconds(size),
     )
-    return Floor(
+    return ReferenceRow(
         name=held.name,
         definition=about.definition,
         values={
@@ -355,9 +355,8 @@ def curve(score: Score) -> Curve:
     chosen = [sampled[i] for i in spaced(len(sampled), CURVE_FRAMES)]
     values = score.per_frame[:, chosen]
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", RuntimeWarning
-        )  # a frame where nothing is defined is NaN
+        # a frame where nothing is defined is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)
         middle = np.nanmean(values, axis=0)
         low = np.nanmin(values, axis=0)
         high = np.nanmax(values, axis=0)

@@ -21,9 +21,9 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
-from lagbench.floors.shipped import shipped_path
-from lagbench.floors.table import FLOORS
-from lagbench.scoring.floors import measured_again
+from lagbench.references.shipped import shipped_path
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.references import measured_again
 from lagbench.scoring.score import score
 from lagbench.scoring.stored import (
     MAX_SCORE_BYTES,
@@ -51,12 +51,10 @@ class CheckResult:
     folder: Path
     entries: int  # entries that were looked at
     findings: tuple[Finding, ...]
-    page_checked: (
-        bool  # whether the page was compared; it is not while anything else is wrong
-    )
-    confirmed: tuple[
-        Confirmation, ...
-    ] = ()  # predictions that gave the same when scored again
+    # whether the page was compared; it is not while anything else is wrong
+    page_checked: bool
+    # predictions that gave the same when scored again
+    confirmed: tuple[Confirmation, ...] = ()
     recorded: tuple[str, ...] = ()  # entries that were added to verified.yaml
     # entries of which some seeds were confirmed and others not looked at: they are not
     # added
@@ -98,7 +96,8 @@ def check_board(
     described = registry or load()
     folder.require()
     files = [
-        folder.path / path for path in (*folder.score_files(), *folder.floor_files())
+        folder.path / path
+        for path in (*folder.score_files(), *folder.reference_files())
     ]
     if isolated:
         broken = unreadable_in_child(files)
@@ -107,7 +106,7 @@ def check_board(
     look = _Look(folder=folder, registry=described, broken=broken)
     for path in folder.entries():
         look.guarded(path, look.entry)
-    for path in folder.floor_files():
+    for path in folder.reference_files():
         look.guarded(path, look.floor)
     look.together()
     if base is not None:
@@ -170,15 +169,13 @@ class _Look:
 
     folder: Folder
     registry: Registry
-    broken: Mapping[
-        Path, str
-    ]  # files that cannot be read, and why, as a child process found
+    # files that cannot be read, and why, as a child process found
+    broken: Mapping[Path, str]
     found: list[Finding] = field(default_factory=list)
     known: list[Entry] = field(default_factory=list)
     sound: set[Path] = field(default_factory=set)  # score files that were read
-    prints: dict[str, list[tuple[Entry, Path]]] = field(
-        default_factory=dict
-    )  # by what was predicted
+    # by what was predicted
+    prints: dict[str, list[tuple[Entry, Path]]] = field(default_factory=dict)
 
     def add(self, check: str, where: object, got: object, **said: Any) -> None:  # noqa: ANN401
         """Add a finding."""
@@ -395,9 +392,9 @@ class _Look:
         """Check the scores of a floor."""
         try:
             size = self.registry.size(*path.parts[1:3])
-            if path.stem not in FLOORS or self.folder.path / path in self.broken:
+            if path.stem not in REFERENCES or self.folder.path / path in self.broken:
                 got = self.broken.get(self.folder.path / path, "an unknown name")
-                self.add("floor", path, got, expected=", ".join(FLOORS))
+                self.add("floor", path, got, expected=", ".join(REFERENCES))
                 return
             identity = read_stored(self.folder.path / path, size).scores.identity
             if not is_current(dataset_of(identity), size):
@@ -455,7 +452,7 @@ class _Look:
                 if path not in told and path.parts[1:3] == files[0].parts[1:3]:
                     told.add(path)
                     self.add("twin", path, f"those of {files[0]}")
-        floors = {skeleton(floor): f"that of the floor {floor}" for floor in FLOORS}
+        floors = {skeleton(floor): f"that of the floor {floor}" for floor in REFERENCES}
         seen: dict[tuple[str, str, str], str] = {}
         for entry in (entry for entry in entries if entry.status is Status.ACTIVE):
             own = f"that of {entry.method}, {entry.name!a}"

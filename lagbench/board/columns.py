@@ -15,7 +15,7 @@ from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.report.html import MISSING, sentence, text, words
 
 from .entry import EntryBudget
-from .model import Floor, Row, Tab, Value
+from .model import ReferenceRow, Row, Tab, Value
 
 MAIN_METRICS = 5
 """Metrics of the first table, the ranking one among them; with more it would be wider
@@ -103,9 +103,8 @@ class Column:
     form: str = "number"  # how cells are written: number, count, factor or text
     reported: bool = False  # said by the submitter, computed again by nobody
     meaning: str
-    of: Callable[[Row | Floor], object] | None = (
-        None  # what a row has there, where no metric stands behind
-    )
+    # what a row has there, where no metric stands behind
+    of: Callable[[Row | ReferenceRow], object] | None = None
 
     @property
     def quantity(self) -> str:
@@ -135,8 +134,8 @@ SKILL = Column(
 )
 
 
-def _of(part: str, key: str) -> Callable[[Row | Floor], object]:
-    def of(row: Row | Floor) -> object:
+def _of(part: str, key: str) -> Callable[[Row | ReferenceRow], object]:
+    def of(row: Row | ReferenceRow) -> object:
         said = row.entry if isinstance(row, Row) else row
         return getattr(getattr(said, part, None) if part else said, key, None)
 
@@ -278,7 +277,7 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     }
 
 
-def value_of(row: Row | Floor, column: Column) -> float | str:
+def value_of(row: Row | ReferenceRow, column: Column) -> float | str:
     """Return what a row has in a column; NaN, or an empty text, where it has
     nothing.
     """
@@ -295,7 +294,7 @@ def value_of(row: Row | Floor, column: Column) -> float | str:
     return float(str(found))
 
 
-def loss_of(row: Row | Floor, column: Column) -> float:
+def loss_of(row: Row | ReferenceRow, column: Column) -> float:
     """Return what a row loses in a column, smaller is better; NaN where nothing is
     judged.
 
@@ -311,7 +310,7 @@ def loss_of(row: Row | Floor, column: Column) -> float:
     return column.loss(value)
 
 
-def held(row: Row | Floor, key: str) -> Value | None:
+def held(row: Row | ReferenceRow, key: str) -> Value | None:
     """Return the value of a metric, or the skill; None where a row has none."""
     if key == "skill" and isinstance(row, Row):
         return row.skill

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
-from lagbench.floors.shipped import shipped, solver_seconds
 from lagbench.metrics.table import METRICS, ranking_metric
+from lagbench.references.shipped import shipped, solver_seconds
 from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
 from lagbench.report.html import Markup, tag, text, words
 

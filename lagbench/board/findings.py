@@ -29,7 +29,7 @@ ROUNDING = 1e-6
 RESCORE = (
     "submit the predictions again: lagbench submit; the score block is not for editing"
 )
-FLOORS_ANEW = "remove the file: `lagbench submit` writes the floors anew"
+REFERENCES_ANEW = "remove the file: `lagbench submit` writes the floors anew"
 
 
 class Check(NamedTuple):
@@ -161,7 +161,7 @@ CHECKS: Mapping[str, Check] = {
         "something else",
         "no floor of the scorer",
         "scores of a floor that `lagbench submit` wrote",
-        FLOORS_ANEW,
+        REFERENCES_ANEW,
     ),
     "verified": Check(
         "a line of verified.yaml that no entry with these score files has",

@@ -23,7 +23,7 @@ Place = tuple[str, str, str]  # split, size and method
 
 SUBMISSIONS = "submissions"
 SCORES = "scores"
-FLOORS = "floors"
+REFERENCES = "floors"
 WEIGHTS = "weights"
 PAGE = "index.html"
 SCHEMA = "schema.json"
@@ -33,7 +33,7 @@ README = "README.md"
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
     SCORES: (".nc",),
-    FLOORS: (".nc",),
+    REFERENCES: (".nc",),
     WEIGHTS: (".pt", ".json"),
 }
 KEPT = ".gitkeep"
@@ -136,13 +136,13 @@ class Folder:
         """
         return self._sound(SCORES)
 
-    def floor_files(self, split: str = "", size: str = "") -> tuple[Path, ...]:
+    def reference_files(self, split: str = "", size: str = "") -> tuple[Path, ...]:
         """Return the scores of floors, of one split and size or all, in the order of
         their names.
         """
         return tuple(
             path
-            for path in self._sound(FLOORS)
+            for path in self._sound(REFERENCES)
             if path.parts[1:3] == (split, size) or not split
         )
 

@@ -30,9 +30,8 @@ class Value:
     low: float  # lower bound of the 95 % interval
     high: float
     per_scenario: tuple[float, ...]  # mean over seeds, in the order of Tab.scenarios
-    at: Mapping[
-        int, float
-    ]  # mean at Tab.marked; empty for metrics that mean nothing at one frame
+    # mean at Tab.marked; empty for metrics that mean nothing at one frame
+    at: Mapping[int, float]
     undefined: int  # frames without a value, all scenarios and seeds together
 
 
@@ -63,21 +62,18 @@ class Pictures:
 
     scenario: int
     map_frames: tuple[int, ...]  # frames of interest and the last one
-    vorticity: NDArray[
-        np.float32
-    ]  # [1/frame], NaN elsewhere, shape [map frame, x node, y node]
+    # [1/frame], NaN elsewhere, shape [map frame, x node, y node]
+    vorticity: NDArray[np.float32]
     histograms: tuple[Histogram, ...]  # of it over the truth's range, by map frame
     film_frames: tuple[int, ...]
-    material: NDArray[
-        np.int8
-    ]  # of each film particle: 0 liquid, 1 jelly, 2 snow, 3 rope
-    film: NDArray[
-        np.float32
-    ]  # positions in [-0.5, 1.5] [length], shape [film frame, particle, 2]
+    # of each film particle: 0 liquid, 1 jelly, 2 snow, 3 rope
+    material: NDArray[np.int8]
+    # positions in [-0.5, 1.5] [length], shape [film frame, particle, 2]
+    film: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Floor:
+class ReferenceRow:
     """What costs no learning: a row that is never ranked."""
 
     name: str
@@ -86,9 +82,8 @@ class Floor:
     curves: Mapping[str, Curve]
     energy: Curve | None
     counts: bool = True  # whether it may be the best floor
-    cost: Cost | None = (
-        None  # what a frame costs it and the solver, on the machine that measured
-    )
+    # what a frame costs it and the solver, on the machine that measured
+    cost: Cost | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,9 +97,8 @@ class Row:
     # against the leader, corrected by Holm; NaN for the leader and without a claim
     p: float
     verified: Verification | None  # the maintainers scored these predictions again
-    skill: (
-        Value | None
-    )  # 1 - score / score of the best floor, where the score files say it
+    # 1 - score / score of the best floor, where the score files say it
+    skill: Value | None
     values: Mapping[str, Value]
     seed_means: tuple[float, ...]  # mean of the ranking metric of each seed
     curves: Mapping[str, Curve]
@@ -173,16 +167,14 @@ class Tab:
     ranking: str  # name of the metric that ranks
     decided: bool  # whether there are scenarios enough for a p-value
     columns: tuple[str, ...]  # names of metrics to show at first, the ranking one first
-    curves: tuple[
-        str, ...
-    ]  # names of metrics with curves, the ranking one or what stands for it first
+    # names of metrics with curves, the ranking one or what stands for it first
+    curves: tuple[str, ...]
     energy: Curve  # true kinetic energy
     truth: Pictures  # those of the rows have the same scenario and frames
     rows: tuple[Row, ...]  # ranked ones by rank, then the others
-    floors: tuple[Floor, ...]
-    solver_seconds: float | None = (
-        None  # processor time of a frame of the solver itself [s]
-    )
+    floors: tuple[ReferenceRow, ...]
+    # processor time of a frame of the solver itself [s]
+    solver_seconds: float | None = None
 
     @property
     def id(self) -> str:
@@ -190,7 +182,7 @@ class Tab:
         return f"{self.size.split}-{self.size.name}"
 
     @property
-    def lines(self) -> tuple[Row | Floor, ...]:
+    def lines(self) -> tuple[Row | ReferenceRow, ...]:
         """All that the table shows."""
         return (*self.rows, *self.floors)
 
@@ -202,7 +194,6 @@ class Board:
     """
 
     tabs: tuple[Tab, ...]  # in the order of the registry
-    empty: tuple[
-        tuple[str, str], ...
-    ]  # splits and sizes that have no learned entry yet
+    # splits and sizes that have no learned entry yet
+    empty: tuple[tuple[str, str], ...]
     metrics: Mapping[str, Metric]  # those that occur, in the table's order

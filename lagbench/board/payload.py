@@ -24,7 +24,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.report.html import MISSING as NOTHING
 from lagbench.report.html import text, words
 
-from .model import Board, Curve, Floor, Histogram, Pictures, Row, Tab
+from .model import Board, Curve, Histogram, Pictures, ReferenceRow, Row, Tab
 
 
 class Fineness(NamedTuple):
@@ -115,7 +115,7 @@ class _Writer:
             "rows": [self._row(row, tab, scale) for row in tab.rows],
         }
 
-    def _series(self, row: Row | Floor, tab: Tab) -> dict[str, Any]:
+    def _series(self, row: Row | ReferenceRow, tab: Tab) -> dict[str, Any]:
         """Return curves of a row, and the means of each scenario of the main
         metrics.
         """
@@ -289,9 +289,8 @@ def pack_film(
     letters = [str(pack(start, limits=limits)[0])]
     now = low + (high - low) * np.rint(_share(start, low, high) * LEVELS) / LEVELS
     before = now
-    going = np.diff(
-        wanted, 2, axis=0, prepend=wanted[:1]
-    )  # beside standing still, then constant velocity
+    # beside standing still, then constant velocity
+    going = np.diff(wanted, 2, axis=0, prepend=wanted[:1])
     # No letter is off by more than 30.5 / 31^2 of the reach; three such errors stand
     # before a letter.
     farthest = float(np.abs(going).max(initial=0.0)) + 1.5 * (high - low) / LEVELS

@@ -18,8 +18,6 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
-from lagbench.floors.shipped import FloorScores, shipped
-from lagbench.floors.table import FLOORS as KNOWN
 from lagbench.metrics.aggregate import (
     Score,
     aggregate,
@@ -27,12 +25,14 @@ from lagbench.metrics.aggregate import (
     mean_over_seeds,
 )
 from lagbench.metrics.table import METRICS
+from lagbench.references.shipped import ReferenceScores, shipped
+from lagbench.references.table import REFERENCES as KNOWN
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score_file import StoredScores, write_statistics
 from lagbench.scoring.stored import read_stored
 
 from .entry import LONGEST_TEXT, OUTSIDE, DataSet, Flag, ScoredFile, Summary
-from .folder import FLOORS, Folder
+from .folder import REFERENCES, Folder
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,24 +108,24 @@ def is_current(dataset: DataSet, size: Size) -> bool:
     return major_of(dataset.version) == size.major and dataset.sha256 == recorded
 
 
-def read_floors(folder: Folder, size: Size) -> tuple[FloorScores, ...]:
+def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
     """Return the floors of a split and size, those of another data set left out.
 
     What ours score, the package ships. Those of a split of somebody's own the scorer
-    measures beside a submission, and :func:`write_floors` keeps them in the folder:
+    measures beside a submission, and :func:`write_references` keeps them in the folder:
     they are equal whoever submits.
     """
     if known := shipped(size):
         return tuple(known.values())
     found = []
-    for path in folder.floor_files(size.split, size.name):
+    for path in folder.reference_files(size.split, size.name):
         scores = read_stored(folder.path / path).scores
         if path.stem not in KNOWN or not is_current(dataset_of(scores.identity), size):
             continue
         read_stored(folder.path / path, size)
         held = {name: made.score for name, made in combine([scores]).items()}
         found.append(
-            FloorScores(
+            ReferenceScores(
                 name=path.stem,
                 scores=held,
                 seconds_per_frame=math.nan,
@@ -142,7 +142,7 @@ def dataset_of(identity: Mapping[str, str]) -> DataSet:
     )
 
 
-def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
+def write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
     """Write the floors of a card that the folder lacks, pictures of the truth alone;
     return their paths.
     """
@@ -159,7 +159,7 @@ def write_floors(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         film=np.stack([preview.film[0], preview.film[0]]),
     )
     for name in card.tallies.keys() - {SUBMISSION}:
-        path = folder.path / FLOORS / header.split / header.size / f"{name}.nc"
+        path = folder.path / REFERENCES / header.split / header.size / f"{name}.nc"
         with suppress(UnreadableFileError):
             if (
                 read_stored(path).scores.identity["dataset_sha256"]

@@ -11,7 +11,7 @@ from lagbench.errors import UsageError, nearest
 from lagbench.scoring.card import digits
 
 from .columns import held
-from .model import Board, Floor, Row, Value
+from .model import Board, ReferenceRow, Row, Value
 
 
 def chosen_data_sets(
@@ -64,7 +64,7 @@ def tables(
         title = f"{tab.size.split} {tab.size.name} {tab.size.version}, by {tab.ranking}{claim}{cost}"
         ranked = [row for row in tab.rows if row.rank is not None]
         rest = [row for row in tab.rows if row.rank is None]
-        shown: list[Row | Floor] = [*ranked, *tab.floors, *rest]
+        shown: list[Row | ReferenceRow] = [*ranked, *tab.floors, *rest]
         yield Table(
             title,
             ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
@@ -123,7 +123,7 @@ def _plain(value: Value) -> dict[str, float | None]:
     }
 
 
-def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
+def _cells(row: Row | ReferenceRow, names: list[str]) -> tuple[str, ...]:
     values = [
         "-"
         if (value := held(row, name)) is None or math.isnan(value.mean)
@@ -131,7 +131,7 @@ def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
         + ("" if math.isnan(value.std) else f" ± {value.std:.2g}")
         for name in names
     ]
-    if isinstance(row, Floor):
+    if isinstance(row, ReferenceRow):
         cost = row.cost
     else:
         cost = row.entry.cost
@@ -143,7 +143,7 @@ def _cells(row: Row | Floor, names: list[str]) -> tuple[str, ...]:
         speed_up = f"{cost.speed_up:.3g}"
     else:
         speed_up = ""
-    if isinstance(row, Floor):
+    if isinstance(row, ReferenceRow):
         return ("-", row.name, *values, time, speed_up, "floor")
     if row.rank is None:
         rank = "-"

@@ -25,7 +25,7 @@ from lagbench.atomic import move_together, refuse_folders
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
 from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
-from lagbench.floors.table import FLOORS as KNOWN_FLOORS
+from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
@@ -63,7 +63,7 @@ from .entry_file import (
 )
 from .findings import print_of, prints_of, skeleton
 from .folder import (
-    FLOORS,
+    REFERENCES,
     SUBMISSIONS,
     VERIFIED,
     Folder,
@@ -71,7 +71,7 @@ from .folder import (
     entry_path,
     score_paths,
 )
-from .ranking import combine, scored_file, summarise, write_floors
+from .ranking import combine, scored_file, summarise, write_references
 from .seeds import extendable, require_new, seeds_of
 from .weights import named_weights, require_weights, stage_weights
 
@@ -93,9 +93,8 @@ class SubmitResult:
     std: float | None  # over seeds; None for one seed
     flags: tuple[str, ...]  # names of flags that were raised
     board: Path
-    files: tuple[
-        Path, ...
-    ]  # what was written; verified.yaml, where the entry before had a line there
+    # what was written; verified.yaml, where the entry before had a line there
+    files: tuple[Path, ...]
     kept: tuple[Path, ...]  # weights of the entry before that are those of this one
     removed: tuple[Path, ...]  # what only the entry before had
 
@@ -222,14 +221,12 @@ class _Plan(NamedTuple):
     about: About
     made: Sequence[Prediction]  # what it says of each file
     results: Sequence[ValidationResult]
-    outside: Sequence[
-        float | None
-    ]  # share of positions beyond the box, where the validation warns
+    # share of positions beyond the box, where the validation warns
+    outside: Sequence[float | None]
     sources: Sequence[Path | None]  # weights of each file
     others: Mapping[Path, Entry]  # active entries of the same data set
-    rivals: Mapping[
-        Path, Entry
-    ]  # entries whose predictions it cannot have: others, and added_to
+    # entries whose predictions it cannot have: others, and added_to
+    rivals: Mapping[Path, Entry]
     added_to: Entry | None
 
 
@@ -298,7 +295,7 @@ def _planned(
             name = "another --method, and name: in meta.yaml"
             fix = f"a further seed: --add; instead of it: --replace; else {name}"
             raise UsageError("there is such an entry already", where=str(own), fix=fix)
-        names = {floor: f"the floor {floor}" for floor in KNOWN_FLOORS}
+        names = {floor: f"the floor {floor}" for floor in KNOWN_REFERENCES}
         names |= {entry.name: str(path) for path, entry in others.items()}
         for name, holder in names.items():
             if skeleton(name) == skeleton(label):
@@ -360,7 +357,7 @@ def _method(header: Header, meta: Meta) -> str:
             fix=f"name it: --method "
             f"{re.sub('[^a-z0-9]+', '-', name.lower()).strip('-') or 'my-model'}",
         )
-    if name in KNOWN_FLOORS:
+    if name in KNOWN_REFERENCES:
         fix = "name your method otherwise; the floors are added by themselves"
         raise UsageError(f"{name!r} is the name of a floor", where="--method", fix=fix)
     return name
@@ -405,9 +402,8 @@ def _about(headers: Sequence[Header], meta: Meta, before: Entry | None) -> About
         )
     held["budget"] = EntryBudget.of(first.size, budgets) or meta.budget
     if held["budget"] is None and before is not None and before.budget is not None:
-        held["budget"] = before.budget.model_copy(
-            update={"track": None}
-        )  # a track follows from all budgets
+        # a track follows from all budgets
+        held["budget"] = before.budget.model_copy(update={"track": None})
     return _fitting(About, held)
 
 
@@ -513,15 +509,15 @@ def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitR
             if name not in lying
         }
         moves |= stage_weights(Path(stage), kept, sources)
+        # the entry last
         texts = {
             Path(VERIFIED): unverified(folder, entry),
             yaml_path: spell(entry),
-        }  # the entry last
+        }
         for number, (name, text) in enumerate(texts.items()):
             if text is not None:
-                moves[name] = (
-                    Path(stage) / f"{number}.yaml"
-                )  # a method may be called verified
+                # a method may be called verified
+                moves[name] = Path(stage) / f"{number}.yaml"
                 moves[name].write_bytes(text)
         records = {name.with_suffix(".json") for name in moves if name.suffix == ".pt"}
         idle = sorted(
@@ -529,11 +525,11 @@ def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitR
             | (records - set(moves))
         )
         folder.require_unlinked(
-            [*moves, *(name.parent for name in idle), Path(FLOORS, split, size)]
+            [*moves, *(name.parent for name in idle), Path(REFERENCES, split, size)]
         )
         removed = [path for name in idle if os.path.lexists(path := folder.path / name)]
         refuse_folders(removed)
-        floors = write_floors(cards[0], folder)
+        floors = write_references(cards[0], folder)
         move_together([(source, folder.path / name) for name, source in moves.items()])
     for path in removed:
         path.unlink()

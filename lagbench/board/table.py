@@ -15,7 +15,7 @@ from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, loss_of, presets_of, value_of, written
 from .folder import weights_path
-from .model import Floor, Row, Tab
+from .model import ReferenceRow, Row, Tab
 
 MOST_REASONS = 4
 """Reasons of a warning that are told; those of other scenarios say the same with other
@@ -75,7 +75,7 @@ def draw_table(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
     ranking = columns[tab.ranking]
     shades = {key: _Shades(tab, column) for key, column in columns.items()}
 
-    def order(row: Row | Floor) -> tuple[bool, float]:
+    def order(row: Row | ReferenceRow) -> tuple[bool, float]:
         loss = ranking.loss(float(value_of(row, ranking)))
         return isinstance(row, Row) and not row.active, math.inf if math.isnan(
             loss
@@ -164,7 +164,7 @@ class _Shades:
             loss for row in judged if math.isfinite(loss := loss_of(row, column))
         )
 
-    def classes(self, row: Row | Floor) -> Iterator[str]:
+    def classes(self, row: Row | ReferenceRow) -> Iterator[str]:
         """Yield the classes of a row's cell."""
         if isinstance(row, Row):
             aside = not row.active
@@ -187,7 +187,7 @@ class _Shades:
 
 
 def _cell(
-    row: Row | Floor, column: Column, shades: _Shades, *, main: bool, ranks: bool
+    row: Row | ReferenceRow, column: Column, shades: _Shades, *, main: bool, ranks: bool
 ) -> Markup:
     value = value_of(row, column)
     found = held(row, column.key)
@@ -237,9 +237,11 @@ def _cell(
     )
 
 
-def _line(tab: Tab, row: Row | Floor, number: int, cells: Sequence[Markup]) -> Markup:
+def _line(
+    tab: Tab, row: Row | ReferenceRow, number: int, cells: Sequence[Markup]
+) -> Markup:
     """Return a row of the table, the floors shaded and never ranked."""
-    if isinstance(row, Floor):
+    if isinstance(row, ReferenceRow):
         parts = [
             tag("span", row.name, class_="name"),
             tag("span", "floor", class_="flag"),

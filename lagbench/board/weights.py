@@ -37,9 +37,8 @@ MOST_BYTES = 40_000_000
 good.
 """
 
-MOST_RECORD = (
-    256 << 10
-)  # longest record of a training beside its weights [bytes]; those of ours take 3 kB
+# longest record of a training beside its weights [bytes]; those of ours take 3 kB
+MOST_RECORD = 256 << 10
 
 RECORD = "training.json"
 

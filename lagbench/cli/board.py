@@ -219,7 +219,7 @@ def check(
 ) -> None:
     """Check entries, score files and every aggregate; for every pull request."""
     from lagbench.board.check import check_board
-    from lagbench.scoring.floors import measured_sizes
+    from lagbench.scoring.references import measured_sizes
 
     if (split or size) and not root:
         raise UsageError(

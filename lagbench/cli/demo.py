@@ -44,9 +44,8 @@ if TYPE_CHECKING:
 
 DEMO_SIZE = "tiny"
 MODEL = "neuralmpm"
-MODEL_SPLIT = (
-    "cavity"  # the baseline that the demo trains, and the split that it learns
-)
+# the baseline that the demo trains, and the split that it learns
+MODEL_SPLIT = "cavity"
 SETTINGS = ("training.steps=150",)
 """Changes to the recipe of size tiny: half a minute, and better than what costs no
 learning with any seed.
@@ -74,9 +73,8 @@ class ModelResult:
     training: TrainingResult  # result of train
     prediction: PredictionResult  # result of predict
     card: ScoreCard  # its scores beside those of the floors
-    solver: (
-        SolverBench | None
-    )  # what our solver takes here; None where it cannot be timed
+    # what our solver takes here; None where it cannot be timed
+    solver: SolverBench | None
     entry: SubmitResult  # its entry of the leaderboard
     page: BuildResult  # the leaderboard's page
 

@@ -111,9 +111,8 @@ def train(
     from lagbench.data.local import locate
 
     if "LOCAL_RANK" not in os.environ:  # of several processes one tells an error
-        locate(
-            split, size, root=root
-        )  # PyTorch takes seconds to load: what can be refused before, is
+        # PyTorch takes seconds to load: what can be refused before, is
+        locate(split, size, root=root)
     with progress_bar(quiet=quiet):
         from lagbench.baselines.machine import is_helper
         from lagbench.baselines.train import train as run

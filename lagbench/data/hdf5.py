@@ -413,12 +413,10 @@ class Structure:
     """
 
     members: int = MAX_LINKS  # most members of a group
-    groups: (
-        Collection[str] | None
-    ) = ()  # groups below the root that it may have; None: any
-    texts: bool = (
-        False  # whether arrays may hold texts; these share one heap of any length
-    )
+    # groups below the root that it may have; None: any
+    groups: Collection[str] | None = ()
+    # whether arrays may hold texts; these share one heap of any length
+    texts: bool = False
     unpacked: int | None = None  # most bytes that all arrays together may become
     # most bytes of chunks that must stay unpacked while frames are read in order
     cache: int = MAX_CACHE

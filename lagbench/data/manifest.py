@@ -101,25 +101,22 @@ class Manifest(_Strict):
     format: Literal[1] = 1  # number of this layout
     split: str  # name of the split
     size: str  # name of the size
-    version: Annotated[
-        str, Field(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")
-    ]  # semantic version of the split
+    # semantic version of the split
+    version: Annotated[str, Field(pattern=r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$")]
     complete: bool = False  # whether every scenario of train, valid and test is there
     # "bitwise" where every file comes from a machine that promises equal bits or has
     # the hash of datasets.yaml, else "tolerance"; see lagbench.work.machine
     identity: Literal["bitwise", "tolerance"] = "bitwise"
     dataset_sha256: Hash | None = None  # data set hash; None until complete
-    subset_sha256: dict[str, Hash] = Field(
-        default_factory=dict
-    )  # hash of every complete subset
+    # hash of every complete subset
+    subset_sha256: dict[str, Hash] = Field(default_factory=dict)
     # mean and std per component over train, see lagbench.data.statistics; empty until
     # train is complete
     statistics: dict[str, Row] = Field(default_factory=dict)
     # the distinct machines and library versions that wrote files, oldest first
     environments: Annotated[tuple[dict[str, str], ...], Field(strict=False)] = ()
-    files: Annotated[
-        tuple[FileEntry, ...], Field(strict=False)
-    ] = ()  # scenario files by ascending id
+    # scenario files by ascending id
+    files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()
 
     def is_of(self, split: str, size: str, major: int) -> bool:
         """Return whether this is of a data set: files are read and written where these

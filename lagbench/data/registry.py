@@ -126,13 +126,11 @@ class Task(_Strict):
 
     input_frames: int = Field(gt=1)  # frames given at the start of a test scenario
     horizon: int = Field(gt=0)  # frames to predict after them
-    frames_of_interest: tuple[int, ...] = Field(
-        strict=False
-    )  # absolute frames at which the scorer reports
+    # absolute frames at which the scorer reports
+    frames_of_interest: tuple[int, ...] = Field(strict=False)
     score_grid: ScoreGrid  # grid of the scorer's fields
-    radius: float = Field(
-        gt=0, allow_inf_nan=False
-    )  # connectivity radius for graph models [length]
+    # connectivity radius for graph models [length]
+    radius: float = Field(gt=0, allow_inf_nan=False)
 
 
 class Measured(_Strict):
@@ -446,9 +444,9 @@ def _read(path: Path) -> _File:
     try:
         return _File.model_validate(read_yaml(path))
     except ValidationError as error:
-        lines = [
-            ""
-        ]  # for each mistake: key, what is expected there, and what was got if that is short
+        # for each mistake: key, what is expected there, and what was got if that is
+        # short
+        lines = [""]
         for item in error.errors()[:10]:
             given = item["input"]
             message = item["msg"].removeprefix("Value error, ")

@@ -129,18 +129,16 @@ class ScenarioHeader:
 
     key: ScenarioKey  # what names the scenario
     seed: str  # how the random numbers were seeded
-    parameters: Mapping[
-        str, object
-    ]  # physical parameters by name, those that enter the content hash
+    # physical parameters by name, those that enter the content hash
+    parameters: Mapping[str, object]
     content_sha256: str  # content hash as stored; see rehash for the true one
     frames: int  # recorded frames
     particles: int  # particles in every frame
     device: str  # device that simulated
     generator: str  # dotted path of the split's module
     lagbench_version: str  # version that wrote the file
-    facts: Mapping[
-        str, float
-    ]  # what the simulation went through, by name; no hash covers it
+    # what the simulation went through, by name; no hash covers it
+    facts: Mapping[str, float]
 
 
 class ScenarioFile:
@@ -326,9 +324,8 @@ def _check_lengths(path: Path, variables: Mapping[str, h5py.Dataset]) -> None:
                 name,
             )
         text = h5py.check_string_dtype(variable.dtype)
-        free = (
-            text is not None and text.length is None
-        )  # how long its values are, they say themselves
+        # how long its values are, they say themselves
+        free = text is not None and text.length is None
         held = variable.size * (1 if free else variable.dtype.itemsize)
         if held > largest:
             what = "a variable is larger than its file can hold"

@@ -176,9 +176,8 @@ def _level(share: NDArray[np.float64], levels: int) -> NDArray[np.intp]:
 
 
 SUFFIXES = (".mp4", ".gif")  # endings of the files that can be written
-Write = Callable[
-    [NDArray[np.uint8]], object
-]  # appends one frame: RGB bytes, shape [row, column, 3]
+# appends one frame: RGB bytes, shape [row, column, 3]
+Write = Callable[[NDArray[np.uint8]], object]
 
 _CODING = [
     "-c:v",
@@ -259,9 +258,8 @@ def _gif(path: Path, rate: float) -> Iterator[Write]:
     """Write a GIF that repeats for ever, all frames in lagbench's 256 colours."""
     images = require("PIL.Image", extra="plots")
     coder = require("PIL.GifImagePlugin", extra="plots")
-    delay = max(
-        20, 10 * round(100.0 / rate)
-    )  # hundredths of a second; viewers slow down below two
+    # hundredths of a second; viewers slow down below two
+    delay = max(20, 10 * round(100.0 / rate))
     with path.open("wb") as file:
 
         def write(frame: NDArray[np.uint8]) -> None:

@@ -49,16 +49,13 @@ UNITS = {  # what colour bars say: physical time throughout, as velocity in the 
 
 # diameter of a drawn particle in particle spacings: neighbours overlap a little
 DOT = 1.25
-MOST_DOTS = (
-    1 << 16
-)  # particles drawn at the most; more would take memory and no eye would tell
+# particles drawn at the most; more would take memory and no eye would tell
+MOST_DOTS = 1 << 16
 
-FEW_NODES = (
-    4  # with neighbours to differentiate over, below which no streamline is drawn
-)
-_ALONG = np.array(
-    [(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)]
-)  # along walls left, right, bottom, top
+# with neighbours to differentiate over, below which no streamline is drawn
+FEW_NODES = 4
+# along walls left, right, bottom, top
+_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])
 
 
 def limit_of(panel: Panel, scene: Scene) -> float:

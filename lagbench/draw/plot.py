@@ -55,11 +55,8 @@ TIMES = (
     0.5,
     1.0,
 )  # moments of a row over time, as shares of the last frame
-MOMENTS = (
-    1 / 9,
-    1 / 2,
-    1.0,
-)  # the same of the last frame of interest, for flows that walls drive
+# the same of the last frame of interest, for flows that walls drive
+MOMENTS = 1 / 9, 1 / 2, 1.0
 DRIVEN = 30
 # scenarios on a sheet of flows that walls drive, that only decay (Figs. 5.7, 5.20)
 DECAYING = 36
@@ -70,9 +67,8 @@ RIM = 0.22
 HEAD = 0.7
 FOOT = 0.58  # of a sheet [inch]
 KIND_PARAMETERS = ("family", "pair")
-WALL_SHARE = (
-    0.6  # the fluid itself seldom moves faster than this share of the wall's speed
-)
+# the fluid itself seldom moves faster than this share of the wall's speed
+WALL_SHARE = 0.6
 
 
 _Cell = tuple[Scene, str, float]  # a small panel: scene, label, top of the colour scale

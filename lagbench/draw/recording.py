@@ -37,9 +37,8 @@ class Scene:
     recording: Recording  # scenario that the frame belongs to
     frame: int  # absolute frame number
     position: NDArray[np.float64]  # [length], shape [particle, 2]
-    velocity: NDArray[
-        np.float64
-    ]  # velocity of the solver [length/s], shape [particle, 2]
+    # velocity of the solver [length/s], shape [particle, 2]
+    velocity: NDArray[np.float64]
     # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
     displacement: NDArray[np.float64]
 
@@ -88,12 +87,10 @@ class Recording:
         self.frames = frames  # recorded frames
         self._read = read
         self._present = np.isfinite(read("position", 0)).all(axis=-1)
-        self.material = read("material", slice(None))[self._present].astype(
-            np.int8
-        )  # [particle]
-        self.wall_velocity = np.zeros(
-            (frames, 4, 2)
-        )  # [length/s], [frame, wall, 2]; zeros without walls
+        # [particle]
+        self.material = read("material", slice(None))[self._present].astype(np.int8)
+        # [length/s], [frame, wall, 2]; zeros without walls
+        self.wall_velocity = np.zeros((frames, 4, 2))
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
         self._mass = float(read("particle_mass", slice(None)))
@@ -224,9 +221,8 @@ def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
             variable.isel(frame=frames) if "frame" in variable.dims else variable
         )
 
-    file = data.encoding.get(
-        "source"
-    )  # as xarray and open_split note where the data are from
+    # as xarray and open_split note where the data are from
+    file = data.encoding.get("source")
     if isinstance(file, str | Path):
         splits = _beside(file, registry)
     else:

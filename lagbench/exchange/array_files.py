@@ -26,27 +26,22 @@ from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 from .mistakes import check_meaning
 from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
 
-READABLE = (
-    ".npy",
-    ".npz",
-    ".nc",
-)  # files that are adopted: an array, named arrays, netCDF
+# files that are adopted: an array, named arrays, netCDF
+READABLE = ".npy", ".npz", ".nc"
 ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = (
     "position",
     "velocity",
     "material",
     "wall_velocity",
 )
-CLASSIC = (
-    b"CDF"  # first bytes of the older netCDF formats, which cannot point to other files
-)
+# first bytes of the older netCDF formats, which cannot point to other files
+CLASSIC = b"CDF"
 
 # What may be in a netCDF-4 file; chunks by default span many frames, so that more of
 # them stay unpacked.
 NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
-Row = tuple[
-    Path, int | None
-]  # a file and, where it holds several, the number of the trajectory in it
+# a file and, where it holds several, the number of the trajectory in it
+Row = tuple[Path, int | None]
 
 
 def natural(paths: Sequence[Path]) -> list[Path]:

@@ -36,9 +36,8 @@ from lagbench.store.publication import publication
 from lagbench.work.progress import Meter, Progress
 
 REMEDY = "try again; if it stays so, name another store: --from"
-Reason = (
-    DataError | WorkFailedError | UsageError
-)  # why something could not be downloaded
+# why something could not be downloaded
+Reason = DataError | WorkFailedError | UsageError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,9 +47,8 @@ class DownloadResult:
     split: str  # name of the split
     size: str  # name of the size
     folder: Path  # folder of the data set
-    mirror: (
-        str | None
-    )  # store that files came from; None where none was needed or reached
+    # store that files came from; None where none was needed or reached
+    mirror: str | None
     downloaded: tuple[int, ...]  # ids that were downloaded
     kept: tuple[int, ...]  # ids whose files were there and right
     generated: tuple[int, ...]  # ids that were simulated instead

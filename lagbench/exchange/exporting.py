@@ -57,9 +57,8 @@ class ExportResult:
     files: tuple[Path, ...]  # the files
     trajectories: dict[str, int]  # number of trajectories by subset
     frames: dict[str, int]  # frames by subset, over all trajectories
-    left_out: (
-        int  # frames that are not in the files, because that format needs equal lengths
-    )
+    # frames that are not in the files, because that format needs equal lengths
+    left_out: int
     bytes: int  # length of the files together [bytes]
 
 
@@ -215,9 +214,8 @@ class WallParticles:
         self.thickness = LAYERS * spacing
         self._bounds = np.array(bounds)
         low, high = self._bounds.T
-        rows: list[
-            tuple[int, float, float]
-        ] = []  # wall, place along it, place across it
+        # wall, place along it, place across it
+        rows: list[tuple[int, float, float]] = []
         for wall, axis in enumerate(ALONG):
             count = max(1, round((high[axis] - low[axis]) / spacing))
             pitch = (high[axis] - low[axis]) / count

@@ -32,12 +32,10 @@ from .metadata import Format, materials_of
 from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
 JOINT = "gns_data"  # key under which some files hold all trajectories together
-_NUMBERS = re.compile(
-    "[iu][1248]|f[248]|b1"
-)  # codes of the types of numbers that may be in a file
-_MOST_STEPS = (
-    1 << 18
-)  # steps of a pickle, each makes one object; NumPy takes about fifty for a trajectory
+# codes of the types of numbers that may be in a file
+_NUMBERS = re.compile("[iu][1248]|f[248]|b1")
+# steps of a pickle, each makes one object; NumPy takes about fifty for a trajectory
+_MOST_STEPS = 1 << 18
 _PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material property
 # how deep arrays may lie in each other: trajectories in a joint array, parts, and a
 # spare
@@ -295,7 +293,6 @@ class _Arrays(pickle.Unpickler):
         ):
             return _Maker(_Array)
         if module == "numpy" and name in ("ndarray", "dtype"):
-            return _Maker(
-                _Type if name == "dtype" else None
-            )  # ndarray is named, and never called
+            # ndarray is named, and never called
+            return _Maker(_Type if name == "dtype" else None)
         raise pickle.UnpicklingError(f"the pickle wants to call {module}.{name}")

@@ -177,16 +177,13 @@ class _Building:
     root: Path  # root folder in which the split's folder is built
     # distance of neighbouring particles at first [length]; 0 before the first scenario
     spacing: float = 0.0
-    entries: list[FileEntry] = field(
-        default_factory=list
-    )  # of the scenarios written so far, by id
-    low: NDArray[np.float64] = field(
-        default_factory=lambda: np.full(2, np.inf)
-    )  # of any particle [length]
+    # of the scenarios written so far, by id
+    entries: list[FileEntry] = field(default_factory=list)
+    # of any particle [length]
+    low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
-    walled: bool | None = (
-        None  # whether trajectories have velocities of walls; None before the first
-    )
+    # whether trajectories have velocities of walls; None before the first
+    walled: bool | None = None
 
     def add(self, subset: str, trajectory: Trajectory) -> None:
         """Write the next scenario."""

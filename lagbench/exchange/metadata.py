@@ -41,9 +41,8 @@ OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Shapes = Mapping[
-    str, Sequence[tuple[int, int]]
-]  # frames and particles of every trajectory, by subset
+# frames and particles of every trajectory, by subset
+Shapes = Mapping[str, Sequence[tuple[int, int]]]
 
 
 class Format(enum.StrEnum):
@@ -53,10 +52,11 @@ class Format(enum.StrEnum):
     LAGRANGEBENCH_H5 = "lagrangebench-h5"
 
 
+# of the files of subsets
 ENDINGS = {
     Format.GNS_NPZ: ".npz",
     Format.LAGRANGEBENCH_H5: ".h5",
-}  # of the files of subsets
+}
 
 NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
@@ -190,14 +190,12 @@ class Hints(BaseModel):
     density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
     input_frames: Annotated[int, Field(gt=1)] | None = None  # frames given
     horizon: Annotated[int, Field(gt=0)] | None = None  # frames to predict
-    frames_of_interest: tuple[int, ...] | None = (
-        None  # absolute frames at which the scorer reports
-    )
+    # absolute frames at which the scorer reports
+    frames_of_interest: tuple[int, ...] | None = None
     cells: Annotated[int, Field(gt=3)] | None = None  # cells across of the score grid
     placement: Literal["cell_centres", "nodes"] | None = None  # where its nodes lie
-    wall_particle_type: tuple[
-        int, ...
-    ] = ()  # numbers of particles that are walls, no material
+    # numbers of particles that are walls, no material
+    wall_particle_type: tuple[int, ...] = ()
 
 
 class Source(BaseModel):
@@ -207,15 +205,12 @@ class Source(BaseModel):
 
     bounds: tuple[Pair, Pair]  # box of the source [its length]
     radius: Length = Field(alias="default_connectivity_radius")  # [its length]
-    frame_interval: Length | None = Field(
-        alias="dt"
-    )  # time between frames [s]; None where none is stated
-    spacing: Length | None = Field(
-        alias="dx"
-    )  # distance of neighbouring particles at first [its length]
-    periodic: tuple[bool, bool] = Field(
-        alias="periodic_boundary_conditions"
-    )  # along x and y
+    # time between frames [s]; None where none is stated
+    frame_interval: Length | None = Field(alias="dt")
+    # distance of neighbouring particles at first [its length]
+    spacing: Length | None = Field(alias="dx")
+    # along x and y
+    periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")
     hints: Hints = Field(alias="lagbench")  # what our own exports add
 
 

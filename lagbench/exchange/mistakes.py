@@ -20,10 +20,8 @@ from lagbench.submission.start import Mistake
 # neighbours along an axis looked at together: two second differences, a step and its
 # neighbours
 STRETCH = 4
-STRETCHES = (
-    64,
-    200,
-)  # stretches of frames and of particles that are looked at, evenly spaced over each axis
+# stretches of frames and of particles that are looked at, evenly spaced over each axis
+STRETCHES = 64, 200
 # change of a step, as a share of the step, from which on frames do not resolve the
 # motion
 ROUGH = 0.5
@@ -39,9 +37,8 @@ FACTOR = 1.5
 SHIFTED = 0.4
 FEWEST = 8  # steps below which chance may look like anything
 
-Block = NDArray[
-    np.float64
-]  # of shape [stretch of frames, frame, stretch of particles, particle, 2]
+# of shape [stretch of frames, frame, stretch of particles, particle, 2]
+Block = NDArray[np.float64]
 
 
 def misplaced_axes(shape: tuple[int, ...]) -> Mistake | None:

@@ -28,15 +28,13 @@ from lagbench.submission.findings import quoted
 from .mistakes import misplaced_axes
 
 Array = NDArray[np.floating]
-Frame = tuple[
-    Array, Array | None
-]  # positions [length of the source], velocities [its length/s] if any
+# positions [length of the source], velocities [its length/s] if any
+Frame = tuple[Array, Array | None]
 # Frames of a trajectory, what returns the positions of one of them, and the kind of
 # each particle.
 Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
-Box = tuple[
-    tuple[float, float], tuple[float, float]
-]  # low and high walls along x and y
+# low and high walls along x and y
+Box = tuple[tuple[float, float], tuple[float, float]]
 
 HARMLESS = 1 << 28  # bytes that may come of anything
 MOST_INFLATION = 200  # times its own length that a larger array may unpack to
@@ -54,16 +52,13 @@ class Trajectory:
 
     name: str  # file and key, for messages
     frames: int  # recorded frames
-    material: NDArray[
-        np.int8
-    ]  # value of ``lagbench.data.MATERIALS`` of each particle, [particle]
+    # value of ``lagbench.data.MATERIALS`` of each particle, [particle]
+    material: NDArray[np.int8]
     read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
-    wall_velocity: Array | None = (
-        None  # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
-    )
-    parameters: Mapping[str, object] = field(
-        default_factory=dict
-    )  # facts that the file states and hashes
+    # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
+    wall_velocity: Array | None = None
+    # facts that the file states and hashes
+    parameters: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +107,8 @@ def _power(length: float) -> float:
     return 1.0
 
 
-Count = Annotated[
-    int, Field(gt=-(1 << 31), lt=1 << 31)
-]  # one that a message can spell out
+# one that a message can spell out
+Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
 
 
 @with_config(ConfigDict(extra="forbid"))
@@ -192,24 +186,19 @@ class Description:
     source: str  # where they come from
     radius: float  # connectivity radius
     frame_interval: float  # time between frames [s]
-    bounds: Box | None = (
-        None  # box that holds the particles; None where the positions say
-    )
+    # box that holds the particles; None where the positions say
+    bounds: Box | None = None
     rescale: bool = False  # whether to fit the bounds into the unit box
     density: float = 1.0  # rest density [mass/length^2]
-    spacing: float | None = (
-        None  # distance of neighbouring particles at first; None to estimate it
-    )
+    # distance of neighbouring particles at first; None to estimate it
+    spacing: float | None = None
     input_frames: int = 6  # frames given to a model
-    horizon: int | None = (
-        None  # frames to predict; None for all that every test scenario has
-    )
-    frames_of_interest: Sequence[int] | None = (
-        None  # absolute frames that are reported; None for the last
-    )
-    cells: int | None = (
-        None  # cells across of the score grid; None for one that suits the spacing
-    )
+    # frames to predict; None for all that every test scenario has
+    horizon: int | None = None
+    # absolute frames that are reported; None for the last
+    frames_of_interest: Sequence[int] | None = None
+    # cells across of the score grid; None for one that suits the spacing
+    cells: int | None = None
     # whether material fills the box, so that vorticity ranks; else positions rank
     full_box: bool = False
     measure: Measure = field(init=False, default=Measure())
@@ -287,9 +276,8 @@ def estimate_spacing(position: Array, radius: float) -> float:
     points = position.astype(np.float64)
     reach = WIDE * radius
     counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
-    inside = float(
-        np.quantile(counts, 0.75)
-    )  # deep inside the material: this leaves surfaces out
+    # deep inside the material: this leaves surfaces out
+    inside = float(np.quantile(counts, 0.75))
     if inside < 2.0 and len(points) > 1:  # a particle counts itself
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",

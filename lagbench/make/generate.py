@@ -68,9 +68,8 @@ from .plan import (
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-BATCH_PARTICLES = (
-    1 << 19
-)  # particles that a parallel device advances together at the most
+# particles that a parallel device advances together at the most
+BATCH_PARTICLES = 1 << 19
 
 
 class Generation:
@@ -95,15 +94,12 @@ class Generation:
         self.workers = workers
         self.scheduler = scheduler  # processes here, or a Dask scheduler's workers
         self.sources = sources  # other root folders to take finished scenarios from
-        self.store: Publication | None = (
-            None  # which the root folder is a working copy of; None if plain
-        )
-        self.manifest = merged(
-            self.size, None
-        )  # what the folder holds, as far as is known
-        self._hashed: list[
-            FileEntry
-        ] = []  # files that were there and right, just hashed
+        # which the root folder is a working copy of; None if plain
+        self.store: Publication | None = None
+        # what the folder holds, as far as is known
+        self.manifest = merged(self.size, None)
+        # files that were there and right, just hashed
+        self._hashed: list[FileEntry] = []
         self.kept: list[int] = []  # ids whose files were there and right
         self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
         self.verdict = ""  # how the hashes compare with datasets.yaml, in words
@@ -365,9 +361,8 @@ class GenerationResult:
     device: str  # where the solver ran
     workers: int  # worker processes
     simulated: tuple[int, ...]  # ids that were (dry run: would be) simulated
-    kept: tuple[
-        int, ...
-    ]  # ids whose files were there and right (dry run: or would be gathered)
+    # ids whose files were there and right (dry run: or would be gathered)
+    kept: tuple[int, ...]
     missing: tuple[int, ...]  # ids of the size that are still not there
     bytes_needed: int  # disk space of 'simulated' before compression [bytes]
     bytes_free: int  # free disk space before the start [bytes]

@@ -78,9 +78,8 @@ def overview(size: Size, root: Path) -> Overview:
     folder = size.folder(root)
     ids = size.scenarios
     url = url_of(root)
-    expected = (
-        estimate(size, ids, drawn=2) if size.simulated else None
-    )  # to draw all would take seconds
+    # to draw all would take seconds
+    expected = estimate(size, ids, drawn=2) if size.simulated else None
     if url is None:
         there = {i for i in ids if size.path(root, i).is_file()}
     else:
@@ -119,12 +118,10 @@ class Finding:
     scenario: int  # its id
     state: State  # whether the file is there and right
     content_sha256: str | None = None  # content hash of a good file
-    problem: str | None = (
-        None  # what is wrong, naming file and, where it can be told, variable
-    )
-    entry: FileEntry | None = (
-        None  # manifest entry of a good file, where one was asked for
-    )
+    # what is wrong, naming file and, where it can be told, variable
+    problem: str | None = None
+    # manifest entry of a good file, where one was asked for
+    entry: FileEntry | None = None
     tolerated: bool = False  # whether a good file has other bits than datasets.yaml
 
 

@@ -34,13 +34,11 @@ if TYPE_CHECKING:
 
 MOST_BYTES = 1 << 16  # a longer file of rates is not ours [bytes]
 MOST_ROWS = 32  # numbers of particles per kind of solver that are kept, the latest ones
-SECONDS = Limit(
-    low=0, high=1e9, open_low=True
-)  # processor time of the generations behind a rate [s]
+# processor time of the generations behind a rate [s]
+SECONDS = Limit(low=0, high=1e9, open_low=True)
 COUNT = Limit(low=1, high=1 << 60, whole=True)  # particle substeps, and frames
-RATIO = Limit(
-    low=1e-3, high=1e4
-)  # time over that of the reference machine, one core of an EPYC server
+# time over that of the reference machine, one core of an EPYC server
+RATIO = Limit(low=1e-3, high=1e4)
 
 # Of the reference machine [s]: one particle's substep
 # (benchmarks/test_solver_throughput.py); starting the kernels, reading out, checking
@@ -97,12 +95,10 @@ class Estimate:
     scenarios: tuple[int, ...]  # their ids, ascending
     substeps: tuple[int, ...]  # substeps of each, in the same order
     frames: int  # frames that they record together
-    bytes: (
-        int  # disk space, before compression [bytes]; files come out a little smaller
-    )
-    core_seconds: (
-        float  # time on one core, twins of test scenarios included [s], for orientation
-    )
+    # disk space, before compression [bytes]; files come out a little smaller
+    bytes: int
+    # time on one core, twins of test scenarios included [s], for orientation
+    core_seconds: float
     measured: bool  # whether at a rate that this machine has measured
 
     def seconds(self, workers: int) -> float:

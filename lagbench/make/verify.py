@@ -68,15 +68,12 @@ class VerificationResult:
     # "bitwise", or "tolerance" where a device wrote files that does not keep the
     # promise of equal bits; "unknown" without a manifest
     identity: str
-    dataset_sha256: (
-        str | None
-    )  # data set hash of the files, where all of them are there and right
-    regenerated: Mapping[
-        int, str
-    ]  # id to "identical", "different" or "nothing to compare with"
-    problems: tuple[
-        str, ...
-    ]  # what is wrong, each naming file and, where it can be told, variable
+    # data set hash of the files, where all of them are there and right
+    dataset_sha256: str | None
+    # id to "identical", "different" or "nothing to compare with"
+    regenerated: Mapping[int, str]
+    # what is wrong, each naming file and, where it can be told, variable
+    problems: tuple[str, ...]
     warnings: tuple[str, ...]  # what a reader should know although it is no fault
     must_be_complete: bool  # whether a missing scenario is a fault
     verdict: str  # how the data set hash compares with datasets.yaml, in words

@@ -58,9 +58,8 @@ class Tally:
     names: tuple[str, ...]  # of the statistics
     frames: tuple[int, ...]  # absolute frame numbers
     total: Floats  # sum of the defined values, shape [statistic, frame]
-    weight: NDArray[
-        np.int64
-    ]  # how many defined values that is, shape [statistic, frame]
+    # how many defined values that is, shape [statistic, frame]
+    weight: NDArray[np.int64]
     undefined: NDArray[np.int64]  # how many values were NaN, shape [statistic, frame]
 
     @classmethod
@@ -196,9 +195,8 @@ class Resampling:
     """A mean over seeds and scenarios, and how far others of both would lead it."""
 
     mean: float
-    parts: Mapping[
-        int, Floats
-    ]  # deviations of the things that are drawn, by stream: scenarios, seeds
+    # deviations of the things that are drawn, by stream: scenarios, seeds
+    parts: Mapping[int, Floats]
 
     @cached_property
     def deviations(self) -> Floats:
@@ -281,9 +279,8 @@ def student_quantile(freedom: float, share: float) -> float:
     on the finite sums 26.7.3 and 26.7.4 of Abramowitz and Stegun: SciPy takes a quarter
     of a second to import. Shares are from 0.5 to 1.
     """
-    whole = (
-        round(freedom) if 3 <= freedom <= 1000 else 0
-    )  # longer sums take longer; nan is not rounded
+    # longer sums take longer; nan is not rounded
+    whole = round(freedom) if 3 <= freedom <= 1000 else 0
     if not whole or abs(freedom - whole) > 1e-9:
         from scipy.special import stdtrit
 
@@ -433,9 +430,8 @@ def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
         rows = [metric.series(*map(tallies[i].series, metric.of)) for i in scenarios]
         series = np.stack([np.asarray(row, np.float64) for row in rows])
         if metric.over_frames is mean and not np.isnan(series).any():
-            values = np.asarray(
-                series.mean(axis=1)
-            )  # all rows at once, to the same bits
+            # all rows at once, to the same bits
+            values = np.asarray(series.mean(axis=1))
         else:
             values = np.array([metric.over_frames(row) for row in series])
     except (Exception, SystemExit) as error:

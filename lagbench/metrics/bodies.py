@@ -74,9 +74,8 @@ class OverBodies:
     material.
     """
 
-    statistic: Callable[
-        [FramePair, str], float
-    ]  # value of one body, given its material
+    # value of one body, given its material
+    statistic: Callable[[FramePair, str], float]
     materials: tuple[str, ...]  # whose bodies are taken
 
     def _present(self, pair: FramePair) -> list[str]:

@@ -163,10 +163,8 @@ def spectrum_error(pair: FramePair) -> float:
     """
     counted = pair.truth.fields.counted
     x, y = (np.flatnonzero(counted.any(axis=axis)) for axis in (1, 0))
-    box = (
-        slice(x[0], x[-1] + 1),
-        slice(y[0], y[-1] + 1),
-    )  # the rectangle that holds the counted nodes
+    # the rectangle that holds the counted nodes
+    box = slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1)
     true, predicted = (
         energy_spectrum(side.fields.velocity[box])
         for side in (pair.truth, pair.prediction)

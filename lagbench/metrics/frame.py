@@ -144,20 +144,16 @@ class Setting:
     grid: Grid
     input_frames: int  # given to the model
     horizon: int  # frames that it predicts
-    frames_of_interest: tuple[
-        int, ...
-    ]  # absolute frames at which slow metrics are measured
-    attribute_std: tuple[
-        float, float, float, float
-    ]  # of x, y [length] and u, v [length/frame] over train
+    # absolute frames at which slow metrics are measured
+    frames_of_interest: tuple[int, ...]
+    # of x, y [length] and u, v [length/frame] over train
+    attribute_std: tuple[float, float, float, float]
     radius: float  # first-frame neighbours lie within this distance [length]
     materials: tuple[str, ...] = (
         "liquid",
     )  # of the split; two or more have metrics of their own
-    bounds: tuple[tuple[float, float], tuple[float, float]] = (
-        (0.0, 1.0),
-        (0.0, 1.0),
-    )  # walls [length]
+    # walls [length]
+    bounds: tuple[tuple[float, float], tuple[float, float]] = (0.0, 1.0), (0.0, 1.0)
 
     @property
     def full_box(self) -> bool:
@@ -234,17 +230,14 @@ class Scenario:
     """What holds in all frames of one scenario."""
 
     setting: Setting  # the split and size
-    given: NDArray[
-        np.floating
-    ]  # true positions from frame 0 to the last given one, [frame, particle, 2]
-    material: NDArray[
-        np.integer
-    ]  # index into lagbench.data.MATERIALS, shape [particle]
+    # true positions from frame 0 to the last given one, [frame, particle, 2]
+    given: NDArray[np.floating]
+    # index into lagbench.data.MATERIALS, shape [particle]
+    material: NDArray[np.integer]
     particle_mass: float  # of every particle [mass]
     area: float  # that the particles cover at first [length^2]
-    active_frames: int | None = (
-        None  # predicted frames until the truth rests; None: the whole horizon
-    )
+    # predicted frames until the truth rests; None: the whole horizon
+    active_frames: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""

@@ -150,39 +150,31 @@ class Metric:
     direction: Direction  # what better means
     source: str  # equation or section that defines it
     summary: str  # what it says, one line
-    perfect: float | None = (
-        None  # value of a perfect prediction; None where it depends on truth or task
-    )
-    statistic: Callable[[FramePair], float] | None = (
-        None  # of one frame pair; None if it follows from others
-    )
-    applies: Callable[[FramePair], bool] = (
-        always  # whether the statistic is measured for a frame pair
-    )
-    defined: Callable[[FramePair], bool] = (
-        always  # whether it is defined there; otherwise it is NaN
-    )
+    # value of a perfect prediction; None where it depends on truth or task
+    perfect: float | None = None
+    # of one frame pair; None if it follows from others
+    statistic: Callable[[FramePair], float] | None = None
+    # whether the statistic is measured for a frame pair
+    applies: Callable[[FramePair], bool] = always
+    # whether it is defined there; otherwise it is NaN
+    defined: Callable[[FramePair], bool] = always
     of: tuple[str, ...] = ()  # statistics that ``series`` takes, its own by default
-    series: Callable[..., Floats] = (
-        identity  # value per frame from those, which are read-only, shape [frame]
-    )
-    over_frames: Callable[[Floats], float] = (
-        mean  # one number of a scenario from the value per frame
-    )
+    # value per frame from those, which are read-only, shape [frame]
+    series: Callable[..., Floats] = identity
+    # one number of a scenario from the value per frame
+    over_frames: Callable[[Floats], float] = mean
     per_frame: bool = True  # whether the value at a single frame means anything
     horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
-    extra: str | None = (
-        None  # extra of lagbench that it needs; measured only when asked for
-    )
+    # extra of lagbench that it needs; measured only when asked for
+    extra: str | None = None
 
     def __post_init__(self) -> None:
         """Fill in ``of``; refuse a metric that nothing could be computed for, judged
         by, or stored under.
         """
         try:
-            object.__setattr__(
-                self, "direction", Direction(self.direction)
-            )  # a package may give a text
+            # a package may give a text
+            object.__setattr__(self, "direction", Direction(self.direction))
         except ValueError:
             what = f"metric {self.name!r} has no such direction"
             got = repr(self.direction)

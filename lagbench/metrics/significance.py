@@ -139,10 +139,8 @@ class Comparison:
     difference: float
     interval: tuple[float, float]  # 95 % bootstrap interval of that mean
     p: float  # two-sided, NaN with fewer than six scenarios: none is claimed
-    seeds: tuple[int, int] = (
-        1,
-        1,
-    )  # of either side; one on both: these weights, not the methods
+    # of either side; one on both: these weights, not the methods
+    seeds: tuple[int, int] = 1, 1
 
     @property
     def significant(self) -> bool:

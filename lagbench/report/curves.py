@@ -37,9 +37,8 @@ from .subject import Gallery, Moment, Subject, kind_of
 
 Floats = NDArray[np.float64]
 
-Series = Sequence[
-    tuple[str, str, Floats]
-]  # label, classes and values over frames of each line
+# label, classes and values over frames of each line
+Series = Sequence[tuple[str, str, Floats]]
 # the axis of energies reaches so many times the truth's greatest; what is beyond is cut
 # off
 TOLERATED = 3.0
@@ -443,9 +442,8 @@ def shares_of(values: Floats, truth: Floats) -> tuple[Floats, Floats]:
     """Return edges of bins over the truth's range, and per cent of the values in
     each.
     """
-    bins = int(
-        np.clip(2.0 * np.sqrt(max(truth.size, 1)), FEWEST_BINS, BINS)
-    )  # few where there are few nodes
+    # few where there are few nodes
+    bins = int(np.clip(2.0 * np.sqrt(max(truth.size, 1)), FEWEST_BINS, BINS))
     low, high = (float(truth.min()), float(truth.max())) if truth.size else (-1.0, 1.0)
     if high > low:
         edges = np.linspace(low, high, bins + 1)

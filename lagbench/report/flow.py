@@ -213,9 +213,8 @@ def _arrows(subject: Subject, fields: Fields, velocity: Floats, limit: float) ->
         SIDE * every * fields.grid.spacing / (right_wall - left_wall) * LONGEST / limit
     )
     u, v = velocity[chosen[:, 0], chosen[:, 1]].T
-    capped = np.minimum(
-        1.0, 1.5 * limit / np.maximum(np.hypot(u, v), 1e-300)
-    )  # runaways stay in sight
+    # runaways stay in sight
+    capped = np.minimum(1.0, 1.5 * limit / np.maximum(np.hypot(u, v), 1e-300))
     lines: list[list[str]] = [[] for _ in range(LEVELS)]
     levels = _levels(np.hypot(u, v), limit)
     for x0, y0, a, b, level in zip(

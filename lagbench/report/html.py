@@ -19,12 +19,10 @@ from unicodedata import east_asian_width
 
 from lagbench.metrics.metric import Metric
 
-VOID = frozenset(
-    {"br", "col", "hr", "img", "link", "meta"}
-)  # elements of HTML without an end tag
-SHAPES = frozenset(
-    {"circle", "line", "path", "rect", "stop", "use"}
-)  # elements of SVG that close themselves
+# elements of HTML without an end tag
+VOID = frozenset({"br", "col", "hr", "img", "link", "meta"})
+# elements of SVG that close themselves
+SHAPES = frozenset({"circle", "line", "path", "rect", "stop", "use"})
 
 _ESCAPES = {
     ord("&"): "&amp;",

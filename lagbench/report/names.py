@@ -108,9 +108,8 @@ class Names:
             if length >= least:
                 continue
             points = _along(dot, end)
-            lead = points[
-                len(points) // 3 :
-            ]  # near the dots of a crowd their lines are as close
+            # near the dots of a crowd their lines are as close
+            lead = points[len(points) // 3 :]
             if any(_meet(point, one) for point in lead for one in self._taken):
                 continue
             length += CROSSING * sum(

@@ -5,7 +5,7 @@ give the same bytes. Numbers have nine significant digits; what is undefined is 
 
 Skill: how much better than the best floor, ``1 - score / score of the best floor``,
 over the ranking metric. The best floor has the least mean over its own scenarios, among
-those that count (see :mod:`lagbench.floors`); the ratio is over the scenarios that both
+those that count (see :mod:`lagbench.references`); the ratio is over the scenarios that both
 have. 1 is perfect, 0 says that nothing was learned, below 0 it is worse than not
 learning.
 
@@ -163,9 +163,8 @@ class Preview:
     film_frames: tuple[int, ...]
     particles: tuple[int, ...]  # numbers of the particles in the film
     material: NDArray[np.int8]  # their materials, shape [film particle]
-    film: NDArray[
-        np.float32
-    ]  # their positions [length], shape [side, film frame, film particle, 2]
+    # their positions [length], shape [side, film frame, film particle, 2]
+    film: NDArray[np.float32]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -179,9 +178,8 @@ class ScoreCard:
     # statistics by row and scenario: of the submission, and of floors that were
     # measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
-    scores: Mapping[
-        str, Mapping[str, Score]
-    ]  # scores by row (submission, then floors) and metric
+    # scores by row (submission, then floors) and metric
+    scores: Mapping[str, Mapping[str, Score]]
     # how much better than the best floor, as scored: it does not follow a replaced
     # `scores`; None where no floor that counts has a score
     skill: Skill | None
@@ -359,9 +357,8 @@ MAX_BYTES = 64 << 20
 class PublishedScores:
     """What a scores.json says, as far as another submission can be compared with it."""
 
-    identity: Mapping[
-        str, str
-    ]  # split, size, version and hash of the data set, and the method
+    # split, size, version and hash of the data set, and the method
+    identity: Mapping[str, str]
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     # scores by row and metric, over the horizon; values per frame are not in the file

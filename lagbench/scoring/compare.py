@@ -25,11 +25,11 @@ from lagbench.errors import (
     check_regular,
     nearest,
 )
-from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
+from lagbench.references.table import REFERENCES
 from lagbench.submission.format import MAX_NAME
 
 from .card import (
@@ -56,9 +56,8 @@ class Contestant:
     """One side of a comparison."""
 
     name: str  # what the user called it
-    identity: Mapping[
-        str, str
-    ]  # split, size, version and hash of the data set, and the method
+    # split, size, version and hash of the data set, and the method
+    identity: Mapping[str, str]
     predictions: tuple[str, ...]  # content hash of the predicted positions, by seed
     ranking: str  # name of the metric that ranks
     scores: Mapping[str, tuple[Score, ...]]  # of each seed, by metric
@@ -72,9 +71,8 @@ class MetricComparison:
     metric: Metric
     first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
-    undefined: tuple[
-        int, int
-    ]  # frames of either side without a value, which are left out of its mean
+    # frames of either side without a value, which are left out of its mean
+    undefined: tuple[int, int]
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
@@ -86,17 +84,15 @@ class ComparisonResult:
     size: str  # of both
     first: str  # method of the first, told apart from that of the second
     second: str  # method of the second, likewise, or the name of the floor
-    namesakes: (
-        bool  # whether both methods have one name, so that a number tells them apart
-    )
+    # whether both methods have one name, so that a number tells them apart
+    namesakes: bool
     same_predictions: bool  # whether both hold the same positions
     ranking: str  # name of the metric that ranks
     scenarios: int  # how many both have in that metric
     seeds: tuple[int, int]  # of either side
     floor: bool  # whether the second is a floor, which has no seeds
-    metrics: Mapping[
-        str, MetricComparison
-    ]  # the ranking one first; observables are left out
+    # the ranking one first; observables are left out
+    metrics: Mapping[str, MetricComparison]
 
     def __repr__(self) -> str:
         """Return who is compared and the verdict; the values are too many."""
@@ -206,7 +202,7 @@ def compare(
     """
     plain = Path(second).name == str(second) and not Path(second).suffix
     bare = plain and not os.path.lexists(second)  # the name of a floor
-    if str(first) in FLOORS and not os.path.lexists(first):
+    if str(first) in REFERENCES and not os.path.lexists(first):
         fix = f"give the floor last: lagbench compare {'PREDICTIONS' if bare else second} {first}"
         raise UsageError(
             "a floor stands in the scores of a submission", got=str(first), fix=fix
@@ -219,7 +215,7 @@ def compare(
     else:
         floor = None
     if floor is None and bare:
-        if str(second) in FLOORS:
+        if str(second) in REFERENCES:
             raise UsageError(
                 "these scores do not hold the floor",
                 where=str(first),

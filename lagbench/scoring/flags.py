@@ -148,9 +148,8 @@ class Evidence:
     autocorrelation: float  # mean over frames of the cosine between e(f) and e(f-1) [1]
     drop: float  # least ratio of the RMS errors of two consecutive frames [1]
     shift: int  # shift of the truth that fits the prediction best [frame]
-    shift_gain: (
-        float  # RMS error at that shift over the RMS error without it, same frames [1]
-    )
+    # RMS error at that shift over the RMS error without it, same frames [1]
+    shift_gain: float
     # RMS error of the last quarter of the frames over that of the first frame [1]
     growth: float
     # largest RMS error over the RMS of the truth's per-frame displacement [1]

@@ -24,15 +24,15 @@ from pathlib import Path
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
-from lagbench.floors.shipped import (
+from lagbench.references.shipped import (
     FOLDER,
     shipped_path,
     write_shipped,
     write_solver_seconds,
 )
-from lagbench.floors.table import FLOORS, floors_of
+from lagbench.references.table import REFERENCES, references_of
 
-from .floors import kept_in, measure, measured_sizes
+from .references import kept_in, measure, measured_sizes
 from .task import load_scored_task
 
 
@@ -53,7 +53,7 @@ def record(
         UsageError: the data set has none of these floors.
     """
     whole = floors is None
-    if not whole and not {floor.name for floor in floors_of(size)}.intersection(
+    if not whole and not {floor.name for floor in references_of(size)}.intersection(
         floors or ()
     ):
         raise UsageError(
@@ -102,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--floor", nargs="+", choices=sorted(FLOORS))
+    what.add_argument("--floor", nargs="+", choices=sorted(REFERENCES))
     what.add_argument("--solver", action="store_true")
     options = parser.parse_args(arguments)
     root = resolve_root(options.root)

@@ -15,13 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from lagbench.floors.floor import Floor, Given, Prediction, given_in
-from lagbench.floors.table import FLOORS
 from lagbench.metrics.aggregate import Tally, as_stored, measure
 from lagbench.metrics.distributions import BINS, histograms
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot, snapshots
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import select
+from lagbench.references.predictor import (
+    Given,
+    Prediction,
+    ReferencePredictor,
+    given_in,
+)
+from lagbench.references.table import REFERENCES
 from lagbench.store.copy import bring
 from lagbench.submission.format import Anatomy
 from lagbench.submission.predictions import open_predictions
@@ -113,9 +118,8 @@ class ScenarioScores:
     preview: Preview | None  # pictures, if they were asked for
 
 
-_selected = functools.cache(
-    select
-)  # the search through installed packages takes as long as some frames
+# the search through installed packages takes as long as some frames
+_selected = functools.cache(select)
 
 
 def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
@@ -134,7 +138,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
             rows = {SUBMISSION: snapshots(scenario, frames)}
             for name in job.floors:
                 given = given_in(truth.file, job.task.size, job.task.truth.root)
-                rows[name] = snapshots(scenario, predicted_by(FLOORS[name], given))
+                rows[name] = snapshots(scenario, predicted_by(REFERENCES[name], given))
             if job.pictured:
                 photographer = PreviewRecorder(number, scenario)
             else:
@@ -143,16 +147,15 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
                 scenario, truth.snapshots(), rows, metrics, photographer, report
             )
     except Exception as error:
-        error.add_note(
-            f"scenario {number}"
-        )  # beside what a package's metric or our own code raises there
+        # beside what a package's metric or our own code raises there
+        error.add_note(f"scenario {number}")
         raise
     return ScenarioScores(
         number, tallies, trace, photographer.preview if photographer else None
     )
 
 
-def predicted_by(floor: Floor, given: Given) -> Prediction:
+def predicted_by(floor: ReferencePredictor, given: Given) -> Prediction:
     """Return what a floor predicts; what it reads of train is brought first."""
     if floor.reads_train:
         bring(given.size, given.root, given.size.subsets["train"])

@@ -13,12 +13,12 @@ from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.local import resolve_root, rooted
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, nearest
-from lagbench.floors import extrapolation
-from lagbench.floors.shipped import shipped
-from lagbench.floors.table import COUNTING
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
+from lagbench.references import extrapolation
+from lagbench.references.shipped import shipped
+from lagbench.references.table import COUNTING
 from lagbench.submission.findings import Finding, ValidationResult
 from lagbench.submission.format import Anatomy, Header
 from lagbench.submission.predictions import open_predictions
@@ -29,7 +29,7 @@ from lagbench.work.run import run_all
 
 from .card import JSON_NAME, SUBMISSION, ScoreCard, read_scores, skill, spell
 from .flags import Flag, below_twin_floor, copy_suspect, physics
-from .floors import measurable
+from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .score_file import NETCDF_NAME, write_statistics
 from .task import ScoredTask, load_scored_task

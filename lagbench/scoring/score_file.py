@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
-from lagbench.floors.table import COUNTING
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
+from lagbench.references.table import COUNTING
 
 from .card import (
     FORMAT,
@@ -189,15 +189,13 @@ def _store(
 class StoredScores:
     """What a scores.nc holds beside its preview."""
 
-    identity: Mapping[
-        str, str
-    ]  # split, size, version and hash of the data set, and the method
+    # split, size, version and hash of the data set, and the method
+    identity: Mapping[str, str]
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     tallies: Mapping[int, Tally]  # statistics of the submission by scenario
-    best_floor: str | None = (
-        None  # name of the best floor; None where none that counts has a score
-    )
+    # name of the best floor; None where none that counts has a score
+    best_floor: str | None = None
     # what it scores in the ranking metric, NaN where undefined, shape [scenario]
     best_floor_values: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
 

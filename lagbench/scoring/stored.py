@@ -40,9 +40,8 @@ from .card import (
 from .score_file import FILM_RANGE, StoredScores, read_statistics
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
-MAX_UNPACKED = (
-    32 << 20
-)  # most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
+# most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
+MAX_UNPACKED = 32 << 20
 
 MAX_STATISTICS = 500
 
@@ -51,18 +50,16 @@ STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
 """What a score file may hold: plain numbers of its own, in one group beside the root.
 """
 
-CPU_SECONDS = (
-    10.0  # computing time of the child for every 50 files, its start aside [s]
-)
+# computing time of the child for every 50 files, its start aside [s]
+CPU_SECONDS = 10.0
 
 FILES_PER_PART = 50
 
 # files that may stop a child before the rest is left unread: each costs a child's whole
 # time
 MOST_STOPS = 5
-WALL_SECONDS = (
-    600.0  # time for every 50 files together [s]; a busy machine may need minutes
-)
+# time for every 50 files together [s]; a busy machine may need minutes
+WALL_SECONDS = 600.0
 
 UNREAD = (
     "not read, because too many others had to be stopped or took all the time allowed"

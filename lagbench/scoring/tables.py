@@ -6,9 +6,9 @@ import math
 from collections.abc import Collection, Iterator
 
 from lagbench.draw.tables import Table
-from lagbench.floors.shipped import DIGITS
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
+from lagbench.references.shipped import DIGITS
 
 from .card import SUBMISSION, ScoreCard
 from .compare import ComparisonResult
@@ -172,11 +172,8 @@ def _against(card: ScoreCard, row: str) -> str:
     ):
         return f"{card.ranking} is the same"
     if found.difference < 0.0:
-        word, low, high = (
-            "better",
-            -high,
-            -low,
-        )  # the bounds of what is printed: how much better
+        # the bounds of what is printed: how much better
+        word, low, high = "better", -high, -low
     else:
         word = "worse"
     if math.isnan(low):

@@ -45,9 +45,8 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
             word = "coarser"
         else:
             word = "finer"
-        described = (
-            Path(task.size.split) / DESCRIPTION
-        )  # no path of this machine: scores.json repeats it
+        # no path of this machine: scores.json repeats it
+        described = Path(task.size.split) / DESCRIPTION
         local = (task.truth.root / described).is_file()
         if local:
             here = f"cells: {cells} under score_grid in {described.as_posix()}, or "

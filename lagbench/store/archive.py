@@ -46,9 +46,8 @@ RELEASES = "https://lagbench.invalid/releases"
 2606).
 """
 
-RELEASES_VARIABLE = (
-    "LAGBENCH_RELEASES"  # environment variable that names another such folder
-)
+# environment variable that names another such folder
+RELEASES_VARIABLE = "LAGBENCH_RELEASES"
 PATH = attrgetter("path")  # the order of scenario files in an archive
 
 

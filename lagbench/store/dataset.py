@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from lagbench.data.manifest import Manifest
 
 
-CHUNK_BYTES = (
-    4 << 20
-)  # Dask reads position and velocity in chunks of about this size [bytes]
+# Dask reads position and velocity in chunks of about this size [bytes]
+CHUNK_BYTES = 4 << 20
 PADDING = -1  # material of particles that a scenario does not have
 
 
@@ -97,9 +96,8 @@ def open_split(
             for i, path in paths.items()
         ]
         joined = _joined(scenarios, list(paths))
-        joined.encoding["source"] = str(
-            next(iter(paths.values())).absolute()
-        )  # local splits are found by it
+        # local splits are found by it
+        joined.encoding["source"] = str(next(iter(paths.values())).absolute())
         joined.set_close(opened.pop_all().close)
     return joined
 

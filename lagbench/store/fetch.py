@@ -38,9 +38,8 @@ from .objects import (
 
 CONNECTIONS = 4  # objects that are fetched side by side
 BLOCK = 1 << 18  # bytes read at a time
-LEAST_RATE = (
-    4096.0  # bytes per second below which a store is refused, each object by itself
-)
+# bytes per second below which a store is refused, each object by itself
+LEAST_RATE = 4096.0
 PATIENCE = 60.0  # seconds of waiting over which the rate is measured
 ATTEMPTS = 5  # attempts in a row that bring nothing before we give up
 MOST_ATTEMPTS = 100  # attempts at one object at all, however little each brings

@@ -39,9 +39,8 @@ LOCAL = ("file://", "local://")
 FIX_LINE = "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: it goes on"
 
 _BUSY = {408, 425, 429, 500, 502, 503, 504}
-_LENGTH = re.compile(
-    r"\d{1,18}"
-)  # no object has more bytes, and Python reads no endless number
+# no object has more bytes, and Python reads no endless number
+_LENGTH = re.compile(r"\d{1,18}")
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
 
 _systems: dict[tuple[object, ...], Any] = {}

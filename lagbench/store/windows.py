@@ -236,9 +236,8 @@ class FrameStore:
 class Window(NamedTuple):
     """Consecutive frames of one scenario."""
 
-    position: NDArray[
-        np.float32
-    ]  # particle positions [length], shape [particle, frame, 2]
+    # particle positions [length], shape [particle, frame, 2]
+    position: NDArray[np.float32]
     material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
     # velocity of the walls [length/s], shape [frame, wall, 2]: what acts on the way to
     # each frame, those to predict included; None in a split without moving walls
@@ -277,9 +276,8 @@ class WindowReader:
         paths = scenario_files(entry, folder, names)
         # what the registry publishes: bounds, task, parameters, statistics of train
         self.size = entry
-        self.history = (
-            entry.task.input_frames if history is None else history
-        )  # frames that a model is given
+        # frames that a model is given
+        self.history = entry.task.input_frames if history is None else history
         self.future = future  # frames after them
         self.length = self.history + future  # frames in a window
         self.origin = origin  # whether windows hold the scenario's first frame too

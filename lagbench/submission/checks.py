@@ -40,9 +40,8 @@ class Survey:
     off_grid: int = 0  # positions outside the unit box
     farthest: float = 0.0  # largest distance outside the box along an axis [length]
     first_outside: tuple[int, int] | None = None  # frame and particle
-    lost: tuple[int, int] | None = (
-        None  # frame and particle of the first beyond MAX_DISTANCE
-    )
+    # frame and particle of the first beyond MAX_DISTANCE
+    lost: tuple[int, int] | None = None
     jump_at: tuple[int, int] | None = None  # frame and particle of the largest jump
     settled: int = 0  # frame that is repeated from there to the end
     _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)

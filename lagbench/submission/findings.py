@@ -102,9 +102,8 @@ class ValidationResult:
     findings: tuple[Finding, ...]  # all that is wrong, in the order of CHECKS
     passed: tuple[str, ...]  # checks that found nothing
     skipped: Mapping[str, str]  # check to the reason why it could not be made
-    sha256: str | None = (
-        None  # content hash of the positions; None where they were not all read
-    )
+    # content hash of the positions; None where they were not all read
+    sha256: str | None = None
 
     @property
     def errors(self) -> tuple[Finding, ...]:

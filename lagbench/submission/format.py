@@ -125,12 +125,10 @@ class Header:
     seed: int | None  # seed of the training
     parameters: int | None  # trainable parameters of the model
     training: str | None  # what the model was trained on, in words
-    diverged_at: Mapping[
-        int, int
-    ]  # scenario id to the absolute frame from which it is frozen
-    solver_seconds_per_frame: float | None = (
-        None  # of our solver on one core of the same machine [s]
-    )
+    # scenario id to the absolute frame from which it is frozen
+    diverged_at: Mapping[int, int]
+    # of our solver on one core of the same machine [s]
+    solver_seconds_per_frame: float | None = None
     budget: Budget | None = None  # what the training took
 
 
@@ -138,17 +136,14 @@ class Header:
 class Anatomy:
     """A file as its headers describe it."""
 
-    links: Mapping[
-        str, str
-    ]  # entry of the root group to what it is; the first MAX_LINKS of them
+    # entry of the root group to what it is; the first MAX_LINKS of them
+    links: Mapping[str, str]
     link_count: int
-    attributes: Mapping[
-        str, object
-    ]  # attribute of the format to its value, None where it is missing
+    # attribute of the format to its value, None where it is missing
+    attributes: Mapping[str, object]
     arrays: Mapping[str, Array]  # variables of the format that a hard link leads to
-    packing: Mapping[
-        str, object
-    ]  # scale_factor and add_offset of ``position``, where it has them
+    # scale_factor and add_offset of ``position``, where it has them
+    packing: Mapping[str, object]
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
     length: int  # length of the file [bytes]
 

@@ -60,9 +60,8 @@ class Start:
     first: Positions  # the first predicted frame
     second: Positions  # the second predicted frame; the first again where there is none
     horizon: int = 0  # frames to predict
-    later: Positions | None = (
-        None  # the truth of the second predicted frame, where there is one
-    )
+    # the truth of the second predicted frame, where there is one
+    later: Positions | None = None
 
     @cached_property
     def true_step(self) -> float:
@@ -332,9 +331,8 @@ def _nearest(
     """
     found = np.empty(len(points), np.int_)
     distance = np.empty(len(points))
-    columns = np.ascontiguousarray(
-        cloud.T
-    )  # a sum over two neighbours in memory takes ten times as long
+    # a sum over two neighbours in memory takes ten times as long
+    columns = np.ascontiguousarray(cloud.T)
     apart = np.empty_like(columns)
     for row, point in enumerate(points):
         np.subtract(columns, point[:, None], out=apart)

@@ -199,7 +199,6 @@ def squared_lengths(steps: NDArray[np.float64]) -> NDArray[np.float64]:
     overwritten.
     """
     steps *= steps
-    squares: NDArray[np.float64] = (
-        steps[..., 0] + steps[..., 1]
-    )  # ten times as fast as a sum over the axis
+    # ten times as fast as a sum over the axis
+    squares: NDArray[np.float64] = steps[..., 0] + steps[..., 1]
     return squares

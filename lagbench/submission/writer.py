@@ -459,9 +459,8 @@ class TemplateResult:
     split: str
     size: str
     scenarios: tuple[int, ...]
-    frames: tuple[
-        int, int
-    ]  # absolute numbers of the first and the last frame to predict
+    # absolute numbers of the first and the last frame to predict
+    frames: tuple[int, int]
     particles: int
     bytes: int
 

@@ -128,9 +128,8 @@ class Client:
 
     name: str  # topic of the events that tell of its tasks
     version: str  # its version of lagbench
-    mark: Mark | None = (
-        None  # what shows that the worker sees its folder; None where none is needed
-    )
+    # what shows that the worker sees its folder; None where none is needed
+    mark: Mark | None = None
 
     def check(self, worker: str, *, threads: int) -> None:
         """Refuse a worker that could not make the client's bits."""
@@ -321,9 +320,8 @@ def _connected(address: str) -> Iterator[Any]:
     After an error they stay off: a client that lost its scheduler logs until the
     process ends.
     """
-    distributed = require(
-        "distributed", extra="cluster"
-    )  # its import sets the levels of its loggers
+    # its import sets the levels of its loggers
+    distributed = require("distributed", extra="cluster")
     levels = {name: logging.getLogger(name).level for name in LOGGERS}
     for name in LOGGERS:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)

@@ -171,9 +171,8 @@ class Pool:
                 except OSError:  # it died while idle
                     self._bury(worker, attempt)
             busy = [worker for worker in self._workers if worker.attempt]
-            news = wait(
-                [worker.channel for worker in busy]
-            )  # one that died has some too
+            # one that died has some too
+            news = wait([worker.channel for worker in busy])
             for worker in busy:
                 if worker.channel in news and worker.attempt is not None:
                     yield self._receive(worker, worker.attempt)

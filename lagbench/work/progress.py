@@ -23,9 +23,8 @@ class Progress:
     scenarios_done: int  # scenarios that are finished
     scenarios: int  # scenarios to finish; 0 where nobody knows
     seconds: float  # time since the start [s]
-    before: int = (
-        0  # scenarios that an earlier run had finished; they took none of that time
-    )
+    # scenarios that an earlier run had finished; they took none of that time
+    before: int = 0
 
     @property
     def rate(self) -> float:

@@ -18,9 +18,8 @@ from .pool import Pool, Report, Task
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-WORTH_WORKERS = (
-    1 << 30
-)  # bytes of files below which starting processes to read them costs more than it gains
+# bytes of files below which starting processes to read them costs more than it gains
+WORTH_WORKERS = 1 << 30
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """Environment of workers: threads of NumPy and HDF5 would only take the cores from the
 others.

@@ -48,9 +48,8 @@ class Given:
     # [length/frame], shape [frame, 4, 2]
     walls: Floats
     area: float  # area that the particles cover at first [length^2]
-    parameters: Mapping[
-        str, object
-    ]  # what the scenario's file states: viscosity, friction and the like
+    # what the scenario's file states: viscosity, friction and the like
+    parameters: Mapping[str, object]
 
     @property
     def last(self) -> Floats:
@@ -80,7 +79,7 @@ class Given:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Floor:
+class ReferencePredictor:
     """One way to predict that costs no learning."""
 
     name: str  # name of its rows
@@ -88,9 +87,8 @@ class Floor:
     definition: str  # what it predicts, one sentence
     predict: Callable[[Given], Prediction]
     applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it
-    counts: bool = (
-        True  # whether it may be the best floor, which skill is measured against
-    )
+    # whether it may be the best floor, which skill is measured against
+    counts: bool = True
     reads_train: bool = False  # whether it looks at the scenarios of train
 
 

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry, Size, load
-from lagbench.floors.floor import Floor, given_in
-from lagbench.floors.shipped import FloorScores, correlation_of, shipped
-from lagbench.floors.table import FLOORS, floors_of
 from lagbench.metrics.aggregate import Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
+from lagbench.references.predictor import ReferencePredictor, given_in
+from lagbench.references.shipped import ReferenceScores, correlation_of, shipped
+from lagbench.references.table import REFERENCES, references_of
 from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
@@ -46,12 +46,12 @@ def measurable(size: Size, root: Path) -> tuple[str, ...]:
     return tuple(floor.name for floor in _possible(size, root) if floor.counts)
 
 
-def _possible(size: Size, root: Path) -> list[Floor]:
+def _possible(size: Size, root: Path) -> list[ReferencePredictor]:
     """Return the floors of a size; what looks at train only where all of train is
     there.
     """
     trained = _has(size, root, "train")
-    return [floor for floor in floors_of(size) if trained or not floor.reads_train]
+    return [floor for floor in references_of(size) if trained or not floor.reads_train]
 
 
 def _has(size: Size, root: Path, subset: str) -> bool:
@@ -95,7 +95,7 @@ def measured_again(
 
 
 @dataclass(frozen=True, kw_only=True)
-class FloorJob:
+class ReferenceJob:
     """What a worker needs to measure the floors on one scenario."""
 
     task: ScoredTask  # the test subset
@@ -106,17 +106,16 @@ class FloorJob:
 
 
 @dataclass(frozen=True, eq=False)
-class FloorTallies:
+class ReferenceTallies:
     """What was measured of the floors on one scenario."""
 
     scenario: int  # id of the scenario
     tallies: Mapping[str, Tally]  # statistics by name of the floor
-    seconds_per_frame: Mapping[
-        str, float
-    ]  # CPU time of the prediction, median over frames [s]
+    # CPU time of the prediction, median over frames [s]
+    seconds_per_frame: Mapping[str, float]
 
 
-def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
+def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
     """Measure the floors on one scenario, or read what was measured before."""
     if job.keep is not None and job.keep.is_file():
         report(job.task.setting.horizon)
@@ -126,7 +125,7 @@ def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
         given = given_in(truth.file, job.task.size, job.task.truth.root)
         rows = {
             name: snapshots(
-                truth.scenario, _timed(predicted_by(FLOORS[name], given), taken)
+                truth.scenario, _timed(predicted_by(REFERENCES[name], given), taken)
             )
             for name, taken in seconds.items()
         }
@@ -134,7 +133,7 @@ def measure_scenario(job: FloorJob, report: Report) -> FloorTallies:
             truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report
         )
     medians = {name: float(np.median(taken)) for name, taken in seconds.items()}
-    found = FloorTallies(job.scenario, tallies, medians)
+    found = ReferenceTallies(job.scenario, tallies, medians)
     if job.keep is not None:
         _keep(found, job.keep)
     return found
@@ -153,7 +152,7 @@ def _timed(
         yield frame
 
 
-def _keep(found: FloorTallies, path: Path) -> None:
+def _keep(found: ReferenceTallies, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     first, *_ = tallies = list(found.tallies.values())
     held: dict[str, Any] = {
@@ -169,13 +168,13 @@ def _keep(found: FloorTallies, path: Path) -> None:
         np.savez(file, **held, seconds_per_frame=list(found.seconds_per_frame.values()))
 
 
-def _kept(job: FloorJob, path: Path) -> FloorTallies:
+def _kept(job: ReferenceJob, path: Path) -> ReferenceTallies:
     with np.load(path, allow_pickle=False) as held:
         names = tuple(held["names"].tolist())
         frames = tuple(held["frames"].tolist())
         sums = zip(held["total"], held["weight"], held["undefined"], strict=True)
         floors = held["floors"].tolist()
-        return FloorTallies(
+        return ReferenceTallies(
             job.scenario,
             {
                 name: Tally(names, frames, *parts)
@@ -202,7 +201,7 @@ def measure(
     workers: int = 1,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
-) -> dict[str, FloorScores]:
+) -> dict[str, ReferenceScores]:
     """Return the scores of floors of a data set, by default all, those of single frames
     by scenario.
 
@@ -212,11 +211,11 @@ def measure(
     task = load_scored_task(size, root)
     names = tuple(
         floor.name
-        for floor in floors_of(size)
+        for floor in references_of(size)
         if floors is None or floor.name in floors
     )
     jobs = {
-        f"floors on scenario {i}": FloorJob(
+        f"floors on scenario {i}": ReferenceJob(
             task=task,
             scenario=i,
             floors=names,
@@ -235,7 +234,7 @@ def measure(
         scores = aggregate(
             select(), {held.scenario: held.tallies[name] for held in found}
         )
-        floors_scores[name] = FloorScores(
+        floors_scores[name] = ReferenceScores(
             name=name,
             scores=scores,
             seconds_per_frame=float(
@@ -247,7 +246,7 @@ def measure(
 
 
 def differences(
-    expected: Mapping[str, FloorScores], found: Mapping[str, FloorScores]
+    expected: Mapping[str, ReferenceScores], found: Mapping[str, ReferenceScores]
 ) -> dict[str, tuple[str, ...]]:
     """Return by floor the metrics whose values per scenario differ, those that one
     lacks included.

@@ -28,11 +28,11 @@ from lagbench.data.grid import Grid, Placement, node_velocity, transfer
 from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.errors import DataError
 
-from .floor import (
+from .predictor import (
     Floats,
-    Floor,
     Given,
     Prediction,
+    ReferencePredictor,
     fills_box,
     given_in,
     linear_field,
@@ -54,9 +54,8 @@ number.
 class Start:
     """How a scenario starts, as scenarios are compared."""
 
-    clouds: dict[
-        int, Floats
-    ]  # quantiles along each direction by material [length], [level, direction]
+    # quantiles along each direction by material [length], [level, direction]
+    clouds: dict[int, Floats]
     shares: dict[int, float]  # share of each material in the particles [1]
     field: Floats  # velocity at the nodes [length/frame], shape [x node, y node, 2]
 
@@ -173,7 +172,7 @@ def _open(given: Given, scenario: int) -> ScenarioFile:
     return read_scenario(given.size.path(given.root, scenario))
 
 
-FLOOR = Floor(
+PREDICTOR = ReferencePredictor(
     name="analog",
     title="Analog",
     definition="The scenario of train whose given frames are nearest to those given "

@@ -13,7 +13,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mirrored
+from .predictor import (
+    Floats,
+    Given,
+    Prediction,
+    ReferencePredictor,
+    fills_box,
+    linear_field,
+    mirrored,
+)
 
 
 def decay(position: Floats) -> float:
@@ -45,7 +53,7 @@ def predict(given: Given) -> Prediction:
         yield now.astype("float32")
 
 
-FLOOR = Floor(
+PREDICTOR = ReferencePredictor(
     name="frozen-field",
     title="Frozen field",
     definition="The velocity field of the last given frame, held (in a box that "

@@ -53,7 +53,7 @@ CURVE_DIGITS = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FloorScores:
+class ReferenceScores:
     """What a floor scores on one split and size."""
 
     name: str  # name of the floor
@@ -62,9 +62,8 @@ class FloorScores:
     scores: Mapping[str, Score]
     # CPU time to predict a frame on the machine that measured [s], which is no score
     seconds_per_frame: float
-    correlation: NDArray[
-        np.float64
-    ]  # of vorticity at frame 54 [1], NaN where undefined, shape [scenario]
+    # of vorticity at frame 54 [1], NaN where undefined, shape [scenario]
+    correlation: NDArray[np.float64]
 
 
 def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
@@ -80,7 +79,7 @@ def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
     return folder / f"{size.split}-{size.name}.json"
 
 
-def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | None:
+def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, ReferenceScores] | None:
     """Return what the floors of a split and size score, by name.
 
     None where none were measured on the data set that the registry describes.
@@ -116,7 +115,7 @@ def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, FloorScores] | No
                 _floats(values),
                 undefined,
             )
-        found[floor] = FloorScores(
+        found[floor] = ReferenceScores(
             name=floor,
             scores=scores,
             seconds_per_frame=said["seconds_per_frame"],
@@ -172,7 +171,7 @@ def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
 
 def write_shipped(
     size: Size,
-    floors: Mapping[str, FloorScores],
+    floors: Mapping[str, ReferenceScores],
     *,
     dataset_sha256: str,
     reported: Sequence[int],
@@ -233,7 +232,7 @@ def _write(size: Size, held: Mapping[str, Any], folder: Path) -> Path:
     return path
 
 
-def _said(floor: FloorScores, reported: Sequence[int]) -> dict[str, Any]:
+def _said(floor: ReferenceScores, reported: Sequence[int]) -> dict[str, Any]:
     scores = floor.scores
     told = {name: score for name, score in scores.items() if score.metric.per_frame}
     return {

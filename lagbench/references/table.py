@@ -8,29 +8,29 @@ from types import MappingProxyType
 from lagbench.data.registry import Size
 
 from . import analog, coarse_solver, extrapolation, frozen_field
-from .floor import Floor
+from .predictor import ReferencePredictor
 
-FLOORS: Mapping[str, Floor] = MappingProxyType(
+REFERENCES: Mapping[str, ReferencePredictor] = MappingProxyType(
     {
         floor.name: floor
         for floor in (
             extrapolation.PERSISTENCE,
             extrapolation.CONSTANT_VELOCITY,
-            frozen_field.FLOOR,
+            frozen_field.PREDICTOR,
             extrapolation.FREE_FLIGHT,
-            analog.FLOOR,
-            coarse_solver.FLOOR,
+            analog.PREDICTOR,
+            coarse_solver.PREDICTOR,
         )
     }
 )
 """All floors by name, in the order in which they are shown."""
 
-COUNTING = frozenset(name for name, floor in FLOORS.items() if floor.counts)
+COUNTING = frozenset(name for name, floor in REFERENCES.items() if floor.counts)
 """Names of those that skill may be measured against."""
 
 
-def floors_of(size: Size) -> tuple[Floor, ...]:
+def references_of(size: Size) -> tuple[ReferencePredictor, ...]:
     """Return the floors of a split and size; a split of the user's own has those of its
     kind of box.
     """
-    return tuple(floor for floor in FLOORS.values() if floor.applies(size))
+    return tuple(floor for floor in REFERENCES.values() if floor.applies(size))

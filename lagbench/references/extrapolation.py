@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .floor import Floor, Given, Prediction, fills_box
+from .predictor import Given, Prediction, ReferencePredictor, fills_box
 
 
 def at_rest(given: Given) -> Prediction:
@@ -41,21 +41,21 @@ def on_parabolas(given: Given) -> Prediction:
         )
 
 
-PERSISTENCE = Floor(
+PERSISTENCE = ReferencePredictor(
     name="persistence",
     title="Persistence",
     definition="The last given frame, repeated.",
     predict=at_rest,
 )
 
-CONSTANT_VELOCITY = Floor(
+CONSTANT_VELOCITY = ReferencePredictor(
     name="constant-velocity",
     title="Constant velocity",
     definition="Every particle keeps its last given velocity and stops at the walls.",
     predict=on_lines,
 )
 
-FREE_FLIGHT = Floor(
+FREE_FLIGHT = ReferencePredictor(
     name="free-flight",
     title="Free flight",
     definition="Every particle falls freely from its last given velocity and stops at "

@@ -22,8 +22,18 @@ from lagbench.data.layout import major_of
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.floors import FLOORS, Given, coarse_solver, floors_of, given_in, shipped
-from lagbench.floors.analog import (
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.split import InitialState
+from lagbench.metrics.table import ranking_metric
+from lagbench.references import (
+    REFERENCES,
+    Given,
+    coarse_solver,
+    given_in,
+    references_of,
+    shipped,
+)
+from lagbench.references.analog import (
     DIRECTIONS,
     Start,
     assigned,
@@ -31,16 +41,13 @@ from lagbench.floors.analog import (
     nearest,
     start_of,
 )
-from lagbench.floors.coarse_solver import coarser, predict_with, spread_subset
-from lagbench.floors.floor import linear_field, mirrored
-from lagbench.floors.frozen_field import decay
-from lagbench.floors.shipped import FOLDER, shipped_path
-from lagbench.floors.table import COUNTING
-from lagbench.generators.constants import solver_constants
-from lagbench.generators.split import InitialState
-from lagbench.metrics.table import ranking_metric
+from lagbench.references.coarse_solver import coarser, predict_with, spread_subset
+from lagbench.references.frozen_field import decay
+from lagbench.references.predictor import linear_field, mirrored
+from lagbench.references.shipped import FOLDER, shipped_path
+from lagbench.references.table import COUNTING
 from lagbench.scoring.card import SUBMISSION, best_floor
-from lagbench.scoring.floors import measurable
+from lagbench.scoring.references import measurable
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +88,7 @@ def scattered(count: int, low: float, high: float, seed: int = 0) -> Floats:
 
 def predicted(name: str, held: Given) -> NDArray[np.float32]:
     """Return what a floor predicts, shape [frame, particle, 2]."""
-    return np.array(list(FLOORS[name].predict(held)))
+    return np.array(list(REFERENCES[name].predict(held)))
 
 
 def own(size: Size, *, placement: str) -> Size:
@@ -138,14 +145,14 @@ def test_which_floors_a_size_has(split: str, size: str, names: str) -> None:
         assert shipped(tier) is None
     else:
         tier = load().size(split, size)
-    assert " ".join(floor.name for floor in floors_of(tier)) == names
+    assert " ".join(floor.name for floor in references_of(tier)) == names
     solved = coarser(tier)
     assert solved is None or solved.grid < tier.grid
     assert all(
         floor.name == name and floor.title and floor.definition[-1] == "."
-        for name, floor in FLOORS.items()
+        for name, floor in REFERENCES.items()
     )
-    assert [floor.name for floor in FLOORS.values() if not floor.counts] == [
+    assert [floor.name for floor in REFERENCES.values() if not floor.counts] == [
         "coarse-solver"
     ]
 
@@ -466,7 +473,7 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
     if major_of(said["dataset_version"]) != size.major:
         pytest.skip("measured on another version of the data")
     held = shipped(size)
-    assert list(held) == [floor.name for floor in floors_of(size)]
+    assert list(held) == [floor.name for floor in references_of(size)]
     ranking = ranking_metric(size)
     for floor in held.values():
         score = floor.scores[ranking]

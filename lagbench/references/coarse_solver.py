@@ -26,7 +26,15 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size, load
 from lagbench.errors import require
 
-from .floor import Floats, Floor, Given, Prediction, fills_box, linear_field, mirrored
+from .predictor import (
+    Floats,
+    Given,
+    Prediction,
+    ReferencePredictor,
+    fills_box,
+    linear_field,
+    mirrored,
+)
 
 if TYPE_CHECKING:
     from lagbench.generators.solver import Solver
@@ -175,7 +183,7 @@ def _leaders(
     return leader
 
 
-FLOOR = Floor(
+PREDICTOR = ReferencePredictor(
     name="coarse-solver",
     title="Coarse solver",
     definition="The solver itself on the grid of the next smaller size, with its time "
