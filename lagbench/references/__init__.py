@@ -14,7 +14,7 @@ from .table import REFERENCES, references_of
 __all__ = [
     "REFERENCES",
     "ReferencePredictor",
-    " ReferencePredictor",
+    "ReferencePredictor",
     "ReferenceScores",
     "Given",
     "references_of",
