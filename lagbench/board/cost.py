@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
+from lagbench.figures.chart import WIDTH, Plot, Spot, close_logarithmic
+from lagbench.figures.html import Markup, tag, text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
-from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
-from lagbench.report.html import Markup, tag, text, words
 
 from .model import Board, Tab
 

@@ -18,8 +18,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import groupby
 
+from lagbench.figures.html import Markup, clipped, escaped, join, tag, text, words
 from lagbench.metrics.metric import Direction, Metric
-from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import columns_of, presets_of, value_of, written
 from .cost import cost_figure
@@ -62,7 +62,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     theme = _part("theme.js")
     parts = "\n".join(_part(f"{name}.js") for name in SCRIPTS)
     script = f'(() => {{\n"use strict";\n{parts}}})();\n'
-    report = files("lagbench.report").joinpath("style.css").read_text("utf-8")
+    report = files("lagbench.figures.report").joinpath("style.css").read_text("utf-8")
     # colours by choice of the reader are those of the report's style sheet once more
     light, dark = re.findall(r":root\{([^}]*)\}", report)[:2]
     light = light.replace("color-scheme:light dark", "color-scheme:light")

@@ -24,10 +24,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, WorkFailedError, nearest, require
 from lagbench.work.progress import watched
 
-from .panels import DOT, Panel, box_of, colour_bar, draw_walls, limit_of, material_key
-from .plot import describe
-from .recording import Recording, Scene, open_recording
-from .style import (
+from .canvas import (
     DPI,
     INK,
     MATERIAL_COLOURS,
@@ -39,6 +36,9 @@ from .style import (
     speed_map,
     vorticity_map,
 )
+from .panels import DOT, Panel, box_of, colour_bar, draw_walls, limit_of, material_key
+from .plot import describe
+from .recording import Recording, Scene, open_recording
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Registry

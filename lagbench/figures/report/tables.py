@@ -11,6 +11,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lagbench.figures.html import (
+    Markup,
+    html,
+    interval,
+    join,
+    paragraph,
+    table,
+    tag,
+    text,
+    unit,
+    words,
+)
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -18,7 +30,6 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
 from lagbench.metrics.table import CHOSEN, FAMILIES, METRICS
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
-from .html import Markup, html, interval, join, paragraph, table, tag, text, unit, words
 from .subject import Row, Subject
 
 AT_FRAMES = (

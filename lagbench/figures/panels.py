@@ -1,6 +1,6 @@
 """Panels of a picture: one frame seen one way, inside the walls of its box.
 
-Needs matplotlib; :mod:`lagbench.draw.plot` composes them.
+Needs matplotlib; :mod:`lagbench.figures.plot` composes them.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
 
+from .canvas import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL, speed_map, vorticity_map
 from .recording import Recording, Scene
-from .style import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL, speed_map, vorticity_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

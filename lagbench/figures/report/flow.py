@@ -16,8 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Fields
+from lagbench.figures.html import (
+    SIDE,
+    Figure,
+    Markup,
+    grid,
+    join,
+    path_data,
+    ramp,
+    tag,
+    vector,
+)
 
-from .html import SIDE, Figure, Markup, grid, join, path_data, ramp, tag, vector
 from .subject import Gallery, Subject, limit_of
 
 Floats = NDArray[np.float64]

@@ -20,6 +20,7 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, nearest
 from lagbench.store.copy import bring
 
+from .canvas import DPI, MUTED, figure, header, save
 from .panels import (
     TITLES,
     Panel,
@@ -30,7 +31,6 @@ from .panels import (
     moving_walls,
 )
 from .recording import Recording, Scene, open_recording
-from .style import DPI, MUTED, figure, header, save
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -16,10 +16,10 @@ from pathlib import Path
 from lagbench.atomic import check_writable, write_atomically
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
+from lagbench.figures.html import Figure, Markup, join, paragraph, tag, words
 from lagbench.scoring.card import ScoreCard
 
 from . import curves, flow, maps, tables
-from .html import Figure, Markup, join, paragraph, tag, words
 from .subject import Subject, open_gallery, subject_of
 
 FILE_NAME = "index.html"

@@ -9,17 +9,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.metrics.aggregate import (
-    FEWEST_FOR_INTERVAL,
-    Score,
-    bootstrap_interval,
-    mean_over_seeds,
-)
-from lagbench.metrics.metric import Direction, mean
-from lagbench.metrics.vorticity import STABLE_PEARSON
-
-from .chart import Bar, Plot, Scale, bar_chart, linear, spanning
-from .html import (
+from lagbench.figures.chart import Bar, Plot, Scale, bar_chart, linear, spanning
+from lagbench.figures.html import (
     Figure,
     Markup,
     clipped,
@@ -33,6 +24,15 @@ from .html import (
     text,
     words,
 )
+from lagbench.metrics.aggregate import (
+    FEWEST_FOR_INTERVAL,
+    Score,
+    bootstrap_interval,
+    mean_over_seeds,
+)
+from lagbench.metrics.metric import Direction, mean
+from lagbench.metrics.vorticity import STABLE_PEARSON
+
 from .subject import Gallery, Moment, Subject, kind_of
 
 Floats = NDArray[np.float64]

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.draw.style import MATERIAL_COLOURS, rgb
+from lagbench.figures.canvas import MATERIAL_COLOURS, rgb
+from lagbench.figures.html import Figure, Markup, grid, image, join, key, ramp, tag
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.scoring.task import ScoredTask
 
-from .html import Figure, Markup, grid, image, join, key, ramp, tag
 from .subject import Gallery, Moment, Subject, Walls, limit_of
 
 Floats = NDArray[np.float64]
