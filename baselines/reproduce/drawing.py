@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import require
-from lagbench.figures.canvas import INK, figure, pixels_of, png_bytes
+from lagbench.figures.canvas import figure, pixels_of, png_bytes
+from lagbench.figures.colours import INK
 from lagbench.figures.panels import (
     Panel,
     colour_bar,

@@ -1,31 +1,35 @@
-"""Charts as SVG: axes with few quiet lines, marks whose colours the page's style sheet
-knows.
+"""Charts as SVG: axes with few quiet lines, and marks coloured by the style sheet.
 
-Classes of marks: ``s0`` .. ``s5`` series, ``d1`` .. ``d3`` dashes, ``truth``,
-``floor0`` .. for the floors. Each chart has a title and a description for those who do
-not see it.
+Classes of marks: ``s0`` to ``s5`` are series, ``d1`` to ``d3`` dashes, ``truth`` is the
+truth, ``floor0`` and so on are reference predictors. Each chart has a title and a
+description for readers who do not see it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .html import Markup, clipped, decimals, join, path_data, power, tag
-from .names import Names, written
+from .html import Markup, clipped, format_multiples, format_power, join, path_data, tag
+from .labels import ANCHORS, Label, LabelBox, place_labels
 
 Floats = NDArray[np.float64]
+Point = tuple[float, float]
 
 WIDE = 60.0
 """From this ratio of greatest to least value an axis of errors is logarithmic."""
 
 DEEPEST = 1e-6
 """A logarithmic axis reaches no lower than this share of its top."""
+
+HUGE = 1e300  # values beyond are no numbers of a chart
+MOST_LABELS = 8  # of a logarithmic axis; of more ticks the powers of ten stay
+PLAIN_POWERS = range(-3, 4)  # powers of ten that are written out
+ROUND_FACTORS = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -37,8 +41,8 @@ class Tick:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """One axis."""
+class AxisScale:
+    """Where values stand along one axis."""
 
     low: float  # value at its start
     high: float  # value at its end
@@ -47,141 +51,160 @@ class Scale:
     ticks: tuple[Tick, ...]  # its marks
 
     def share(self, values: ArrayLike) -> Floats:
-        """Return where values lie between low (0) and high (1); NaN where they have no
-        place.
+        """Return where values lie between low (0) and high (1).
+
+        NaN stands for values that have no place.
         """
         x = np.asarray(values, np.float64)
         if not self.log:
             return (x - self.low) / (self.high - self.low)
-        logs = np.where(x > 0.0, np.log10(np.where(x > 0.0, x, 1.0)), np.nan)
+        is_positive = x > 0.0
+        logs = np.where(is_positive, np.log10(np.where(is_positive, x, 1.0)), np.nan)
         low = math.log10(self.low)
         high = math.log10(self.high)
         return np.asarray((logs - low) / (high - low), np.float64)
 
     @property
     def factor(self) -> str:
-        """What the labels are to be multiplied by, empty for 1."""
+        """The factor of all labels, empty for 1."""
         if self.exponent:
-            return f"×{power(self.exponent)}"
+            return f"×{format_power(self.exponent)}"
         return ""
 
 
-def linear(low: float, high: float, *, count: int = 5, tight: bool = False) -> Scale:
-    """Return a linear axis that covers a range."""
+def linear(
+    low: float, high: float, *, count: int = 5, tight: bool = False
+) -> AxisScale:
+    """Return a linear axis that covers a range with about so many steps.
+
+    A tight axis ends at the range, others at the next ticks.
+    """
     if not high > low:
         middle = abs(low) or 1.0
         high = low + 0.5 * middle
         low = low - 0.5 * middle
-    rough = (high - low) / count
-    unit = 10.0 ** math.floor(math.log10(rough))
-    # the round number next above
-    step = next(
-        k * unit for k in (1.0, 2.0, 2.5, 5.0, 10.0) if k * unit >= rough * (1 - 1e-9)
-    )
+    step = _round_up((high - low) / count)
     first = math.floor(low / step + 1e-9)
     last = math.ceil(high / step - 1e-9)
-    numbers = [k * step for k in range(first, last + 1)]
+    values = [k * step for k in range(first, last + 1)]
     if tight:
-        numbers = [
-            value
-            for value in numbers
-            if low - 1e-9 * step <= value <= high + 1e-9 * step
-        ]
+        slack = 1e-9 * step
+        values = [v for v in values if low - slack <= v <= high + slack]
     else:
-        low = numbers[0]
-        high = numbers[-1]
-    largest = max(abs(low), abs(high))
-    order = math.floor(math.log10(largest))
+        low = values[0]
+        high = values[-1]
+
+    order = math.floor(math.log10(max(abs(low), abs(high))))
+    exponent = 0
     if order < -2 or order > 4:
         exponent = order
-    else:
-        exponent = 0
     unit = 10.0**exponent
-    labels = decimals([value / unit for value in numbers], step / unit)
-    return Scale(low, high, False, exponent, tuple(map(Tick, numbers, labels)))
+    labels = format_multiples([value / unit for value in values], step / unit)
+    return AxisScale(low, high, False, exponent, tuple(map(Tick, values, labels)))
 
 
-def logarithmic(low: float, high: float) -> Scale:
-    """Return a logarithmic axis over whole decades; few decades have ticks between,
-    many skip some.
+def _round_up(rough: float) -> float:
+    """Return the next number that is 1, 2, 2.5 or 5 times a power of ten."""
+    unit = 10.0 ** math.floor(math.log10(rough))
+    for factor in ROUND_FACTORS:
+        if factor * unit >= rough * (1 - 1e-9):
+            break
+    return factor * unit
+
+
+def logarithmic(low: float, high: float) -> AxisScale:
+    """Return a logarithmic axis over whole decades.
+
+    A single decade has ticks between, many decades skip some.
     """
     first = math.floor(math.log10(low) + 1e-9)
     last = math.ceil(math.log10(high) - 1e-9)
     last = max(last, first + 1)
     every = 1 + (last - first) // 7
-    ticks = [Tick(10.0**k, power(k)) for k in range(first, last + 1, every)]
+    ticks = [Tick(10.0**k, format_power(k)) for k in range(first, last + 1, every)]
     if last - first == 1:
-        ticks += [
-            Tick(factor * 10.0**first, f"{factor}×{power(first)}") for factor in (2, 5)
-        ]
-    return Scale(10.0**first, 10.0**last, True, 0, tuple(ticks))
+        for factor in (2, 5):
+            label = f"{factor}×{format_power(first)}"
+            ticks.append(Tick(factor * 10.0**first, label))
+    return AxisScale(10.0**first, 10.0**last, True, 0, tuple(ticks))
 
 
-def close_logarithmic(low: float, high: float) -> Scale:
-    """Return a logarithmic axis that ends at the next 1, 2 or 5; of many ticks the
-    powers of ten are kept.
+def close_logarithmic(low: float, high: float) -> AxisScale:
+    """Return a logarithmic axis that ends at the next 1, 2 or 5 times a power of ten.
+
+    Where there are many ticks, only the powers of ten are labelled.
     """
-    decades = range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)
-    marks = [(factor * 10.0**k, factor, k) for k in decades for factor in (1, 2, 5)]
+    first_decade = math.floor(math.log10(low)) - 1
+    last_decade = math.ceil(math.log10(high)) + 1
+    marks = []
+    for k in range(first_decade, last_decade):
+        marks += [(factor * 10.0**k, factor, k) for factor in (1, 2, 5)]
     first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.8 * low)
     last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
-    kept = marks[first : last + 1]
-    if len(kept) > 8:
-        shown = [mark for mark in kept if mark[1] == 1]
-    else:
-        shown = kept
+    marks = marks[first : last + 1]
+
     ticks = []
-    for value, factor, k in shown:
-        if factor == 1:
-            long = power(k)
+    for value, factor, k in marks:
+        if factor != 1 and len(marks) > MOST_LABELS:
+            continue
+        if k in PLAIN_POWERS:
+            label = f"{value:g}"
+        elif factor == 1:
+            label = format_power(k)
         else:
-            long = f"{factor}×{power(k)}"
-        ticks.append(Tick(value, f"{value:g}" if -3 <= k <= 3 else long))
-    return Scale(kept[0][0], kept[-1][0], True, 0, tuple(ticks))
+            label = f"{factor}×{format_power(k)}"
+        ticks.append(Tick(value, label))
+    return AxisScale(marks[0][0], marks[-1][0], True, 0, tuple(ticks))
 
 
 def spanning(
     series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None
-) -> Scale:
-    """Return an axis for series of values; what is not finite is left out."""
-    values = np.concatenate(
-        [np.asarray(s, np.float64).ravel() for s in series] or [np.zeros(0)]
-    )
-    values = values[np.isfinite(values) & (np.abs(values) < 1e300)]
+) -> AxisScale:
+    """Return an axis for series of values; values that are not finite are left out.
+
+    Args:
+        series: values, of any shape.
+        zero: whether a linear axis holds 0.
+        log: whether the axis is logarithmic; None decides by the range of the values.
+    """
+    parts = [np.asarray(values, np.float64).ravel() for values in series]
+    values = np.concatenate([*parts, np.zeros(0)])
+    values = values[np.isfinite(values) & (np.abs(values) < HUGE)]
     if not values.size:
         return linear(0.0, 1.0)
     low = float(values.min())
     high = float(values.max())
+    positive = values[:0]
     if high > 0.0:
         positive = values[values > DEEPEST * high]
-    else:
-        positive = values[:0]
+
+    has_logs = positive.size > 0 and high > 1.0 / HUGE
     if log is None:
-        log = (
-            low >= 0.0
-            and positive.size > 0
-            and float(np.percentile(positive, 5)) * WIDE < high
-        )
-    if log and positive.size and high > 1e-300:
+        log = False
+        if has_logs and low >= 0.0:
+            log = float(np.percentile(positive, 5)) * WIDE < high
+    if log and has_logs:
         return logarithmic(float(positive.min()), high)
-    return linear(min(low, 0.0) if zero else low, max(high, 0.0) if zero else high)
+    if zero:
+        low = min(low, 0.0)
+        high = max(high, 0.0)
+    return linear(low, high)
 
 
+# lengths of a chart [pixel]
 WIDTH = 460
 HEIGHT = 270
 LEFT = 44
 RIGHT = 10
 TOP = 30
 BOTTOM = 40
-MARGIN = 3
-"""Marks may reach so far over the rim of the plot [pixel]."""
+MARGIN = 3  # marks may reach so far over the rim of the plot
+DOT_RADIUS = 5
+REACH_RADIUS = 14  # of the disc around a dot that the pointer meets
+LABEL_ROOM = 22  # letters of a dot's label
 
 FAR = 3.0
 """Marks are cut off at so many heights or widths of the plot."""
-
-ROW = 40
-BAR = 11
-"""Height of a bar's row, and of the bar [pixel]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +214,7 @@ class Spot:
     x: float
     y: float
     name: str  # drawn beside it where there is room
-    said: str  # what it is in words, for those who do not see it
+    description: str  # the dot in words, for readers who do not see it
     kind: str  # classes of the mark
     href: str | None = None  # where it leads
 
@@ -200,164 +223,163 @@ class Plot:
     """One chart, built mark by mark."""
 
     def __init__(
-        self, x: Scale, y: Scale, *, x_label: str, y_label: str, height: int = HEIGHT
+        self,
+        x: AxisScale,
+        y: AxisScale,
+        *,
+        x_label: str,
+        y_label: str,
+        height: int = HEIGHT,
     ) -> None:
         self._x = x
         self._y = y
-        self._labels = (x_label, y_label)
-        self._height = height  # height [pixel]; the width is 460
-        self._across = WIDTH - LEFT - RIGHT
-        self._up = height - TOP - BOTTOM
+        self._x_label = x_label
+        self._y_label = y_label
+        self._height = height
+        self._plot_width = WIDTH - LEFT - RIGHT
+        self._plot_height = height - TOP - BOTTOM
         self._marks: list[Markup] = []
-        self._names = Names(self._across, self._up)
-        self._linked = False  # whether the keyboard reaches marks
+        self._notes: list[LabelBox] = []  # text that labels of dots must not cover
+        self._is_interactive = False
 
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
-        data = path_data(zip(self._columns(x), self._rows(y), strict=True))
-        self._path(data, f"line {kind}", title)
-
-    def front(self, x: ArrayLike, y: ArrayLike) -> None:
-        """Draw a line through dots, which their names keep off."""
-        self.line(x, y, "front")
-        places = list(
-            zip(self._columns(x).tolist(), self._rows(y).tolist(), strict=True)
-        )
-        for pair in pairwise(places):
-            self._names.keep_off(*pair)
+        points = zip(self._columns(x), self._rows(y), strict=True)
+        self._add_path(path_data(points), f"line {kind}", title)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
         """Fill between two lines where both are numbers."""
         columns = self._columns(x)
         below = self._rows(low)
         above = self._rows(high)
-        known = np.isfinite(below) & np.isfinite(above)
-        for run in _runs(known):
-            there = zip(columns[run], above[run], strict=True)
+        for run in _runs(np.isfinite(below) & np.isfinite(above)):
+            forth = zip(columns[run], above[run], strict=True)
             back = zip(columns[run][::-1], below[run][::-1], strict=True)
-            self._path(path_data([*there, *back]) + "Z", f"band {kind}")
+            self._add_path(path_data([*forth, *back]) + "Z", f"band {kind}")
 
     def steps(
         self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = ""
     ) -> None:
-        """Draw a histogram's outline; there is one edge more than heights."""
+        """Draw the outline of a histogram; there is one edge more than heights."""
         x = np.repeat(np.asarray(edges, np.float64), 2)[1:-1]
-        self.line(
-            x, np.repeat(np.asarray(heights, np.float64), 2), f"steps {kind}", title
-        )
+        y = np.repeat(np.asarray(heights, np.float64), 2)
+        self.line(x, y, f"steps {kind}", title)
 
     def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
         """Draw a cloud of points."""
         points = zip(self._columns(x), self._rows(y), strict=True)
-        self._path("".join(path_data([point]) for point in points), f"dots {kind}")
+        self._add_path(_dot_data(points), f"dots {kind}")
 
-    def level(self, value: float, label: str, *, above: bool = True) -> None:
-        """Draw a horizontal line with a name at its right end."""
+    def level(self, value: float, label: str) -> None:
+        """Draw a horizontal line with a label at its right end."""
         row = float(self._rows(np.array([value]))[0])
-        self._path(path_data([(0, row), (self._across, row)]), "level")
-        if above:
-            place = row - 5
-        else:
-            place = row + 13
-        self._marks.append(
-            tag("text", label, x=self._across, y=f"{place:.1f}", class_="note end")
-        )
+        self._add_path(path_data([(0, row), (self._plot_width, row)]), "level")
+        self._marks.append(draw_text(label, self._plot_width, row - 5, "note end"))
 
     def upright(self, value: float, label: str) -> None:
-        """Draw a vertical line with a name at its top."""
+        """Draw a vertical line with a label at its top."""
         column = float(self._columns(np.array([value]))[0])
-        self._path(path_data([(column, 0), (column, self._up)]), "level")
-        left = column > self._across / 2
-        x, kind = (column - 5, "note end") if left else (column + 5, "note")
-        self._marks.append(written(label, x, 11, kind))
-        self._names.take(label, (x, 11, float(left)))
+        self._add_path(path_data([(column, 0), (column, self._plot_height)]), "level")
+        is_right = column > self._plot_width / 2
+        if is_right:
+            note = Label(label, column - 5, 11, 1.0)
+        else:
+            note = Label(label, column + 5, 11, 0.0)
+        self._marks.append(_draw_label(note, "note"))
+        self._notes.append(note.box)
 
     def spots(self, spots: Sequence[Spot]) -> None:
-        """Draw dots that the keyboard reaches, and their names where they touch
-        nothing; first come first.
+        """Draw dots that the keyboard reaches, with labels where there is room.
+
+        Spots that come first have the choice.
         """
-        self._linked = True
-        columns = self._columns([s.x for s in spots])
-        rows = self._rows([s.y for s in spots])
-        places = list(zip(columns.tolist(), rows.tolist(), strict=True))
-        names, leads = self._names.beside(
-            [clipped(spot.name, 22) for spot in spots], places
+        self._is_interactive = True
+        columns = self._columns([spot.x for spot in spots]).tolist()
+        rows = self._rows([spot.y for spot in spots]).tolist()
+        labels = place_labels(
+            [clipped(spot.name, LABEL_ROOM) for spot in spots],
+            list(zip(columns, rows, strict=True)),
+            plot=LabelBox(0, 0, self._plot_width, self._plot_height),
+            taken=self._notes,
         )
-        for spot, (x, y), name in zip(spots, places, names, strict=True):
-            drawn = [
-                tag("title", spot.said),
-                tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=14, class_="reach"),
-                tag("circle", cx=f"{x:.1f}", cy=f"{y:.1f}", r=5),
-                name,
-            ]
-            kind = f"dot {spot.kind}".strip()
-            if spot.href is None:
-                reached = {"tabindex": 0, "role": "img"}
-            else:
-                reached = {"href": spot.href}
-            if spot.href is None:
-                element = "g"
-            else:
-                element = "a"
-            self._marks.append(
-                tag(element, *drawn, class_=kind, **reached, aria_label=spot.said)
-            )
-        self._marks += leads  # above the dots
+        for spot, x, y, label in zip(spots, columns, rows, labels, strict=True):
+            self._marks.append(_draw_spot(spot, x, y, label))
 
     def svg(self, title: str, description: str) -> Markup:
         """Return the chart."""
+        shift = f"translate({MARGIN} {MARGIN})"
         area = tag(
             "svg",
-            tag("g", *self._marks, transform=f"translate({MARGIN} {MARGIN})"),
+            tag("g", *self._marks, transform=shift),
             x=LEFT - MARGIN,
             y=TOP - MARGIN,
-            width=self._across + 2 * MARGIN,
-            height=self._up + 2 * MARGIN,
+            width=self._plot_width + 2 * MARGIN,
+            height=self._plot_height + 2 * MARGIN,
         )
-        return _canvas(
-            self._height, title, description, *self._axes(), area, linked=self._linked
-        )
+        role = "img"
+        if self._is_interactive:
+            role = "group"
+        parts = [*self._draw_axes(), area]
+        return _wrap_svg(self._height, title, description, parts, role=role)
 
-    def _path(self, data: str, kind: str, title: str = "") -> None:
-        self._marks.append(
-            tag("path", *([tag("title", title)] if title else []), d=data, class_=kind)
-        )
+    def _add_path(self, data: str, kind: str, title: str = "") -> None:
+        children = []
+        if title:
+            children.append(tag("title", title))
+        self._marks.append(tag("path", *children, d=data, class_=kind))
 
-    def _columns(self, x: ArrayLike) -> NDArray[np.float64]:
-        return np.clip(self._x.share(x), -FAR, FAR) * self._across
+    def _columns(self, x: ArrayLike) -> Floats:
+        return np.clip(self._x.share(x), -FAR, FAR) * self._plot_width
 
-    def _rows(self, y: ArrayLike) -> NDArray[np.float64]:
-        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._up
+    def _rows(self, y: ArrayLike) -> Floats:
+        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._plot_height
 
-    def _axes(self) -> list[Markup]:
-        bottom = TOP + self._up
+    def _draw_axes(self) -> list[Markup]:
+        bottom = TOP + self._plot_height
         right = WIDTH - RIGHT
         drawn = []
         for tick in self._y.ticks:
             row = TOP + float(self._rows(tick.value))
-            drawn.append(
-                tag("path", d=path_data([(LEFT, row), (right, row)]), class_="grid")
-            )
-            drawn.append(written(tick.label, LEFT - 7, row + 4, "tick end"))
+            drawn.append(_draw_line((LEFT, row), (right, row), "grid"))
+            drawn.append(draw_text(tick.label, LEFT - 7, row + 4, "tick end"))
         for tick in self._x.ticks:
             column = LEFT + float(self._columns(tick.value))
-            drawn.append(
-                tag(
-                    "path",
-                    d=path_data([(column, bottom), (column, bottom + 4)]),
-                    class_="mark",
-                )
-            )
-            drawn.append(written(tick.label, column, bottom + 17, "tick middle"))
-        x_label, y_label = self._labels
-        return [
-            *drawn,
-            tag("path", d=path_data([(LEFT, bottom), (right, bottom)]), class_="axis"),
-            written(
-                _with_factor(x_label, self._x), right, self._height - 5, "label end"
-            ),
-            written(_with_factor(y_label, self._y), 2, 14, "label"),
-        ]
+            drawn.append(_draw_line((column, bottom), (column, bottom + 4), "mark"))
+            drawn.append(draw_text(tick.label, column, bottom + 17, "tick middle"))
+        drawn.append(_draw_line((LEFT, bottom), (right, bottom), "axis"))
+
+        x_label = _with_factor(self._x_label, self._x)
+        drawn.append(draw_text(x_label, right, self._height - 5, "label end"))
+        y_label = _with_factor(self._y_label, self._y)
+        drawn.append(draw_text(y_label, 2, 14, "label"))
+        return drawn
+
+
+def _draw_spot(spot: Spot, x: float, y: float, label: Label | None) -> Markup:
+    """Return a dot with its label; the element takes the keyboard's focus."""
+    place = {"cx": f"{x:.1f}", "cy": f"{y:.1f}"}
+    parts = [
+        tag("title", spot.description),
+        tag("circle", **place, r=REACH_RADIUS, class_="reach"),
+        tag("circle", **place, r=DOT_RADIUS),
+    ]
+    if label is not None:
+        parts.append(_draw_label(label, "name"))
+    kind = f"dot {spot.kind}".strip()
+    if spot.href is None:
+        element = "g"
+        attributes: dict[str, object] = {"tabindex": 0, "role": "img"}
+    else:
+        element = "a"
+        attributes = {"href": spot.href}
+    return tag(element, *parts, class_=kind, **attributes, aria_label=spot.description)
+
+
+# lengths of a chart of bars [pixel]
+ROW_HEIGHT = 40
+BAR_HEIGHT = 11
+BARS_LEFT = 8
+BARS_RIGHT = 14
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -366,92 +388,105 @@ class Bar:
 
     label: str  # what it stands for
     value: float  # its length; NaN leaves it out
-    written: str  # the value as text
+    value_text: str  # the value as text
     dots: Sequence[float]  # values of the scenarios, drawn on the bar
     kind: str  # classes of the mark
     bold: bool = False  # whether it is the best
 
 
 def bar_chart(
-    bars: Sequence[Bar], scale: Scale, label: str, title: str, description: str
+    bars: Sequence[Bar], scale: AxisScale, *, label: str, title: str, description: str
 ) -> Markup:
     """Return horizontal bars with their names above them."""
-    left = 8
-    right = 14
-    across = WIDTH - left - right
-    bottom = ROW * len(bars) + 6
+    across = WIDTH - BARS_LEFT - BARS_RIGHT
+    bottom = ROW_HEIGHT * len(bars) + 6
 
-    def place(value: float) -> float:
-        return left + across * float(
-            np.clip(np.nan_to_num(scale.share(value), nan=0.0), 0.0, 1.0)
-        )
+    def column_of(value: float) -> float:
+        share = float(np.nan_to_num(scale.share(value), nan=0.0))
+        return BARS_LEFT + across * min(max(share, 0.0), 1.0)
 
     drawn: list[Markup] = []
     for tick in scale.ticks:
-        column = place(tick.value)
-        drawn.append(
-            tag("path", d=path_data([(column, 4), (column, bottom)]), class_="grid")
-        )
-        drawn.append(written(tick.label, column, bottom + 16, "tick middle"))
+        column = column_of(tick.value)
+        drawn.append(_draw_line((column, 4), (column, bottom), "grid"))
+        drawn.append(draw_text(tick.label, column, bottom + 16, "tick middle"))
+
+    start = float(BARS_LEFT)
     if not scale.log:
-        zero = place(0.0)
-    else:
-        zero = left
+        start = column_of(0.0)
     for number, bar in enumerate(bars):
-        top = number * ROW + 19
-        name = tag("tspan", bar.label, class_="strong" if bar.bold else None)
-        value = tag("tspan", f"  {bar.written}", class_="value")
-        drawn.append(tag("text", name, value, x=14, y=top - 5, class_="name"))
+        top = number * ROW_HEIGHT + 19
+        drawn.append(_draw_bar_name(bar, top))
         if np.isfinite(bar.value):
-            low, high = sorted((zero, place(bar.value)))
-            box = {
-                "x": f"{low:.1f}",
-                "y": top,
-                "width": f"{max(high - low, 1.0):.1f}",
-                "height": BAR,
-            }
-            drawn.append(tag("rect", **box, class_=f"bar {bar.kind}"))
-        points = [
-            (place(value), top + BAR / 2) for value in bar.dots if np.isfinite(value)
-        ]
+            low, high = sorted((start, column_of(bar.value)))
+            box = {"x": f"{low:.1f}", "width": f"{max(high - low, 1.0):.1f}"}
+            kind = f"bar {bar.kind}"
+            drawn.append(tag("rect", **box, y=top, height=BAR_HEIGHT, class_=kind))
+        middle = top + BAR_HEIGHT / 2
+        points = [(column_of(dot), middle) for dot in bar.dots if np.isfinite(dot)]
         if points:
-            drawn.append(
-                tag("path", d="".join(path_data([p]) for p in points), class_="dots on")
-            )
-    drawn.append(tag("path", d=path_data([(zero, 4), (zero, bottom)]), class_="axis"))
-    drawn.append(
-        written(_with_factor(label, scale), WIDTH - right, bottom + 34, "label end")
-    )
-    return _canvas(bottom + 40, title, description, *drawn)
+            drawn.append(tag("path", d=_dot_data(points), class_="dots on"))
+    drawn.append(_draw_line((start, 4), (start, bottom), "axis"))
+    axis_label = _with_factor(label, scale)
+    drawn.append(draw_text(axis_label, WIDTH - BARS_RIGHT, bottom + 34, "label end"))
+    return _wrap_svg(bottom + 40, title, description, drawn, role="img")
 
 
-def _canvas(
-    height: int, title: str, description: str, *drawn: object, linked: bool = False
+def _draw_bar_name(bar: Bar, top: float) -> Markup:
+    kind = None
+    if bar.bold:
+        kind = "strong"
+    name = tag("tspan", clipped(bar.label), class_=kind)
+    value = tag("tspan", f"  {bar.value_text}", class_="value")
+    return tag("text", name, value, x=14, y=top - 5, class_="name")
+
+
+def draw_text(text: str, x: float, y: float, kind: str) -> Markup:
+    """Return a text at a place, on its base line."""
+    return tag("text", text, x=f"{x:.1f}", y=f"{y:.1f}", class_=kind)
+
+
+def _draw_label(label: Label, kind: str) -> Markup:
+    classes = f"{kind} {ANCHORS[label.left_share]}".strip()
+    return draw_text(label.text, label.x, label.y, classes)
+
+
+def _draw_line(start: Point, end: Point, kind: str) -> Markup:
+    return tag("path", d=path_data([start, end]), class_=kind)
+
+
+def _dot_data(points: Iterable[Point]) -> str:
+    """Return path data of single points; a line with round ends makes dots of them."""
+    return "".join(path_data([point]) for point in points)
+
+
+def _wrap_svg(
+    height: int, title: str, description: str, parts: Sequence[object], *, role: str
 ) -> Markup:
     return tag(
         "svg",
         tag("title", title),
         tag("desc", description),
-        *drawn,
+        *parts,
         viewBox=f"0 0 {WIDTH} {height}",
         class_="chart",
-        role="group" if linked else "img",
+        role=role,
         aria_label=title,
     )
 
 
-def _with_factor(label: str, scale: Scale) -> Markup:
-    factor = tag("tspan", f"  {scale.factor}", class_="factor") if scale.factor else ""
-    return join([label, factor])
+def _with_factor(label: str, scale: AxisScale) -> Markup:
+    if not scale.factor:
+        return join([label])
+    return join([label, tag("tspan", f"  {scale.factor}", class_="factor")])
 
 
-def _runs(known: NDArray[np.bool_]) -> list[slice]:
+def _runs(is_kept: NDArray[np.bool_]) -> list[slice]:
     """Return the stretches of True.
 
     >>> _runs(np.array([True, True, False, True]))
     [slice(0, 2, None), slice(3, 4, None)]
     """
-    change = np.flatnonzero(
-        np.diff(np.concatenate([[False], known, [False]]).astype(np.int8))
-    )
-    return [slice(int(a), int(b)) for a, b in change.reshape(-1, 2)]
+    padded = np.concatenate([[False], is_kept, [False]]).astype(np.int8)
+    changes = np.flatnonzero(np.diff(padded)).reshape(-1, 2)
+    return [slice(int(start), int(stop)) for start, stop in changes]

@@ -1,6 +1,5 @@
-"""The report: one HTML page with the figures of the thesis, from score cards and
-predictions.
+"""The report: one HTML page with the figures of the thesis.
 
-``report.write_report`` needs no plotting library, no network and no script: charts are
-SVG, pictures small PNG files inside the page.
+It is made from score reports and predictions. ``report.write_report`` needs no plotting
+library, no network and no script: charts are SVG, pictures small PNG files in the page.
 """

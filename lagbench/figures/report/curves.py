@@ -1,28 +1,25 @@
-"""Curves over frames, of scenarios and of methods; bars, histograms and residuals at
-the key frame.
-"""
+"""Curves over frames: of every scenario, and means of every method."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.figures.chart import Bar, Plot, Scale, bar_chart, linear, spanning
+from lagbench.figures.chart import AxisScale, Plot, linear, spanning
 from lagbench.figures.html import (
-    Figure,
     Markup,
-    clipped,
-    html,
+    ReportFigure,
+    draw_key,
+    draw_table,
+    format_quantity,
     join,
-    key,
-    quantity,
     sentence,
-    table,
     tag,
-    text,
     words,
+    wrap_number,
 )
 from lagbench.metrics.aggregate import (
     FEWEST_FOR_INTERVAL,
@@ -30,505 +27,316 @@ from lagbench.metrics.aggregate import (
     bootstrap_interval,
     mean_over_seeds,
 )
-from lagbench.metrics.metric import Direction, mean
+from lagbench.metrics.metric import Metric
 from lagbench.metrics.vorticity import STABLE_PEARSON
 
-from .subject import Gallery, Moment, Subject, kind_of
+from .subject import ReportRow, Subject, series_kind
 
 Floats = NDArray[np.float64]
 
-# label, classes and values over frames of each line
-Series = Sequence[tuple[str, str, Floats]]
-# the axis of energies reaches so many times the truth's greatest; what is beyond is cut
-# off
+# the axis of energies reaches so many times the truth's greatest energy; what is beyond
+# is cut off
 TOLERATED = 3.0
 
+CORRELATION = "vorticity_pearson"
+POSITION_ERROR = "position_rmse"
 
-def error_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield the error over frames for all test scenarios, two figures per entry (Fig.
-    5.10).
-    """
-    several = len(subject.entries) > 1
-    if several:
-        shared = " The axis is shared by all files."
-    else:
-        shared = ""
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One line of a chart."""
+
+    label: str
+    kind: str  # classes of the mark
+    values: Floats  # shape [frame]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurveTexts:
+    """The texts of a figure of curves."""
+
+    name: str  # identifier, unique on the page
+    title: str
+    thesis: str  # the figure of the thesis that it corresponds to
+    caption: str
+    series: str = "method"  # what a line stands for
+
+
+def error_curves(subject: Subject) -> Iterator[ReportFigure]:
+    """Yield errors over frames in all test scenarios, by entry (Fig. 5.10)."""
+    for entry in subject.entries:
+        for name in (_main_error(subject), POSITION_ERROR):
+            if name in entry.card.submission:
+                yield _draw_scenarios(subject, entry.number, name)
+
+
+def _draw_scenarios(subject: Subject, number: int, name: str) -> ReportFigure:
+    """Return a metric of one entry, a line per test scenario."""
+    entry = subject.entries[number]
+    score = entry.card.submission[name]
+    series = []
+    for i, scenario in enumerate(score.scenarios):
+        label = f"scenario {scenario}"
+        series.append(Series(label, series_kind(i), score.per_frame[i]))
+
+    # the axis holds the curves of all entries
+    every = [other.card.submission[name].per_frame for other in subject.entries]
+    x_axis = _frame_axis(subject)
+    y_label = format_quantity(score.metric)
+    plot = Plot(x_axis, spanning(every), x_label="frame", y_label=y_label)
+    for line in series:
+        plot.line(subject.frames, line.values, line.kind, line.label)
     first = subject.frames[0]
     last = subject.frames[-1]
-    for entry in subject.entries:
-        for name in (
-            "vorticity_mse" if subject.full_box else "attribute_mse",
-            "position_rmse",
-        ):
-            score = entry.card.submission.get(name)
-            if score is None:
-                continue
-            y = spanning(
-                [other.card.submission[name].per_frame for other in subject.entries]
-            )
-            scenarios = enumerate(zip(score.scenarios, score.per_frame, strict=True))
-            series = [
-                (f"scenario {number}", kind_of(i), values)
-                for i, (number, values) in scenarios
-            ]
-            plot = Plot(
-                _frame_axis(subject), y, x_label="frame", y_label=quantity(score.metric)
-            )
-            for label, kind, values in series:
-                plot.line(subject.frames, values, kind, label)
-            said = f"Lines of {len(series)} test scenarios of {entry.name} from frame {first} to {last}."
-            yield _figure(
-                subject,
-                f"scenarios-{name.replace('_', '-')}-{entry.number}",
-                f"{words(name, capital=True)}, every test scenario"
-                + (f": {entry.name}" if several else ""),
-                "Fig. 5.10",
-                series,
-                plot.svg(f"{score.metric.name} over frames", said),
-                f"{sentence(score.metric)} One line per test scenario.{shared}",
-                what="scenario",
-            )
-
-
-def method_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield the methods side by side: mean over scenarios with its interval (Fig.
-    5.11).
-    """
-    said = f"Mean over {len(subject.scenarios)} test scenarios"
-    if len(subject.scenarios) >= FEWEST_FOR_INTERVAL:
-        said += "; the bands are 95 % bootstrap intervals over scenarios"
-    said += ". Grey: floors that cost nothing."
-    for name, thesis in (
-        ("vorticity_mse" if subject.full_box else "attribute_mse", "Fig. 5.11"),
-        ("position_rmse", "Fig. 5.11"),
-        ("velocity_rmse", "Fig. 5.11"),
-        ("vorticity_pearson", "Fig. 5.13"),
-    ):
-        yield from _by_method(subject, name, "methods", "over frames", thesis, said)
-
-
-def body_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
-    said = "Mean over the scenarios with an elastic body."
-    for name in ("shape_error", "connectivity"):
-        yield from _by_method(
-            subject, name, "bodies", "of jelly and rope", "section 4.8.2", said
-        )
-
-
-def _by_method(
-    subject: Subject, name: str, part: str, of: str, thesis: str, said: str
-) -> Iterator[Figure]:
-    """Yield the mean over scenarios of a metric, a line per method, where methods have
-    it.
-    """
-    rows = [row for row in subject.rows if name in row.scores]
-    bodies = part == "bodies"
-    if not rows:
-        return
-    metric = rows[0].scores[name].metric
-    series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
-    if (true := rows[0].scores.get(f"{name}_true")) is not None:
-        series.insert(0, ("truth", "truth", _mean(true)))
-    twin = np.asarray(subject.task.twin_floor if name == "position_rmse" else ())
-    twinned = len(twin) == len(subject.frames)
-    drawn = [*(values for _, _, values in series), *([twin] if twinned else [])]
-    if name == "connectivity":
-        y = linear(0.0, 1.0)
-    else:
-        y = spanning(drawn, log=False if bodies else None)
-    if name == "vorticity_pearson":
-        y = linear(
-            min(float(np.min(line[np.isfinite(line)], initial=0.0)) for line in drawn),
-            1.0,
-        )
-    plot = Plot(_frame_axis(subject), y, x_label="frame", y_label=quantity(metric))
-    for row in rows:
-        if row.entry is not None and not bodies:
-            low, high = np.array(
-                [*map(bootstrap_interval, row.scores[name].per_frame.T)]
-            ).T
-            plot.band(subject.frames, low, high, row.kind)
-    _draw(subject, plot, series)
-    if twinned:
-        plot.line(subject.frames, twin, "twin", "the solver after a nudge of 2^-20")
-    if name == "vorticity_pearson":
-        plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
-    methods = ", ".join(row.name for row in rows)
-    yield _figure(
-        subject,
-        f"{part}-{name.replace('_', '-')}",
-        f"{words(name, capital=True)} {of}",
-        thesis,
-        series,
-        plot.svg(
-            f"{name} over frames", f"{metric.summary}, one line each for {methods}."
-        ),
-        f"{sentence(metric)} {said}",
-        more=[("twin", "twin of the solver")] if twinned else [],
-    )
-
-
-def energy_curves(subject: Subject) -> Iterator[Figure]:
-    """Yield kinetic energy: what is kept of it (Fig. 5.19), and its value (Fig.
-    5.28).
-    """
-    first = subject.entries[0].card.submission
-    scenario = subject.scenarios[0]
-    true = ("truth", "truth", 100.0 * _mean(first["energy_retention_true"]))
-    yield _energy_figure(
-        subject,
-        "energy-kept",
-        "Kinetic energy kept",
-        "Fig. 5.19",
-        [
-            true,
-            *(
-                (r.name, r.kind, 100.0 * _mean(r.scores["energy_retention"]))
-                for r in subject.rows
-            ),
-        ],
-        "kinetic energy [% of the last given frame]",
-        f"Kinetic energy relative to the last given frame, mean over "
-        f"{len(subject.scenarios)} test scenarios."
-        " A surrogate that damps falls below the truth, one that blows up rises "
-        "above it;"
-        " more energy than the truth is no merit.",
-    )
-    raw = [
-        (e.name, e.kind, e.card.submission["energy_predicted"].per_frame[0])
-        for e in subject.entries
-    ]
-    yield _energy_figure(
-        subject,
-        "energy-raw",
-        f"Kinetic energy, scenario {scenario}",
-        "Fig. 5.28",
-        [("truth", "truth", first["energy_true"].per_frame[0]), *raw],
-        "kinetic energy [mass length²/frame²]",
-        f"E = Σ m |u|² / 2 with u the displacement per frame, in scenario {scenario}.",
-    )
-
-
-def _energy_figure(
-    subject: Subject,
-    name: str,
-    title: str,
-    thesis: str,
-    series: Series,
-    label: str,
-    said: str,
-) -> Figure:
-    top = np.nanmax(series[0][2], initial=0.0)
-    cut = [
-        np.minimum(values, TOLERATED * top) if top > 0.0 else values
-        for _, _, values in series
-    ]
-    plot = Plot(
-        _frame_axis(subject), spanning(cut, log=False), x_label="frame", y_label=label
-    )
-    _draw(subject, plot, series)
-    beyond = (
-        any(np.any(values > TOLERATED * top) for _, _, values in series) and top > 0.0
-    )
-    if beyond:
-        more = f" What exceeds {TOLERATED:g} times the truth's maximum is cut off."
-    else:
-        more = ""
     drawn = plot.svg(
-        title,
-        f"Kinetic energy over frames of "
-        f"{', '.join(method for method, _, _ in series)}.",
+        f"{score.metric.name} over frames",
+        f"Lines of {len(series)} test scenarios of {entry.name} from frame {first} to "
+        f"{last}.",
     )
-    return _figure(subject, name, title, thesis, series, drawn, said + more)
 
-
-def _draw(subject: Subject, plot: Plot, series: Series) -> None:
-    """Draw lines, the first on top."""
-    for label, kind, values in reversed(series):
-        plot.line(subject.frames, values, kind, label)
-
-
-def _figure(
-    subject: Subject,
-    name: str,
-    title: str,
-    thesis: str,
-    series: Series,
-    drawn: Markup,
-    caption: str,
-    *,
-    more: Sequence[tuple[str, str]] = (),
-    what: str = "method",
-) -> Figure:
-    """Return a chart of lines with its key, and their values at the frames of interest
-    and the last one.
-    """
-    frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
-    column = {int(frame): i for i, frame in enumerate(subject.frames)}
-    rows = [
-        [label, *(html(values[column[frame]]) for frame in frames)]
-        for label, _, values in series
-    ]
-    return Figure(
-        name=name,
+    title = f"{words(name, capital=True)}, every test scenario"
+    caption = f"{sentence(score.metric)} One line per test scenario."
+    if len(subject.entries) > 1:
+        title += f": {entry.name}"
+        caption += " The axis is shared by all files."
+    texts = CurveTexts(
+        name=f"scenarios-{name.replace('_', '-')}-{number}",
         title=title,
-        thesis=thesis,
-        body=join([key([*((kind, label) for label, kind, _ in series), *more]), drawn]),
+        thesis="Fig. 5.10",
         caption=caption,
-        data=table(
-            [what, *(tag("span", f"frame {frame}") for frame in frames)],
-            rows,
-            label="Numbers",
-        ),
+        series="scenario",
     )
+    return _compose_figure(subject, texts, series, drawn)
 
 
-def _frame_axis(subject: Subject) -> Scale:
-    return linear(
-        float(subject.frames[0]), float(subject.frames[-1]), count=6, tight=True
-    )
-
-
-def _mean(score: Score) -> Floats:
-    return mean_over_seeds(
-        np.where(np.isfinite(score.per_frame), score.per_frame, np.nan)
-    )
-
-
-SHOWN = (
-    ("vorticity_pearson", "Correlation of vorticity", "Fig. 5.13"),
-    ("vorticity_kl", "KL divergence of vorticity", "Fig. 5.16"),
-    ("vorticity_w1", "Distance of vorticity distributions", "Fig. 5.16"),
-)
-
-
-def bar_figures(subject: Subject) -> Iterator[Figure]:
-    """Yield one figure per metric that is defined in this split."""
-    frame = subject.key_frame
-    unknown = [np.nan] * len(subject.scenarios)  # of shipped floors the mean is kept
-    for name, title, thesis in SHOWN:
+def method_curves(subject: Subject) -> Iterator[ReportFigure]:
+    """Yield means over scenarios with their intervals, by method (Fig. 5.11)."""
+    note = f"Mean over {len(subject.scenarios)} test scenarios"
+    if len(subject.scenarios) >= FEWEST_FOR_INTERVAL:
+        note += "; the bands are 95 % bootstrap intervals over scenarios"
+    note += ". Grey: reference predictors, which learn nothing."
+    figures = {
+        _main_error(subject): "Fig. 5.11",
+        POSITION_ERROR: "Fig. 5.11",
+        "velocity_rmse": "Fig. 5.11",
+        CORRELATION: "Fig. 5.13",
+    }
+    for name, thesis in figures.items():
         rows = [row for row in subject.rows if name in row.scores]
         if not rows:
             continue
         metric = rows[0].scores[name].metric
-        values = {row.name: row.scores[name].at(frame) for row in rows}
-        rows.sort(
-            key=lambda row: float(
-                np.nan_to_num(metric.loss(mean(values[row.name])), nan=np.inf)
-            )
+        series = _mean_series(rows, name)
+        perturbed = _perturbed_run(subject, name)
+        y_axis = _error_axis(name, [*series, *perturbed])
+        y_label = format_quantity(metric)
+        plot = Plot(_frame_axis(subject), y_axis, x_label="frame", y_label=y_label)
+        for row in rows:
+            if row.entry is not None:
+                low, high = _frame_intervals(row.scores[name])
+                plot.band(subject.frames, low, high, row.kind)
+        _draw_lines(subject, plot, series)
+        for line in perturbed:
+            title = "the solver after a perturbation of 2^-20"
+            plot.line(subject.frames, line.values, line.kind, title)
+        if name == CORRELATION:
+            plot.level(STABLE_PEARSON, f"stable above {STABLE_PEARSON}")
+
+        texts = CurveTexts(
+            name=f"methods-{name.replace('_', '-')}",
+            title=f"{words(name, capital=True)} over frames",
+            thesis=thesis,
+            caption=f"{sentence(metric)} {note}",
         )
-        best = next((row for row in rows if row.entry is not None), None)
-        bars = [
-            Bar(
-                label=clipped(row.name),
-                value=mean(values[row.name]),
-                written=text(mean(values[row.name])),
-                dots=tuple(values[row.name].tolist()) if row.entry is not None else (),
-                kind=row.kind,
-                bold=row is best and len(subject.entries) > 1,
-            )
-            for row in rows
-        ]
-        known = [
-            value
-            for bar in bars
-            for value in (bar.value, *bar.dots)
-            if np.isfinite(value)
-        ]
-        higher = metric.direction is Direction.HIGHER
-        if higher:
-            scale = linear(min(0.0, *known, 0.0), 1.0)
+        drawn = plot.svg(f"{name} over frames", _describe_lines(metric, rows))
+        yield _compose_figure(subject, texts, series, drawn, unlisted=perturbed)
+
+
+def body_curves(subject: Subject) -> Iterator[ReportFigure]:
+    """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
+    for name in ("shape_error", "connectivity"):
+        rows = [row for row in subject.rows if name in row.scores]
+        if not rows:
+            continue
+        metric = rows[0].scores[name].metric
+        series = _mean_series(rows, name)
+        if name == "connectivity":
+            y_axis = linear(0.0, 1.0)
         else:
-            scale = spanning([np.array(known)], log=False)
-        whole = f"{title} at frame {frame}"
-        said = "; ".join(f"{bar.label}: {bar.written}" for bar in bars)
-        cells = [
-            [row.name, *map(html, (bar.value, *(bar.dots or unknown)))]
-            for row, bar in zip(rows, bars, strict=True)
-        ]
-        yield Figure(
-            name=f"bars-{name.replace('_', '-')}",
-            title=whole,
-            thesis=thesis,
-            body=bar_chart(bars, scale, quantity(metric), whole, said),
-            caption=f"{sentence(metric)} Mean over {len(subject.scenarios)} test "
-            f"scenarios at frame {frame},"
-            f" dots are the scenarios of entries. {'Higher' if higher else 'Lower'} "
-            f"is better;"
-            f" perfect is {metric.perfect:g}. A dash means undefined, as for a "
-            f"prediction at rest.",
-            data=table(
-                ["method", "mean", *(f"scenario {i}" for i in subject.scenarios)],
-                cells,
-                label=title,
-            ),
+            y_axis = spanning([line.values for line in series], log=False)
+        y_label = format_quantity(metric)
+        plot = Plot(_frame_axis(subject), y_axis, x_label="frame", y_label=y_label)
+        _draw_lines(subject, plot, series)
+        texts = CurveTexts(
+            name=f"bodies-{name.replace('_', '-')}",
+            title=f"{words(name, capital=True)} of jelly and rope",
+            thesis="section 4.8.2",
+            caption=f"{sentence(metric)} Mean over the scenarios with an elastic body.",
         )
+        drawn = plot.svg(f"{name} over frames", _describe_lines(metric, rows))
+        yield _compose_figure(subject, texts, series, drawn)
 
 
-BINS = 40
-FEWEST_BINS = 10
+def _main_error(subject: Subject) -> str:
+    if subject.is_full_box:
+        return "vorticity_mse"
+    return "attribute_mse"
 
-MOST_DOTS = 1600  # Of more nodes evenly many are drawn
-FAR_QUANTILE = 0.5  # axes leave out this share of the nodes at either end [%]
+
+def _mean_series(rows: Sequence[ReportRow], name: str) -> list[Series]:
+    """Return the mean over scenarios of each method, after the truth's own value."""
+    series = []
+    true_score = rows[0].scores.get(f"{name}_true")
+    if true_score is not None:
+        series.append(Series("truth", "truth", _mean_over_scenarios(true_score)))
+    for row in rows:
+        values = _mean_over_scenarios(row.scores[name])
+        series.append(Series(row.name, row.kind, values))
+    return series
 
 
-def histogram_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
-    """Yield the distribution of vorticity at the key frame (5.12) and at several
-    (5.18).
-    """
+def _perturbed_run(subject: Subject, name: str) -> list[Series]:
+    """Return the error of a perturbed run of the solver, where there is one."""
+    if name != POSITION_ERROR:
+        return []
+    values = np.asarray(subject.task.twin_floor)
+    if len(values) != len(subject.frames):
+        return []
+    return [Series("perturbed run of the solver", "twin", values)]
+
+
+def _error_axis(name: str, series: Sequence[Series]) -> AxisScale:
+    lines = [line.values for line in series]
+    if name == CORRELATION:
+        values = np.concatenate(lines)
+        lowest = np.min(values[np.isfinite(values)], initial=0.0)
+        return linear(float(lowest), 1.0)
+    return spanning(lines)
+
+
+def _frame_intervals(score: Score) -> tuple[Floats, Floats]:
+    """Return low and high end of the interval of each frame, shape [frame] each."""
+    bounds = [bootstrap_interval(values) for values in score.per_frame.T]
+    low, high = np.array(bounds).T
+    return low, high
+
+
+def _describe_lines(metric: Metric, rows: Sequence[ReportRow]) -> str:
+    methods = ", ".join(row.name for row in rows)
+    return f"{metric.summary}, one line each for {methods}."
+
+
+def energy_curves(subject: Subject) -> Iterator[ReportFigure]:
+    """Yield the retained kinetic energy (Fig. 5.19), and its value (Fig. 5.28)."""
+    yield _retained_energy(subject)
+    yield _raw_energy(subject)
+
+
+def _retained_energy(subject: Subject) -> ReportFigure:
+    scores = subject.entries[0].card.submission
+    true_values = 100.0 * _mean_over_scenarios(scores["energy_retention_true"])
+    series = [Series("truth", "truth", true_values)]
+    for row in subject.rows:
+        values = 100.0 * _mean_over_scenarios(row.scores["energy_retention"])
+        series.append(Series(row.name, row.kind, values))
+    texts = CurveTexts(
+        name="energy-kept",
+        title="Kinetic energy kept",
+        thesis="Fig. 5.19",
+        caption="Kinetic energy relative to the last given frame, mean over "
+        f"{len(subject.scenarios)} test scenarios. A surrogate that damps falls below "
+        "the truth, one that blows up rises above it; more energy than the truth is no "
+        "merit.",
+    )
+    y_label = "kinetic energy [% of the last given frame]"
+    return _energy_figure(subject, texts, series, y_label=y_label)
+
+
+def _raw_energy(subject: Subject) -> ReportFigure:
     scenario = subject.scenarios[0]
-    items = [
-        ("truth", "truth"),
-        *((entry.kind, entry.name) for entry in subject.entries),
-    ]
-    moment = gallery.moments[scenario, subject.key_frame]
-    yield Figure(
-        name="histogram",
-        title=f"Vorticity distribution at frame {subject.key_frame}",
-        thesis="Fig. 5.12",
-        body=join([key(items), _histogram(subject, moment)]),
-        caption=f"Share of the grid nodes per bin of vorticity [1/frame], scenario "
-        f"{scenario}. Black: the"
-        " truth, whose range sets the bins; the first and the last bin hold all that "
-        "lies beyond.",
+    scores = subject.entries[0].card.submission
+    series = [Series("truth", "truth", scores["energy_true"].per_frame[0])]
+    for entry in subject.entries:
+        values = entry.card.submission["energy_predicted"].per_frame[0]
+        series.append(Series(entry.name, entry.kind, values))
+    texts = CurveTexts(
+        name="energy-raw",
+        title=f"Kinetic energy, scenario {scenario}",
+        thesis="Fig. 5.28",
+        caption="E = Σ m |u|² / 2 with u the displacement per frame, in scenario "
+        f"{scenario}.",
     )
-    charts = [
-        tag(
-            "div",
-            tag("p", f"frame {held.frame}", class_="panels-title"),
-            _histogram(subject, held),
-        )
-        for held in gallery.at(scenario, subject.histogram_frames)
-    ]
-    yield Figure(
-        name="histograms",
-        title="Vorticity distribution over time",
-        thesis="Fig. 5.18",
-        body=join([key(items), tag("div", *charts, class_="figures small")]),
-        caption=f"As the figure before, at other frames of scenario {scenario}; each "
-        f"frame has bins of its"
-        " own.",
-        wide=True,
-    )
+    y_label = "kinetic energy [mass length²/frame²]"
+    return _energy_figure(subject, texts, series, y_label=y_label)
 
 
-def _histogram(subject: Subject, moment: Moment) -> Markup:
-    true = moment.pairs[0].true_vorticity
-    edges, heights = shares_of(true, true)
-    shares = [("truth", "truth", heights)]
-    for entry, pair in zip(subject.entries, moment.pairs, strict=True):
-        shares.append(
-            (entry.name, entry.kind, shares_of(pair.predicted_vorticity, true)[1])
-        )
-    top = max(float(heights.max()) for _, _, heights in shares)
-    plot = Plot(
-        linear(float(edges[0]), float(edges[-1]), tight=True),
-        linear(0.0, top),
-        x_label="vorticity [1/frame]",
-        y_label="share of nodes [%]",
-        height=230,
-    )
-    for name, kind, heights in [*shares[1:], shares[0]]:
-        plot.steps(edges, heights, kind, name)
-    return plot.svg(
-        f"Vorticity distribution at frame {moment.frame}",
-        f"Histograms of {', '.join(name for name, _, _ in shares)} in scenario "
-        f"{moment.scenario}.",
-    )
+def _energy_figure(
+    subject: Subject, texts: CurveTexts, series: Sequence[Series], *, y_label: str
+) -> ReportFigure:
+    """Return energies over frames; the first series is the truth's."""
+    highest = TOLERATED * float(np.nanmax(series[0].values, initial=0.0))
+    lines = [line.values for line in series]
+    caption_note = ""
+    if highest > 0.0:
+        if any(np.any(values > highest) for values in lines):
+            caption_note = (
+                f" Energies beyond {TOLERATED:g} times the truth's maximum are cut off."
+            )
+        lines = [np.minimum(values, highest) for values in lines]
+    y_axis = spanning(lines, log=False)
+    plot = Plot(_frame_axis(subject), y_axis, x_label="frame", y_label=y_label)
+    _draw_lines(subject, plot, series)
+    methods = ", ".join(line.label for line in series)
+    drawn = plot.svg(texts.title, f"Kinetic energy over frames of {methods}.")
+    return _compose_figure(subject, texts, series, drawn, note=caption_note)
 
 
-def shares_of(values: Floats, truth: Floats) -> tuple[Floats, Floats]:
-    """Return edges of bins over the truth's range, and per cent of the values in
-    each.
+def _draw_lines(subject: Subject, plot: Plot, series: Sequence[Series]) -> None:
+    """Draw lines, the first on top."""
+    for line in reversed(series):
+        plot.line(subject.frames, line.values, line.kind, line.label)
+
+
+def _compose_figure(
+    subject: Subject,
+    texts: CurveTexts,
+    series: Sequence[Series],
+    drawn: Markup,
+    *,
+    unlisted: Sequence[Series] = (),
+    note: str = "",
+) -> ReportFigure:
+    """Return a chart of lines with its key and a table of values at some frames.
+
+    The table has the frames of interest and the last one. Unlisted series stand in the
+    key alone.
     """
-    # few where there are few nodes
-    bins = int(np.clip(2.0 * np.sqrt(max(truth.size, 1)), FEWEST_BINS, BINS))
-    low, high = (float(truth.min()), float(truth.max())) if truth.size else (-1.0, 1.0)
-    if high > low:
-        edges = np.linspace(low, high, bins + 1)
-    else:
-        edges = np.linspace(low - 1.0, high + 1.0, bins + 1)
-    # the end bins are open
-    count = np.bincount(
-        np.searchsorted(edges[1:-1], values, side="right"), minlength=bins
+    frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
+    columns = np.searchsorted(subject.frames, frames)
+    head: list[object] = [texts.series]
+    head += [tag("span", f"frame {frame}") for frame in frames]
+    rows = []
+    for line in series:
+        numbers = [wrap_number(value) for value in line.values[columns].tolist()]
+        rows.append([line.label, *numbers])
+
+    key = draw_key([(line.kind, line.label) for line in (*series, *unlisted)])
+    return ReportFigure(
+        name=texts.name,
+        title=texts.title,
+        thesis=texts.thesis,
+        body=join([key, drawn]),
+        caption=texts.caption + note,
+        data=draw_table(head, rows, label="Numbers"),
     )
-    return edges, 100.0 * count / max(1, values.size)
 
 
-def residual_figures(subject: Subject, gallery: Gallery) -> Iterator[Figure]:
-    """Yield residuals against the truth (5.14) and against the node's number (5.15)."""
-    scenario = subject.scenarios[0]
-    pairs = gallery.moments[scenario, subject.key_frame].pairs
-    if not pairs[0].node_count:  # nodes are the truth's
-        return
-    # axes leave out the farthest nodes
-    reach = float(
-        max(
-            np.percentile(np.abs(pair.vorticity_residual), 100.0 - FAR_QUANTILE)
-            for pair in pairs
-        )
-    )
-    if np.isfinite(reach) and 0.0 < reach < 1e300:
-        reach = reach
-    else:
-        reach = 1.0
-    y = linear(-reach, reach)
-    true = pairs[0].true_vorticity
-    low, high = np.percentile(true, [FAR_QUANTILE, 100.0 - FAR_QUANTILE])
-    room = 0.05 * (high - low)
-    by_truth = linear(float(low - room), float(high + room), tight=True)
-    by_number = linear(0.0, float(pairs[0].nodes.size), tight=True)
-    if len(true) > MOST_DOTS:
-        drawn = f" {min(len(true), MOST_DOTS)} of {len(true)} nodes are drawn."
-    else:
-        drawn = ""
-    said = (
-        f"Residual r = predicted − true vorticity [1/frame] at the grid nodes, "
-        f"scenario {scenario}, frame"
-        f" {subject.key_frame}."
-    )
-    slope = "A cloud without slope around 0 is good; slope −1 means that no rotation is predicted."
-    places = (
-        "Nodes are numbered column by column from the lower left: clusters are places."
-    )
-    for name, against, thesis, axis, label, told in (
-        (
-            "truth",
-            "true vorticity",
-            "Fig. 5.14",
-            by_truth,
-            "true vorticity [1/frame]",
-            slope,
-        ),
-        ("node", "node number", "Fig. 5.15", by_number, "node", places),
-    ):
-        title = f"Residual against {against}"
-        charts = []
-        for entry, pair in zip(subject.entries, pairs, strict=True):
-            if name == "truth":
-                x = pair.true_vorticity
-            else:
-                x = np.flatnonzero(pair.nodes).astype(np.float64)
-            every = -(-len(x) // MOST_DOTS)
-            plot = Plot(
-                axis, y, x_label=label, y_label="residual [1/frame]", height=230
-            )
-            plot.dots(x[::every], pair.vorticity_residual[::every], entry.kind)
-            plot.level(0.0, "")
-            spread = text(float(np.sqrt(np.mean(pair.vorticity_residual**2))))
-            rms = tag("span", f"RMS {spread}", class_="muted n")
-            heading = tag("p", entry.name, "  ", rms, class_="panels-title")
-            cloud = plot.svg(
-                f"{title}, {entry.name}",
-                f"{len(x)} nodes, RMS residual {spread} per frame.",
-            )
-            charts.append(tag("div", heading, cloud))
-        yield Figure(
-            name=f"residuals-{name}",
-            title=title,
-            thesis=thesis,
-            body=tag("div", *charts, class_="figures small"),
-            caption=f"{said} {told}{drawn}",
-            wide=len(charts) > 1,
-        )
+def _frame_axis(subject: Subject) -> AxisScale:
+    first = float(subject.frames[0])
+    last = float(subject.frames[-1])
+    return linear(first, last, count=6, tight=True)
+
+
+def _mean_over_scenarios(score: Score) -> Floats:
+    is_finite = np.isfinite(score.per_frame)
+    return mean_over_seeds(np.where(is_finite, score.per_frame, np.nan))

@@ -1,45 +1,48 @@
-"""Tables: scores beside the floors, scores at frames, every metric.
-
-The top of the page: what was scored, the numbers that matter, flags and warnings.
-"""
+"""Tables of the report: scores over the horizon, at frames, per scenario, ranked."""
 
 from __future__ import annotations
 
-import math
-import shlex
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.figures.html import (
     Markup,
-    html,
+    draw_table,
+    format_unit,
     interval,
     join,
     paragraph,
-    table,
     tag,
     text,
-    unit,
     words,
+    wrap_number,
 )
-from lagbench.metrics.aggregate import Score, bootstrap_interval
-from lagbench.metrics.frame import Floats
+from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction, Metric, mean
-from lagbench.metrics.significance import FEWEST_SCENARIOS, compare, standings
+from lagbench.metrics.significance import (
+    FEWEST_SCENARIOS,
+    Comparison,
+    Standing,
+    compare,
+    standings,
+)
 from lagbench.metrics.table import CHOSEN, FAMILIES, METRICS
-from lagbench.metrics.vorticity import STABLE_PEARSON
 
-from .subject import Row, Subject
+from .subject import ReportRow, Subject
 
-AT_FRAMES = (
+Floats = NDArray[np.float64]
+
+# metrics of the table at the key frame, in full boxes and with a free surface
+AT_FRAME_FULL_BOX = (
     "vorticity_mae",
     "vorticity_mse",
     "vorticity_rmse",
     "vorticity_pearson",
     "vorticity_kl",
 )
-AT_FRAMES_FREE = (
+AT_FRAME_FREE_SURFACE = (
     "sliced_w2",
     "position_rmse",
     "attribute_mse",
@@ -47,104 +50,125 @@ AT_FRAMES_FREE = (
     "energy_ratio",
 )
 
-_WORDS = {
+AIMS = {
     Direction.LOWER: "lower is better",
     Direction.HIGHER: "higher is better",
     Direction.NONE: "observable",
 }
 
+LINE_BREAK = "\u200b"  # where a line may end
+
 
 def score_table(subject: Subject) -> Markup:
-    """Return the chosen metrics over the horizon, with intervals, beside the floors."""
-    wanted = dict.fromkeys((subject.ranking.name, *CHOSEN))
-    return _score_rows(subject, [name for name in wanted if _anywhere(subject, name)])
+    """Return the chosen metrics over the horizon, with intervals, by method."""
+    names = dict.fromkeys((subject.ranking.name, *CHOSEN))
+    return _horizon_table(subject, _measured(subject, names))
 
 
 def every_metric(subject: Subject) -> Markup:
     """Return all metrics over the horizon, family by family."""
-    families = {
-        family.capitalize(): [
-            metric.name for metric in metrics if _anywhere(subject, metric.name)
-        ]
-        for family, metrics in FAMILIES.items()
-    }
-    own = subject.entries[0].card.submission
-    families["Of other packages"] = [name for name in own if name not in METRICS]
-    return join(
-        join([tag("h4", family), _score_rows(subject, names)])
-        for family, names in families.items()
-        if names
-    )
+    parts = []
+    for family, metrics in FAMILIES.items():
+        names = _measured(subject, [metric.name for metric in metrics])
+        if names:
+            parts.append(tag("h4", family.capitalize()))
+            parts.append(_horizon_table(subject, names))
+
+    submission = subject.entries[0].card.submission
+    names = [name for name in submission if name not in METRICS]
+    if names:
+        parts.append(tag("h4", "Of other packages"))
+        parts.append(_horizon_table(subject, names))
+    return join(parts)
 
 
-def _anywhere(subject: Subject, name: str) -> bool:
-    """Tell whether all entries have a metric; shipped floors lack those of extras."""
-    return all(name in entry.card.submission for entry in subject.entries)
-
-
-def _score_rows(subject: Subject, names: Sequence[str]) -> Markup:
-    rows = subject.rows
-    cells = []
+def _measured(subject: Subject, names: Sequence[str] | dict[str, None]) -> list[str]:
+    """Return the metrics that all entries have, of some names."""
+    submissions = [entry.card.submission for entry in subject.entries]
+    measured = []
     for name in names:
-        scores = [row.scores.get(name) for row in rows]
-        metric = rows[0].scores[name].metric
-        best = _best(
-            metric, [[] if score is None else score.values for score in scores]
-        )
-        if name == subject.ranking.name:
-            ranks = [" ", tag("span", "ranks", class_="flag ok")]
-        else:
-            ranks = []
-        broken = name.replace("_", "_\u200b")  # where a line may end
-        named = tag(
-            "span",
-            broken,
-            tag("span", unit(metric), class_="unit"),
-            *ranks,
-            class_="metric",
-        )
-        target = metric.direction is Direction.TARGET
-        if target:
-            aim = f"aims at {metric.perfect:g}"
-        else:
-            aim = _WORDS[metric.direction]
-        line: list[object] = [
-            join([named, tag("span", f"{metric.summary}; {aim}", class_="sub")])
-        ]
-        for i, score in enumerate(scores):
-            if score:
-                undefined = sum(score.undefined)
+        if all(name in submission for submission in submissions):
+            measured.append(name)
+    return measured
+
+
+def _horizon_table(subject: Subject, names: Sequence[str]) -> Markup:
+    """Return means over the horizon, a line per metric and a column per method."""
+    head = ["metric", *map(_draw_heading, subject.rows)]
+    lines = []
+    for name in names:
+        metric = subject.rows[0].scores[name].metric
+        # reference predictors lack metrics of other packages
+        scores = [row.scores.get(name) for row in subject.rows]
+        values: list[Sequence[float] | Floats] = []
+        for score in scores:
+            if score is None:
+                values.append([])
             else:
-                undefined = 0
-            lost = (
-                tag("span", f"{undefined} undefined", class_="ci") if undefined else ""
-            )
-            number = (
-                tag("span", text(score.mean), class_="n best" if i in best else "n")
-                if score
-                else ""
-            )
-            line.append(join([number, interval(score.interval), lost]) if score else "")
-        cells.append(line)
-    return table(["metric", *map(_heading, rows)], cells, kind="scores", label="Scores")
+                values.append(score.values)
+        best = _find_best(metric, values)
+
+        ranks = metric.name == subject.ranking.name
+        line: list[object] = [_draw_metric(metric, ranks=ranks)]
+        for column, score in enumerate(scores):
+            if score is None:
+                line.append("")
+            else:
+                line.append(_draw_score(score, is_best=column in best))
+        lines.append(line)
+    return draw_table(head, lines, kind="scores", label="Scores")
 
 
-def _heading(row: Row) -> Markup:
-    if row.entry:
-        return tag("span", row.name)
-    return tag("span", row.name, class_="muted whole")
+def _draw_metric(metric: Metric, *, ranks: bool) -> Markup:
+    """Return name, unit, summary and aim of a metric."""
+    parts: list[object] = [metric.name.replace("_", f"_{LINE_BREAK}")]
+    parts.append(tag("span", format_unit(metric), class_="unit"))
+    if ranks:
+        parts += [" ", tag("span", "ranks", class_="flag ok")]
+    if metric.direction is Direction.TARGET:
+        aim = f"aims at {metric.perfect:g}"
+    else:
+        aim = AIMS[metric.direction]
+    summary = tag("span", f"{metric.summary}; {aim}", class_="sub")
+    return join([tag("span", *parts, class_="metric"), summary])
 
 
-def _best(metric: Metric, values: Sequence[Sequence[float] | Floats]) -> frozenset[int]:
-    """Return which are best by the mean of the scenarios' losses; none where nothing is
-    judged or defined.
+def _draw_score(score: Score, *, is_best: bool) -> Markup:
+    """Return a mean with its interval and the number of undefined values."""
+    parts = [_draw_number(score.mean, is_best=is_best), interval(score.interval)]
+    undefined_count = sum(score.undefined)
+    if undefined_count:
+        parts.append(tag("span", f"{undefined_count} undefined", class_="ci"))
+    return join(parts)
 
-    Those that read the same are included. Beside and beyond what a metric aims at do
-    not cancel.
+
+def _draw_number(value: float, *, is_best: bool) -> Markup:
+    kind = "n"
+    if is_best:
+        kind = "n best"
+    return tag("span", text(value), class_=kind)
+
+
+def _draw_heading(row: ReportRow) -> Markup:
+    if row.entry is None:
+        return tag("span", row.name, class_="muted whole")
+    return tag("span", row.name)
+
+
+def _find_best(
+    metric: Metric, values: Sequence[Sequence[float] | Floats]
+) -> frozenset[int]:
+    """Return which methods are best by the mean of their scenarios' losses.
+
+    Losses that read the same are equal. An observable, or a metric that nobody has, has
+    no best. Values above and below a target do not cancel, as losses are averaged.
     """
     if metric.direction is Direction.NONE:
         return frozenset()
-    losses = [mean(np.array([metric.loss(value) for value in held])) for held in values]
+    losses = []
+    for method_values in values:
+        scenario_losses = [metric.loss(value) for value in method_values]
+        losses.append(mean(np.array(scenario_losses)))
     if not np.isfinite(losses).any():
         return frozenset()
     least = text(float(np.nanmin(losses)))
@@ -152,83 +176,80 @@ def _best(metric: Metric, values: Sequence[Sequence[float] | Floats]) -> frozens
 
 
 def frame_table(subject: Subject) -> Markup:
-    """Return the metrics of Tables 5.4 and 5.5 at the key frame, one row per method."""
-    if subject.full_box:
-        chosen = AT_FRAMES
-    else:
-        chosen = AT_FRAMES_FREE
-    names = [name for name in chosen if _anywhere(subject, name)]
+    """Return the metrics of Tables 5.4 and 5.5 at the key frame, by method."""
+    names = _measured(subject, AT_FRAME_FREE_SURFACE)
+    if subject.is_full_box:
+        names = _measured(subject, AT_FRAME_FULL_BOX)
     frame = subject.key_frame
-    cells: list[list[object]] = [[_heading(row)] for row in subject.rows]
+    lines: list[list[object]] = [[_draw_heading(row)] for row in subject.rows]
     for name in names:
         metric = subject.rows[0].scores[name].metric
-        held = [row.scores[name].at(frame) for row in subject.rows]
-        # of floors the mean alone is known, which says nothing where a metric aims at a
-        # value
-        aims = metric.direction is Direction.TARGET
-        count = len(subject.scenarios)
-        best = _best(
-            metric,
-            [values[:0] if aims and len(values) < count else values for values in held],
-        )
-        for i, (line, values) in enumerate(zip(cells, held, strict=True)):
-            line.append(
-                tag("span", text(mean(values)), class_="n best" if i in best else "n")
-            )
-    return table(
-        ["method", *(words(n) for n in names)], cells, label=f"Scores at frame {frame}"
-    )
+        values = [row.scores[name].at(frame) for row in subject.rows]
+        best = _find_best(metric, _comparable(subject, metric, values))
+        for number, line in enumerate(lines):
+            value = mean(values[number])
+            line.append(_draw_number(value, is_best=number in best))
+    head = ["method", *map(words, names)]
+    return draw_table(head, lines, label=f"Scores at frame {frame}")
+
+
+def _comparable(
+    subject: Subject, metric: Metric, values: Sequence[Floats]
+) -> list[Floats]:
+    """Return values by method, none for means that cannot be compared.
+
+    Of reference predictors only the mean is known. It says nothing about a metric with
+    a target: scenarios on both sides of the target cancel.
+    """
+    if metric.direction is not Direction.TARGET:
+        return list(values)
+    comparable = []
+    for method_values in values:
+        has_all_scenarios = len(method_values) >= len(subject.scenarios)
+        if has_all_scenarios:
+            comparable.append(method_values)
+        else:
+            comparable.append(method_values[:0])
+    return comparable
 
 
 def scenario_table(subject: Subject) -> Markup:
-    """Return the ranking metric of every scenario, one row per method."""
+    """Return the ranking metric of every scenario, by method."""
     name = subject.ranking.name
-    cells = [
-        [_heading(row), *map(html, row.scores[name].values.tolist())]
-        for row in subject.rows
-    ]
-    return table(
-        ["method", *(str(i) for i in subject.scenarios)],
-        cells,
-        label=f"{name} per scenario",
-    )
+    lines = []
+    for row in subject.rows:
+        values = row.scores[name].values.tolist()
+        lines.append([_draw_heading(row), *map(wrap_number, values)])
+    head = ["method", *map(str, subject.scenarios)]
+    return draw_table(head, lines, label=f"{name} per scenario")
 
 
-def verdict_table(subject: Subject) -> Markup:
-    """Return sign-flip tests of entries against the leader, corrected by Holm; floors
-    follow, unranked.
+def ranking_table(subject: Subject) -> Markup:
+    """Return the ranking of entries, each tested against the leader.
+
+    Tests are sign-flip tests, corrected by Holm. Reference predictors follow, unranked.
     """
     name = subject.ranking.name
-    entries = {row.name: row for row in subject.rows if row.entry}
-    placed = standings({method: row.scores[name] for method, row in entries.items()})
-    leader = entries[next(iter(placed))]
-    cells = []
-    for method, place in placed.items():
+    entries = {row.name: row for row in subject.rows if row.entry is not None}
+    scores = {method: row.scores[name] for method, row in entries.items()}
+    ranked = standings(scores)
+    leader_score = scores[next(iter(ranked))]
+
+    lines: list[list[object]] = []
+    for method, standing in ranked.items():
         row = entries[method]
-        same = place.rank == 1
-        found = compare(row.scores[name], leader.scores[name])
-        cells.append(
-            [
-                _heading(row),
-                str(place.rank),
-                html(row.scores[name].mean),
-                tag("span", "leader", class_="muted")
-                if same
-                else html(found.difference),
-                "" if same else interval(found.interval),
-                "" if same else html(place.p),
-                tag("span", "no", class_="muted")
-                if place.tied
-                else ""
-                if same
-                else "yes",
-            ]
-        )
+        score = row.scores[name]
+        comparison = compare(score, leader_score)
+        cells = _draw_standing(standing, comparison)
+        rank = str(standing.rank)
+        lines.append([_draw_heading(row), rank, wrap_number(score.mean), *cells])
     for row in subject.rows:
-        if not row.entry:
-            found = compare(row.scores[name], leader.scores[name])
-            apart = [html(found.difference), interval(found.interval), "", ""]
-            cells.append([_heading(row), "", html(row.scores[name].mean), *apart])
+        if row.entry is None:
+            score = row.scores[name]
+            comparison = compare(score, leader_score)
+            cells = _draw_difference(comparison)
+            mean_cell = wrap_number(score.mean)
+            lines.append([_draw_heading(row), "", mean_cell, *cells, "", ""])
     head = [
         "method",
         "rank",
@@ -238,242 +259,31 @@ def verdict_table(subject: Subject) -> Markup:
         "p",
         "told from the leader",
     ]
+    note = tag("small", _explain_test(subject), class_="muted")
+    return join([draw_table(head, lines, label="Comparison"), paragraph(note)])
+
+
+def _draw_difference(comparison: Comparison) -> list[object]:
+    return [wrap_number(comparison.difference), interval(comparison.interval)]
+
+
+def _draw_standing(standing: Standing, comparison: Comparison) -> list[object]:
+    """Return difference from the leader, interval, p, and whether they differ."""
+    if standing.rank == 1:
+        return [tag("span", "leader", class_="muted"), "", "", ""]
+    verdict: object = "yes"
+    if standing.tied:
+        verdict = tag("span", "no", class_="muted")
+    return [*_draw_difference(comparison), wrap_number(standing.p), verdict]
+
+
+def _explain_test(subject: Subject) -> str:
     count = len(subject.scenarios)
-    if count < FEWEST_SCENARIOS:
-        few = f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed."
-    else:
-        few = ""
-    test = (
+    note = (
         f"p: exact two-sided sign-flip test over {count} scenarios, corrected by Holm "
-        f"for the comparisons"
-        f" with the leader. It is about these weights: other seeds may stand "
-        f"otherwise.{few}"
+        "for the comparisons with the leader. It is about these weights: other seeds "
+        "may stand otherwise."
     )
-    return join(
-        [
-            table(head, cells, label="Comparison"),
-            paragraph(tag("small", test, class_="muted")),
-        ]
-    )
-
-
-TILES = (
-    "vorticity_pearson",
-    "stable_frames",
-    "spectrum_error",
-    "position_rmse_20",
-    "outside_share",
-)
-
-STATES = {True: ("raised", "bad"), False: ("clear", "ok"), None: ("unknown", "unknown")}
-"""What a flag says, and the classes of that."""
-
-TILE_NOTES = {
-    "spectrum_error": "decades of energy, at the frames of interest",
-    "position_rmse_20": "particle by particle, first 20 frames",
-}
-
-
-def title(subject: Subject) -> str:
-    """Return the title of the window."""
-    names = ", ".join(entry.name for entry in subject.entries)
-    return f"{names} on {subject.task.size.split} {subject.task.size.name}"
-
-
-def head(subject: Subject) -> Markup:
-    """Return the top of the page."""
-    size = subject.task.size
-    header = subject.entries[0].card.header
-    setting = subject.task.setting
-    many = len(subject.entries) > 1
-    names = " · ".join(entry.name for entry in subject.entries)
-    lede = (
-        f"Given {setting.input_frames} frames of each of {len(subject.scenarios)} "
-        f"test scenarios, predict the"
-        f" next {setting.horizon}. {subject.title}, {size.particles} particles, data "
-        f"set version"
-        f" {header.dataset_version}."
-    )
-    best = subject.best_entry
-    ranking = subject.ranking.name
-    tiles = []
-    if many:
-        whose = f"{best.name}: "
-    else:
-        whose = ""
-    if best.entry is not None:
-        found = best.entry.card.skill
-    else:
-        found = None
-    if found is not None:
-        said = f"1 - score / score of {found.floor}"
-        tiles.append(_card(f"{whose}skill", found.value, found.interval, said))
-    tiles.append(
-        _tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best))
-    )
-    for name in TILES:
-        score = best.scores.get(name)
-        if score is None or name == ranking:
-            continue
-        if name == "stable_frames":
-            tiles.append(_tile("stable", score, stable_of(score)))
-        elif name == "vorticity_pearson":
-            values = score.at(subject.key_frame)
-            said = f"at frame {subject.key_frame}"
-            tiles.append(
-                _card(words(name), mean(values), bootstrap_interval(values), said)
-            )
-        else:
-            tiles.append(
-                _tile(words(name), score, TILE_NOTES.get(name, "mean over the horizon"))
-            )
-    brand = tag(
-        "p", f"lagbench · score report · {size.split} {size.name}", class_="brand"
-    )
-    tail = tag("p", lede, class_="lede"), tag("ul", *tiles, class_="tiles")
-    return join([brand, tag("h1", names), *tail])
-
-
-def stable_of(score: Score) -> str:
-    """Return out of how many frames, and how many of all scenarios' do not count."""
-    lost = sum(score.undefined)
-    every = len(score.scenarios) * len(score.frames)
-    said = f"of {len(score.frames)}, correlation above {STABLE_PEARSON}"
-    if lost:
-        return f"{said}; {lost} of {every} frames undefined"
-    return said
-
-
-def _tile(what: str, score: Score, more: str) -> Markup:
-    return _card(f"{what}{unit(score.metric)}", score.mean, score.interval, more)
-
-
-def _card(what: str, value: float, bounds: tuple[float, float], more: str) -> Markup:
-    low, high = bounds
-    if math.isnan(low):
-        spread = ""
-    else:
-        spread = tag("span", f"{text(low)} … {text(high)}", class_="more")
-    number = tag("span", text(value), class_="big")
-    return tag(
-        "li",
-        tag("span", what, class_="what"),
-        number,
-        spread,
-        tag("span", more, class_="more"),
-    )
-
-
-def _beside(subject: Subject, row: Row) -> str:
-    metric = subject.ranking
-    floors = [r for r in subject.rows if r.entry is None]
-    if not floors or metric.direction is not Direction.LOWER:
-        return "mean over the horizon; this ranks"
-    floor = min(
-        floors,
-        key=lambda r: (
-            math.isnan(r.scores[metric.name].mean),
-            r.scores[metric.name].mean,
-        ),
-    )
-    below = floor.scores[metric.name].mean
-    if below > 0.0:
-        ratio = row.scores[metric.name].mean / below
-    else:
-        ratio = math.nan
-    return f"{text(ratio, 2)} × {floor.name}"
-
-
-def flag_list(subject: Subject) -> Markup:
-    """Return flags and warnings of every entry."""
-    many = len(subject.entries) > 1
-    parts = []
-    for entry in subject.entries:
-        items = []
-        for flag in entry.card.flags:
-            word, kind = STATES[flag.raised]
-            evidence = [
-                f"{name.replace('_', ' ')} {text(value)}"
-                for name, value in flag.evidence.items()
-            ]
-            if flag.reasons:
-                reasons = f": {'; '.join(flag.reasons)}"
-            else:
-                reasons = ""
-            items.append(
-                _item(
-                    word,
-                    kind,
-                    flag.name.replace("_", " "),
-                    reasons,
-                    ", ".join(evidence),
-                )
-            )
-        for finding in entry.card.warnings:
-            more = f"{finding.where}: expected {finding.expected}, got {finding.got}. {finding.fix}"
-            items.append(
-                _item("warning", "warn", finding.check, f": {finding.what}", more)
-            )
-        if marks := sorted(entry.card.header.diverged_at.items()):
-            said = ", ".join(f"scenario {i} at frame {frame}" for i, frame in marks)
-            said = f": the rollout is frozen from there on: {said}"
-            items.append(_item("warning", "warn", "diverged", said))
-        parts.append(
-            join(
-                [
-                    tag("h4", entry.name) if many else "",
-                    tag("ul", *items, class_="flags"),
-                ]
-            )
-        )
-    return join(parts)
-
-
-def _item(
-    word: str, kind: str, name: str, said: str, more: str | None = None
-) -> Markup:
-    if more is None:
-        below = ""
-    else:
-        below = tag("span", more, class_="sub")
-    told = tag("span", tag("strong", name), said, below)
-    return tag("li", tag("span", word, class_=f"flag {kind}"), told)
-
-
-def identity(subject: Subject) -> Markup:
-    """Return what was scored, by hash, and the command that scores it again."""
-    first = subject.entries[0].card.header
-    data = [
-        [
-            "data set",
-            tag("code", f"{first.split}/{first.size} version {first.dataset_version}"),
-        ],
-        ["data set SHA-256", tag("code", first.dataset_sha256)],
-    ]
-    parts = [table(["what", "value"], data, kind="text", label="Data set")]
-    for entry in subject.entries:
-        header = entry.card.header
-        parameters = header.parameters
-        seconds = header.seconds_per_frame
-        known = {
-            "method": header.method,
-            "predictions SHA-256": tag("code", entry.card.predictions_sha256),
-            "parameters": None
-            if parameters is None
-            else f"{parameters:,}".replace(",", "\u202f"),
-            "seconds per frame": None if seconds is None else text(seconds),
-            "device": header.device,
-            "seed": header.seed,
-            "training": header.training,
-        }
-        about = [[name, value] for name, value in known.items() if value is not None]
-        parts += [
-            tag("h4", entry.name),
-            table(["what", "value"], about, kind="text", label=entry.name),
-        ]
-    files = " ".join(shlex.quote(entry.predictions.name) for entry in subject.entries)
-    parts += [
-        tag("h4", "The same report again"),
-        tag("pre", f"lagbench score {files} --report report"),
-    ]
-    return join(parts)
+    if count < FEWEST_SCENARIOS:
+        note += f" Under {FEWEST_SCENARIOS} scenarios nothing is claimed."
+    return note
