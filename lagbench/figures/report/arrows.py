@@ -126,7 +126,7 @@ def _draw_arrows(
     data = [""] * LEVELS
     arrows = zip(x, y, along_x, along_y, levels, strict=True)
     for middle_x, middle_y, a, b, level in arrows:
-        data[level] += _arrow_data(middle_x, middle_y, a, b)
+        data[level] += arrow_data(middle_x, middle_y, a, b)
     paths = []
     for level, level_data in enumerate(data):
         if level_data:
@@ -134,7 +134,7 @@ def _draw_arrows(
     return join(paths)
 
 
-def _arrow_data(x: float, y: float, a: float, b: float) -> str:
+def arrow_data(x: float, y: float, a: float, b: float) -> str:
     """Return path data of an arrow (a, b) around its middle; a short one is a dot."""
     if np.hypot(a, b) < SHORTEST:
         return path_data([(x, y)])
