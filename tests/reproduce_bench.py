@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from score_bench import Floats, Predict, ScoreBench
 
-from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.metrics import METRICS, Score
+from studies.thesis.evidence import Evidence, Method, Seeded, Sources
 
 SPLIT = "cavity"
 SIZE = "tiny"

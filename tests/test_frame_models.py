@@ -27,11 +27,11 @@ from lagbench.baselines.frame_model import FrameNetwork, FrameState, FrameWindow
 from lagbench.baselines.lstm import LSTM, LSTMWithMLP
 from lagbench.baselines.mlp import MLP
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.reproduce.thesis import STUDIES, Study
 from lagbench.data import grid as gridding
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
+from studies.thesis.published import STUDIES, Study
 
 SCENARIOS = rotations(4)
 FACTS = facts_of(SCENARIOS)

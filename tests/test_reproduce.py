@@ -21,24 +21,24 @@ from reproduce_bench import NOISE, SIZE, SPLIT, markdown_rows, pretend
 from score_bench import ScoreBench, bench_of
 
 from lagbench.baselines.checkpoint import load as load_checkpoint
-from lagbench.baselines.reproduce import results
-from lagbench.baselines.reproduce.__main__ import main
-from lagbench.baselines.reproduce.catalogue import FIGURES
-from lagbench.baselines.reproduce.drawing import opened
-from lagbench.baselines.reproduce.evidence import (
+from lagbench.data.grid import fields
+from lagbench.data.registry import Registry, Size, load
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring.score_file import read_statistics
+from studies import results
+from studies.thesis.__main__ import main
+from studies.thesis.catalogue import FIGURES
+from studies.thesis.drawing import opened
+from studies.thesis.evidence import (
     Evidence,
     Method,
     Seeded,
     Sources,
     budget,
 )
-from lagbench.baselines.reproduce.plan import Plan
-from lagbench.baselines.reproduce.runs import make_runs
-from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
-from lagbench.data.grid import fields
-from lagbench.data.registry import Registry, Size, load
-from lagbench.make.generate import GenerationResult
-from lagbench.scoring.score_file import read_statistics
+from studies.thesis.plan import Plan
+from studies.thesis.published import EXPECTED, ROSTER
+from studies.thesis.runs import make_runs
 
 
 @pytest.fixture(scope="session")
@@ -244,9 +244,7 @@ def test_what_is_missing_is_listed_with_its_command(
     assert ROSTER["mlp"].label in refused
     assert ROSTER["supergat-unlinked"].label in absent
     for split in EXPECTED:
-        command = (
-            f"python -m lagbench.baselines.reproduce --size {SIZE} --split {split}"
-        )
+        command = f"python -m studies.thesis --size {SIZE} --split {split}"
         assert sum(command in line for line in missing) == 1
 
 
@@ -436,7 +434,7 @@ def test_unknown_names_are_answered_with_the_nearest(
 
 def test_a_reader_that_leaves_stops_nothing() -> None:
     """``--list | head -1``: exit code 0 and no traceback."""
-    words = [sys.executable, "-m", "lagbench.baselines.reproduce", "--list"]
+    words = [sys.executable, "-m", "studies.thesis", "--list"]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
@@ -506,7 +504,7 @@ def test_an_interrupt_says_how_to_go_on(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lagbench.baselines.reproduce.__main__.make_runs", stop)
+    monkeypatch.setattr("studies.thesis.__main__.make_runs", stop)
     assert main(options(plan, "--only", "table_5_4"), registry=cavity.registry) == 130
     assert "goes on" in capsys.readouterr().err
 

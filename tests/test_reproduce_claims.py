@@ -14,8 +14,12 @@ import pytest
 from reproduce_bench import a_method, known
 from scipy.stats import kendalltau
 
-from lagbench.baselines.reproduce import thesis
-from lagbench.baselines.reproduce.claims import (
+from lagbench.data.registry import load
+from lagbench.metrics import METRICS, Score
+from lagbench.scoring.score_file import read_statistics
+from studies.results import agreement
+from studies.thesis import published as thesis
+from studies.thesis.claims import (
     CLAIMS,
     Claim,
     Verdict,
@@ -24,17 +28,13 @@ from lagbench.baselines.reproduce.claims import (
     compared,
     floors_ahead,
 )
-from lagbench.baselines.reproduce.drawing import SMOOTHED, loss_over_steps, smoothed
-from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
-from lagbench.baselines.reproduce.results import agreement
-from lagbench.baselines.reproduce.tables import (
+from studies.thesis.drawing import SMOOTHED, loss_over_steps, smoothed
+from studies.thesis.evidence import Evidence, Method, Seeded, Sources
+from studies.thesis.tables import (
     cubic_errors,
     cubic_vorticity,
     rollout_table,
 )
-from lagbench.data.registry import load
-from lagbench.metrics import METRICS, Score
-from lagbench.scoring.score_file import read_statistics
 
 FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
 

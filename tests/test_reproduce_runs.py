@@ -14,14 +14,14 @@ import netCDF4
 import pytest
 
 from lagbench.baselines import catalogue
-from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import runs, tables
-from lagbench.baselines.reproduce.plan import TABLES, Plan, known_studies
-from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score_file import read_statistics
+from studies.thesis import __main__ as command
+from studies.thesis import runs, tables
+from studies.thesis.plan import TABLES, Plan, known_studies
+from studies.thesis.published import STUDIES
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 

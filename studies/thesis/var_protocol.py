@@ -1,6 +1,6 @@
 """VAR(1) by the thesis's own protocol (section 4.8.3, Listing 4.1), timed and weighed.
 
-    python -m lagbench.baselines.reproduce.var_protocol [--split fluid] [--size full]
+    python -m studies.thesis.var_protocol [--split fluid] [--size full]
         [--root FOLDER] [--lags 1] [--json]
 
 All frames of all scenarios, in the order of their ids, are standardised per feature
@@ -34,7 +34,7 @@ from lagbench.draw.tables import Table
 
 from .drawing import Figure, Sheet
 from .plan import Plan
-from .thesis import SECTION_4_8_3, number
+from .published import SECTION_4_8_3, number
 
 TRAIN = 0.70
 VALID = 0.15

@@ -16,7 +16,7 @@ from lagbench.scoring.task import ScoredTask, load_scored_task
 
 from .evidence import STUDIES as COMMITTED
 from .evidence import WEIGHTS, Evidence, Sources, read_json
-from .thesis import STUDIES, Model, Study
+from .published import STUDIES, Model, Study
 
 PREDICTIONS = "predictions.nc"
 

@@ -1,6 +1,6 @@
 """Make the tables and figures of the thesis at one size: train, predict, score, draw.
 
-    python -m lagbench.baselines.reproduce --size mini --root DATA --runs runs [--only table_5_4,fig_5_5]
+    python -m studies.thesis --size mini --root DATA --runs runs [--only table_5_4,fig_5_5]
 
 What is there is not made again; interrupted, it goes on. Writes Markdown, CSV and PNG
 to ``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is,
@@ -28,8 +28,8 @@ from .catalogue import FIGURES
 from .drawing import Figure, write_sheet
 from .evidence import STUDIES, WEIGHTS, budget
 from .plan import TABLES, Plan
+from .published import EXPECTED, ROSTER, Model, label, number
 from .runs import Run, complain, make_runs, make_studies, note, outlook, score_committed
-from .thesis import EXPECTED, ROSTER, Model, label, number
 
 
 def main(
@@ -37,7 +37,7 @@ def main(
 ) -> int:
     """Make what the arguments name; return the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m lagbench.baselines.reproduce",
+        prog="python -m studies.thesis",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -31,7 +31,7 @@ from .drawing import (
     tidy,
 )
 from .plan import Plan
-from .thesis import (
+from .published import (
     LOSS_SNAPSHOTS,
     TABLE_4_8,
     colour,

@@ -22,7 +22,15 @@ from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, hol
 from lagbench.metrics.table import CHOSEN
 
 from .evidence import Evidence, ordered
-from .thesis import FRAME_MODELS, OPERATORS, ROSTER, interval, key_frame, label, number
+from .published import (
+    FRAME_MODELS,
+    OPERATORS,
+    ROSTER,
+    interval,
+    key_frame,
+    label,
+    number,
+)
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from .plan import (
     study_name,
     study_rows,
 )
-from .thesis import Model, Study
+from .published import Model, Study
 
 if TYPE_CHECKING:
     from lagbench.baselines.recipe import Recipe

@@ -44,7 +44,7 @@ from .plan import (
     study_name,
     study_rows,
 )
-from .thesis import (
+from .published import (
     FRAME_MODELS,
     OPERATORS,
     STATISTICS,

@@ -1,7 +1,7 @@
 """Write docs/results.md from committed files: claims, scores beside the thesis's
 numbers, costs.
 
-    python -m lagbench.baselines.reproduce.results -o docs/results.md [--board
+    python -m studies.results -o docs/results.md [--board
         leaderboard] [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
 
 Score files and entries of the leaderboard and what trainings recorded suffice: no data
@@ -25,8 +25,8 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.tables import ARROWS
 
-from .claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
-from .evidence import (
+from .thesis.claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
+from .thesis.evidence import (
     BOARD,
     STUDIES,
     WEIGHTS,
@@ -37,9 +37,8 @@ from .evidence import (
     hardware,
     read_json,
 )
-from .plan import TABLES, known_studies, study_name, study_rows
-from .tables import rollout_table, studies_beside_thesis
-from .thesis import (
+from .thesis.plan import TABLES, known_studies, study_name, study_rows
+from .thesis.published import (
     EXPECTED,
     OPERATORS,
     ROSTER,
@@ -52,13 +51,14 @@ from .thesis import (
     number,
     scenario_of,
 )
-from .var_protocol import FILE, beside_thesis
+from .thesis.tables import rollout_table, studies_beside_thesis
+from .thesis.var_protocol import FILE, beside_thesis
 
 HEAD = """# Results
 
 The reference models, their variants and floors on the test scenarios of each data set, beside the numbers
 of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
-`python -m lagbench.baselines.reproduce.results -o docs/results.md` from the entries and score files in
+`python -m studies.results -o docs/results.md` from the entries and score files in
 `leaderboard/` and the records of their trainings; do not edit.
 
 How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 nothing learned, below 0 worse
@@ -82,10 +82,10 @@ lagbench score runs/cavity/mini/supergat-0/predictions.nc
 lagbench submit runs/cavity/mini/supergat-0/predictions.nc --from meta.yaml
 ```
 
-All models, tables and figures of a size, resumable: `python -m lagbench.baselines.reproduce --size mini
+All models, tables and figures of a size, resumable: `python -m studies.thesis --size mini
 --root DATA --runs runs`; `lagbench submit` makes entries of them. What is no entry is
 read from `docs/studies/<split>/<size>/`: `mlp_studies.json`, as in the folder of runs, and
-`var_protocol.json`, as `python -m lagbench.baselines.reproduce.var_protocol --size mini --json` prints it.
+`var_protocol.json`, as `python -m studies.thesis.var_protocol --size mini --json` prints it.
 Variants change an option or two:"""
 
 
@@ -436,9 +436,7 @@ def _missing(found: Sequence[Evidence]) -> Iterator[str]:
                 what = "all models"
             else:
                 what = ", ".join(missing)
-            command = (
-                f"python -m lagbench.baselines.reproduce --size {size} --split {split}"
-            )
+            command = f"python -m studies.thesis --size {size} --split {split}"
             yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
         if evidence.stale:
             yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
@@ -451,7 +449,7 @@ def _markdown(held: Table) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write or check the page."""
     parser = argparse.ArgumentParser(
-        prog="python -m lagbench.baselines.reproduce.results",
+        prog="python -m studies.results",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -33,7 +33,7 @@ from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 
-from .thesis import ROSTER
+from .published import ROSTER
 
 BOARD = Path("leaderboard")
 WEIGHTS = BOARD / "weights"

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from . import figures, tables, var_protocol
 from .drawing import Figure
-from .thesis import FRAME_MODELS, OPERATORS
+from .published import FRAME_MODELS, OPERATORS
 
 # what several figures share; each row below holds only how it differs
 _STUDY = Figure(title="", draw=tables.studies, needs={"fluid": ()})
