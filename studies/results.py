@@ -1,12 +1,12 @@
-"""Write docs/results.md from committed files: claims, scores beside the thesis's
-numbers, costs.
+"""Write docs/results.md from committed files: claims, scores and costs.
 
-    python -m studies.results -o docs/results.md [--board
-        leaderboard] [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
+    python -m studies.results -o docs/results.md [--board leaderboard]
+        [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
 
-Score files and entries of the leaderboard and what trainings recorded suffice: no data
-set is read. ``--runs`` adds what is not committed yet. The same files give the same
-bytes; ``--check`` writes nothing and fails where the page is stale.
+The page shows our scores beside the numbers of the thesis. It needs the entries and
+score files of the leaderboard and the records of trainings; no data set is read.
+``--runs`` adds runs that are not committed yet. The same files give the same bytes.
+``--check`` writes nothing and fails where the page is stale.
 """
 
 from __future__ import annotations
@@ -14,440 +14,301 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from itertools import combinations
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.draw.tables import Table, markdown
 from lagbench.errors import LagbenchError
-from lagbench.metrics.metric import Direction, Metric
-from lagbench.metrics.table import CHOSEN
-from lagbench.references.table import REFERENCES
-from lagbench.scoring.tables import ARROWS
 
-from .thesis.claims import CLAIMS, answer, claim_rows, comparison_table, floors_ahead
-from .thesis.evidence import (
+from .result_tables import (
+    claims_overview,
+    cost_table,
+    horizon_table,
+    order_agreement,
+    summary_table,
+    training_table,
+    vorticity_table,
+)
+from .thesis.cases import key_frame
+from .thesis.claims import CLAIMS, claim_rows, comparison_table, leading_references
+from .thesis.items import table_markdown
+from .thesis.plan import TABLES, read_studies, study_name, study_rows
+from .thesis.published import TABLE_4_8
+from .thesis.roster import EXPECTED, ROSTER, SIZES, RosterModel, label
+from .thesis.split_results import (
     BOARD,
-    STUDIES,
+    COMMITTED_STUDIES,
     WEIGHTS,
-    Evidence,
-    Method,
     Sources,
-    budget,
-    hardware,
+    SplitResults,
     read_json,
 )
-from .thesis.plan import TABLES, known_studies, study_name, study_rows
-from .thesis.published import (
-    EXPECTED,
-    OPERATORS,
-    ROSTER,
-    SIZES,
-    TABLE_4_8,
-    TABLE_5_4,
-    interval,
-    key_frame,
-    label,
-    number,
-    scenario_of,
-)
 from .thesis.tables import rollout_table, studies_beside_thesis
-from .thesis.var_protocol import FILE, beside_thesis
+from .thesis.var_protocol import FILE_NAME as PROTOCOL_FILE
+from .thesis.var_protocol import beside_thesis
 
-HEAD = """# Results
+INTRODUCTION = """\
+# Results
 
-The reference models, their variants and floors on the test scenarios of each data set, beside the numbers
-of the thesis (D. Dharma, PhD thesis, University of Leeds, 2025). Written by
-`python -m studies.results -o docs/results.md` from the entries and score files in
-`leaderboard/` and the records of their trainings; do not edit.
+On this page you can look up how well the reference models predict each data set, which
+claims of the thesis hold on our data, and what the trainings cost. The first table has
+the best model of each data set. After it come the claims, the trainings, and one
+chapter per data set with all models beside the numbers of the thesis (D. Dharma, PhD
+thesis, University of Leeds, 2025)."""
 
-How to read it. `skill` is 1 - score / score of the best floor: 1 perfect, 0 nothing learned, below 0 worse
-than what costs no learning. Cells are means over test scenarios with 95 % bootstrap intervals, and ± the
-deviation over seeds where there are several; intervals here are those over scenarios, those of the board
-resample seeds too and are wider where there are few. Differences are tested by the exact sign-flip test
-over scenarios where both have one seed, else by the two-way bootstrap over scenarios and seeds (of one
-training used in two ways: of the differences seed by seed), two-sided, corrected for the number of rivals
-(Holm); with fewer than six scenarios nothing is claimed. The thesis trained on its own data, at what is
-here size `full`, for hours on GPUs, and prints one scenario per table: its absolute numbers are beside ours
-for orientation, and only orders can be compared at size `mini` (a quarter of the particles, half the grid).
-`docs/scoring.md` defines every metric."""
+HOW_TO_READ = """\
+## How to read this page
 
-COMMANDS = """## How to make these again
+- **Reference predictors** learn nothing. A naive baseline predicts without equations; a
+  classical solver integrates the equations on a coarser grid
+  ([references](references.md)).
+- **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
+  as that baseline, and below 0 is worse.
+- **Cells** are means over test scenarios with 95 % bootstrap intervals over scenarios.
+  After ± stands the deviation over seeds, where there are several. The board resamples
+  seeds too, so its intervals are wider where there are few seeds.
+- **Tests** are two-sided. Where both models have one seed, the test is the exact
+  sign-flip test over scenarios. Else it is the two-way bootstrap over scenarios and
+  seeds. For one training that is used in two ways it takes the differences seed by
+  seed. The p-values are corrected for the number of rivals (Holm). With fewer than six
+  scenarios nothing is claimed.
+- **The thesis** trained on its own data, at the size called `full` here, for hours on
+  GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
+  orientation. At size `mini` (a quarter of the particles, half the grid) compare only
+  the orders of the models.
+- **Metrics** are defined in [scoring](scoring.md).
+
+`python -m studies.results -o docs/results.md` writes this page from the entries and
+score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
+
+CLAIMS_NOTE = """\
+The answers use the ranking metric over the horizon. "Ahead" counts the better means.
+"Better" (yes) and "worse" (no) are significant at 5 %; everything else is open. Two
+models are compared over the seeds that both have, or over all seeds if they share none.
+A dash stands where an entry is missing."""
+
+TRAINING_NOTE = """\
+The validation columns have the least validation error up to a quarter, half and all of
+the steps, of the first seed. The last column is the gain of the last doubling of the
+steps. A model that gained more than 2 % has not converged. Hours are without
+validations, as in the entries; the first trainings of NeuralMPM did not time their
+validations apart."""
+
+COST_NOTE = """\
+Cost. The columns have the recipe, and the options that the training or the prediction
+changed (`none`: no option). Where the seeds differ, their values stand in the order of
+the seeds. Without a record of the training, the words of the entry are used. The
+speed-up is our solver's time for a frame, on one core, over that of the model on the
+same machine. Hours are without validations."""
+
+COMMANDS = """\
+## How to make these results again
 
 ```
 lagbench generate --split cavity --size mini
 lagbench train --baseline supergat --split cavity --size mini --seed 0
-lagbench predict runs/cavity/mini/supergat-0/weights.pt -o runs/cavity/mini/supergat-0/predictions.nc
-lagbench score runs/cavity/mini/supergat-0/predictions.nc
-lagbench submit runs/cavity/mini/supergat-0/predictions.nc --from meta.yaml
+lagbench predict runs/cavity/mini/supergat-0/weights.pt -o predictions.nc
+lagbench score predictions.nc
+lagbench submit predictions.nc --from meta.yaml
 ```
 
-All models, tables and figures of a size, resumable: `python -m studies.thesis --size mini
---root DATA --runs runs`; `lagbench submit` makes entries of them. What is no entry is
-read from `docs/studies/<split>/<size>/`: `mlp_studies.json`, as in the folder of runs, and
-`var_protocol.json`, as `python -m studies.thesis.var_protocol --size mini --json` prints it.
+`python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
+and figures of a size. It can be interrupted and repeated. `lagbench submit` makes
+entries of its runs.
+
+Results without an entry are read from `docs/studies/<split>/<size>/`. There,
+`mlp_studies.json` is a copy of that in the folder of runs, and `var_protocol.json` is
+the output of `python -m studies.thesis.var_protocol --size mini --json`.
+
 Variants change an option or two:"""
 
 
 def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
     """Return the page."""
-    found = [Evidence(sources, split, size) for size in sizes for split in EXPECTED]
-    known = [evidence for evidence in found if evidence.methods]
-    learned = [evidence for evidence in known if evidence.models]
-    parts = [
-        HEAD,
-        *_claims(learned),
-        *(part for evidence in known for part in _chapter(evidence)),
-    ]
-    homes = [home for home in (sources.studies, sources.runs) if home]
-    protocols = []
-    studies = []
+    all_results = []
     for size in sizes:
-        measured = next(
-            (p for home in homes if (p := home / "fluid" / size / FILE).is_file()), None
-        )
-        protocols += [beside_thesis(read_json(measured)).text] if measured else []
-        for name, (_, split) in TABLES.items():
-            data = sources.size(split, size).measured
-            trained = known_studies(
-                [h / split / size for h in homes], data.dataset_sha256 if data else None
-            )
-            if any(study_name(study) in trained for study in study_rows(name)):
-                studies.append(studies_beside_thesis(name, size, trained).text)
-    parts += (
-        ["## VAR by the thesis's protocol (section 4.8.3)", *protocols]
-        if protocols
-        else []
-    )
-    parts += ["## MLPs from frame to frame", *studies] if studies else []
-    variants = []
-    for model in (model for model in ROSTER.values() if model.varied):
-        settings = "".join(f" --set {setting}" for setting in model.settings)
-        if model.recipe:
-            recipe = f" --recipe {model.recipe}"
-        else:
-            recipe = ""
-        how = f"`--baseline {model.baseline}{recipe}{settings}`"
-        if model.weights:
-            how = f"`lagbench predict{settings}` with weights of `{model.weights}`"
-        variants.append(f"- `{model.name}`: {how}")
+        for split in EXPECTED:
+            all_results.append(SplitResults(sources, split, size))
+    scored = [results for results in all_results if results.methods]
+    learned = [results for results in scored if results.models]
+
+    parts = [INTRODUCTION]
+    if learned:
+        parts.append(summary_table(learned))
+    parts.append(HOW_TO_READ)
+    parts += _claims(learned)
+    for results in scored:
+        parts += _chapter(results)
+
+    protocols = list(_protocols(sources, sizes))
+    if protocols:
+        parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols]
+    studies = list(_studies(sources, sizes))
+    if studies:
+        parts += ["## MLPs from frame to frame", *studies]
+
+    variants = [_variant_line(model) for model in ROSTER.values() if model.variant_of]
+    missing = [line for results in all_results for line in _missing_lines(results)]
     parts += [
         COMMANDS,
         "\n".join(variants),
         "## Missing",
-        "\n".join(_missing(found)) or "Nothing.",
+        "\n".join(missing) or "Nothing.",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _claims(learned: Sequence[Evidence]) -> Iterator[str]:
+def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
     """Yield an overview of all claims, then the comparisons behind each."""
     yield "## Claims"
     if not learned:
-        yield "No model has been scored yet; the end of this page has the commands."
+        yield "No model has been scored yet. The commands are at the end of this page."
         return
-    rows = {claim: {e.where: claim_rows(claim, e) for e in learned} for claim in CLAIMS}
-    yield (
-        "By the ranking metric over the horizon: ahead in the mean; better (yes) and "
-        "worse (no) at 5 %, open"
-        " otherwise. Two methods are compared by the seeds that both have, by all "
-        "where they share none. A"
-        " dash where an entry is missing."
-    )
-    yield markdown(
-        ["", *(e.where for e in learned)],
-        [
-            [claim.question, *(answer(found) or "-" for found in held.values())]
-            for claim, held in rows.items()
-        ],
-    )
-    for claim, held in rows.items():
-        compared = [row for found in held.values() for row in found]
+
+    rows_by_claim = {}
+    for claim in CLAIMS:
+        rows_by_claim[claim] = {
+            results.where: claim_rows(claim, results) for results in learned
+        }
+    yield CLAIMS_NOTE
+    yield claims_overview(rows_by_claim, [results.where for results in learned])
+
+    for claim, rows_by_place in rows_by_claim.items():
         yield f"### {claim.question}"
-        if compared:
-            yield _markdown(comparison_table(compared))
+        all_rows = [row for rows in rows_by_place.values() for row in rows]
+        if all_rows:
+            yield table_markdown(comparison_table(all_rows))
         else:
-            yield f"Nothing to compare: it takes entries of {label(claim.first)} and of a rival on one split."
-    ahead = floors_ahead(learned)
-    if ahead.rows:
-        yield "### In which metrics is a floor better than every model, in the mean?"
-        yield _markdown(ahead)
-    yield "### What does a CPU hour buy?"
-    yield (
-        "Validation: the least value up to a quarter, half and all of the steps, and "
-        "what the last doubling"
-        " gained, of the first seed, in the metric that was validated. Models whose "
-        "last doubling gained more"
-        " than 2 % have not converged. Hours are without validations, as in entries "
-        "(the first"
-        " trainings of NeuralMPM did not time them apart)."
-    )
-    heads = (
-        "model",
-        "steps x windows",
-        "epochs",
-        "CPU hours per seed",
-        "skill",
-        "validated",
-    )
-    learning = ("validation at 1/4", "1/2", "1", "last doubling")
-    yield markdown(
-        ("where", *heads, *learning),
-        [row for e in learned for row in _training_rows(e)],
-    )
-
-
-def _training_rows(evidence: Evidence) -> Iterator[list[str]]:
-    """Yield what each model was trained for and what that brought, best first."""
-    for name in evidence.order(evidence.models):
-        method = evidence.models[name]
-        record = method.seeds[0].record
-        # beside the step an entry holds one number, the metric that was validated
-        held = [
-            (e["step"], n, v)
-            for e in record.get("validation", ())
-            for n, v in e.items()
-            if n != "step"
-        ]
-        best = [
-            min(
-                (value for step, _, value in held if step <= share * record["step"]),
-                default=None,
+            yield (
+                f"There is nothing to compare yet: a split needs entries of "
+                f"{label(claim.first)} and of a rival."
             )
-            for share in (0.25, 0.5, 1.0)
-        ]
-        if "windows" in record:
-            seen = record["step"] * record["recipe"]["training"]["batch"]
-        else:
-            seen = None
-        if best[1] and best[2] is not None:
-            gain = 1.0 - best[2] / best[1]
-        else:
-            gain = None
-        yield [
-            evidence.where,
-            label(name),
-            budget(record),
-            number(seen / record["windows"] if seen else None),
-            number(method.hours_per_seed),
-            number(evidence.skill(name)),
-            held[0][1] if held else "-",
-            *map(number, best),
-            "-" if gain is None else f"{100.0 * gain:.2g} %",
-        ]
+
+    leading = leading_references(learned)
+    if leading.rows:
+        yield (
+            "### In which metrics has a reference predictor a better mean than every "
+            "model?"
+        )
+        yield table_markdown(leading)
+
+    yield "### What does a CPU hour buy?"
+    yield TRAINING_NOTE
+    yield training_table(learned)
 
 
-def _chapter(evidence: Evidence) -> Iterator[str]:
-    """Yield what was scored on one split and size: over the horizon, beside the thesis,
-    costs.
-    """
-    from lagbench.baselines.job import (
-        changes_of,
-    )  # loads torch, which the imports of this page do not
-
-    task = evidence.size.task
-    size = evidence.size
-    yield f"## {evidence.where}"
+def _chapter(results: SplitResults) -> Iterator[str]:
+    """Yield the scores on one split and size: horizon, thesis, costs."""
+    size = results.size
+    task = size.task
+    test_count = len(size.subsets["test"])
+    train_count = len(size.subsets["train"])
+    yield f"## {results.where}"
     yield (
-        f"{size.particles} particles, {task.input_frames} frames given, "
-        f"{task.horizon} predicted,"
-        f" {len(size.subsets['test'])} test scenarios, {len(size.subsets['train'])} "
-        f"to train on; data set"
-        f" {size.version}. Best first by `{evidence.ranking}`."
+        f"{size.particles} particles; {task.input_frames} given frames, "
+        f"{task.horizon} predicted ones; {test_count} test scenarios, {train_count} "
+        f"to train on; data set {size.version}. The best by `{results.ranking}` "
+        "comes first."
     )
-    yield _horizon(evidence)
-    if not evidence.models:
+    yield horizon_table(results)
+    if not results.models:
         return
+
     if size.split in TABLE_4_8:
-        yield "Table 4.8: errors of a rollout by scene, ours / the thesis's."
-        yield _markdown(rollout_table(evidence, TABLE_4_8[size.split]))
+        yield "Table 4.8: errors of a rollout by scene. A cell is ours / the thesis's."
+        yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
     else:
-        yield from _vorticity_at(evidence)
-    yield (
-        "Cost. Recipe, and what training or prediction changed of it (`none`: "
-        "nothing), seeds in their order"
-        " where they differ, from the entry's words where no record of the training "
-        "lies beside it. Speed-up:"
-        " our solver's time for a frame on one core over the model's, same machine. "
-        "Hours are without"
-        " validations."
+        yield _vorticity_note(results)
+        yield vorticity_table(results)
+        tau = order_agreement(results)
+        if tau is not None:
+            yield (
+                f"Kendall's tau of the two orders by MSE: {tau} "
+                "(1: the same order, -1: reversed)."
+            )
+    yield COST_NOTE
+    yield cost_table(results)
+
+
+def _vorticity_note(results: SplitResults) -> str:
+    note = (
+        "Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame "
+        f"{key_frame(results.size)}. A cell is the mean over test scenarios, with the "
+        "first test scenario (T0) in brackets"
     )
-    heads = (
-        "model",
-        "recipe",
-        "changed",
-        "parameters",
-        "seeds",
-        "CPU hours per seed",
-        "hardware",
-    )
-    rows = []
-    for name, method in evidence.models.items():
-        record = method.seeds[0].record
-        cost = method.cost
-        recipes = [held.record.get("recipe", {}) for held in method.seeds]
-        changed = [
-            recipe.get("changed")
-            or "; ".join(changes_of(recipe))
-            or ("none" if recipe else "-")
-            for recipe in recipes
-        ]
-        paid = (
-            (cost.seconds_per_frame, cost.solver_seconds_per_frame, cost.speed_up)
-            if cost
-            else (None,) * 3
+    if results.size.split == "cavity":
+        return f"{note}. The thesis has T0."
+    return f"{note}."
+
+
+def _protocols(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
+    """Yield the results of VAR by the thesis's protocol, committed ones first."""
+    for size in sizes:
+        for home in (sources.studies, sources.runs):
+            if home is None:
+                continue
+            path = home / "fluid" / size / PROTOCOL_FILE
+            if path.is_file():
+                yield beside_thesis(read_json(path)).text
+                break
+
+
+def _studies(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
+    """Yield the tables of MLPs that have a row with results."""
+    homes = [home for home in (sources.studies, sources.runs) if home is not None]
+    for size in sizes:
+        for name, (_, split) in TABLES.items():
+            measured = sources.size(split, size).measured
+            data_hash = measured.dataset_sha256 if measured else None
+            folders = [home / split / size for home in homes]
+            studies = read_studies(folders, data_hash)
+            row_names = {study_name(study) for study in study_rows(name)}
+            if row_names & studies.keys():
+                yield studies_beside_thesis(name, size, studies).text
+
+
+def _variant_line(model: RosterModel) -> str:
+    """Return how a variant of a reference model is made."""
+    settings = "".join(f" --set {setting}" for setting in model.settings)
+    if model.weights_of:
+        weights = f"weights of `{model.weights_of}`"
+        return f"- `{model.name}`: `lagbench predict{settings}` with {weights}"
+    recipe = f" --recipe {model.recipe}" if model.recipe else ""
+    return f"- `{model.name}`: `--baseline {model.baseline}{recipe}{settings}`"
+
+
+def _missing_lines(results: SplitResults) -> Iterator[str]:
+    """Yield the models without an entry, and the command that makes them."""
+    split = results.size.split
+    expected = EXPECTED[split]
+    unscored = []
+    missing = []
+    for name in expected:
+        if name in results.methods:
+            continue
+        if results.was_trained(name):
+            unscored.append(label(name))
+        else:
+            missing.append(label(name))
+
+    if unscored:
+        names = ", ".join(unscored)
+        yield (
+            f"- {results.where}: {names}: trained, but without a score "
+            "([baselines](baselines.md) says why)."
         )
-        rows.append(
-            [
-                label(name),
-                " / ".join(
-                    dict.fromkeys(recipe.get("name", "-") for recipe in recipes)
-                ),
-                " / ".join(dict.fromkeys(changed)),
-                "-" if method.parameters is None else f"{method.parameters:,}",
-                ", ".join(
-                    "-" if held.seed is None else str(held.seed)
-                    for held in method.seeds
-                ),
-                number(method.hours_per_seed),
-                hardware(record),
-                *map(number, paid),
-            ]
-        )
-    yield markdown((*heads, "s/frame", "solver s/frame", "speed-up"), rows)
-
-
-def _horizon(evidence: Evidence) -> str:
-    """Return the scores over the horizon of models and floors: skill, ranking metric,
-    the chosen ones.
-    """
-    free = evidence.size.split in TABLE_4_8
-    held: dict[str, Metric] = {}
-    for method in evidence.methods.values():
-        held |= {name: score.metric for name, score in method.scores.items()}
-    chosen = [
-        held[name]
-        for name in dict.fromkeys((evidence.ranking, *CHOSEN))
-        if name in held
-    ]
-    # vorticity says little where the material does not fill the box
-    hidden = ("vorticity", "distributions") if free else ()
-    shown = [
-        m
-        for m in chosen
-        if m.direction is not Direction.NONE and m.family not in hidden
-    ]
-
-    def cell(method: Method, metric: str) -> str:
-        if metric not in method.scores:
-            return "-"
-        score = method.scores[metric]
-        if len(method.seeds) > 1:
-            spread = f" ± {number(method.spread(metric), 2)}"
-        else:
-            spread = ""
-        if count := sum(score.undefined):
-            undefined = f", {count} undefined"
-        else:
-            undefined = ""
-        return interval(score.mean, score.interval) + spread + undefined
-
-    rows = []
-    for name in evidence.order():
-        method = evidence.methods[name]
-        if name in REFERENCES:
-            seeds = "floor"
-        else:
-            seeds = str(len(method.seeds))
-        cells = [cell(method, metric.name) for metric in shown]
-        rows.append([label(name), number(evidence.skill(name)), seeds, *cells])
-    heads = ["model", "skill", "seeds"]
-    for m in shown:  # as in "position_rmse [length], lower"
-        if m.direction is Direction.TARGET:
-            goal = f" {m.perfect:g}"
-        else:
-            goal = ""
-        heads.append(f"{m.name} [{m.unit}], {ARROWS[m.direction]}{goal}")
-    return markdown(heads, rows)
-
-
-def _vorticity_at(evidence: Evidence) -> Iterator[str]:
-    """Yield Tables 5.4 and 5.5 and Fig. 5.13's correlations: ours, T0 in brackets, the
-    thesis's beside.
-    """
-    frame = key_frame(evidence.size)
-    first = scenario_of(evidence.size, 0)
-    if evidence.size.split == "cavity":
-        thesis = TABLE_5_4
-    else:
-        thesis = {}
-    measures = ("mae", "mse", "rmse", "kl", "pearson")
-    yield (
-        f"Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame {frame}, mean over "
-        f"scenarios, in brackets the"
-        f" first test scenario (T0){'; the thesis has T0' if thesis else ''}."
-    )
-    heads = [
-        f"{m.upper()}{who}"
-        for m in measures
-        for who in (("", ", thesis") if thesis else ("",))
-    ]
-    models = evidence.models
-    rows = []
-    for name in dict.fromkeys(n for n in (*OPERATORS, *models) if n in models):
-        row = [label(name)]
-        for measure in measures:
-            values = [
-                models[name].at(f"vorticity_{measure}", frame, where)
-                for where in (None, first)
-            ]
-            row.append(f"{number(values[0])} ({number(values[1])})")
-            row += [number(thesis.get(name, {}).get(measure), 4)] if thesis else []
-        rows.append(row)
-    yield markdown(["model", *heads], rows)
-    both = [name for name in thesis if name in models]
-    if len(both) > 1:
-        ours = {name: models[name].at("vorticity_mse", frame) for name in both}
-        tau = agreement([thesis[name]["mse"] for name in both], list(ours.values()))
-        yield f"Kendall's tau of the two orders by MSE: {number(tau, 2)} (1: the same order, -1: reversed)."
-
-
-def agreement(first: Sequence[float], second: Sequence[float]) -> float:
-    """Return Kendall's tau of two rankings without ties: 1 the same order, -1 reversed,
-    0 unrelated.
-    """
-    pairs = list(combinations(zip(first, second, strict=True), 2))
-    turned = sum((a - b) * (x - y) < 0.0 for (a, x), (b, y) in pairs)
-    return 1.0 - 2.0 * turned / len(pairs)
-
-
-def _missing(found: Sequence[Evidence]) -> Iterator[str]:
-    """Yield what has no entry on each split and size, and the command that makes it."""
-    for evidence in found:
-        split = evidence.size.split
-        size = evidence.size.name
-        absent = [name for name in EXPECTED[split] if name not in evidence.methods]
-        refused = [label(name) for name in absent if evidence.trained(name)]
-        missing = [label(name) for name in absent if not evidence.trained(name)]
-        if refused:
-            yield f"- {evidence.where}: {', '.join(refused)}: trained, no score (docs/baselines.md says why)."
-        if missing:
-            if len(missing) == len(EXPECTED[split]):
-                what = "all models"
-            else:
-                what = ", ".join(missing)
-            command = f"python -m studies.thesis --size {size} --split {split}"
-            yield f"- {evidence.where}: {what}: `{command}`, then `lagbench submit`."
-        if evidence.stale:
-            yield f"- {evidence.where}: {len(evidence.stale)} score files of other data, left out."
-
-
-def _markdown(held: Table) -> str:
-    return markdown(held.columns, held.rows)
+    if missing:
+        names = ", ".join(missing)
+        if len(missing) == len(expected):
+            names = "all models"
+        command = f"python -m studies.thesis --size {results.size.name} --split {split}"
+        yield f"- {results.where}: {names}: `{command}`, then `lagbench submit`."
+    if results.stale:
+        count = len(results.stale)
+        yield f"- {results.where}: {count} score files of other data, left out."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Write or check the page."""
+    """Write or check the page; return the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m studies.results",
         description=__doc__,
@@ -462,32 +323,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--studies",
         type=Path,
-        default=STUDIES,
-        help="committed results that are no entries",
+        default=COMMITTED_STUDIES,
+        help="folder of committed results without an entry",
     )
     parser.add_argument("--root", type=Path, help="not needed: no data set is read")
     parser.add_argument(
-        "--check", action="store_true", help="write nothing; fail where it is stale"
+        "--check",
+        action="store_true",
+        help="write nothing; fail where the page is stale",
     )
-    given = parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
     try:
         sources = Sources(
-            board=given.board,
-            weights=given.weights,
-            runs=given.runs,
-            studies=given.studies,
+            board=options.board,
+            weights=options.weights,
+            runs=options.runs,
+            studies=options.studies,
         )
         page = render(sources).encode()
-        if given.check:
-            stale = not given.output.is_file() or given.output.read_bytes() != page
-            sys.stdout.write(f"{given.output}: {'stale' if stale else 'up to date'}\n")
-            return int(stale)
-        write_atomically(given.output, page)
+        if options.check:
+            return _check(options.output, page)
+        write_atomically(options.output, page)
     except LagbenchError as error:
         sys.stderr.write(f"error: {error}\n")
         return error.exit_code
-    sys.stdout.write(f"{given.output}: written, {len(page)} bytes\n")
+    sys.stdout.write(f"{options.output}: written, {len(page)} bytes\n")
     return 0
+
+
+def _check(path: Path, page: bytes) -> int:
+    """Return 0 if a file holds the page, else 1."""
+    if path.is_file() and path.read_bytes() == page:
+        sys.stdout.write(f"{path}: up to date\n")
+        return 0
+    sys.stdout.write(f"{path}: stale\n")
+    return 1
 
 
 if __name__ == "__main__":

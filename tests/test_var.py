@@ -327,4 +327,6 @@ def test_the_protocol_of_the_thesis_runs(
         **found,
         "mse_at": {int(frame): value for frame, value in found["mse_at"].items()},
     }
-    assert "| 3.5e+18 |" in var_protocol.table(var_protocol.ProtocolResult(**ours))
+    assert "| 3.5e+18 |" in var_protocol.result_markdown(
+        var_protocol.ProtocolResult(**ours)
+    )

@@ -1,12 +1,13 @@
 """Make the tables and figures of the thesis at one size: train, predict, score, draw.
 
-    python -m studies.thesis --size mini --root DATA --runs runs [--only table_5_4,fig_5_5]
+    python -m studies.thesis --size mini --root DATA --runs runs [--only NAMES]
 
-What is there is not made again; interrupted, it goes on. Writes Markdown, CSV and PNG
-to ``RUNS/reproduce/<size>/`` and prints the Markdown. ``--list`` says what there is,
-``--dry-run`` what would be trained; ``--no-training`` shows what the runs that are
-there allow, and what committed weights do, whose predictions are made on the spot, and
-committed studies.
+Complete runs are kept, so an interrupted command can be repeated. It writes Markdown,
+CSV and PNG to ``RUNS/reproduce/<size>/`` and prints the Markdown.
+
+``--list`` lists tables and figures, ``--dry-run`` says what would be trained.
+``--no-training`` shows complete runs, committed studies and committed weights, whose
+predictions it makes.
 """
 
 from __future__ import annotations
@@ -24,18 +25,65 @@ from lagbench.data.registry import Registry, load
 from lagbench.errors import LagbenchError, UsageError, nearest
 from lagbench.work.pool import worker_count
 
-from .catalogue import FIGURES
-from .drawing import Figure, write_sheet
-from .evidence import STUDIES, WEIGHTS, budget
+from .catalogue import ITEMS
+from .formatting import number
+from .items import ThesisItem, write_sheet
 from .plan import TABLES, Plan
-from .published import EXPECTED, ROSTER, Model, label, number
-from .runs import Run, complain, make_runs, make_studies, note, outlook, score_committed
+from .roster import EXPECTED, ROSTER, RosterModel, label
+from .runs import (
+    Run,
+    complain,
+    describe_run,
+    make_runs,
+    make_studies,
+    note,
+    score_committed,
+)
+from .split_results import COMMITTED_STUDIES, WEIGHTS, format_budget
 
 
 def main(
     arguments: Sequence[str] | None = None, *, registry: Registry | None = None
 ) -> int:
-    """Make what the arguments name; return the exit code."""
+    """Make the tables and figures that the arguments name; return the exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        items = _chosen_items(options.only, options.split)
+        if options.list:
+            _list_items(items)
+            return 0
+
+        (registry or load()).size("cavity", options.size)  # refuses unknown sizes
+        default_output = options.runs / "reproduce" / options.size
+        plan = Plan(
+            size=options.size,
+            root=resolve_root(options.root),
+            runs=options.runs,
+            output=options.output or default_output,
+            weights=options.weights,
+            studies=options.studies,
+            seeds=_parse_seeds(options.seeds),
+            recipe=options.recipe,
+            settings=tuple(options.set),
+            device=options.device,
+            threads=options.threads,
+            registry=registry,
+        )
+        workers = worker_count(options.workers, default=1)
+        if options.dry_run:
+            return rehearse(plan, items, split=options.split)
+        if options.no_training:
+            workers = 0
+        return reproduce(plan, items, split=options.split, workers=workers)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; the same command goes on where it stopped\n")
+        return 130  # as every command of the package
+    except LagbenchError as error:
+        complain(error)
+        return error.exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m studies.thesis",
         description=__doc__,
@@ -48,10 +96,7 @@ def main(
         metavar="NAMES",
         help="tables and figures, as in table_5_4,fig_5_5; all by default",
     )
-    add(
-        "--split",
-        help="only what is about this split, and all models that are meant for it",
-    )
+    add("--split", help="only items about this split, and all models meant for it")
     add("--root", type=Path, help="folder of all data sets")
     add("--runs", type=Path, default=Path("runs"), help="folder of runs")
     add("--output", "-o", type=Path, help="RUNS/reproduce/<size> by default")
@@ -59,8 +104,8 @@ def main(
     add(
         "--studies",
         type=Path,
-        default=STUDIES,
-        help="folder of committed results that are no entries",
+        default=COMMITTED_STUDIES,
+        help="folder of committed results without an entry",
     )
     add("--seeds", default="0", help="seeds of every training, as in 0,1")
     add("--recipe", metavar="NAME", help="variant of the recipes, as in short")
@@ -85,129 +130,124 @@ def main(
     add(
         "--no-training",
         action="store_true",
-        help="train nothing: runs that are there, what is committed",
+        help="train nothing: show complete runs and committed results",
     )
     add(
         "--dry-run", action="store_true", help="make nothing, say what would be trained"
     )
-    add(
-        "--list",
-        action="store_true",
-        help="list tables and figures, and what they need",
-    )
-    given = parser.parse_args(arguments)
-    try:
-        figures = _chosen(given.only, given.split)
-        if given.list:
-            for figure in figures:
-                needs = [
-                    f"{split}: {' '.join(names)}"
-                    for split, names in figure.needs.items()
-                    if names
-                ]
-                needs += [f"trainings of {figure.studies}"] if figure.studies else []
-                _say(
-                    f"{figure.name:14} {figure.title}; needs "
-                    f"{'; '.join(needs) or 'no training'}"
-                )
-            return 0
-        (registry or load()).size("cavity", given.size)
-        plan = Plan(
-            size=given.size,
-            root=resolve_root(given.root),
-            runs=given.runs,
-            output=given.output or given.runs / "reproduce" / given.size,
-            weights=given.weights,
-            studies=given.studies,
-            seeds=_seeds(given.seeds),
-            recipe=given.recipe,
-            settings=tuple(given.set),
-            device=given.device,
-            threads=given.threads,
-            registry=registry,
-        )
-        workers = worker_count(given.workers, default=1)
-        if given.dry_run:
-            return rehearse(plan, figures, split=given.split)
-        return reproduce(
-            plan,
-            figures,
-            split=given.split,
-            workers=0 if given.no_training else workers,
-        )
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted; the same command goes on where it stopped\n")
-        return 130  # as every command of ours
-    except LagbenchError as error:
-        complain(error)
-        return error.exit_code
+    add("--list", action="store_true", help="list tables and figures with their models")
+    return parser
+
+
+def _list_items(items: Sequence[ThesisItem]) -> None:
+    """Print the name, title and needed models of items."""
+    for item in items:
+        needs = []
+        for split, names in item.needs.items():
+            if names:
+                needs.append(f"{split}: {' '.join(names)}")
+        if item.studies:
+            needs.append(f"trainings of {item.studies}")
+        all_needs = "; ".join(needs) or "no training"
+        _print(f"{item.name:14} {item.title}; needs {all_needs}")
 
 
 def reproduce(
-    plan: Plan, figures: Sequence[Figure], *, split: str | None = None, workers: int = 1
+    plan: Plan,
+    items: Sequence[ThesisItem],
+    *,
+    split: str | None = None,
+    workers: int = 1,
 ) -> int:
-    """Make figures; what fails is said, and the others are made. Return 0, or the last
-    error's code.
+    """Make items, ``workers`` trainings side by side; 0 workers train nothing.
 
-    ``workers`` trainings run side by side; with 0 there are none.
+    An item that fails is reported, and the others are made.
+
+    Returns:
+        0, or the exit code of the last error.
     """
-
-    def draw(figure: Figure) -> None:
-        _say(
-            write_sheet(
-                figure.draw(plan, figure), plan.output, figure.name, _head(plan, figure)
-            )
-        )
-
-    def jobs() -> Iterator[tuple[str, Callable[[], None]]]:
-        if workers:
-            for study in _studies(plan, figures):
-                note(f"studies of {study}")
-                yield "", partial(make_studies, plan, study)
-        else:
-            for where, name in _wanted(figures, split):
-                yield "", partial(score_committed, plan, where, ROSTER[name])
-        yield from ((figure.name, partial(draw, figure)) for figure in figures)
-
+    training_code = 0
     if workers:
-        made = make_runs(plan, _runs(plan, figures, split), workers=workers)
+        runs = _needed_runs(plan, items, split)
+        training_code = make_runs(plan, runs, workers=workers)
+        preparations = _study_jobs(plan, items)
     else:
-        made = 0
-    code = _each(jobs()) or made
+        preparations = _committed_jobs(plan, items, split)
+
+    jobs = [*preparations]
+    for item in items:
+        jobs.append((item.name, partial(_draw_item, plan, item)))
+    code = _run_each(jobs) or training_code
     for path in plan.stale:
         note(f"{path}: scores of another version of the data; left out")
     return code
 
 
-def rehearse(plan: Plan, figures: Sequence[Figure], *, split: str | None = None) -> int:
-    """Say what :func:`reproduce` would train, predict and score; return 0, or the last
-    error's code.
+Job = tuple[str, Callable[[], None]]
+"""Name for messages, and function."""
 
-    Data that are not there are named with the command that makes them.
+
+def _study_jobs(plan: Plan, items: Sequence[ThesisItem]) -> Iterator[Job]:
+    """Yield the trainings of MLPs that items need."""
+    for study in _needed_studies(plan, items):
+        yield "", partial(_make_study, plan, study)
+
+
+def _make_study(plan: Plan, study: str) -> None:
+    note(f"studies of {study}")
+    make_studies(plan, study)
+
+
+def _committed_jobs(
+    plan: Plan, items: Sequence[ThesisItem], split: str | None
+) -> Iterator[Job]:
+    """Yield the runs of committed weights that items need."""
+    for where, name in _needed_models(items, split):
+        yield "", partial(score_committed, plan, where, ROSTER[name])
+
+
+def _draw_item(plan: Plan, item: ThesisItem) -> None:
+    sheet = item.draw(plan, item)
+    text = write_sheet(sheet, plan.output, name=item.name, head=_head(plan, item))
+    _print(text)
+
+
+def rehearse(
+    plan: Plan, items: Sequence[ThesisItem], *, split: str | None = None
+) -> int:
+    """Say what :func:`reproduce` would train, predict and score.
+
+    Missing data are named with the command that makes them.
+
+    Returns:
+        0, or the exit code of the last error.
     """
-
-    def say(where: str, model: Model, seed: int) -> None:
-        _say(
-            f"{where} {plan.size} {model.name}-{seed}: "
-            f"{outlook(plan, where, model, seed)}"
-        )
-
-    runs = _runs(plan, figures, split)
-    for tier in map(plan.tier, dict.fromkeys(where for where, _, _ in runs)):
+    runs = _needed_runs(plan, items, split)
+    for where in dict.fromkeys(run_split for run_split, _, _ in runs):
+        tier = plan.tier(where)
         if read_manifest(plan.root, tier.split, tier.name, tier.major) is None:
-            note(
-                f"{tier.split} {tier.name} is not there yet: "
-                f"{remedy(tier, root=plan.root)}"
-            )
-    code = _each(("", partial(say, *run)) for run in runs)
-    for study in _studies(plan, figures):
-        _say(f"studies of {study}")
+            fix = remedy(tier, root=plan.root)
+            note(f"{tier.split} {tier.name} is not there yet: {fix}")
+
+    jobs: list[Job] = []
+    for where, model, seed in runs:
+        jobs.append(("", partial(_print_outlook, plan, where, model=model, seed=seed)))
+    code = _run_each(jobs)
+    for study in _needed_studies(plan, items):
+        _print(f"studies of {study}")
     return code
 
 
-def _each(jobs: Iterable[tuple[str, Callable[[], None]]]) -> int:
-    """Do named jobs one after the other; what fails is said. Return 0, or the last
-    error's code.
+def _print_outlook(plan: Plan, split: str, *, model: RosterModel, seed: int) -> None:
+    outlook = describe_run(plan, split, model=model, seed=seed)
+    _print(f"{split} {plan.size} {model.name}-{seed}: {outlook}")
+
+
+def _run_each(jobs: Iterable[Job]) -> int:
+    """Run jobs one after the other, and report those that fail.
+
+    Returns:
+        0, or the exit code of the last error.
     """
     code = 0
     for name, job in jobs:
@@ -219,52 +259,61 @@ def _each(jobs: Iterable[tuple[str, Callable[[], None]]]) -> int:
     return code
 
 
-def _wanted(figures: Sequence[Figure], split: str | None) -> list[tuple[str, str]]:
-    """Return split and name of every model that figures need, and of all that the
-    roster has for a split.
+def _needed_models(
+    items: Sequence[ThesisItem], split: str | None
+) -> list[tuple[str, str]]:
+    """Return split and name of every model that items need.
+
+    With a split, all models that the roster has for it are added.
     """
-    wanted = {
-        (where, name): None
-        for figure in figures
-        for where, names in figure.needs.items()
-        for name in names
-    }
-    wanted |= {(split, name): None for name in EXPECTED.get(split or "", ()) if split}
-    return list(wanted)
+    needed: dict[tuple[str, str], None] = {}  # a set that keeps its order
+    for item in items:
+        for where, names in item.needs.items():
+            for name in names:
+                needed[where, name] = None
+    if split:
+        for name in EXPECTED.get(split, ()):
+            needed[split, name] = None
+    return list(needed)
 
 
-def _runs(plan: Plan, figures: Sequence[Figure], split: str | None) -> list[Run]:
-    """Return split, model and seed of every run that figures need, one seed after the
-    other.
+def _needed_runs(
+    plan: Plan, items: Sequence[ThesisItem], split: str | None
+) -> list[Run]:
+    """Return split, model and seed of every run that items need, seed by seed.
 
     Models without the variant of the recipes are left out, with a note: their plain
     recipe may take days where the variant takes minutes. A variant that no model has is
-    a mistake, which training tells.
+    a mistake of the user, which the training reports.
     """
-    wanted = _wanted(figures, split)
-    having = [
-        (where, name) for where, name in wanted if plan.has_recipe(where, ROSTER[name])
-    ]
-    for where, name in wanted if having else ():
-        if (where, name) not in having:
-            _leave_out(plan, f"{where} {plan.size} {name}", ROSTER[name].baseline)
-    return [
-        (where, ROSTER[name], seed)
-        for seed in plan.seeds
-        for where, name in having or wanted
-    ]
+    needed = _needed_models(items, split)
+    with_recipe = []
+    for where, name in needed:
+        if plan.has_recipe(where, ROSTER[name]):
+            with_recipe.append((where, name))
+    if with_recipe:
+        for where, name in needed:
+            if (where, name) not in with_recipe:
+                _leave_out(plan, f"{where} {plan.size} {name}", ROSTER[name].baseline)
+
+    runs = []
+    for seed in plan.seeds:
+        for where, name in with_recipe or needed:
+            runs.append((where, ROSTER[name], seed))
+    return runs
 
 
-def _studies(plan: Plan, figures: Sequence[Figure]) -> Iterator[str]:
-    """Yield the tables of MLPs to train; all are left out where MLPs have no such
-    variant.
+def _needed_studies(plan: Plan, items: Sequence[ThesisItem]) -> Iterator[str]:
+    """Yield the tables of MLPs to train.
 
-    At full their rows have recipes of their own, of no variant.
+    All are left out where MLPs do not have the variant of the recipes. At full their
+    rows have recipes of their own, which have no variant.
     """
-    for study in dict.fromkeys(figure.studies for figure in figures if figure.studies):
-        if plan.has_recipe(TABLES[study][1], ROSTER["mlp"]) and not (
-            plan.recipe and plan.size == "full"
-        ):
+    for study in dict.fromkeys(item.studies for item in items if item.studies):
+        _, split = TABLES[study]
+        has_variant = plan.has_recipe(split, ROSTER["mlp"])
+        has_own_recipes = plan.size == "full"
+        if has_variant and not (plan.recipe and has_own_recipes):
             yield study
         else:
             _leave_out(plan, f"studies of {study}", "mlp")
@@ -272,60 +321,54 @@ def _studies(plan: Plan, figures: Sequence[Figure]) -> Iterator[str]:
 
 def _leave_out(plan: Plan, what: str, baseline: str) -> None:
     note(
-        f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; without "
-        f"--recipe it is made"
+        f"{what}: left out, {baseline} has no recipe {plan.recipe!r} for it; "
+        "without --recipe it is made"
     )
 
 
-def _head(plan: Plan, figure: Figure) -> str:
-    """Return the title and what was run: size, budget, seeds, hours."""
-    lines = [
-        f"# {figure.name.replace('_', ' ')}: {figure.title}",
-        "",
-        f"Size {plan.size}.",
-    ]
-    for split, names in figure.needs.items():
-        if names:
-            known = plan.evidence(split).methods
-        else:
-            known = {}
+def _head(plan: Plan, item: ThesisItem) -> str:
+    """Return the title of an item and its runs: size, budget, seeds, hours."""
+    title = f"# {item.name.replace('_', ' ')}: {item.title}"
+    lines = [title, "", f"Size {plan.size}."]
+    for split, names in item.needs.items():
         for name in names:
-            if name not in known:
+            methods = plan.results(split).methods
+            if name not in methods:
                 lines.append(f"- {split}, {label(name)}: no run")
                 continue
-            seeds = known[name].seeds
-            which = ", ".join(str(held.seed) for held in seeds)
+            method = methods[name]
+            seeds = ", ".join(str(training.seed) for training in method.trainings)
+            budget = format_budget(method.trainings[0].record)
+            hours = number(method.hours_per_seed)
             lines.append(
-                f"- {split}, {label(name)}: seeds {which}; {budget(seeds[0].record)} "
-                f"steps x windows;"
-                f" {number(known[name].hours_per_seed)} CPU hours per seed"
+                f"- {split}, {label(name)}: seeds {seeds}; "
+                f"{budget} steps x windows; {hours} CPU hours per seed"
             )
     return "\n".join(lines)
 
 
-def _chosen(only: str | None, split: str | None) -> list[Figure]:
-    """Return the figures that were asked for."""
+def _chosen_items(only: str | None, split: str | None) -> list[ThesisItem]:
+    """Return the items that the options name."""
     if split is not None and split not in EXPECTED:
         raise UsageError(
             f"no split {split!r}", where="--split", fix=nearest(split, EXPECTED)
         )
-    if only:
-        names = only.split(",")
-    else:
-        names = list(FIGURES)
+    names = only.split(",") if only else list(ITEMS)
+    items = []
     for name in names:
-        if name not in FIGURES:
+        if name not in ITEMS:
             raise UsageError(
                 f"no table or figure {name!r}",
                 where="--only",
-                fix=nearest(name, FIGURES),
+                fix=nearest(name, ITEMS),
             )
-    return [
-        FIGURES[name] for name in names if split is None or split in FIGURES[name].needs
-    ]
+        if split is None or split in ITEMS[name].needs:
+            items.append(ITEMS[name])
+    return items
 
 
-def _seeds(text: str) -> tuple[int, ...]:
+def _parse_seeds(text: str) -> tuple[int, ...]:
+    """Return the seeds of a text, as in 0,1."""
     try:
         seeds = tuple(int(part) for part in text.split(","))
     except ValueError:
@@ -340,10 +383,8 @@ def _seeds(text: str) -> tuple[int, ...]:
     return seeds
 
 
-def _say(text: str) -> None:
-    """Print a text; where the reader has left, as ``head`` does, the work goes on
-    without.
-    """
+def _print(text: str) -> None:
+    """Print a text; if the reader has left, as ``head`` does, the work goes on."""
     try:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()

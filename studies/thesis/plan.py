@@ -1,4 +1,4 @@
-"""What is to be reproduced, and where everything of it lies."""
+"""What to reproduce at one size, and where its files lie."""
 
 from __future__ import annotations
 
@@ -14,9 +14,15 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
 from lagbench.scoring.task import ScoredTask, load_scored_task
 
-from .evidence import STUDIES as COMMITTED
-from .evidence import WEIGHTS, Evidence, Sources, read_json
-from .published import STUDIES, Model, Study
+from .published import MLP_STUDIES, MLPStudy
+from .roster import RosterModel
+from .split_results import (
+    COMMITTED_STUDIES,
+    WEIGHTS,
+    Sources,
+    SplitResults,
+    read_json,
+)
 
 PREDICTIONS = "predictions.nc"
 
@@ -26,37 +32,35 @@ TABLES: Mapping[str, tuple[str, str]] = {
     "table_4_4": ("4.4", "multimaterial"),
     "table_4_5": ("4.5", "multimaterial"),
 }
-"""Number of the table in the thesis, and the split it is made on."""
+"""Tables of MLPs: their number in the thesis, and the split that they are made on."""
 
 SHARES: Mapping[str, tuple[float, int]] = {"mini": (0.1, 16), "tiny": (0.01, 64)}
-"""Share of the thesis's epochs, and what its batch is divided by, by size."""
+"""Share of the thesis's epochs, and divisor of its batch, by size."""
 
-# what the rows came to, in a folder of runs or of committed studies
+# results of the rows of these tables, in a folder of runs or of committed studies
 STUDY_FILE = "mlp_studies.json"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """One size to reproduce: what was asked for, and where everything of it lies."""
+    """One size to reproduce: the user's choices, and the folders of its files."""
 
     size: str
     root: Path  # folder of all data sets
-    runs: Path  # folder of runs; what is there is not made again
+    runs: Path  # folder of runs; complete runs there are kept
     output: Path  # folder of tables and pictures
     weights: Path = WEIGHTS  # folder of committed weights
-    studies: Path = COMMITTED  # folder of committed results that are no entries
+    studies: Path = COMMITTED_STUDIES  # folder of committed results without an entry
     seeds: tuple[int, ...] = (0,)  # seeds of every training; pictures show the first
-    # variant of the recipes, as in short; None for the size's own
-    recipe: str | None = None
-    settings: tuple[str, ...] = ()  # changes to every recipe, as in training.steps=100
+    recipe: str | None = None  # variant of the recipes: short; None for the size's own
+    settings: tuple[str, ...] = ()  # changes to every recipe: training.steps=100
     device: str = "auto"
-    # of a training on the CPU; one per core by default, one with workers
+    # CPU threads of a training; one per core by default, one with workers
     threads: int | None = None
-    registry: Registry | None = None  # where splits are described; ours when None
-    # folders of runs that could not be made, or are not those that were asked for:
-    # nothing of them is shown
+    registry: Registry | None = None  # descriptions of the splits; ours when None
+    # folders of runs that failed or have another recipe: nothing of them is shown
     failed: set[Path] = field(default_factory=set, compare=False, repr=False)
-    _evidence: dict[str, Evidence] = field(
+    _results: dict[str, SplitResults] = field(
         default_factory=dict, compare=False, repr=False
     )
     _subsets: dict[str, ScoredTask] = field(
@@ -65,66 +69,73 @@ class Plan:
 
     @cached_property
     def described(self) -> Registry:
-        """Splits, those of the root folder included."""
+        """Descriptions of the splits, those in the root folder included."""
         return rooted(self.root, self.registry)
 
     def tier(self, split: str) -> Size:
-        """Return what the registry says of a split at this size."""
+        """Return the description of a split at this size."""
         return self.described.size(split, self.size)
 
     def hash(self, split: str) -> str | None:
-        """Return the hash of a split's data, those at hand before those recorded; None
-        where unknown.
+        """Return the hash of a split's data; None where unknown.
+
+        The hash of the data in the root folder wins over the recorded one.
         """
         tier = self.tier(split)
         manifest = read_manifest(self.root, tier.split, tier.name, tier.major)
+        if manifest is not None and manifest.dataset_sha256:
+            return manifest.dataset_sha256
         if tier.measured:
-            recorded = tier.measured.dataset_sha256
-        else:
-            recorded = None
-        return (manifest.dataset_sha256 if manifest else None) or recorded
+            return tier.measured.dataset_sha256
+        return None
 
-    def has_recipe(self, split: str, model: Model) -> bool:
-        """Return whether a model has the variant of the recipes that was asked for."""
+    def has_recipe(self, split: str, model: RosterModel) -> bool:
+        """Return whether a model has the chosen variant of the recipes."""
         if self.recipe is None or self.recipe.endswith((".yaml", ".yml")):
             return True
+
+        # these load torch
         from lagbench.baselines.catalogue import find
         from lagbench.baselines.recipe import recipe_names
 
         try:
-            known = recipe_names(find(model.baseline))
-        except UsageError:  # it cannot be loaded: training says why
+            names = recipe_names(find(model.baseline))
+        except UsageError:  # the model cannot be loaded: training says why
             return True
-        return any(
-            f"{where}/{self.size}-{self.recipe}" in known for where in (split, "*")
-        )
+        variant = f"{self.size}-{self.recipe}"
+        return f"{split}/{variant}" in names or f"*/{variant}" in names
 
     def home(self, split: str) -> Path:
         """Return the folder of a split's runs: ``runs/<split>/<size>[-<recipe>]``."""
-        return (
-            self.runs
-            / split
-            / (f"{self.size}-{self.recipe}" if self.recipe else self.size)
-        )
+        if self.recipe:
+            return self.runs / split / f"{self.size}-{self.recipe}"
+        return self.runs / split / self.size
 
     def folder(self, split: str, name: str, seed: int) -> Path:
         """Return the folder of one training."""
         return self.home(split) / f"{name}-{seed}"
 
     def predictions(self, split: str, name: str) -> Path | None:
-        """Return a model's predictions, those of the first seed asked for; None where
-        none were scored.
+        """Return a model's file of predictions; None where none was scored.
+
+        The first chosen seed comes before the others.
         """
-        method = self.evidence(split).methods.get(name)
-        held = sorted(
-            method.seeds if method else (), key=lambda one: one.seed != self.seeds[0]
+        method = self.results(split).methods.get(name)
+        if method is None:
+            return None
+        first_seed = self.seeds[0]
+        trainings = sorted(
+            method.trainings, key=lambda training: training.seed != first_seed
         )
-        paths = [one.path.with_name(PREDICTIONS) for one in held]
-        return next((path for path in paths if path.is_file()), None)
+        for training in trainings:
+            path = training.path.with_name(PREDICTIONS)
+            if path.is_file():
+                return path
+        return None
 
     @property
     def sources(self) -> Sources:
-        """Where the evidence of these runs lies."""
+        """The folders that the results of these runs are read from."""
         return Sources(
             board=None,
             weights=self.weights,
@@ -132,23 +143,22 @@ class Plan:
             recipe=self.recipe,
             registry=self.described,
             studies=self.studies,
-            left_out=frozenset(self.failed),
+            excluded_runs=frozenset(self.failed),
         )
 
-    def evidence(self, split: str) -> Evidence:
-        """Return scores, costs and records of a split's runs; read once, after they are
-        made.
-        """
-        if split not in self._evidence:
-            self._evidence[split] = Evidence(self.sources, split, self.size)
-        return self._evidence[split]
+    def results(self, split: str) -> SplitResults:
+        """Return the results of a split's runs; they are read once, after the runs."""
+        if split not in self._results:
+            self._results[split] = SplitResults(self.sources, split, self.size)
+        return self._results[split]
 
     @property
     def stale(self) -> list[Path]:
-        """Score files of other data among the evidence that was read; they are left
-        out.
-        """
-        return [path for evidence in self._evidence.values() for path in evidence.stale]
+        """Score files of other data among the results that were read."""
+        paths = []
+        for results in self._results.values():
+            paths += results.stale
+        return paths
 
     def test_subset(self, split: str) -> ScoredTask:
         """Return the test subset of a split as the scorer sees it."""
@@ -157,38 +167,32 @@ class Plan:
         return self._subsets[split]
 
 
-def study_name(study: Study) -> str:
-    """Return what a row is called in files and folders, as in ``mlp-4-2-1``."""
+def study_name(study: MLPStudy) -> str:
+    """Return the name of a row in files and folders, as in ``mlp-4-2-1``."""
     return f"mlp-{study.table.replace('.', '-')}-{study.row}"
 
 
-def study_rows(name: str) -> tuple[Study, ...]:
+def study_rows(name: str) -> tuple[MLPStudy, ...]:
     """Return the rows of a table."""
-    return tuple(study for study in STUDIES if study.table == TABLES[name][0])
+    table_number, _ = TABLES[name]
+    return tuple(study for study in MLP_STUDIES if study.table == table_number)
 
 
-def study_folder(plan: Plan, name: str, study: Study) -> Path:
-    """Return the folder of a row's training; it lies apart from the runs that are
-    scored.
+def study_folder(plan: Plan, name: str, study: MLPStudy) -> Path:
+    """Return the folder of a row's training, apart from the runs that are scored."""
+    _, split = TABLES[name]
+    return plan.home(split) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
+
+
+def read_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
+    """Return the results of rows by :func:`study_name`.
+
+    A row has the errors ``train`` and ``valid`` and the record of its ``training``. A
+    later folder wins over an earlier one. Rows of data with another hash are left out.
     """
-    return (
-        plan.home(TABLES[name][1]) / "studies" / f"{study_name(study)}-{plan.seeds[0]}"
-    )
-
-
-def known_studies(homes: Iterable[Path], data: str | None) -> dict[str, Any]:
-    """Return what rows came to, by :func:`study_name`: ``train``, ``valid`` and the
-    record of ``training``.
-
-    A row of a later folder goes before that of an earlier one; rows of data with
-    another hash are left out.
-    """
-    held: dict[str, Any] = {}
+    studies: dict[str, Any] = {}
     for home in homes:
-        rows = read_json(home / STUDY_FILE).items()
-        held |= {
-            name: row
-            for name, row in rows
-            if data in (None, row["training"]["dataset_sha256"])
-        }
-    return held
+        for name, row in read_json(home / STUDY_FILE).items():
+            if data is None or row["training"]["dataset_sha256"] == data:
+                studies[name] = row
+    return studies
