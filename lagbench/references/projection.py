@@ -14,11 +14,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from lagbench.data.box import Box
 
-from .predictor import Floats, Given, Prediction, ReferencePredictor, fills_box
+from .predictor import Given, Prediction, ReferencePredictor, fills_box
 from .staggered import StaggeredGrid
 
 RESOLUTIONS = {"projection-half": 0.5, "projection": 1.0, "projection-double": 2.0}
