@@ -102,7 +102,7 @@ class Box:
     @cached_property
     def lengths(self) -> Floats:
         """Extent along each axis [length], shape [axis]."""
-        return np.asarray(self.high) - np.asarray(self.low)
+        return np.asarray(np.subtract(self.high, self.low), np.float64)
 
     @property
     def volume(self) -> float:
@@ -117,7 +117,7 @@ class Box:
     @property
     def walls(self) -> tuple[str, ...]:
         """Names of the walls: two for each axis that is not periodic."""
-        names = []
+        names: list[str] = []
         for axis, is_periodic in enumerate(self.periodic):
             if not is_periodic:
                 names.extend(WALL_NAMES[2 * axis : 2 * axis + 2])
@@ -133,7 +133,7 @@ class Box:
             start: points [length], shape [..., axis].
             end: points [length], shape [..., axis].
         """
-        way = np.asarray(end) - np.asarray(start)
+        way = np.asarray(np.subtract(end, start))
         if not self.is_periodic:
             return way
         period = np.where(self.periodic, self.lengths, np.inf)

@@ -14,36 +14,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from lagbench.data.box import Box
-
-from .predictor import Given, Prediction, ReferencePredictor, fills_box
+from .predictor import Given, Kind, Prediction, ReferencePredictor, fills_box
 from .staggered import StaggeredGrid
 
-RESOLUTIONS = {"projection-half": 0.5, "projection": 1.0, "projection-double": 2.0}
+RESOLUTIONS = {"projection": 1, "projection-2x": 2, "projection-3x": 3}
 """Cells of each solver over those of the score grid, along each axis."""
-
-EFFECTIVE_VISCOSITY = "effective_viscosity"
-"""Parameter of a size whose data have no viscosity of their own [length^2/s]."""
-
-
-def viscosity_of(given: Given) -> float:
-    """Return the kinematic viscosity that the scenario or its data set states.
-
-    The unit is length^2/s. Where neither states one the fluid is inviscid: 0.
-    """
-    stated = given.parameters.get("viscosity")
-    if stated is None and EFFECTIVE_VISCOSITY in given.size.parameters:
-        stated = given.size.value(EFFECTIVE_VISCOSITY)
-    return float(str(stated or 0.0))
 
 
 def cell_counts(given: Given, resolution: float) -> tuple[int, ...]:
     """Return the cells along each axis of the box, shape [axis]."""
-    box = Box.from_bounds(given.size.bounds)
-    score_cells = given.size.task.score_grid.cells
-    return tuple(
-        max(4, round(length * score_cells * resolution)) for length in box.lengths
-    )
+    density = resolution * given.size.task.score_grid.cells
+    return tuple(max(4, round(density * length)) for length in given.box.lengths)
 
 
 def predict(given: Given, resolution: float) -> Prediction:
@@ -54,10 +35,10 @@ def predict(given: Given, resolution: float) -> Prediction:
         resolution: cells over those of the score grid [1].
     """
     interval = given.size.frame_interval
-    viscosity = viscosity_of(given)
+    viscosity = given.viscosity
     walls = given.walls / interval
     grid = StaggeredGrid(
-        Box.from_bounds(given.size.bounds),
+        given.box,
         cells=cell_counts(given, resolution),
         no_slip=given.driven,
     )
@@ -100,16 +81,16 @@ def predict_at(resolution: float) -> Callable[[Given], Prediction]:
     return predict_scenario
 
 
-def _describe(name: str, resolution: float) -> ReferencePredictor:
+def _describe(name: str, resolution: int) -> ReferencePredictor:
     return ReferencePredictor(
         name=name,
-        title=name.replace("-", " ").capitalize(),
+        title=f"Projection solver, {resolution} x the score grid",
+        kind=Kind.CLASSICAL,
         definition="Incompressible Navier-Stokes on a staggered grid with"
-        f" {resolution:g} times the cells of the score grid along each axis; it knows"
-        " the viscosity and the motion of the walls.",
+        f" {resolution} times the cells of the score grid along each axis; it knows the"
+        " viscosity and the motion of the walls.",
         applies=fills_box,
         predict=predict_at(resolution),
-        counts=False,
     )
 
 

@@ -16,6 +16,7 @@ the viscous time of a cell per step.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 
@@ -80,7 +81,7 @@ class StaggeredGrid:
         """Return where the first face of a component lies [length], shape [axis]."""
         offset = np.full(self.dimension, 0.5)
         offset[component] = 0.0
-        return np.asarray(self.box.low) + offset * self.spacing
+        return np.asarray(np.asarray(self.box.low) + offset * self.spacing)
 
     def rest(self) -> Velocity:
         """Return the velocity of a fluid at rest [length/s]."""
@@ -226,7 +227,7 @@ class StaggeredGrid:
             upper = _slice(dimension, axis, 1, count + 1)
             flux_below = carried_below * carrier[lower]
             flux_above = carried_above * carrier[upper]
-        return (flux_above - flux_below) / self.spacing[axis]
+        return np.asarray((flux_above - flux_below) / self.spacing[axis])
 
     def _at_edges(self, padded: Floats, *, axis: int, component: int) -> Floats:
         """Return u_axis half a cell before the faces of another component.
@@ -277,15 +278,16 @@ class StaggeredGrid:
             wall_velocity=wall_velocity,
         )
         dt = duration / steps
-        settings = {
-            "viscosity": viscosity,
-            "wall_velocity": wall_velocity,
-            "force": force,
-        }
+        rate_of = functools.partial(
+            self.acceleration,
+            viscosity=viscosity,
+            wall_velocity=wall_velocity,
+            force=force,
+        )
         for _ in range(steps):
-            rate = self.acceleration(velocity, **settings)
+            rate = rate_of(velocity)
             predictor = self.project(_add(velocity, rate, dt))
-            later_rate = self.acceleration(predictor, **settings)
+            later_rate = rate_of(predictor)
             moved = _add(velocity, rate, 0.5 * dt)
             velocity = self.project(_add(moved, later_rate, 0.5 * dt))
         return velocity
