@@ -198,14 +198,16 @@ class Film:
         for recording, painter, left in zip(
             self._recordings, self._painters, self._lefts, strict=True
         ):
-            panel = unpack(painter.paint(recording.scene(number)))
+            scene = recording.scene(number)
+            panel = unpack(painter.paint(scene))
             image[TOP : TOP + SIDE, left : left + SIDE] = panel
 
         # the counter stands at the bottom right
         text = self._counter_text(number)
-        counter = np.concatenate([self._letters[letter] for letter in text], axis=1)
+        letters = [self._letters[letter] for letter in text]
+        counter = np.concatenate(letters, axis=1)
         right = self.size[0] - MARGIN
-        left = right - LETTER_WIDTH * len(text)
+        left = right - counter.shape[1]
         top = TOP + SIDE + 12
         image[top : top + LETTER_HEIGHT, left:right] = counter
         return image

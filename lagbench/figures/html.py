@@ -90,7 +90,7 @@ def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     return Markup(f"<{name}{attribute_text}>{join(children)}</{name}>")
 
 
-def path_data(points: Iterable[tuple[float, float]]) -> str:
+def path_data(points: Iterable[Iterable[float]]) -> str:
     """Return SVG path data through points; a point that is no number leaves a gap.
 
     >>> nan = float("nan")

@@ -16,8 +16,8 @@ DESCENT = 3.0
 CAPITAL_WIDTH = 9.0
 LETTER_WIDTH = 6.4
 
-# Shift of a label from the middle of its dot, and the share of it that lies to the left.
-# Labels above and below clear the dots that stand in one row with theirs.
+# Shift of a label from the middle of its dot, and the share of it that lies to the
+# left. Labels above and below clear the dots that stand in one row with theirs.
 ABOVE = -11.0
 BELOW = 19.0
 SHIFTS = (

@@ -72,9 +72,12 @@ def _scenario_figure(
     interval = subject.task.size.frame_interval
     columns = []
     for moment in moments:
-        columns.append(f"frame {moment.frame}\u2002{moment.frame * interval:.2f} s")
+        seconds = moment.frame * interval
+        columns.append(f"{moment.title}\u2002{seconds:.2f} s")
     materials = np.unique(moments[0].truth.scenario.material).tolist()
-    key = [(f"m{material}", MATERIALS[material]) for material in materials]
+    key = []
+    for material in materials:
+        key.append((f"m{material}", MATERIALS[material]))
     title = f"Particles, scenario {scenario}"
     if label.mark:
         title += f": {label.mark}"
