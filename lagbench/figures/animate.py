@@ -181,10 +181,12 @@ class Film:
         self._limit = _common_limit(recordings, panel)
         self._painters = []
         self._lefts = []  # left side of each panel [pixel]
-        for column, recording in enumerate(recordings):
+        left = MARGIN
+        for recording in recordings:
             painter = Painter(recording, panel, side=SIDE, limit=self._limit)
             self._painters.append(painter)
-            self._lefts.append(MARGIN + column * (SIDE + GAP))
+            self._lefts.append(left)
+            left += SIDE + GAP
 
         width = self._lefts[-1] + SIDE + MARGIN
         height = TOP + SIDE + BOTTOM

@@ -281,14 +281,17 @@ class Plot:
     def level(self, value: float, label: str) -> None:
         """Draw a horizontal line with a label at its right end."""
         row = float(self._rows(value))
-        self._marks.append(_draw_line((0, row), (self._plot_width, row), "level"))
-        self._marks.append(draw_text(label, self._plot_width, row - 5, "note end"))
+        right = self._plot_width
+        line = _draw_line((0, row), (right, row), "level")
+        note = draw_text(label, right, row - 5, "note end")
+        self._marks += [line, note]
 
     def upright(self, value: float, label: str) -> None:
         """Draw a vertical line with a label at its top."""
         column = float(self._columns(value))
         bottom = self._plot_height
-        self._marks.append(_draw_line((column, 0), (column, bottom), "level"))
+        line = _draw_line((column, 0), (column, bottom), "level")
+        self._marks.append(line)
         is_right = column > self._plot_width / 2
         if is_right:
             note = Label(label, column - 5, 11, 1.0)
@@ -330,7 +333,12 @@ class Plot:
         role = "img"
         if self._is_interactive:
             role = "group"
-        parts = [*self._draw_axes(), area]
+        parts = [
+            *self._draw_y_axis(),
+            *self._draw_x_axis(),
+            *self._draw_axis_labels(),
+            area,
+        ]
         return _wrap_svg(self._height, title, description, parts, role=role)
 
     def _add_path(self, data: str, kind: str, title: str = "") -> None:
@@ -351,27 +359,43 @@ class Plot:
     def _rows(self, y: ArrayLike) -> Floats:
         return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._plot_height
 
-    def _draw_axes(self) -> list[Markup]:
-        bottom = TOP + self._plot_height
+    def _draw_y_axis(self) -> list[Markup]:
+        """Return a line across the plot for each tick, with its label."""
         right = WIDTH - RIGHT
+        label_right = LEFT - 7
         drawn = []
         for tick in self._y.ticks:
             row = TOP + float(self._rows(tick.value))
             line = _draw_line((LEFT, row), (right, row), "grid")
-            label = draw_text(tick.label, LEFT - 7, row + 4, "tick end")
+            label = draw_text(tick.label, label_right, row + 4, "tick end")
             drawn += [line, label]
+        return drawn
+
+    def _draw_x_axis(self) -> list[Markup]:
+        """Return the axis with a mark for each tick, with its label."""
+        right = WIDTH - RIGHT
+        bottom = TOP + self._plot_height
+        mark_bottom = bottom + 4
+        base_line = bottom + 17
+        drawn = []
         for tick in self._x.ticks:
             column = LEFT + float(self._columns(tick.value))
-            line = _draw_line((column, bottom), (column, bottom + 4), "mark")
-            label = draw_text(tick.label, column, bottom + 17, "tick middle")
-            drawn += [line, label]
-        drawn.append(_draw_line((LEFT, bottom), (right, bottom), "axis"))
-
-        x_label = _with_factor(self._x_label, self._x)
-        drawn.append(draw_text(x_label, right, self._height - 5, "label end"))
-        y_label = _with_factor(self._y_label, self._y)
-        drawn.append(draw_text(y_label, 2, 14, "label"))
+            mark = _draw_line((column, bottom), (column, mark_bottom), "mark")
+            label = draw_text(tick.label, column, base_line, "tick middle")
+            drawn += [mark, label]
+        axis = _draw_line((LEFT, bottom), (right, bottom), "axis")
+        drawn.append(axis)
         return drawn
+
+    def _draw_axis_labels(self) -> list[Markup]:
+        x_label = _with_factor(self._x_label, self._x)
+        y_label = _with_factor(self._y_label, self._y)
+        right = WIDTH - RIGHT
+        below = self._height - 5
+        return [
+            draw_text(x_label, right, below, "label end"),
+            draw_text(y_label, 2, 14, "label"),
+        ]
 
 
 def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:
@@ -418,45 +442,56 @@ def bar_chart(
     bars: Sequence[Bar], scale: AxisScale, *, label: str, title: str, description: str
 ) -> Markup:
     """Return horizontal bars with their names above them."""
-    across = WIDTH - BARS_LEFT - BARS_RIGHT
     bottom = ROW_HEIGHT * len(bars) + 6
-
-    def column_of(value: float) -> float:
-        share = float(np.nan_to_num(scale.share(value), nan=0.0))
-        return BARS_LEFT + across * min(max(share, 0.0), 1.0)
-
     drawn: list[Markup] = []
     for tick in scale.ticks:
-        column = column_of(tick.value)
+        column = _bar_column(scale, tick.value)
         line = _draw_line((column, 4), (column, bottom), "grid")
         tick_label = draw_text(tick.label, column, bottom + 16, "tick middle")
         drawn += [line, tick_label]
 
     start = float(BARS_LEFT)
     if not scale.log:
-        start = column_of(0.0)
+        start = _bar_column(scale, 0.0)
     for number, bar in enumerate(bars):
         top = number * ROW_HEIGHT + 19
         drawn.append(_draw_bar_name(bar, top))
         if np.isfinite(bar.value):
-            low, high = sorted((start, column_of(bar.value)))
-            box = tag(
-                "rect",
-                x=f"{low:.1f}",
-                y=top,
-                width=f"{max(high - low, 1.0):.1f}",
-                height=BAR_HEIGHT,
-                class_=f"bar {bar.kind}",
-            )
-            drawn.append(box)
+            end = _bar_column(scale, bar.value)
+            drawn.append(_draw_bar(bar, start, end, top=top))
         middle = top + BAR_HEIGHT / 2
-        points = [(column_of(dot), middle) for dot in bar.dots if np.isfinite(dot)]
+        points = []
+        for dot in bar.dots:
+            if np.isfinite(dot):
+                points.append((_bar_column(scale, dot), middle))
         if points:
             drawn.append(tag("path", d=_dot_data(points), class_="dots on"))
-    drawn.append(_draw_line((start, 4), (start, bottom), "axis"))
+
+    axis = _draw_line((start, 4), (start, bottom), "axis")
+    right = WIDTH - BARS_RIGHT
     axis_label = _with_factor(label, scale)
-    drawn.append(draw_text(axis_label, WIDTH - BARS_RIGHT, bottom + 34, "label end"))
+    drawn.append(axis)
+    drawn.append(draw_text(axis_label, right, bottom + 34, "label end"))
     return _wrap_svg(bottom + 40, title, description, drawn, role="img")
+
+
+def _bar_column(scale: AxisScale, value: float) -> float:
+    """Return where a value stands along the bars [pixel]."""
+    across = WIDTH - BARS_LEFT - BARS_RIGHT
+    share = float(np.nan_to_num(scale.share(value), nan=0.0))
+    return BARS_LEFT + across * min(max(share, 0.0), 1.0)
+
+
+def _draw_bar(bar: Bar, start: float, end: float, *, top: float) -> Markup:
+    width = max(abs(end - start), 1.0)
+    return tag(
+        "rect",
+        x=f"{min(start, end):.1f}",
+        y=top,
+        width=f"{width:.1f}",
+        height=BAR_HEIGHT,
+        class_=f"bar {bar.kind}",
+    )
 
 
 def _draw_bar_name(bar: Bar, top: float) -> Markup:

@@ -94,7 +94,8 @@ def draw(
         colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
         _draw_dots(axes, scene, colours)
     elif panel is Panel.SPEED:
-        _draw_dots(axes, scene, scale.to_rgba(scene.speed))
+        colours = scale.to_rgba(scene.speed)
+        _draw_dots(axes, scene, colours)
     elif panel is Panel.VORTICITY:
         _draw_field(axes, scene, scene.vorticity, scale)
     else:

@@ -283,12 +283,17 @@ def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Pa
     paths: dict[str, Path] = {}
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            for name in KIND_PARAMETERS:
-                kind = str(recording.parameters.get(name, ""))
-                if kind:
-                    paths.setdefault(kind, path)
-                    break
-    return dict(sorted(paths.items(), key=lambda item: item[1].name))
+            parameters = recording.parameters
+        for name in KIND_PARAMETERS:
+            kind = str(parameters.get(name, ""))
+            if kind:
+                paths.setdefault(kind, path)
+                break
+
+    def file_name(kind: str) -> str:
+        return paths[kind].name
+
+    return {kind: paths[kind] for kind in sorted(paths, key=file_name)}
 
 
 def _arrange_over_time(

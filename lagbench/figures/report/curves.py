@@ -188,7 +188,8 @@ def _mean_series(rows: Sequence[ReportRow], name: str) -> list[Series]:
     series = []
     true_score = rows[0].scores.get(f"{name}_true")
     if true_score is not None:
-        series.append(Series("truth", "truth", _mean_over_scenarios(true_score)))
+        true_values = _mean_over_scenarios(true_score)
+        series.append(Series("truth", "truth", true_values))
     for row in rows:
         values = _mean_over_scenarios(row.scores[name])
         series.append(Series(row.name, row.kind, values))

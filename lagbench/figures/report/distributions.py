@@ -148,10 +148,13 @@ def _bar_table(subject: Subject, bars: Sequence[Bar], title: str) -> Markup:
     unknown = [np.nan] * len(subject.scenarios)
     rows = []
     for bar in bars:
-        numbers = [bar.value, *(bar.dots or unknown)]
-        rows.append([bar.label, *map(wrap_number, numbers)])
-    columns = [f"scenario {scenario}" for scenario in subject.scenarios]
-    return draw_table(["method", "mean", *columns], rows, label=title)
+        scenario_values = bar.dots or unknown
+        cells = map(wrap_number, scenario_values)
+        rows.append([bar.label, wrap_number(bar.value), *cells])
+    head = ["method", "mean"]
+    for scenario in subject.scenarios:
+        head.append(f"scenario {scenario}")
+    return draw_table(head, rows, label=title)
 
 
 def histogram_figure(subject: Subject, gallery: Gallery) -> ReportFigure:

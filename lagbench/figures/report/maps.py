@@ -115,7 +115,8 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     ) -> list[Markup]:
         panels = []
         for name, field in zip(names, fields, strict=True):
-            png = draw_map(crop_to_walls(subject.task, field), limit)
+            shown = crop_to_walls(subject.task, field)
+            png = draw_map(shown, limit)
             alt = f"{what} of {name}, frame {frame}"
             panels.append(draw_image_panel(png, label.classes, alt))
         return panels
@@ -151,10 +152,12 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
 def _masked_speeds(moment: Moment) -> list[Floats]:
     """Return the speed of truth and entries at the nodes, NaN where none counts."""
     flows = [moment.truth.fields]
-    flows += [pair.predicted_fields for pair in moment.pairs]
+    for pair in moment.pairs:
+        flows.append(pair.predicted_fields)
     speeds = []
     for flow in flows:
-        speed = np.sqrt((flow.velocity**2).sum(axis=-1))
+        squares = flow.velocity**2
+        speed = np.sqrt(squares.sum(axis=-1))
         speeds.append(np.where(flow.counted, speed, np.nan))
     return speeds
 
@@ -167,7 +170,8 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     limit = limit_of(_true_vorticities(moments))
 
     def draw_panel(field: Floats, what: str, frame: int) -> Markup:
-        png = draw_diverging_map(crop_to_walls(subject.task, field), limit)
+        shown = crop_to_walls(subject.task, field)
+        png = draw_diverging_map(shown, limit)
         return draw_image_panel(png, label.classes, f"{what}, frame {frame}")
 
     true_panels = []
@@ -214,7 +218,8 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     def draw_row(what: str, fields: Sequence[Floats]) -> list[Markup]:
         panels = []
         for moment, field, limit in zip(moments, fields, limits, strict=True):
-            png = draw_diverging_map(crop_to_walls(subject.task, field), limit)
+            shown = crop_to_walls(subject.task, field)
+            png = draw_diverging_map(shown, limit)
             classes = gallery.labels[moment.scenario].classes
             alt = f"{what}, scenario {moment.scenario}"
             panels.append(draw_image_panel(png, classes, alt))
