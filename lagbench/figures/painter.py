@@ -125,8 +125,8 @@ class Painter:
         rows = scene.vorticity.T[::-1]
         vorticity = rows[np.ix_(row, column)]
         is_defined = np.isfinite(vorticity)
-        known = np.where(is_defined, vorticity, 0.0)
-        share = 0.5 + 0.5 * known / self.limit
+        finite_vorticity = np.where(is_defined, vorticity, 0.0)
+        share = 0.5 + 0.5 * finite_vorticity / self.limit
         colours = self._look_up(share)
         return np.where(is_defined, colours, walls)
 

@@ -31,6 +31,12 @@ def draw_bar(label: str, value: float, *, dots: tuple[float, ...] = ()) -> Bar:
     return Bar(label=label, value=value, value_text=text(value), dots=dots, kind="s0")
 
 
+def empty_plot() -> Plot:
+    """Return a plot of 0 to 4 along both axes."""
+    axis = linear(0, 4)
+    return Plot(axis, axis, x_label="x", y_label="y")
+
+
 def read_plot(plot: Plot) -> Reading:
     """Return the elements of a chart without faults."""
     reading = read_html(plot.svg("title", "description"))
@@ -40,7 +46,7 @@ def read_plot(plot: Plot) -> Reading:
 
 def test_missing_values_leave_gaps() -> None:
     """A NaN ends a line and a band; the next value starts another."""
-    plot = Plot(linear(0, 4), linear(0, 4), x_label="x", y_label="y")
+    plot = empty_plot()
     x = [0, 1, 2, 3, 4]
     low = [0, 0, math.nan, 1, 1]
     high = [1, 1, 2, 2, 2]
@@ -211,7 +217,7 @@ def test_a_lonely_dot_has_its_label_to_the_right() -> None:
 
 def test_a_dot_without_room_for_a_label_says_its_name() -> None:
     """Of many dots at one place the first is labelled; the others have a title."""
-    plot = Plot(linear(0, 4), linear(0, 4), x_label="x", y_label="y")
+    plot = empty_plot()
     spots = []
     for number in range(20):
         name = f"method number {number}"
