@@ -135,7 +135,7 @@ def install(monkeypatch: pytest.MonkeyPatch, **models: type) -> None:
         EntryPoint(name, f"{model.__module__}:{model.__name__}", catalogue.GROUP)
         for name, model in models.items()
     )
-    monkeypatch.setattr(catalogue, "installed", lambda group: own + added)
+    monkeypatch.setattr(catalogue, "list_entry_points", lambda group: own + added)
 
 
 def trainer(

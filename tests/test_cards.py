@@ -21,7 +21,7 @@ from swirls import write_swirl
 
 from lagbench.data import registry
 from lagbench.data.layout import dataset_folder
-from lagbench.data.manifest import Manifest, describe_file, merge
+from lagbench.data.manifest import Manifest, build_manifest, describe_file
 from lagbench.data.registry import Size
 from lagbench.draw.tables import escape, markdown
 from lagbench.make import cards
@@ -50,7 +50,7 @@ def make(
                 update={"facts": {"kinetic_energy_first": 0.125 + scenario}}
             )
         )
-    manifest = merge(
+    manifest = build_manifest(
         None,
         entries,
         split=split,

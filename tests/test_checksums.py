@@ -20,8 +20,8 @@ from lagbench.data.checksums import (
     dataset_hash,
     dtype_name,
     file_sha256,
-    plain,
     subset_hash,
+    to_plain,
 )
 from lagbench.errors import DataError
 
@@ -264,7 +264,7 @@ def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
         -0.0,
         [np.float64(2)],
     ]
-    assert repr([plain(value) for value in given_values]) == repr(
+    assert repr([to_plain(value) for value in given_values]) == repr(
         [0.5, 3, "a", 1, -1, 0.0, [2.0]]
     )
 

@@ -20,7 +20,8 @@ from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenar
 
 from lagbench.data import MATERIALS
 from lagbench.data.checksums import ContentHasher, file_sha256
-from lagbench.data.writer import ScenarioWriter, check_scenario, read_scenario, rehash
+from lagbench.data.scenario import check_scenario, read_scenario, rehash
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.generators.split import Material
 

@@ -16,8 +16,8 @@ from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
+    build_manifest,
     describe_file,
-    merge,
     read_manifest,
     write_manifest,
 )
@@ -66,7 +66,7 @@ def merged(
     told.
     """
     entries = [entry(i) if isinstance(i, int) else i for i in ids]
-    return merge(
+    return build_manifest(
         old,
         entries,
         **{**OPTIONS, "environment": {"python": "3.11"}, "statistics": None, **options},

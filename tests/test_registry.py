@@ -384,7 +384,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
             points += 2 * [
                 EntryPoint(name, f"{name}_split", registry.GROUP)
             ]  # found on two paths
-        monkeypatch.setattr(registry, "installed", lambda group: points)
+        monkeypatch.setattr(registry, "list_entry_points", lambda group: points)
         registry._load.cache_clear()
         return load()
 
@@ -460,17 +460,19 @@ def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     """
     monkeypatch.syspath_prepend(tmp_path)
     os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
-    assert registry.installed("some.group") == ()
+    assert registry.list_entry_points("some.group") == ()
     folder = tmp_path / "wave_splits-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
     )
     (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
-    assert [point.name for point in registry.installed("some.group")] == ["waves"]
+    assert [point.name for point in registry.list_entry_points("some.group")] == [
+        "waves"
+    ]
     shutil.rmtree(folder)
     os.utime(tmp_path, (1, 1))
-    assert registry.installed("some.group") == ()
+    assert registry.list_entry_points("some.group") == ()
 
 
 def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:

@@ -272,7 +272,7 @@ def test_an_interrupted_download_goes_on(
 
     A hundred bytes a second are below the least rate.
     """
-    monkeypatch.setattr(fetch, "PATIENCE", 0.3)
+    monkeypatch.setattr(fetch, "RATE_SECONDS", 0.3)
     monkeypatch.setattr(fetch, "MOST_ATTEMPTS", 1)
     server.faults = {name: fault}
     with pytest.raises(

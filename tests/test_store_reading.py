@@ -248,7 +248,7 @@ def test_who_watches_is_told_how_far_it_is(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     lagbench.open_split(SPLIT, size=SIZE, root=url).close()
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
-    with copy.quietly():
+    with copy.silence_fetching():
         lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
     assert capsys.readouterr() == ("", "")
 

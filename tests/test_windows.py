@@ -283,9 +283,9 @@ def test_memory_is_bounded(train: Open, limit: int) -> None:
     ).tolist():
         assert torch.equal(data[i].position, whole[i].position)
         assert data.store.cached_bytes <= limit
-    kept = sum(frame.nbytes for frame in data.store._frames.values())
+    kept = sum(frame.nbytes for frame in data.store._cached_frames.values())
     assert kept == data.store.cached_bytes
-    assert all(frame.base is None for frame in data.store._frames.values())
+    assert all(frame.base is None for frame in data.store._cached_frames.values())
 
 
 def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +303,7 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
     data = train(cache_bytes=0)
     for i in (0, 40, 60, 0, 40, 60):
         assert data[i].scenario == data.place(i)[0]
-        assert len(data.store._open) == 1
+        assert len(data.store._open_scenarios) == 1
         assert len(open_scenarios() - before) <= 1
 
 
@@ -473,7 +473,7 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     data = train()
     first = data[0]
     sent = pickle.loads(pickle.dumps(data))
-    assert (sent.store.cached_bytes, len(sent.store._open)) == (0, 0)
+    assert (sent.store.cached_bytes, len(sent.store._open_scenarios)) == (0, 0)
     assert torch.equal(sent[0].position, first.position)
     batches = [
         list(

@@ -18,10 +18,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lagbench.data.local import remedy, resolve_root
+from lagbench.data.local import resolve_root, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
-from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.work.pool import worker_count
 
 from .catalogue import FIGURES
@@ -197,7 +197,7 @@ def rehearse(plan: Plan, figures: Sequence[Figure], *, split: str | None = None)
         if read_manifest(plan.root, tier.split, tier.name, tier.major) is None:
             note(
                 f"{tier.split} {tier.name} is not there yet: "
-                f"{remedy(tier, root=plan.root)}"
+                f"{suggest_repair(tier, root=plan.root)}"
             )
     code = _each(("", partial(say, *run)) for run in runs)
     for study in _studies(plan, figures):
@@ -307,7 +307,7 @@ def _chosen(only: str | None, split: str | None) -> list[Figure]:
     """Return the figures that were asked for."""
     if split is not None and split not in EXPECTED:
         raise UsageError(
-            f"no split {split!r}", where="--split", fix=nearest(split, EXPECTED)
+            f"no split {split!r}", where="--split", fix=suggest_name(split, EXPECTED)
         )
     if only:
         names = only.split(",")
@@ -318,7 +318,7 @@ def _chosen(only: str | None, split: str | None) -> list[Figure]:
             raise UsageError(
                 f"no table or figure {name!r}",
                 where="--only",
-                fix=nearest(name, FIGURES),
+                fix=suggest_name(name, FIGURES),
             )
     return [
         FIGURES[name] for name in names if split is None or split in FIGURES[name].needs

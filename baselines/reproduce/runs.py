@@ -16,7 +16,7 @@ from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.pool import Report, crashed
+from lagbench.work.pool import Report, crash_error
 from lagbench.work.run import run_all
 
 from .evidence import RECORD_NAME, read_json
@@ -75,7 +75,7 @@ def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
         if isinstance(error, LagbenchError):
             told = error
         else:
-            told = crashed(error)
+            told = crash_error(error)
         complain(told, name)
         return told.exit_code
     return 0

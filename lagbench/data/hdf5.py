@@ -1,11 +1,11 @@
-"""Look at a stranger's HDF5 file without trusting it: what it holds, before values are
-read.
+"""Inspect an HDF5 file of a stranger before its values are read.
 
 HDF5 lets a file point to other files (external links, external storage, virtual data
-sets), ask for plug-ins, and claim any size. Here links are listed and never followed,
-and what a header declares is held against what the file holds. :func:`check_structure`
-refuses a file; formats that report all their findings together use :func:`describe` and
-:func:`storage_problem`.
+sets), ask for plug-ins, and claim any size. Links are listed here and never followed.
+What a header declares is compared with what the file holds.
+
+:func:`check_structure` refuses a file. Formats that report all issues together use
+:func:`describe_array` and :func:`find_storage_issue`.
 """
 
 from __future__ import annotations
@@ -24,31 +24,34 @@ import numpy as np
 from lagbench.errors import LagbenchError, UnreadableFileError, check_regular
 
 MAX_LINKS = 1000
-"""Most entries of a group that are looked at."""
+"""Most entries of a group that are inspected."""
 
 MAX_ATTRIBUTE = 1 << 16
 """Longest attribute that is read [bytes]."""
 
 MAX_CACHE = 1 << 27
-"""Most memory for chunks that must stay unpacked while rows are read in order [bytes].
-"""
+"""Most memory for chunks that stay unpacked while rows are read in order [bytes]."""
 
 MAX_CHUNKS = 200_000
 """Most chunks of an array; each costs some microseconds to find."""
 
-HARMLESS = 1 << 28
-"""Bytes that may come of anything."""
+HARMLESS_BYTES = 1 << 28
+"""Any array or chunk may unpack to this many bytes."""
 
 DEFLATE_RATIO = 1032
 """No zlib stream unpacks to more than this many times its length."""
 
-MOST = 200
-"""Times its packed length that an array beyond HARMLESS may unpack to; particles at
-rest reach 100.
+MAX_ARRAY_RATIO = 200
+"""Most unpacked bytes per packed byte of an array beyond HARMLESS_BYTES.
+
+Particles at rest reach 100.
 """
 
+CHECKSUM_BYTES = 4
+"""Length of the checksum that the Fletcher-32 filter adds to a chunk [bytes]."""
+
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
-FOREIGN: Mapping[bytes, str] = {
+OTHER_FORMATS: Mapping[bytes, str] = {
     b"CDF": "netCDF-3, the old format",
     b"PK\x03\x04": "a zip archive, perhaps .npz",
     b"\x93NUMPY": "a NumPy .npy file",
@@ -65,7 +68,7 @@ LAYOUTS = {
 INSIDE = ("compact", "contiguous", "chunked")
 """Layouts of arrays whose values lie in the file itself."""
 
-KINDS = {
+TYPE_NAMES = {
     h5py.h5t.STRING: "string",
     h5py.h5t.COMPOUND: "compound",
     h5py.h5t.VLEN: "variable-length",
@@ -78,15 +81,24 @@ KINDS = {
 LINKS = {h5py.h5l.TYPE_SOFT: "soft link", h5py.h5l.TYPE_EXTERNAL: "external link"}
 OBJECTS = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "variable"}
 
-AGAIN = "write the file again; if it was copied or downloaded, compare its length"
+WRITE_AGAIN = "write the file again; if it was copied or downloaded, compare its length"
 
 
-def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> None:
-    """Refuse what is no HDF5 file by its kind, length and first bytes."""
+# --- opening --------------------------------------------------------------------------
+
+
+def check_file(
+    path: Path, *, longest: int | None = None, fix: str = WRITE_AGAIN
+) -> None:
+    """Refuse a file that is not HDF5 by its kind, length and first bytes.
+
+    Raises:
+        UnreadableFileError: no regular file, too long, or another signature.
+    """
     check_regular(path, longest=longest, fix=fix)
     try:
         with path.open("rb") as stream:
-            head = stream.read(len(SIGNATURE))
+            first_bytes = stream.read(len(SIGNATURE))
     except OSError as error:
         raise UnreadableFileError(
             "cannot open the file",
@@ -95,65 +107,72 @@ def check_file(path: Path, *, longest: int | None = None, fix: str = AGAIN) -> N
             got=error.strerror or error,
             fix="check the path and that you may read the file",
         ) from error
-    if head != SIGNATURE:
-        text = head.isascii() and head.decode("ascii").isprintable()
-        if head:
-            guess = "text" if text else "bytes of another format"
-        else:
-            guess = "an empty file"
-        got = next(
-            (what for start, what in FOREIGN.items() if head.startswith(start)), guess
-        )
-        expected = "HDF5, as netCDF4 is"
+    if first_bytes != SIGNATURE:
         raise UnreadableFileError(
-            "not an HDF5 file", where=str(path), expected=expected, got=got, fix=fix
+            "not an HDF5 file",
+            where=str(path),
+            expected="HDF5, as netCDF4 is",
+            got=_guess_format(first_bytes),
+            fix=fix,
         )
+
+
+def _guess_format(first_bytes: bytes) -> str:
+    for signature, format_name in OTHER_FORMATS.items():
+        if first_bytes.startswith(signature):
+            return format_name
+    if not first_bytes:
+        return "an empty file"
+    if first_bytes.isascii() and first_bytes.decode("ascii").isprintable():
+        return "text"
+    return "bytes of another format"
 
 
 @contextmanager
-def reading(path: Path, variable: str | None = None) -> Iterator[None]:
+def hdf5_errors(path: Path, variable: str | None = None) -> Iterator[None]:
     """Turn whatever HDF5 raises on damaged bytes into an UnreadableFileError."""
     try:
         yield
     except LagbenchError:
         raise
-    except (
-        Exception
-    ) as error:  # no list of types holds: damage surfaces as nearly any of them
+    except Exception as error:  # damage surfaces as nearly any type
+        where = str(path)
+        if variable is not None:
+            where = f"{path}, variable {variable!r}"
+        message = " ".join(str(error).split())[:300]
         raise UnreadableFileError(
             "HDF5 cannot read the file",
-            where=str(path) if variable is None else f"{path}, variable {variable!r}",
+            where=where,
             expected="an undamaged HDF5 file",
-            got=f"{type(error).__name__}: {' '.join(str(error).split())[:300]}",
-            fix=AGAIN,
+            got=f"{type(error).__name__}: {message}",
+            fix=WRITE_AGAIN,
         ) from error
 
 
 @contextmanager
-def opened(
-    path: Path, *, longest: int | None = None, fix: str = AGAIN
+def open_hdf5(
+    path: Path, *, longest: int | None = None, fix: str = WRITE_AGAIN
 ) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading: no lock, nothing but a regular file of bounded
-    length.
-    """
+    """Open a regular HDF5 file of bounded length for reading, without a lock."""
     check_file(path, longest=longest, fix=fix)
-    with reading(path):
+    with hdf5_errors(path):
         file = h5py.File(path, "r", locking=False)
     with file:
         yield file
 
 
+# --- what headers say -----------------------------------------------------------------
+
+
 @dataclass(frozen=True)
-class Odd:
-    """An attribute that is there but cannot be used, and why."""
+class UnusableAttribute:
+    """An attribute that exists but cannot be used."""
 
     reason: str
 
 
-class Problem(NamedTuple):
-    """What is wrong with the storage of an array, what would be right, and what was
-    found.
-    """
+class StorageIssue(NamedTuple):
+    """A reason to refuse the storage of an array."""
 
     what: str
     expected: str
@@ -161,7 +180,7 @@ class Problem(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Array:
+class ArrayInfo:
     """A data set as its header describes it."""
 
     shape: tuple[int, ...] | None  # None where asking could touch another file
@@ -170,8 +189,8 @@ class Array:
     item: int  # length of a value [bytes]
     layout: str  # "contiguous", "chunked", "compact", "virtual" or "external files"
     chunks: tuple[int, ...] | None
-    packed: int  # what the file says to hold of it [bytes]
-    largest_chunk: int  # longest chunk as it is packed [bytes]
+    packed: int  # its length in the file, as the file says [bytes]
+    largest_chunk: int  # longest packed chunk [bytes]
     filters: tuple[int, ...]
     foreign_filters: tuple[str, ...]  # those beyond zlib, shuffle and checksum, by name
 
@@ -187,37 +206,56 @@ class Array:
             return self.item * math.prod(self.chunks)
         return 0
 
+    @property
+    def chunk_counts(self) -> tuple[int, ...]:
+        """Number of chunks along each dimension; empty where it is not chunked."""
+        if self.shape is None or self.chunks is None:
+            return ()
+        counts = []
+        for length, chunk_length in zip(self.shape, self.chunks, strict=True):
+            counts.append(-(-length // chunk_length))  # rounded up
+        return tuple(counts)
 
-def members_of(group: h5py.Group, most: int = MAX_LINKS) -> tuple[dict[str, str], int]:
-    """Return the first members of a group with what each is, and how many there are.
+
+def list_members(
+    group: h5py.Group, most: int = MAX_LINKS
+) -> tuple[dict[str, str], int]:
+    """Return the first members of a group with their kinds, and the number of all.
 
     A member is a "variable", "group", "named type", "soft link", "external link" or
     "user-defined link".
     """
     count: int = group.id.get_num_objs()
-    found = {}
+    members = {}
     for index in range(min(count, most)):
         name = group.id.get_objname_by_idx(index)
-        kind = group.id.links.get_info(name).type
-        word = LINKS.get(kind, "user-defined link")
-        if kind == h5py.h5l.TYPE_HARD:
-            word = OBJECTS.get(h5py.h5o.get_info(group.id, name).type, "named type")
-        found[name.decode("utf-8", "backslashreplace")] = word
-    return found, count
+        link_type = group.id.links.get_info(name).type
+        if link_type == h5py.h5l.TYPE_HARD:
+            object_type = h5py.h5o.get_info(group.id, name).type
+            kind = OBJECTS.get(object_type, "named type")
+        else:
+            kind = LINKS.get(link_type, "user-defined link")
+        members[name.decode("utf-8", "backslashreplace")] = kind
+    return members, count
 
 
-def attribute_of(owner: h5py.HLObject, name: str) -> object:
-    """Return a number or a text; None where it is missing, Odd where it is neither."""
+def read_single_value(owner: h5py.HLObject, name: str) -> object:
+    """Return an attribute that is one number or one text.
+
+    None where it is missing, an UnusableAttribute where it is something else.
+    """
     if not h5py.h5a.exists(owner.id, name.encode()):
         return None
     attribute = h5py.h5a.open(owner.id, name.encode())
-    kind = attribute.get_type().get_class()
-    if kind not in (h5py.h5t.STRING, h5py.h5t.INTEGER, h5py.h5t.FLOAT):
-        return Odd("neither a text nor a number")
+    type_class = attribute.get_type().get_class()
+    if type_class not in (h5py.h5t.STRING, h5py.h5t.INTEGER, h5py.h5t.FLOAT):
+        return UnusableAttribute("neither a text nor a number")
     if attribute.get_space().get_simple_extent_npoints() != 1:
-        return Odd("not a single value")
-    if attribute.get_storage_size() > MAX_ATTRIBUTE:
-        return Odd(f"{attribute.get_storage_size()} bytes")
+        return UnusableAttribute("not a single value")
+    length = attribute.get_storage_size()
+    if length > MAX_ATTRIBUTE:
+        return UnusableAttribute(f"{length} bytes")
+
     value: Any = owner.attrs[name]
     if isinstance(value, (np.ndarray, np.generic)):
         value = value.item()
@@ -225,192 +263,204 @@ def attribute_of(owner: h5py.HLObject, name: str) -> object:
         try:
             value = value.decode("utf-8").rstrip("\0")
         except UnicodeDecodeError:
-            return Odd("no UTF-8")
+            return UnusableAttribute("no UTF-8")
     if isinstance(value, str) and len(value) > MAX_ATTRIBUTE:
-        return Odd(f"{len(value)} characters")
+        return UnusableAttribute(f"{len(value)} characters")
     if isinstance(value, (str, int, float)):
         return value
-    return Odd("neither a text nor a number")
+    return UnusableAttribute("neither a text nor a number")
 
 
-def layout_of(dataset: h5py.Dataset) -> str:
-    """Return how the values are stored: one of :data:`INSIDE`, "virtual", "external
-    files" or "unknown".
+def read_layout(dataset: h5py.Dataset) -> str:
+    """Return how the values are stored.
+
+    One of :data:`INSIDE`, "virtual", "external files" or "unknown".
     """
-    plist = dataset.id.get_create_plist()
-    if plist.get_external_count():
+    creation_properties = dataset.id.get_create_plist()
+    if creation_properties.get_external_count():
         return "external files"
-    return LAYOUTS.get(plist.get_layout(), "unknown")
+    return LAYOUTS.get(creation_properties.get_layout(), "unknown")
 
 
-def describe(dataset: h5py.Dataset) -> Array:
+def describe_array(dataset: h5py.Dataset) -> ArrayInfo:
     """Return what the header of a data set says; no value is read."""
-    plist = dataset.id.get_create_plist()
-    layout = layout_of(dataset)
+    layout = read_layout(dataset)
     # HDF5 opens the sources of a virtual data set to tell its shape.
-    elsewhere = layout not in INSIDE
-    plain = (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
-    simple = not elsewhere and dataset.id.get_space().get_simple_extent_type() in plain
-    filters = [plist.get_filter(i) for i in range(plist.get_nfilters())]
-    sizes: list[int] = []
+    is_inside = layout in INSIDE
+    shape = None
+    if is_inside and _has_simple_shape(dataset):
+        shape = tuple(dataset.id.shape)
+
+    creation_properties = dataset.id.get_create_plist()
+    chunks = None
+    chunk_lengths: list[int] = []
+    packed = 0
     if layout == "chunked":
-        dataset.id.chunk_iter(lambda chunk: sizes.append(chunk.size))
-    kind = dataset.id.get_type()
-    return Array(
-        shape=tuple(dataset.id.shape) if simple else None,
-        dims=() if elsewhere else dims_of(dataset),
-        kind=_kind(kind),
-        item=kind.get_size(),
+        chunks = tuple(creation_properties.get_chunk())
+        dataset.id.chunk_iter(lambda chunk: chunk_lengths.append(chunk.size))
+        packed = sum(chunk_lengths)
+    elif is_inside:
+        packed = dataset.id.get_storage_size()
+
+    filters = []
+    foreign_filters = []
+    for index in range(creation_properties.get_nfilters()):
+        code, *_, description = creation_properties.get_filter(index)
+        filters.append(code)
+        if code not in FILTERS:
+            foreign_filters.append(f"{description.decode('ascii', 'replace')} ({code})")
+
+    value_type = dataset.id.get_type()
+    return ArrayInfo(
+        shape=shape,
+        dims=read_dimensions(dataset) if is_inside else (),
+        kind=_name_type(value_type),
+        item=value_type.get_size(),
         layout=layout,
-        chunks=tuple(plist.get_chunk()) if layout == "chunked" else None,
-        packed=sum(sizes)
-        if layout == "chunked"
-        else 0
-        if elsewhere
-        else dataset.id.get_storage_size(),
-        largest_chunk=max(sizes, default=0),
-        filters=tuple(code for code, *_ in filters),
-        foreign_filters=tuple(
-            f"{text.decode('ascii', 'replace')} ({code})"
-            for code, *_, text in filters
-            if code not in FILTERS
-        ),
+        chunks=chunks,
+        packed=packed,
+        largest_chunk=max(chunk_lengths, default=0),
+        filters=tuple(filters),
+        foreign_filters=tuple(foreign_filters),
     )
 
 
-def dims_of(dataset: h5py.Dataset) -> tuple[str, ...]:
-    """Return the names of the dimension scales that netCDF attaches, one per
-    dimension.
-    """
+def _has_simple_shape(dataset: h5py.Dataset) -> bool:
+    extent_type = dataset.id.get_space().get_simple_extent_type()
+    return extent_type in (h5py.h5s.SIMPLE, h5py.h5s.SCALAR)
+
+
+def read_dimensions(dataset: h5py.Dataset) -> tuple[str, ...]:
+    """Return the names of netCDF's dimension scales, one per dimension."""
     rank: int = dataset.id.rank
+    unnamed = ("",) * rank
     if not h5py.h5a.exists(dataset.id, b"DIMENSION_LIST"):
-        return ("",) * rank
+        return unnamed
     attribute = h5py.h5a.open(dataset.id, b"DIMENSION_LIST")
-    kind = attribute.get_type()
-    is_list = (
-        kind.get_class() == h5py.h5t.VLEN
-        and kind.get_super().get_class() == h5py.h5t.REFERENCE
+    list_type = attribute.get_type()
+    is_list_of_references = (
+        list_type.get_class() == h5py.h5t.VLEN
+        and list_type.get_super().get_class() == h5py.h5t.REFERENCE
     )
-    if not is_list or attribute.shape != (rank,):
-        return ("",) * rank
-    scales = dataset.attrs["DIMENSION_LIST"]
-    names = (
-        h5py.h5r.get_name(scale[0], dataset.id) or b"" if len(scale) else b""
-        for scale in scales
-    )
-    return tuple(
-        name.decode("utf-8", "backslashreplace").rsplit("/", 1)[-1] for name in names
-    )
+    if not is_list_of_references or attribute.shape != (rank,):
+        return unnamed
+
+    names = []
+    for scales in dataset.attrs["DIMENSION_LIST"]:
+        path = b""
+        if len(scales):
+            path = h5py.h5r.get_name(scales[0], dataset.id) or b""
+        names.append(path.decode("utf-8", "backslashreplace").rsplit("/", 1)[-1])
+    return tuple(names)
 
 
-def _kind(kind: h5py.h5t.TypeID) -> str:
+def _name_type(value_type: h5py.h5t.TypeID) -> str:
     """Return a type in words; byte order is left out, since HDF5 undoes it."""
-    if kind.get_class() == h5py.h5t.FLOAT:
-        if kind in (h5py.h5t.IEEE_F32LE, h5py.h5t.IEEE_F32BE):
+    type_class = value_type.get_class()
+    bits = 8 * value_type.get_size()
+    if type_class == h5py.h5t.FLOAT:
+        if value_type in (h5py.h5t.IEEE_F32LE, h5py.h5t.IEEE_F32BE):
             return "float32"
-        if kind.get_size() != 4:
-            return f"float{8 * kind.get_size()}"
+        if bits != 32:
+            return f"float{bits}"
         return "a float of 4 bytes, not IEEE"
-    if kind.get_class() == h5py.h5t.INTEGER:
-        if kind.get_sign() == h5py.h5t.SGN_2:
-            sign = ""
-        else:
-            sign = "u"
-        return f"{sign}int{8 * kind.get_size()}"
-    return KINDS.get(kind.get_class(), "another type")
+    if type_class == h5py.h5t.INTEGER:
+        if value_type.get_sign() == h5py.h5t.SGN_2:
+            return f"int{bits}"
+        return f"uint{bits}"
+    return TYPE_NAMES.get(type_class, "another type")
 
 
-def cache_of(array: Array) -> tuple[int, int]:
+def estimate_chunk_cache(array: ArrayInfo) -> tuple[int, int]:
     """Return the bytes and the number of chunks to keep while frames are read in order.
 
-    A chunk is unpacked once if all chunks that a frame touches stay until the frames,
-    and for chunks over several scenarios the scenarios, that share them are through.
+    A chunk is unpacked once if all chunks of a frame stay until the last frame that
+    shares them. The same holds for the scenarios of chunks over several scenarios.
     """
-    if array.chunks is None or array.shape is None:
+    counts = array.chunk_counts
+    if array.chunks is None or not counts:
         return 0, 1
-    counts = [-(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)]
+    cached_chunks = math.prod(counts[2:])
     if array.chunks[0] > 1:
-        rows = counts[1:2]
-    else:
-        rows = []
-    kept = max(1, math.prod([*rows, *counts[2:]]))
-    return kept * array.chunk_bytes, kept
+        cached_chunks *= math.prod(counts[1:2])
+    cached_chunks = max(1, cached_chunks)
+    return cached_chunks * array.chunk_bytes, cached_chunks
 
 
-def storage_problem(
-    array: Array, *, length: int, cache: int = MAX_CACHE
-) -> Problem | None:
-    """Return why an array reaches outside its file, needs plug-ins, or is a trap; None
-    where it is sound.
+# --- refusing -------------------------------------------------------------------------
 
-    ``length`` is that of the file [bytes]: chunks may overlap, and then promise more
-    than it has; ``cache`` the most memory for chunks that must stay unpacked [bytes].
+
+def find_storage_issue(
+    array: ArrayInfo, *, length: int, cache: int = MAX_CACHE
+) -> StorageIssue | None:
+    """Return why an array must not be read; None where it is sound.
+
+    An array must not reach outside its file, need plug-ins, or claim more than it has.
+
+    Args:
+        array: the header of the array.
+        length: length of the file [bytes]. Chunks may overlap, and then promise more.
+        cache: most memory for chunks that must stay unpacked [bytes].
     """
     if array.shape is None:
-        away = "file" in array.layout or array.layout == "virtual"
-        if away:
+        what = "there are no values"
+        if "file" in array.layout or array.layout == "virtual":
             what = "the values lie in other files"
-        else:
-            what = "there are no values"
-        return Problem(
-            what, "compact, contiguous or chunked storage in this file", array.layout
-        )
+        expected = "compact, contiguous or chunked storage in this file"
+        return StorageIssue(what, expected, array.layout)
     if array.foreign_filters:
-        got = ", ".join(array.foreign_filters)
-        return Problem(
+        return StorageIssue(
             "a filter is needed that not every reader has",
             "zlib, shuffle, checksum or none",
-            got,
+            ", ".join(array.foreign_filters),
         )
+    # Each zlib in a pipeline multiplies what a chunk may unpack to by a thousand.
     if len(set(array.filters)) < len(array.filters):
-        # Each zlib in a pipeline multiplies what a chunk may unpack to by a thousand.
-        got = f"filters {', '.join(map(str, array.filters[:10]))}"
-        return Problem(
-            "a filter is applied more than once", "each filter at most once", got
+        codes = ", ".join(str(code) for code in array.filters[:10])
+        return StorageIssue(
+            "a filter is applied more than once",
+            "each filter at most once",
+            f"filters {codes}",
         )
     if array.packed > length:
-        got = f"{array.packed} bytes in a file of {length}"
-        return Problem(
+        return StorageIssue(
             "the values claim more room than the file has",
             f"at most {length} bytes",
-            got,
+            f"{array.packed} bytes in a file of {length}",
         )
     if array.chunks is None or len(array.shape) != len(array.chunks):
         return None
-    count = math.prod(
-        -(-n // c) for n, c in zip(array.shape, array.chunks, strict=True)
-    )
-    if count > MAX_CHUNKS:
-        return Problem(
+    return _find_chunk_issue(array, cache)
+
+
+def _find_chunk_issue(array: ArrayInfo, cache: int) -> StorageIssue | None:
+    chunk_count = math.prod(array.chunk_counts)
+    if chunk_count > MAX_CHUNKS:
+        return StorageIssue(
             "too many chunks",
             f"at most {MAX_CHUNKS}",
-            f"{count} of shape {array.chunks}",
+            f"{chunk_count} of shape {array.chunks}",
         )
-    whole = array.chunk_bytes
-    if array.largest_chunk > 2 * whole + 1024:
-        # zlib unpacks as much as the stream says: a thousand times its length at worst.
-        got = f"{array.largest_chunk} bytes"
-        return Problem(
+    # zlib unpacks as much as the stream says: a thousand times its length at worst.
+    if array.largest_chunk > 2 * array.chunk_bytes + 1024:
+        return StorageIssue(
             "a chunk is longer packed than unpacked",
-            f"about {whole} bytes at most",
-            got,
+            f"about {array.chunk_bytes} bytes at most",
+            f"{array.largest_chunk} bytes",
         )
-    size = cache_of(array)[0]
-    if size > cache:
-        got = f"chunks {array.chunks}: {size} bytes"
-        return Problem(
+    cache_bytes, _ = estimate_chunk_cache(array)
+    if cache_bytes > cache:
+        return StorageIssue(
             "frames cannot be read without unpacking much more",
             f"at most {cache} bytes",
-            got,
+            f"chunks {array.chunks}: {cache_bytes} bytes",
         )
     return None
 
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """What a format expects of a file: everything else is refused before a value is
-    read.
-    """
+    """What a format expects of a file; anything else is refused before it is read."""
 
     members: int = MAX_LINKS  # most members of a group
     # groups below the root that it may have; None: any
@@ -424,114 +474,149 @@ class Structure:
 
 def check_structure(
     file: h5py.File, path: Path, expected: Structure
-) -> dict[str, Array]:
-    """Return the arrays of an open file by name ("a", "group/b"); refuse what may harm
-    a reader.
+) -> dict[str, ArrayInfo]:
+    """Return the arrays of an open file by name ("a", "group/b"); refuse a trap.
 
     Refused are links, foreign storage and filters, filters that are applied twice,
     groups and types that the format does not have, and arrays that unpack to far more
-    than the file holds: by their headers, and large chunks by unpacking them up to the
-    length that they declare.
+    than the file holds. The headers tell most of it. Large chunks are unpacked up to
+    the length that they declare: this check has to hold in a process without limits.
+
+    Raises:
+        UnreadableFileError: the file has another structure, is damaged, or is a trap.
     """
-
-    def refused(name: str, what: str, wanted: str, got: str) -> UnreadableFileError:
-        if name:
-            where = f"{path}, {name!a}"
-        else:
-            where = str(path)
-        fix = "write it again without links, filters of its own, and arrays larger than their values"
-        return UnreadableFileError(what, where=where, expected=wanted, got=got, fix=fix)
-
-    def names() -> Iterator[str]:
-        root, _ = members_of(file["/"], expected.members)
-        for prefix in [
-            "",
-            *(f"{name}/" for name, kind in root.items() if kind == "group"),
-        ]:
-            members, count = members_of(file[prefix or "/"], expected.members)
-            if count > expected.members:
-                raise refused(
-                    prefix,
-                    "too many members",
-                    f"at most {expected.members}",
-                    str(count),
-                )
-            for name, kind in members.items():
-                if kind == "variable":
-                    yield f"{prefix}{name}"
-                elif (
-                    kind != "group"
-                    or prefix
-                    or not (expected.groups is None or name in expected.groups)
-                ):
-                    raise refused(
-                        prefix + name,
-                        "a member that is no variable",
-                        "a variable",
-                        kind,
-                    )
-
     length = path.stat().st_size
-    found = {}
-    with reading(path):
-        for name in names():
-            array = found[name] = describe(file[name])
-            if problem := storage_problem(array, length=length, cache=expected.cache):
-                raise refused(name, *problem)
-            text = expected.texts and array.kind in ("string", "variable-length")
-            if not text and not array.kind.startswith(("float", "int", "uint")):
-                raise refused(
-                    name, "an array of another type", "plain numbers", array.kind
-                )
-            if problem := _inflation(file[name], array):
-                raise refused(name, *problem)
-    total = sum(array.unpacked + array.chunk_bytes for array in found.values())
+    arrays = {}
+    with hdf5_errors(path):
+        for name in _list_arrays(file, path, expected):
+            array = describe_array(file[name])
+            issue = (
+                find_storage_issue(array, length=length, cache=expected.cache)
+                or _find_type_issue(array, expected)
+                or _find_inflation(file[name], array)
+            )
+            if issue is not None:
+                raise _refusal(path, name, issue)
+            arrays[name] = array
+
+    total = sum(array.unpacked + array.chunk_bytes for array in arrays.values())
     if expected.unpacked is not None and total > expected.unpacked:
-        most = f"at most {expected.unpacked} bytes"
-        raise refused("", "the file unpacks to too much", most, f"{total} bytes")
-    return found
+        issue = StorageIssue(
+            "the file unpacks to too much",
+            f"at most {expected.unpacked} bytes",
+            f"{total} bytes",
+        )
+        raise _refusal(path, "", issue)
+    return arrays
 
 
-def _inflation(dataset: h5py.Dataset, array: Array) -> Problem | None:
-    """Hold what an array declares against what its chunks hold."""
-    if array.unpacked > max(HARMLESS, MOST * array.packed):
-        what = "the array would unpack to far more than the file holds"
-        return Problem(
-            what,
-            f"at most {MOST} times {array.packed} bytes",
+def _list_arrays(file: h5py.File, path: Path, expected: Structure) -> list[str]:
+    """Return the names of all arrays; refuse other members than the format has."""
+    arrays = []
+    groups = [""]
+    while groups:
+        group = groups.pop(0)
+        members, count = list_members(file[group or "/"], expected.members)
+        if count > expected.members:
+            most = f"at most {expected.members}"
+            issue = StorageIssue("too many members", most, str(count))
+            raise _refusal(path, group, issue)
+        for member, kind in members.items():
+            name = f"{group}{member}"
+            if kind == "variable":
+                arrays.append(name)
+            elif kind == "group" and not group and _may_hold(expected, member):
+                groups.append(f"{member}/")
+            else:
+                issue = StorageIssue("a member that is no variable", "a variable", kind)
+                raise _refusal(path, name, issue)
+    return arrays
+
+
+def _may_hold(expected: Structure, group: str) -> bool:
+    return expected.groups is None or group in expected.groups
+
+
+def _find_type_issue(array: ArrayInfo, expected: Structure) -> StorageIssue | None:
+    if expected.texts and array.kind in ("string", "variable-length"):
+        return None
+    if array.kind.startswith(("float", "int", "uint")):
+        return None
+    return StorageIssue("an array of another type", "plain numbers", array.kind)
+
+
+def _find_inflation(dataset: h5py.Dataset, array: ArrayInfo) -> StorageIssue | None:
+    """Return an issue where an array unpacks to more than its file can hold."""
+    if array.unpacked > max(HARMLESS_BYTES, MAX_ARRAY_RATIO * array.packed):
+        return StorageIssue(
+            "the array would unpack to far more than the file holds",
+            f"at most {MAX_ARRAY_RATIO} times {array.packed} bytes",
             f"{array.unpacked} bytes",
         )
-    if (
-        array.largest_chunk * DEFLATE_RATIO <= HARMLESS
-        or h5py.h5z.FILTER_DEFLATE not in array.filters
-    ):
+    if h5py.h5z.FILTER_DEFLATE not in array.filters:
         return None
-    places: list[tuple[int, ...]] = []
-    dataset.id.chunk_iter(
-        lambda chunk: (
-            places.append(chunk.chunk_offset)
-            if chunk.size * DEFLATE_RATIO > HARMLESS
-            else None
-        )
-    )
-    most = array.chunk_bytes + 4  # a checksum may stand behind the values
-    for place in places:
-        mask, raw = dataset.id.read_direct_chunk(place)
-        applied = [
-            code for bit, code in enumerate(array.filters) if not mask >> bit & 1
-        ]
-        if h5py.h5z.FILTER_DEFLATE not in applied:
-            continue
-        after = applied[applied.index(h5py.h5z.FILTER_DEFLATE) + 1 :]
-        packed = bytes(raw)[: len(raw) - 4 * len(after)]
-        # no writer packs first and shuffles then
-        if (
-            h5py.h5z.FILTER_SHUFFLE in after
-            or len(zlib.decompressobj().decompress(packed, most + 1)) > most
-        ):
-            return Problem(
+    for offset in _list_large_chunks(dataset, array):
+        if _exceeds_declared_length(dataset, array, offset):
+            return StorageIssue(
                 "a chunk unpacks to more than it declares",
                 f"{array.chunk_bytes} bytes",
                 "more",
             )
     return None
+
+
+def _list_large_chunks(
+    dataset: h5py.Dataset, array: ArrayInfo
+) -> list[tuple[int, ...]]:
+    """Return the offsets of chunks that may unpack to more than HARMLESS_BYTES."""
+    harmless_length = HARMLESS_BYTES // DEFLATE_RATIO
+    if array.largest_chunk <= harmless_length:
+        return []
+    offsets: list[tuple[int, ...]] = []
+
+    def note_large(chunk: h5py.h5d.StoreInfo) -> None:
+        if chunk.size > harmless_length:
+            offsets.append(chunk.chunk_offset)
+
+    dataset.id.chunk_iter(note_large)
+    return offsets
+
+
+def _exceeds_declared_length(
+    dataset: h5py.Dataset, array: ArrayInfo, offset: tuple[int, ...]
+) -> bool:
+    """Unpack a chunk to at most its declared length; tell whether there is more."""
+    # Bit i of the mask says that filter i was left out for this chunk.
+    mask, chunk = dataset.id.read_direct_chunk(offset)
+    applied_filters = []
+    for bit, code in enumerate(array.filters):
+        if not mask >> bit & 1:
+            applied_filters.append(code)
+    if h5py.h5z.FILTER_DEFLATE not in applied_filters:
+        return False
+    position = applied_filters.index(h5py.h5z.FILTER_DEFLATE)
+    later_filters = applied_filters[position + 1 :]
+    # No writer packs first and shuffles then.
+    if h5py.h5z.FILTER_SHUFFLE in later_filters:
+        return True
+
+    stream_length = len(chunk) - CHECKSUM_BYTES * len(later_filters)
+    stream = bytes(chunk)[:stream_length]
+    # A checksum may stand behind the values.
+    longest = array.chunk_bytes + CHECKSUM_BYTES
+    values = zlib.decompressobj().decompress(stream, longest + 1)
+    return len(values) > longest
+
+
+def _refusal(path: Path, name: str, issue: StorageIssue) -> UnreadableFileError:
+    where = str(path)
+    if name:
+        where = f"{path}, {name!a}"
+    return UnreadableFileError(
+        issue.what,
+        where=where,
+        expected=issue.expected,
+        got=issue.got,
+        fix="write it again without links, filters of its own, and arrays larger than "
+        "their values",
+    )

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UsageError, WorkFailedError, nearest, require
+from lagbench.errors import UsageError, WorkFailedError, require, suggest_name
 from lagbench.work.progress import watched
 
 from .panels import DOT, Panel, box_of, colour_bar, draw_walls, limit_of, material_key
@@ -324,7 +324,7 @@ def animate(
     path = Path(output)
     check_ending(path)
     if kind is not None and kind not in KINDS:
-        fix = nearest(str(kind), map(str, KINDS))
+        fix = suggest_name(str(kind), map(str, KINDS))
         raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
     whole = isinstance(every, int | np.integer)
     if (

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data import WALLS
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError, nearest
-from lagbench.store.copy import bring
+from lagbench.errors import DataError, UsageError, suggest_name
+from lagbench.store.copy import update_working_copy
 
 from .panels import (
     TITLES,
@@ -115,11 +115,13 @@ def contact_sheet(
         DataError: no scenario is there, or a file is damaged.
     """
     tier, folder, splits = locate(split, size, root=root, registry=registry)
-    bring(tier, folder, tier.scenarios)
+    update_working_copy(tier, folder, tier.scenarios)
     files = scenario_files(tier, folder)
     if not files:
         where = f"{tier.split} {size} under {folder}"
-        raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
+        raise DataError(
+            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
+        )
     if kind is None:
         panel = None
     else:
@@ -281,7 +283,9 @@ def check_kind(kind: str) -> None:
     """Refuse a kind of picture that :func:`plot_frame` cannot draw."""
     if kind not in KINDS:
         raise UsageError(
-            f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS)
+            f"no kind of picture {kind!r}",
+            where="--kind",
+            fix=suggest_name(kind, KINDS),
         )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
-from lagbench.data.local import rooted
+from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
@@ -181,7 +181,7 @@ def _beside(file: str | Path, registry: Registry | None) -> Registry:
     file.
     """
     parents = Path(file).absolute().parents  # the root is where `scenario_path` has it
-    return rooted(parents[min(4, len(parents) - 1)], registry)
+    return load_rooted_registry(parents[min(4, len(parents) - 1)], registry)
 
 
 def _of_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:

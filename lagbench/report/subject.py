@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
@@ -197,7 +197,7 @@ def subject_of(
                 what = f"one report, two values of {name}"
                 fix = "report submissions to one data set together, others on their own"
                 raise UsageError(what, where=str(path), expected=one, got=two, fix=fix)
-    described = rooted(folder, registry)
+    described = load_rooted_registry(folder, registry)
     task = load_scored_task(described.size(header.split, header.size), folder)
     names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
     entries = [

@@ -3,7 +3,7 @@
 
 ``--root s3://bucket/prefix`` means a folder of the user's cache that holds copies of
 the store's objects, see :mod:`lagbench.data.layout`. *Fetching* moves bytes over a line
-(:mod:`.fetch`), *bringing* puts what is fetched and right into the working copy
-(:mod:`.copy`), a *publication* puts it back (:mod:`.publication`); :mod:`.objects`
-opens, lists and puts. docs/scaling.md has the rules.
+(:mod:`.fetch`) into the working copy (:mod:`.copy`), a *publication* puts them back
+(:mod:`.publication`); :mod:`.objects` opens, lists and puts. docs/scaling.md has the
+rules.
 """
