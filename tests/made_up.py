@@ -26,7 +26,7 @@ from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import format_yaml, read_yaml
-from lagbench.report.report import write_report
+from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.stored import read_stored

@@ -191,9 +191,9 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import pool_tasks
-from lagbench.work.pool import Pool, Task
+from lagbench.work.pool import Pool, WorkItem
 with Pool(1) as pool:
-    pool.submit(Task(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
+    pool.submit(WorkItem(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
     print([event.value for event in pool.events()])
 """
 

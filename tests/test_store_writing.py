@@ -331,11 +331,11 @@ def test_what_was_made_anew_is_not_fetched_back(
         new = first.model_copy(
             update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)}
         )
-        store.follow(
+        store.put_files(
             manifest.model_copy(update={"files": (new, *manifest.files[1:])}),
             at_once=True,
         )
-        store.bring(size.scenarios)
+        store.fetch(size.scenarios)
     assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
     assert path.stat().st_size == new.bytes
     assert named(objects(full)[MANIFEST])[0] == "train/0000.nc"
