@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from lagbench.data.hdf5 import Structure, check_structure, open_hdf5
+from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 
 ANY = Structure(groups=None)

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from lagbench.errors import DataError, LagbenchError
 
 from .checksums import ContentHasher, to_plain
-from .hdf5 import DEFLATE_RATIO
-from .layout import ScenarioKey, generation_command
-from .netcdf import (
+from .hdf5 import (
+    DEFLATE_RATIO,
     is_text,
     is_text_of_any_length,
     list_dimensions,
@@ -32,6 +31,7 @@ from .netcdf import (
     read_attribute,
     read_attributes,
 )
+from .layout import ScenarioKey, generation_command
 from .variables import (
     ATTRIBUTES,
     MAX_VALUES_PER_FRAME,

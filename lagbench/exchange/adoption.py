@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
-from lagbench.data.hdf5 import Structure, check_structure, hdf5_errors, open_hdf5
+from lagbench.data.hdf5 import hdf5_errors, open_hdf5
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 

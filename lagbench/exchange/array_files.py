@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.hdf5 import Structure, check_structure, open_hdf5
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import MAX_ID
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .mistakes import check_meaning

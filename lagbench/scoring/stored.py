@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
-from lagbench.data.hdf5 import Structure, check_structure, open_hdf5
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import Size
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric

@@ -19,8 +19,9 @@ from typing import TypeVar
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import SIGNATURE, Structure, check_structure, open_hdf5
+from lagbench.data.hdf5 import SIGNATURE, open_hdf5
 from lagbench.data.scenario import check_scenario
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
 from .objects import (

@@ -17,9 +17,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
-from lagbench.data.netcdf import list_variables
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import damage_error
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError

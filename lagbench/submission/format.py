@@ -16,15 +16,13 @@ from typing import Any
 
 import h5py
 
-from lagbench.data.hdf5 import (
+from lagbench.data.hdf5 import MAX_LINKS, hdf5_errors, list_members
+from lagbench.data.structure import (
     MAX_ATTRIBUTE,
-    MAX_LINKS,
     ArrayInfo,
     UnusableAttribute,
     describe_array,
     find_storage_issue,
-    hdf5_errors,
-    list_members,
     read_single_value,
 )
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
