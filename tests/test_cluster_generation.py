@@ -65,7 +65,7 @@ def test_a_worker_killed_and_one_slowed(
     """
     monkeypatch.setattr(
         campaign,
-        "environment_of",
+        "describe_machine",
         lambda device: {"machine": "aarch64", "device": device},
     )
     folder = tmp_path / SPLIT / SIZE / "v2"

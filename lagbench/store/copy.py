@@ -255,12 +255,17 @@ def _list_lacking(
 
 
 def remote_manifest(
-    size: Size, url: str, *, fresh: float = FRESH_SECONDS
+    size: Size, url: str, *, fresh: float | None = None
 ) -> Manifest | None:
     """Return the manifest of a data set in a store; None where there is none.
 
-    An earlier answer of this process counts while it is no older than ``fresh`` [s].
+    Args:
+        size: the data set.
+        url: root of the store.
+        fresh: age up to which an earlier answer counts [s]; FRESH_SECONDS by default.
     """
+    if fresh is None:
+        fresh = FRESH_SECONDS
     address = object_address(size, url, MANIFEST_NAME)
     if address in _manifests:
         answered, manifest = _manifests[address]
