@@ -25,7 +25,7 @@ from cluster_bench import (
     writers,
 )
 from conftest import SIZE, SPLIT
-from spread_jobs import report_for_ever
+from parallel_jobs import report_for_ever
 
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest

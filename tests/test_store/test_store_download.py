@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from exchange_readers import straight_runs
-from lying_server import Mirror, serving
+from faulty_server import Mirror, serving
 from object_stores import Store, holding
 from typer.testing import CliRunner
 

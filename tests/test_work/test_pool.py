@@ -18,7 +18,7 @@ from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedErro
 from lagbench.work.machine import available_cores
 from lagbench.work.pool import ATTEMPTS, Pool, WorkItem, worker_count
 
-HERE = str(Path(__file__).parent)
+HERE = str(Path(__file__).parents[1])
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -193,7 +193,9 @@ sys.path.insert(0, sys.argv[1])
 import pool_tasks
 from lagbench.work.pool import Pool, WorkItem
 with Pool(1) as pool:
-    pool.submit(WorkItem(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
+    function = getattr(pool_tasks, sys.argv[2])
+    arguments = (eval(sys.argv[3]),)
+    pool.submit(WorkItem(name="a", function=function, arguments=arguments))
     print([event.value for event in pool.events()])
 """
 
