@@ -151,9 +151,7 @@ class Manifest(_ManifestModel):
 def describe_file(
     root: Path, key: ScenarioKey, *, digest: str | None = None
 ) -> FileEntry:
-    """Return the manifest entry of a scenario file on disk; its content is not
-    re-hashed.
-    """
+    """Return the manifest entry of a scenario file, with the hash that it states."""
     # h5py is loaded by those who read a file, not by those who read a manifest.
     from .scenario import read_scenario
 

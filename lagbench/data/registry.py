@@ -404,14 +404,16 @@ def load(path: Path | None = None) -> Registry:
 def _load(path: Path | None, modified: int) -> Registry:
     """Load a file once per modification time."""
     file = path or default_path()
-    own = _read(file)
-    registry = Registry(own.splits, own.measured, dict.fromkeys(own.splits, file))
+    our_file = _read(file)
+    registry = Registry(
+        our_file.splits, our_file.measured, dict.fromkeys(our_file.splits, file)
+    )
     if path is not None:
         return registry
 
     for point in dict.fromkeys(list_entry_points(GROUP)):
-        own_split = own.splits.get(point.name)
-        if own_split is not None and own_split.generator == point.value:
+        our_split = our_file.splits.get(point.name)
+        if our_split is not None and our_split.generator == point.value:
             continue
         try:
             registry = _add_split(registry, point)

@@ -1,5 +1,4 @@
-"""Data sets in a store, which is any root that is a URL: ``s3://``, ``https://``,
-``file://`` and others.
+"""Data sets in a store: a root that is a URL, as ``s3://``, ``https://``, ``file://``.
 
 ``--root s3://bucket/prefix`` means a folder of the user's cache that holds copies of
 the store's objects, see :mod:`lagbench.data.layout`. *Fetching* moves bytes over a line
