@@ -20,8 +20,8 @@ from lagbench.data import MATERIALS
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
+from lagbench.errors import LagbenchError, suggest_name
 from lagbench.figures.tables import markdown
-from lagbench.errors import LagbenchError, nearest
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped
 from lagbench.scoring.stored import published
@@ -70,7 +70,7 @@ def main() -> int:
             )
             parser.error(
                 f"no entry {method!r} of {asked.split} {asked.size}: "
-                f"{nearest(method, known)}"
+                f"{suggest_name(method, known)}"
             )
         seeds = [published(path).scores["submission"][metric].values for path in files]
         rows[method] = np.mean(seeds, axis=0)

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import read_scenario
+from lagbench.data.scenario import read_scenario
 
 NAMES = ("wall", "motion", "reynolds_number", "start_frame")
 

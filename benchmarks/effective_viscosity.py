@@ -20,7 +20,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import read_scenario
+from lagbench.data.scenario import read_scenario
 
 
 def main() -> int:

@@ -25,7 +25,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import ScenarioFile, read_scenario
+from lagbench.data.scenario import ScenarioFile, read_scenario
 from lagbench.metrics.vorticity import pearson
 
 Array = NDArray[np.float64]

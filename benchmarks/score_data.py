@@ -15,8 +15,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Registry, default_path, load
-from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import read_yaml
 from lagbench.submission import PredictionsWriter
 

@@ -116,7 +116,7 @@ def lasting_workers() -> Iterator[None]:
         try:
             yield pool
         finally:
-            if pool._waiting or any(worker.attempt for worker in pool._workers):
+            if pool._queue or any(worker.attempt for worker in pool._workers):
                 held.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:

@@ -25,8 +25,13 @@ from pydantic_core import ErrorDetails
 
 from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.data.yamlfile import read_yaml, spell_yaml
-from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
+from lagbench.data.yamlfile import format_yaml, read_yaml
+from lagbench.errors import (
+    ChecksFailedError,
+    UnreadableFileError,
+    UsageError,
+    suggest_name,
+)
 from lagbench.submission.findings import quoted
 
 from .entry import PATTERNS, Entry, Meta, Status, Verification
@@ -156,7 +161,7 @@ def spell(value: Any) -> bytes:  # noqa: ANN401
     if isinstance(value, Entry):
         held = value.model_dump(mode="python", exclude_defaults=True)
         value = {key: held[key] for key in Entry.ORDER if key in held}
-    return spell_yaml(_plain(value), default_flow_style=None).encode()
+    return format_yaml(_plain(value), default_flow_style=None).encode()
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
@@ -179,7 +184,7 @@ def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
                 isinstance(key, str) and key in kind.model_fields
             ):  # else a position, or a name in a mapping
                 kind = _model_in(kind.model_fields[key].annotation) or kind
-        fix = nearest(str(place[-1])[:100], list(kind.model_fields))
+        fix = suggest_name(str(place[-1])[:100], list(kind.model_fields))
         return Mistake(where=where, what="unknown key", got=given, fix=fix)
     if item["type"] == "missing":
         return Mistake(where=where, what="this key is missing", got="no such key")

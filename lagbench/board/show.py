@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
 from lagbench.scoring.card import digits
 
@@ -27,7 +27,7 @@ def chosen_data_sets(
         return found
     wanted = " ".join(name for name in (split, size) if name)
     if known:
-        fix = nearest(wanted, map(" ".join, known))
+        fix = suggest_name(wanted, map(" ".join, known))
     else:
         fix = "submit something: lagbench submit"
     raise UsageError("no entries there", where=f"leaderboard {wanted}", fix=fix)
@@ -44,7 +44,7 @@ def tables(
             raise UsageError(
                 f"no metric {name!r} here",
                 where="--metric",
-                fix=nearest(name, board.metrics),
+                fix=suggest_name(name, board.metrics),
             )
     for tab in board.tabs:
         skill = ("skill",) if any(row.skill for row in tab.rows) else ()

@@ -24,7 +24,12 @@ from typing import NamedTuple
 from lagbench.atomic import move_together, refuse_folders
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import ChecksFailedError, Mistakes, UsageError, WorkFailedError
+from lagbench.errors import (
+    ChecksFailedError,
+    ErrorCollector,
+    UsageError,
+    WorkFailedError,
+)
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
@@ -135,7 +140,7 @@ def submit(
     """
     folder = Folder(board)
     paths = [Path(path) for path in predictions]
-    mistakes = Mistakes()
+    mistakes = ErrorCollector()
     with mistakes:
         if add and replace:
             raise UsageError(
@@ -177,7 +182,7 @@ def submit(
             raise UsageError(
                 what, expected=f"1 to {MOST_SEEDS}, one per seed", got=len(paths)
             )
-    mistakes.tell()
+    mistakes.raise_errors()
     plan = _planned(
         folder,
         paths,
@@ -271,7 +276,7 @@ def _planned(
             outside.append(outside_share(opened, size) if warned else None)
     others = dict[Path, Entry]()
     before = None
-    mistakes = Mistakes()
+    mistakes = ErrorCollector()
     with mistakes:
         seeds = seeds_of(headers)
     with mistakes:
@@ -311,7 +316,7 @@ def _planned(
         about = _about(headers, meta, before)
     with mistakes:
         sources = require_weights(weights, headers, others)
-    mistakes.tell()
+    mistakes.raise_errors()
     rivals = others | ({} if before is None else {before.yaml_path: before})
     taken = {
         made.sha256: str(where)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import Manifest
-from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.registry import Registry, Size, Split, format_ids
 from lagbench.figures.tables import escape, markdown
 
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
@@ -283,7 +283,7 @@ def dataset_card(
         else:
             digest = "incomplete"
         subsets.append(
-            (name, spell_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest)
+            (name, format_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest)
         )
     options = f"--split {size.split} --size {size.name}"
     parts = [

@@ -20,21 +20,21 @@ from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expanded
+from lagbench.data.layout import MANIFEST_NAME, expand_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
-    merged,
-    note_entries,
+    merge_entries,
     read_or_empty,
+    record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.registry import Registry, Size, Split, format_ids
 from lagbench.data.statistics import file_moments, statistics
-from lagbench.errors import UsageError, check_installed, nearest
+from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import (
     Pace,
@@ -44,11 +44,16 @@ from lagbench.generators.simulate import (
     twin_substeps,
 )
 from lagbench.generators.solver import Device
-from lagbench.store.copy import gather, gatherable
-from lagbench.store.publication import Publication, check_address, look_at, publication
+from lagbench.store.copy import gather, list_gatherable
+from lagbench.store.publication import (
+    Publication,
+    check_address,
+    inspect_store,
+    publish,
+)
 from lagbench.work.cluster import Cluster, await_file
-from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Pool, Report, Task, worker_count
+from lagbench.work.machine import describe_machine, promises_bits
+from lagbench.work.pool import Pool, Report, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
@@ -97,7 +102,7 @@ class Generation:
         # which the root folder is a working copy of; None if plain
         self.store: Publication | None = None
         # what the folder holds, as far as is known
-        self.manifest = merged(self.size, None)
+        self.manifest = merge_entries(self.size, None)
         # files that were there and right, just hashed
         self._hashed: list[FileEntry] = []
         self.kept: list[int] = []  # ids whose files were there and right
@@ -120,7 +125,7 @@ class Generation:
         """
         old = read_or_empty(self.size, self.root)
         if self.store:
-            held = self.store.held
+            held = self.store.stored_entries
         else:
             held = {}
         local = [i for i in self.size.scenarios if i not in held]
@@ -143,7 +148,9 @@ class Generation:
         bad = set(suspects) - {entry.scenario for entry in self._hashed}
         kept = tuple(e for e in old.files if e.scenario not in bad)
         there = [*self._hashed, *held.values()]
-        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), there)
+        self.manifest = merge_entries(
+            self.size, old.model_copy(update={"files": kept}), there
+        )
         self.kept = [
             i for i in wanted if (i not in bad or i in (gathered or ())) and not force
         ]
@@ -164,7 +171,7 @@ class Generation:
                 )
             )
         self.survey(wanted, force=force)
-        note_entries(self.folder, self._hashed)
+        record_entry_hashes(self.folder, self._hashed)
         check_disk(self.root, self.to_do.bytes)
         self._keep(self.manifest)
         try:
@@ -240,7 +247,7 @@ class Generation:
         ]
         tasks = [
             self._task(
-                f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids)
+                f"scenario {format_ids(ids)}", simulate, ids, sum(costs[i] for i in ids)
             )
             for ids in batches
         ]
@@ -271,9 +278,11 @@ class Generation:
                     self._meter.count(
                         event.value if event.kind == "progress" else -event.value
                     )
-                elif event.task.function is simulate:
+                elif event.item.function is simulate:
                     self._take(
-                        event.value, team, event.machine or environment_of(self.device)
+                        event.value,
+                        team,
+                        event.machine or describe_machine(self.device),
                     )
                 else:
                     floors = {
@@ -289,7 +298,7 @@ class Generation:
                         e.model_copy(update={"twin_floor": floors[e.scenario]})
                         for e in files
                     ]
-                    self._keep(merged(self.size, self.manifest, files))
+                    self._keep(merge_entries(self.size, self.manifest, files))
 
     def _task(
         self,
@@ -297,14 +306,14 @@ class Generation:
         function: Callable[..., Any],
         scenarios: tuple[int, ...],
         cost: float,
-    ) -> Task:
+    ) -> WorkItem:
         job = SimulationJob(
             size=self.size, scenarios=scenarios, root=self.root, device=self.device
         )
         name = f"{self.size.split} {self.size.name}, {what}"
-        return Task(name=name, function=function, arguments=(job,), cost=cost)
+        return WorkItem(name=name, function=function, arguments=(job,), cost=cost)
 
-    def _twin(self, scenario: int) -> Task:
+    def _twin(self, scenario: int) -> WorkItem:
         what = f"twin of scenario {scenario}"
         cost = twin_substeps(self.size, scenario)
         return self._task(what, twin_floors, (scenario,), cost)
@@ -329,8 +338,8 @@ class Generation:
             describe_file(self.root, self.size.key(outcome.scenario))
             for outcome in outcomes
         ]
-        note_entries(self.folder, entries)
-        self._keep(merged(self.size, self.manifest, entries, environment))
+        record_entry_hashes(self.folder, entries)
+        self._keep(merge_entries(self.size, self.manifest, entries, environment))
         self._meter.count(scenarios=len(entries))
         for entry in entries:
             if entry.subset == "test":
@@ -341,12 +350,12 @@ class Generation:
         if manifest.files or (self.folder / MANIFEST_NAME).exists():
             write_manifest(self.root, manifest)
             if self.store:
-                self.store.follow(manifest)
+                self.store.put_files(manifest)
 
     def _bring(self, scenarios: Iterable[int]) -> None:
         """Have files of scenarios here that only the store holds."""
         if self.store:
-            self.store.bring(scenarios)
+            self.store.fetch(scenarios)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -431,7 +440,7 @@ def generate(
     devices = [known.value for known in Device]
     if device not in devices:
         raise UsageError(
-            f"no device {device!r}", where="--device", fix=nearest(device, devices)
+            f"no device {device!r}", where="--device", fix=suggest_name(device, devices)
         )
     target = Device(device)
     cores = worker_count(workers, default=None if target.value == "cpu" else 1)
@@ -444,12 +453,14 @@ def generate(
         Meter(progress),
         split=splits.split(tier.split),
         scheduler=scheduler,
-        sources=[expanded(source, "--gather") for source in gather],
+        sources=[expand_path(source, "--gather") for source in gather],
     )
     if dry_run:
-        generation.store = look_at(tier, folder)
+        generation.store = inspect_store(tier, folder)
         there = {
-            i for source in generation.sources for i in gatherable(tier, folder, source)
+            i
+            for source in generation.sources
+            for i in list_gatherable(tier, folder, source)
         }
         generation.survey(wanted, force=force, gathered=there)
     else:
@@ -457,7 +468,7 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-            publication(tier, folder) as generation.store,
+            publish(tier, folder) as generation.store,
         ):
             generation.run(wanted, force=force)
     manifest = generation.manifest

@@ -14,11 +14,16 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256, plain
+from lagbench.data.checksums import file_sha256, to_plain
 from lagbench.data.layout import scenario_path, url_of
 from lagbench.data.local import DESCRIPTION
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, noted_hashes
-from lagbench.data.registry import Size, spell_ids
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    load_recorded_hashes,
+)
+from lagbench.data.registry import Size, format_ids
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw
@@ -157,7 +162,7 @@ def examine(
         # A manifest is the word of whoever wrote it: only what was hashed here is not
         # hashed again.
         if quick:
-            noted = noted_hashes(size.folder(root))(path)
+            noted = load_recorded_hashes(size.folder(root))(path)
         else:
             noted = None
         # Before the values: a file that changes meanwhile then fits no note.
@@ -256,7 +261,7 @@ def _check_header(
     if not size.simulated:  # then the recorded content hash covers the parameters
         return
     parameters = {
-        name: plain(value)
+        name: to_plain(value)
         for name, value in file_parameters(size, draw(size, scenario)).items()
     }
     # What only the simulation tells is covered by the content hash.
@@ -309,9 +314,9 @@ def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -
     ]
     if broken:
         what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
-        others = [f"scenarios {spell_ids(broken)}"]
+        others = [f"scenarios {format_ids(broken)}"]
     elif differing:
-        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
+        return f"scenarios {format_ids(differing)} have {other_bits(size)}"
     elif others:
         what = "subsets or the data set have another hash though every scenario has its own"
     else:

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import CACHE_VARIABLE, cache_folder
 from lagbench.data.limits import NEEDED, Limit
-from lagbench.data.registry import Size, parse_ids, spell_ids
-from lagbench.errors import UsageError, WorkFailedError, nearest
+from lagbench.data.registry import Size, format_ids, parse_ids
+from lagbench.errors import UsageError, WorkFailedError, suggest_name
 
 if TYPE_CHECKING:
     from lagbench.generators.simulate import Pace
@@ -61,7 +61,9 @@ def select(
     for name in names:
         if name not in size.subsets:
             what = f"{size.split} {size.name} has no subset {name!r}"
-            raise UsageError(what, where="--subset", fix=nearest(name, size.subsets))
+            raise UsageError(
+                what, where="--subset", fix=suggest_name(name, size.subsets)
+            )
     held = {i for name in names for i in size.subsets[name]}
     if scenarios is None:
         return tuple(sorted(held))
@@ -78,12 +80,12 @@ def select(
     strangers = [i for i in wanted if i not in held]
     if strangers or not wanted:
         raise UsageError(
-            f"no scenario {spell_ids(strangers) or 'at all'} in {', '.join(names)}",
+            f"no scenario {format_ids(strangers) or 'at all'} in {', '.join(names)}",
             where=f"--scenarios, {size.split} {size.name}",
             expected="; ".join(
-                f"{name} {spell_ids(size.subsets[name])}" for name in names
+                f"{name} {format_ids(size.subsets[name])}" for name in names
             ),
-            got=spell_ids(wanted),
+            got=format_ids(wanted),
         )
     return tuple(sorted(set(wanted)))
 

@@ -20,15 +20,15 @@ from lagbench.data.checksums import (
     file_sha256,
     subset_hash,
 )
-from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import Manifest, note, read_manifest
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import Manifest, read_manifest, record_hashes
+from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device
-from lagbench.store.copy import bring, unstored
-from lagbench.work.pool import Pool, Task, worker_count
+from lagbench.store.copy import list_unstored, update_working_copy
+from lagbench.work.pool import Pool, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 
 from .inventory import (
@@ -97,7 +97,7 @@ class VerificationResult:
             raise DataError("nothing is generated", where=where, fix=self.fix)
         if self.must_be_complete and not self.complete:
             missing = ", ".join(
-                f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing
+                f"{r.name} {format_ids(r.missing)}" for r in self.subsets if r.missing
             )
             got = f"missing: {missing}"
             raise DataError(
@@ -150,13 +150,13 @@ def verify(
         )
     if regenerate:
         check_installed("taichi", extra="generate")
-    bring(tier, folder, ids, thoroughly=True)
+    update_working_copy(tier, folder, ids, thoroughly=True)
     manifest: Manifest | None = None
     warnings: list[str] = []
     try:
         manifest = read_manifest(folder, tier.split, tier.name, tier.major)
         if manifest is None:
-            warnings.append(f"there is no manifest: {remedy(tier, root=folder)}")
+            warnings.append(f"there is no manifest: {suggest_repair(tier, root=folder)}")
         elif manifest.identity == "tolerance":
             warnings.append(
                 "identity: tolerance - a device wrote these files that does not "
@@ -178,7 +178,7 @@ def verify(
     # Which files are right is noted, so that scorer and generator need not hash their
     # values again.
     right = {i: f.content_sha256 for i, f in findings.items() if f.content_sha256}
-    note(
+    record_hashes(
         tier.folder(folder),
         {tier.path(folder, i): content for i, content in right.items()},
         digests_of,
@@ -194,7 +194,7 @@ def verify(
         if regenerated[i] == "different"
     ]
     # A killed writer leaves files here that the store never got.
-    alone = unstored(tier, folder, [*right])
+    alone = list_unstored(tier, folder, [*right])
     problems += [
         f"scenario {i} is in the working copy alone, not in the store" for i in alone
     ]
@@ -221,10 +221,10 @@ def verify(
     ]
     problems += [f"the data set hash is {wrong}"] if verdict == wrong else []
     if tolerated:
-        gaps = [f"scenarios {spell_ids(tolerated)} have {other_bits(tier)}"]
+        gaps = [f"scenarios {format_ids(tolerated)} have {other_bits(tier)}"]
     else:
         gaps = []
-    gaps += [f"{r.name} lacks {spell_ids(r.missing)}" for r in reports if r.missing]
+    gaps += [f"{r.name} lacks {format_ids(r.missing)}" for r in reports if r.missing]
     gaps += [
         f"{r.name} has files of no scenario: {', '.join(r.extra)}"
         for r in reports
@@ -242,7 +242,7 @@ def verify(
         warnings=(*warnings, *gaps, *_notes(tier, manifest, findings)),
         must_be_complete=complete,
         verdict=verdict,
-        fix=remedy(tier, root=folder),
+        fix=suggest_repair(tier, root=folder),
     )
 
 
@@ -279,7 +279,9 @@ def _regenerate(
                 size=size, scenarios=(scenario,), root=Path(folder), device=Device.CPU
             )
             name = f"{size.split} {size.name}, scenario {scenario}"
-            pool.submit(Task(name=name, function=simulate, arguments=(job,), cost=cost))
+            pool.submit(
+                WorkItem(name=name, function=simulate, arguments=(job,), cost=cost)
+            )
         for event in pool.events():
             if event.kind == "done":
                 hashes |= {
@@ -351,7 +353,7 @@ def _notes(
         if i in entries and f.content_sha256 not in (None, entries[i])
     ]
     if others:
-        notes = [f"the manifest has other hashes of {spell_ids(others)}"]
+        notes = [f"the manifest has other hashes of {format_ids(others)}"]
     else:
         notes = []
     # What follows from the bits must be as recorded where all of them are.

@@ -17,7 +17,7 @@ from swirls import write_swirl
 
 from lagbench.data import registry
 from lagbench.data.layout import dataset_folder
-from lagbench.data.manifest import Manifest, describe_file, merge
+from lagbench.data.manifest import Manifest, build_manifest, describe_file
 from lagbench.data.registry import Size
 from lagbench.figures.tables import escape
 from lagbench.make import cards
@@ -46,7 +46,7 @@ def make(
         entry = describe_file(root, size.key(scenario))
         facts = {"kinetic_energy_first": 0.125 + scenario}
         entries.append(entry.model_copy(update={"facts": facts}))
-    manifest = merge(
+    manifest = build_manifest(
         None,
         entries,
         split=split,

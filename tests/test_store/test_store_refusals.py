@@ -28,7 +28,7 @@ Use = Callable[[str], object]
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Be a machine of its own, on which nothing arrives."""
-    monkeypatch.setattr(copy, "FRESH", 0.0)
+    monkeypatch.setattr(copy, "FRESH_SECONDS", 0.0)
     folder = machine(monkeypatch, tmp_path / "cache")
     yield folder
     assert files(folder) == {}

@@ -14,7 +14,8 @@ import h5py
 import numpy as np
 import pytest
 
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 
 ANY = Structure(groups=None)
@@ -22,7 +23,7 @@ ANY = Structure(groups=None)
 
 def look(path: Path, expected: Structure = ANY) -> set[str]:
     """Return the names of the arrays of a file that passes."""
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         return set(check_structure(file, path, expected))
 
 

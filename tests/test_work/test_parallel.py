@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 from cluster_bench import local_cluster, scheduler_process
-from score_bench import ScoreBench, bench_of, straight
-from spread_jobs import (
+from parallel_jobs import (
     Deadly,
     double,
     sit_after_dying_once,
     take_worker_along,
     time_out,
 )
+from score_bench import ScoreBench, bench_of, straight
 
 from lagbench.data.registry import Registry
 from lagbench.errors import WorkFailedError
@@ -52,7 +52,7 @@ LOSER = """
 import sys
 from lagbench.errors import WorkFailedError
 from lagbench.work.run import run_all
-from spread_jobs import take_worker_along
+from parallel_jobs import take_worker_along
 try:
     run_all(take_worker_along, {"job 0": 0}, scheduler=sys.argv[1])
 except WorkFailedError as error:
@@ -130,7 +130,7 @@ def test_a_lost_scheduler(losable: str, capfd: pytest.CaptureFixture[str]) -> No
 
 def test_a_lost_scheduler_stays_quiet_to_the_end(losable: str) -> None:
     """Nothing of Dask's is printed either when the process ends."""
-    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    there = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
     command = [sys.executable, "-c", LOSER, losable]
     ended = subprocess.run(
         command, env=there, capture_output=True, text=True, check=True

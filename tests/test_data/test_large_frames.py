@@ -63,10 +63,13 @@ from scenario_factory import make_key, write_scenario
 from lagbench.data.scenario import check_scenario
 from lagbench.data.statistics import file_moments
 import scenario_factory, numpy
-particles, frames = 100_000, int(sys.argv[3])
+particles = 100_000
+frames = int(sys.argv[3])
 frame = numpy.random.default_rng(0).random((particles, 2), dtype=numpy.float32)
-scenario_factory.frames_of = lambda *_: (frame + numpy.float32(k / 1000) for k in range(frames))
-path, _ = write_scenario(Path(sys.argv[2]), make_key(), frames=frames, particles=particles)
+shifts = [numpy.float32(k / 1000) for k in range(frames)]
+scenario_factory.frames_of = lambda *_: (frame + shift for shift in shifts)
+root = Path(sys.argv[2])
+path, _ = write_scenario(root, make_key(), frames=frames, particles=particles)
 check_scenario(path)
 file_moments(path)
 print(re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1])
@@ -82,7 +85,7 @@ def test_memory_does_not_grow_with_frames(tmp_path: Path) -> None:
         words = [
             "-c",
             PEAK,
-            str(Path(__file__).parent),
+            str(Path(__file__).parents[1]),
             str(tmp_path / str(frames)),
             str(frames),
         ]

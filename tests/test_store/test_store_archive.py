@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
-from lying_server import Mirror, serving
+from faulty_server import Mirror, serving
 
 import lagbench
 from lagbench.data.manifest import Manifest

@@ -162,7 +162,7 @@ def test_the_manifest_comes_last(
     """At no time does it name an object that is not there; after the cards it is put
     once more.
     """
-    monkeypatch.setattr(publication, "EVERY", 0.0)
+    monkeypatch.setattr(publication, "MANIFEST_SECONDS", 0.0)
     run(simulated_here(url))
     names = [name for name, _ in wrote]
     assert names[:5] == [
@@ -324,18 +324,18 @@ def test_what_was_made_anew_is_not_fetched_back(
     path = root / FOLDER / "train/0000.nc"
     path.write_bytes(path.read_bytes() + b"\0")
     manifest = read_manifest(root, SPLIT, SIZE, 2)
-    with publication.publication(size, root) as store:
+    with publication.publish(size, root) as store:
         assert store is not None
         assert manifest is not None
         first = manifest.files[0]
         new = first.model_copy(
             update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)}
         )
-        store.follow(
+        store.put_files(
             manifest.model_copy(update={"files": (new, *manifest.files[1:])}),
             at_once=True,
         )
-        store.bring(size.scenarios)
+        store.fetch(size.scenarios)
     assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
     assert path.stat().st_size == new.bytes
     assert named(objects(full)[MANIFEST])[0] == "train/0000.nc"

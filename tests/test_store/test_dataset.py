@@ -14,7 +14,7 @@ from scenario_factory import frames_of, make_key, write_scenario
 
 import lagbench
 from lagbench.data import registry
-from lagbench.data.manifest import merge, write_manifest
+from lagbench.data.manifest import build_manifest, write_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError
 from lagbench.store.dataset import list_splits, load_manifest, open_split
@@ -193,7 +193,7 @@ def test_load_manifest(tmp_path: Path) -> None:
     ):
         load_manifest("cavity", size="tiny", root=tmp_path)
     names: dict[str, Any] = {"split": "cavity", "size": "tiny", "version": "2.0.0"}
-    manifest = merge(None, [], **names, subsets={"test": (3,)}, environment={})
+    manifest = build_manifest(None, [], **names, subsets={"test": (3,)}, environment={})
     write_manifest(tmp_path, manifest)
     assert load_manifest("cavity", size="tiny", root=tmp_path) == manifest
 

@@ -41,32 +41,40 @@ SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
         ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
     ],
 )
-def test_full_sizes_are_those_of_the_design(
+def test_full_sizes_are_those_of_the_documentation(
     split: str, interval: float, expected: tuple[int, ...]
 ) -> None:
-    """Particles, grid and substeps of section 3; frames over train, valid and test;
-    subsets of version 2.
-    """
+    """Particles, grid, substeps, frames and scenarios of train, valid and test."""
     full = load().size(split, "full")
-    official = [full.subsets[name] for name in ("train", "valid", "test")]
-    frames = sum(full.frame_count(i) for ids in official for i in ids)
-    numbers = (full.particles, full.grid, full.substeps_per_frame, frames)
-    assert (*numbers, *map(len, official)) == expected
+    frame_count = 0
+    scenario_counts = []
+    for name in ("train", "valid", "test"):
+        ids = full.subsets[name]
+        scenario_counts.append(len(ids))
+        frame_count += sum(full.frame_count(scenario) for scenario in ids)
+    numbers = (full.particles, full.grid, full.substeps_per_frame, frame_count)
+    assert (*numbers, *scenario_counts) == expected
     assert full.frame_interval == pytest.approx(interval, rel=1e-15)
     assert full.dt == pytest.approx(interval / full.substeps_per_frame, rel=1e-15)
 
 
-def test_special_ids_of_the_design() -> None:
-    """Subsets are runs of ids; extra and the frames of fluid 0 and 26 are as section 3
-    names them.
-    """
-    fluid, pairs, cavity, noise = (load().size(split, "full") for split in SPLITS)
+def test_subsets_are_runs_of_ids() -> None:
+    """The subset extra and the long scenarios of fluid are the documented ones."""
+    registry = load()
+    fluid = registry.size("fluid", "full")
     assert fluid.subsets["test"] == tuple(range(36, 52))
     assert fluid.subsets["valid"] == tuple(range(28, 36))
-    assert fluid.frame_count(0) == fluid.frame_count(26) == 600
-    assert pairs.subsets["extra"] == tuple(range(72, 87))
-    assert {pairs.frame_count(i) for i in pairs.subsets["extra"]} == {1200}
+    assert fluid.frame_count(0) == 600
+    assert fluid.frame_count(26) == 600
+
+    multimaterial = registry.size("multimaterial", "full")
+    extra = multimaterial.subsets["extra"]
+    assert extra == tuple(range(72, 87))
+    assert {multimaterial.frame_count(scenario) for scenario in extra} == {1200}
+
+    cavity = registry.size("cavity", "full")
     assert cavity.subsets["test"] == tuple(range(56, 76))
+    noise = registry.size("curl-noise", "full")
     assert noise.subsets["test"] == tuple(range(56, 72))
 
 
@@ -384,7 +392,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
             points += 2 * [
                 EntryPoint(name, f"{name}_split", registry.GROUP)
             ]  # found on two paths
-        monkeypatch.setattr(registry, "installed", lambda group: points)
+        monkeypatch.setattr(registry, "list_entry_points", lambda group: points)
         registry._load.cache_clear()
         return load()
 
@@ -460,17 +468,19 @@ def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     """
     monkeypatch.syspath_prepend(tmp_path)
     os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
-    assert registry.installed("some.group") == ()
+    assert registry.list_entry_points("some.group") == ()
     folder = tmp_path / "wave_splits-1.0.dist-info"
     folder.mkdir()
     (folder / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
     )
     (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
-    assert [point.name for point in registry.installed("some.group")] == ["waves"]
+    assert [point.name for point in registry.list_entry_points("some.group")] == [
+        "waves"
+    ]
     shutil.rmtree(folder)
     os.utime(tmp_path, (1, 1))
-    assert registry.installed("some.group") == ()
+    assert registry.list_entry_points("some.group") == ()
 
 
 def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
@@ -485,7 +495,10 @@ def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
     (folder / "entry_points.txt").write_text(
         f"[{registry.GROUP}]\nwaves = wave_splits.gone\n"
     )
-    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); from lagbench.__main__ import app; app()"
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+        "from lagbench.__main__ import app; app()"
+    )
     command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
     done = subprocess.run(
         command, capture_output=True, text=True, timeout=60, check=False

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lagbench.data.yamlfile import MAX_BYTES, read_yaml, spell_yaml
+from lagbench.data.yamlfile import MAX_BYTES, format_yaml, read_yaml
 from lagbench.errors import UnreadableFileError
 
 BOMB = "a: &a [x, x, x]\nb: &b [*a, *a, *a]\nc: [*b, *b, *b]\n"
@@ -91,5 +91,5 @@ def test_text_stays_text(text: str, tmp_path: Path) -> None:
     value.
     """
     path = tmp_path / "held.yaml"
-    path.write_text(spell_yaml({"held": [text, 1.5, 7]}), encoding="utf-8")
+    path.write_text(format_yaml({"held": [text, 1.5, 7]}), encoding="utf-8")
     assert read_yaml(path) == {"held": [text, 1.5, 7]}

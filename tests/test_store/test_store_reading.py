@@ -37,7 +37,7 @@ MANIFEST = f"{FOLDER}/manifest.json"
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Be a machine of its own, that asks for the manifest each time."""
-    monkeypatch.setattr(copy, "FRESH", 0.0)
+    monkeypatch.setattr(copy, "FRESH_SECONDS", 0.0)
     return machine(monkeypatch, tmp_path / "cache")
 
 
@@ -196,15 +196,17 @@ def test_verify_mends_the_copy_and_tells_of_the_store(
 
 
 def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
-    """The error names the object, and no file of it is left: a bit changed, too short,
-    another scenario.
-    """
-    good, other = (folder.read(f"{FOLDER}/test/{name}.nc") for name in ("0003", "0004"))
-    for bad in (good[:-9] + bytes([good[-9] ^ 1]) + good[-8:], good[:-1], other):
-        folder.put(f"{FOLDER}/test/0003.nc", bad)
+    """The error names the object, and no file of it is left."""
+    name = f"{FOLDER}/test/0003.nc"
+    good = folder.read(name)
+    changed = bytearray(good)
+    changed[-9] ^= 1
+    other_scenario = folder.read(f"{FOLDER}/test/0004.nc")
+    for wrong in (bytes(changed), good[:-1], other_scenario):
+        folder.put(name, wrong)
         with pytest.raises((WrongContentError, WrongLengthError)) as caught:
             lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
-        assert caught.value.where == f"{folder.url}/{FOLDER}/test/0003.nc"
+        assert caught.value.where == f"{folder.url}/{name}"
         assert {*here(folder.url)} <= {"test/0004.nc"}
         shutil.rmtree(resolve_root(folder.url) / FOLDER)
 
@@ -248,7 +250,7 @@ def test_who_watches_is_told_how_far_it_is(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     lagbench.open_split(SPLIT, size=SIZE, root=url).close()
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
-    with copy.quietly():
+    with copy.silence_fetching():
         lagbench.open_split(SPLIT, size=SIZE, subset="valid", root=url).close()
     assert capsys.readouterr() == ("", "")
 

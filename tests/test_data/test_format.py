@@ -20,7 +20,8 @@ from scenario_factory import DIMS, PARAMETERS, frames_of, make_key, write_scenar
 
 from lagbench.data import MATERIALS
 from lagbench.data.checksums import ContentHasher, file_sha256
-from lagbench.data.writer import ScenarioWriter, check_scenario, read_scenario, rehash
+from lagbench.data.scenario import check_scenario, read_scenario, rehash
+from lagbench.data.writer import ScenarioWriter
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.generators.split import Material
 
@@ -53,22 +54,26 @@ def damaged(
 
 @pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
 def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None:
-    """Plain open_dataset gives the dims, types and coordinates of the design, nothing
-    decoded away.
-    """
-    pytest.importorskip(engine if engine == "h5netcdf" else "netCDF4")
-    with xr.open_dataset(written[0], engine=engine) as scenario:
-        assert {str(name): v.dims for name, v in scenario.variables.items()} == DIMS
-        assert {name: str(scenario[name].dtype) for name in TYPES} == TYPES
+    """Plain open_dataset gives the documented dims, types and coordinates."""
+    if engine == "h5netcdf":
+        pytest.importorskip("h5netcdf")
+    path, _ = written
+    with xr.open_dataset(path, engine=engine) as scenario:
+        dims = {str(name): item.dims for name, item in scenario.variables.items()}
+        assert dims == DIMS
+        types = {name: str(scenario[name].dtype) for name in TYPES}
+        assert types == TYPES
         assert set(scenario.coords) == {"frame", "time", "particle", "space", "wall"}
         assert list(scenario["space"].values) == ["x", "y"]
         assert list(scenario["wall"].values) == ["left", "right", "bottom", "top"]
         np.testing.assert_array_equal(scenario["position"], frames_of(3, 4, 8))
         np.testing.assert_array_equal(scenario["time"], np.arange(4) * 0.1)
-        np.testing.assert_array_equal(scenario["wall_velocity"][:, 3, 0], 0.125)
-        assert scenario.attrs["Conventions"] == "CF-1.11"
-        assert {name: scenario.attrs[name] for name in PARAMETERS} == PARAMETERS
-        assert scenario.attrs["reynolds_number"] == 100.0
+        top_velocity = scenario["wall_velocity"][:, 3, 0]
+        np.testing.assert_array_equal(top_velocity, 0.125)
+        attributes = scenario.attrs
+        assert attributes["Conventions"] == "CF-1.11"
+        assert {name: attributes[name] for name in PARAMETERS} == PARAMETERS
+        assert attributes["reynolds_number"] == 100.0
         assert scenario["material"].attrs["flag_meanings"].split() == list(MATERIALS)
     assert tuple(material.name.lower() for material in Material) == MATERIALS
 
@@ -80,13 +85,12 @@ def test_plain_h5py_opens_it(written: tuple[Path, str], tmp_path: Path) -> None:
     clock.
     """
     with h5py.File(written[0]) as file:
-        for held in (file["position"], file["velocity"]):
-            assert held.chunks == (1, 8, 2)
-            assert (held.compression, held.compression_opts, held.shuffle) == (
-                "gzip",
-                1,
-                True,
-            )
+        for name in ("position", "velocity"):
+            variable = file[name]
+            assert variable.chunks == (1, 8, 2)
+            assert variable.compression == "gzip"
+            assert variable.compression_opts == 1
+            assert variable.shuffle
         np.testing.assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
     first, _ = write_scenario(tmp_path / "a", KEY)
     second, _ = write_scenario(tmp_path / "b", KEY)

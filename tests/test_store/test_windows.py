@@ -283,9 +283,9 @@ def test_memory_is_bounded(train: Open, limit: int) -> None:
     ).tolist():
         assert torch.equal(data[i].position, whole[i].position)
         assert data.store.cached_bytes <= limit
-    kept = sum(frame.nbytes for frame in data.store._frames.values())
+    kept = sum(frame.nbytes for frame in data.store._cached_frames.values())
     assert kept == data.store.cached_bytes
-    assert all(frame.base is None for frame in data.store._frames.values())
+    assert all(frame.base is None for frame in data.store._cached_frames.values())
 
 
 def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -303,7 +303,7 @@ def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) ->
     data = train(cache_bytes=0)
     for i in (0, 40, 60, 0, 40, 60):
         assert data[i].scenario == data.place(i)[0]
-        assert len(data.store._open) == 1
+        assert len(data.store._open_scenarios) == 1
         assert len(open_scenarios() - before) <= 1
 
 
@@ -350,8 +350,7 @@ def test_every_epoch_draws_every_window_once(train: Open) -> None:
 
 @pytest.mark.parametrize("odd", [-1, 1.5, None, "1"])
 def test_places_that_there_are_not(train: Open, odd: Any) -> None:
-    """Seeds, epochs and positions are whole numbers from 0: others would draw windows
-    twice.
+    """Seeds, epochs and positions are whole numbers from 0.
 
     The last position is the end of the epoch itself; what is refused moves nothing.
     """
@@ -387,9 +386,9 @@ def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
     second = WindowSampler(train(), seed=0)
     second.load_state_dict(json.loads(json.dumps(first.state_dict())))
     resumed = itertools.chain.from_iterable(itertools.repeat(second))
-    assert [next(resumed) for _ in range(2 * WINDOWS)] == [
-        next(run) for _ in range(2 * WINDOWS)
-    ]
+    count = 2 * WINDOWS
+    expected = list(itertools.islice(run, count))
+    assert list(itertools.islice(resumed, count)) == expected
 
 
 def test_ranks_share_out_one_order(
@@ -473,7 +472,7 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     data = train()
     first = data[0]
     sent = pickle.loads(pickle.dumps(data))
-    assert (sent.store.cached_bytes, len(sent.store._open)) == (0, 0)
+    assert (sent.store.cached_bytes, len(sent.store._open_scenarios)) == (0, 0)
     assert torch.equal(sent[0].position, first.position)
     batches = [
         list(
@@ -492,18 +491,18 @@ def test_worker_processes_read_the_same(train: Open) -> None:
 
 
 def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
-    """All test scenarios side by side, all frames or consecutive ones; unequal lengths
-    do not go together.
-    """
+    """All test scenarios side by side; unequal lengths do not go together."""
     paths = scenario_paths("cavity", size="tiny", root=root, registry=registry)
     batch = scenario_batch(list(paths.values()), slice(3, 9))
-    assert (list(paths), batch.windows, batch.frames) == ([4, 5], 2, 6)
-    assert (batch.scenario.tolist(), batch.frame.tolist()) == ([4, 5], [3, 3])
-    for row, i in enumerate(paths):
-        expected = frames_of(i, 26, 8)[3:9].transpose(1, 0, 2)
-        np.testing.assert_array_equal(
-            batch.position[batch.sample == row].numpy(), expected
-        )
+    assert list(paths) == [4, 5]
+    assert batch.windows == 2
+    assert batch.frames == 6
+    assert batch.scenario.tolist() == [4, 5]
+    assert batch.frame.tolist() == [3, 3]
+    for row, scenario in enumerate(paths):
+        expected = frames_of(scenario, 26, 8)[3:9].transpose(1, 0, 2)
+        position = batch.position[batch.sample == row]
+        np.testing.assert_array_equal(position.numpy(), expected)
     assert scenario_batch(paths[4]).frames == 26
     assert scenario_batch(paths[4], slice(-2, None)).frame.tolist() == [24]
     for frames in (slice(50, 60), slice(0, 10, 2), slice(5, 5)):
@@ -587,15 +586,14 @@ def drifting(batch: Batch) -> torch.Tensor:
 
 
 def test_a_window_is_followed_by_a_frame(train: Open) -> None:
-    """The first frame leaves, the new one joins; forcing and frame number go on with
-    them.
+    """The first frame leaves, the new one joins, with forcing and frame number.
 
     Parts are consecutive frames: with steps the forcing would be another frame's.
     """
-    batch = collate([train(history=3, future=2)[i] for i in (0, 4)])
+    data = train(history=3, future=2)
+    batch = collate([data[0], data[4]])
     given = batch.part(slice(3))
-    new = batch.position[:, 3]
-    later = given.followed_by(new)
+    later = given.followed_by(batch.position[:, 3])
     assert same(later, batch.part(slice(1, 4)))
     assert later.frame.tolist() == [1, 5]
     assert given.frames == later.frames == 3
@@ -605,17 +603,19 @@ def test_a_window_is_followed_by_a_frame(train: Open) -> None:
 
 
 def test_a_rollout_feeds_on_itself(train: Open) -> None:
-    """By hand: x2 = 2 x1 - x0 + w2 and x3 = 2 x2 - x1 + w3; gradients reach the given
-    frames.
-    """
-    batch = collate([train(history=2, future=2)[i] for i in (0, 40)])
+    """By hand: x2 = 2 x1 - x0 + w2 and x3 = 2 x2 - x1 + w3, with gradients."""
+    data = train(history=2, future=2)
+    batch = collate([data[0], data[40]])
     assert batch.wall_velocity is not None
     x0 = batch.position[:, 0].requires_grad_()
     x1 = batch.position[:, 1]
-    w2, w3 = (batch.wall_velocity[batch.sample, f].sum(1) for f in (2, 3))
+    w2 = batch.wall_velocity[batch.sample, 2].sum(1)
+    w3 = batch.wall_velocity[batch.sample, 3].sum(1)
     x2 = 2 * x1 - x0 + w2
-    expected = torch.stack([x2, 2 * x2 - x1 + w3], 1)
-    given = replace(batch.part(slice(2)), position=torch.stack([x0, x1], 1))
+    x3 = 2 * x2 - x1 + w3
+    expected = torch.stack([x2, x3], 1)
+    given_positions = torch.stack([x0, x1], 1)
+    given = replace(batch.part(slice(2)), position=given_positions)
     found = roll_out(drifting, given, 2)
     assert torch.equal(found, expected)
     found.sum().backward()

@@ -16,9 +16,9 @@ from cluster_bench import gone
 
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 from lagbench.work.machine import available_cores
-from lagbench.work.pool import ATTEMPTS, Pool, Task, worker_count
+from lagbench.work.pool import ATTEMPTS, Pool, WorkItem, worker_count
 
-HERE = str(Path(__file__).parent)
+HERE = str(Path(__file__).parents[1])
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
@@ -32,7 +32,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def failure(name: str, function: Callable[..., object]) -> LagbenchError:
     """Return the error that a task ends a pool with."""
     with Pool(1) as pool:
-        pool.submit(Task(name=name, function=function))
+        pool.submit(WorkItem(name=name, function=function))
         with pytest.raises(LagbenchError) as caught:
             list(pool.events())
     return caught.value
@@ -43,7 +43,7 @@ def test_results_come_back_costliest_first() -> None:
     report.
     """
     tasks = [
-        Task(name=f"{n}", function=pool_tasks.square, arguments=(n,), cost=float(n))
+        WorkItem(name=f"{n}", function=pool_tasks.square, arguments=(n,), cost=float(n))
         for n in (2, 5, 3)
     ]
     with Pool(1) as pool:
@@ -62,14 +62,14 @@ def test_tasks_may_be_added_while_others_run() -> None:
     there.
     """
     with Pool(2) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.square, arguments=(2,)))
+        pool.submit(WorkItem(name="a", function=pool_tasks.square, arguments=(2,)))
         results = []
         for event in pool.events():
             if event.kind == "done":
                 results.append(event.value)
                 if event.value == 4:
                     pool.submit(
-                        Task(name="b", function=pool_tasks.square, arguments=(7,))
+                        WorkItem(name="b", function=pool_tasks.square, arguments=(7,))
                     )
         assert results == [4, 49]
         assert len(pool.process_ids()) == 1
@@ -81,7 +81,9 @@ def test_a_killed_worker_costs_one_attempt(tmp_path: Path) -> None:
     """
     with Pool(1) as pool:
         pool.submit(
-            Task(name="a", function=pool_tasks.die_once, arguments=(tmp_path / "seen",))
+            WorkItem(
+                name="a", function=pool_tasks.die_once, arguments=(tmp_path / "seen",)
+            )
         )
         events = [(event.kind, event.value) for event in pool.events()]
     assert events == [
@@ -107,7 +109,7 @@ def test_attempts_are_counted_for_each_submission(tmp_path: Path) -> None:
     adds up.
     """
     marker = tmp_path / "seen"
-    task = Task(name="a", function=pool_tasks.die_once, arguments=(marker,))
+    task = WorkItem(name="a", function=pool_tasks.die_once, arguments=(marker,))
     with Pool(1) as pool:
         for _ in range(ATTEMPTS):
             pool.submit(task)
@@ -158,7 +160,9 @@ def test_leaving_the_pool_kills_its_workers(tmp_path: Path) -> None:
     """No worker outlives the with block, however busy."""
     marker = tmp_path / "pid"
     with Pool(1) as pool:
-        pool.submit(Task(name="a", function=pool_tasks.sleep_long, arguments=(marker,)))
+        pool.submit(
+            WorkItem(name="a", function=pool_tasks.sleep_long, arguments=(marker,))
+        )
         events = pool.events()
         next(events)
         process = pool.process_ids()[0]
@@ -170,7 +174,7 @@ def test_workers_that_are_done_exit_by_themselves(tmp_path: Path) -> None:
     """Compiled kernels are kept as a worker ends, so one without work is not killed."""
     with Pool(1) as pool:
         pool.submit(
-            Task(
+            WorkItem(
                 name="a",
                 function=pool_tasks.leave_a_note,
                 arguments=(tmp_path / "note",),
@@ -187,9 +191,11 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import pool_tasks
-from lagbench.work.pool import Pool, Task
+from lagbench.work.pool import Pool, WorkItem
 with Pool(1) as pool:
-    pool.submit(Task(name="a", function=getattr(pool_tasks, sys.argv[2]), arguments=(eval(sys.argv[3]),)))
+    function = getattr(pool_tasks, sys.argv[2])
+    arguments = (eval(sys.argv[3]),)
+    pool.submit(WorkItem(name="a", function=function, arguments=arguments))
     print([event.value for event in pool.events()])
 """
 

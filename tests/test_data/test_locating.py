@@ -18,7 +18,14 @@ from typer.testing import CliRunner
 import lagbench
 from lagbench.__main__ import app
 from lagbench.data.layout import dataset_folder, scenario_path
-from lagbench.data.local import home, is_name, locate, locate_new, resolve_root, rooted
+from lagbench.data.local import (
+    is_split_name,
+    load_rooted_registry,
+    locate,
+    locate_new,
+    locate_split,
+    resolve_root,
+)
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt
@@ -106,11 +113,11 @@ def test_all_ways_to_name_it(
         for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")
     ]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
-        found = home(split, root=root)
+        found = locate_split(split, root=root)
         assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())
     monkeypatch.chdir(own.parent.parent)
     monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
-    assert home("own").root == own.parent
+    assert locate_split("own").root == own.parent
     assert locate("root/own").size.split == "own"
     assert locate(str(own), root=own.parent).root == own.parent
     with pytest.raises(UsageError, match="another root"):
@@ -206,7 +213,7 @@ def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> No
 )
 def test_paths_are_no_names(name: str) -> None:
     """Whatever could leave the root folder cannot be the name of a split."""
-    assert not is_name(name)
+    assert not is_split_name(name)
 
 
 @pytest.mark.parametrize("path", ["relative", "absolute"])
@@ -227,9 +234,9 @@ def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> 
 def test_a_rooted_registry_leaves_its_base_alone(own: Path) -> None:
     """Looking up a local split adds it to no other registry, nor to another root's."""
     base = load()
-    known = rooted(own.parent, base)
+    known = load_rooted_registry(own.parent, base)
     assert known.split("own").generator == "none"
     assert "own" not in base.splits
-    assert rooted(own.parent.parent, known).local_names() == ()
+    assert load_rooted_registry(own.parent.parent, known).local_names() == ()
     with pytest.raises(UsageError):
-        rooted(own.parent.parent, known).split("own")
+        load_rooted_registry(own.parent.parent, known).split("own")

@@ -20,8 +20,8 @@ from lagbench.data.checksums import (
     dataset_hash,
     dtype_name,
     file_sha256,
-    plain,
     subset_hash,
+    to_plain,
 )
 from lagbench.errors import DataError
 
@@ -104,13 +104,12 @@ def test_pieces_order_and_endianness_do_not_matter(
 ) -> None:
     """Any cut into pieces, memory order and byte order gives the hash of the whole."""
     cut = data.draw(st.integers(0, values.shape[0]))
-    hasher = VariableHasher(
-        "position", values.dtype, tuple("abcdef"[: values.ndim]), values.shape
-    )
+    dims = tuple("abcdef"[: values.ndim])
+    hasher = VariableHasher("position", values.dtype, dims, values.shape)
     hasher.update(values[:cut])
-    hasher.update(
-        np.asfortranarray(values[cut:]).astype(values.dtype.newbyteorder(">"))
-    )
+    big_endian = values.dtype.newbyteorder(">")
+    rest = np.asfortranarray(values[cut:])
+    hasher.update(rest.astype(big_endian))
     assert hasher.hexdigest() == digest(values)
 
 
@@ -120,16 +119,17 @@ def test_any_change_of_a_value_changes_the_hash(
 ) -> None:
     """One flipped bit matters, except the sign of zero and what a NaN carries."""
     flat = values.reshape(-1).copy()
-    where = data.draw(st.integers(0, flat.size - 1))
+    place = data.draw(st.integers(0, flat.size - 1))
+    bit = data.draw(st.integers(0, 8 * flat.itemsize - 1))
+    before = flat[place].copy()
     bits = flat.view(f"<u{flat.itemsize}")
-    before = flat[where].copy()
-    bits[where] ^= bits.dtype.type(1) << bits.dtype.type(
-        data.draw(st.integers(0, 8 * flat.itemsize - 1))
-    )
-    same = (before == 0 and flat[where] == 0) or (
-        np.isnan(before) and np.isnan(flat[where])
-    )
-    assert (digest(flat.reshape(values.shape)) == digest(values)) == same
+    unsigned = bits.dtype.type
+    bits[place] ^= unsigned(1) << unsigned(bit)
+    after = flat[place]
+    are_zeros = before == 0 and after == 0
+    are_nans = np.isnan(before) and np.isnan(after)
+    has_same_hash = digest(flat.reshape(values.shape)) == digest(values)
+    assert has_same_hash == (are_zeros or are_nans)
     # The smallest integer is a value like any other, not a zero.
     whole = np.zeros((2, 3), np.int32)
     least = np.full((2, 3), -(2**31), np.int32)
@@ -138,17 +138,17 @@ def test_any_change_of_a_value_changes_the_hash(
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
 def test_every_nan_is_one(dtype: Any) -> None:
-    """NaN of either sign, quiet or signalling, with any payload, hashes as the
-    canonical one.
-    """
-    width = np.dtype(dtype).itemsize * 8
+    """NaN of any sign and payload, quiet or signalling, hashes as the canonical one."""
+    item_bytes = np.dtype(dtype).itemsize
     quiet = np.full(4, np.nan, dtype)
-    odd = quiet.view(f"u{width // 8}").copy()
-    odd[1] |= odd.dtype.type(1 << (width - 1))
-    odd[2] |= odd.dtype.type(5)
-    exponent = np.array(np.inf, dtype).view(odd.dtype)
-    odd[3] = exponent | odd.dtype.type(1)
-    assert digest(odd.view(dtype)) == digest(quiet)
+    bits = quiet.view(f"u{item_bytes}").copy()
+    unsigned = bits.dtype.type
+    sign = 1 << (8 * item_bytes - 1)
+    bits[1] |= unsigned(sign)
+    bits[2] |= unsigned(5)
+    exponent = np.array(np.inf, dtype).view(bits.dtype)
+    bits[3] = exponent | unsigned(1)
+    assert digest(bits.view(dtype)) == digest(quiet)
 
 
 @given(FLOATS.filter(lambda values: values.dtype == np.float32))
@@ -264,7 +264,7 @@ def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
         -0.0,
         [np.float64(2)],
     ]
-    assert repr([plain(value) for value in given_values]) == repr(
+    assert repr([to_plain(value) for value in given_values]) == repr(
         [0.5, 3, "a", 1, -1, 0.0, [2.0]]
     )
 
@@ -283,7 +283,9 @@ def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
     )
     subsets = {"valid": "1" * 64, "train": "0" * 64, "test": "2" * 64}
     text = (
-        f'{{"major":1,"size":"tiny","split":"cavity","subsets":{{"test":"{"2" * 64}","train":"{"0" * 64}",'
+        '{"major":1,"size":"tiny","split":"cavity","subsets":'
+        f'{{"test":"{"2" * 64}",'
+        f'"train":"{"0" * 64}",'
         f'"valid":"{"1" * 64}"}}}}'
     )
     expected = hashlib.sha256(text.encode()).hexdigest()

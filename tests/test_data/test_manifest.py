@@ -16,8 +16,8 @@ from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
+    build_manifest,
     describe_file,
-    merge,
     read_manifest,
     write_manifest,
 )
@@ -66,7 +66,7 @@ def merged(
     told.
     """
     entries = [entry(i) if isinstance(i, int) else i for i in ids]
-    return merge(
+    return build_manifest(
         old,
         entries,
         **{**OPTIONS, "environment": {"python": "3.11"}, "statistics": None, **options},
@@ -233,9 +233,7 @@ def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
 def test_a_damaged_manifest_names_the_key(
     tmp_path: Path, change: dict[str, Any], of_entry: dict[str, str], said: str
 ) -> None:
-    """It is told with file, key and remedy; no JSON as a whole file. A FIFO would be
-    waited for.
-    """
+    """The error has file, key and hint; a FIFO is refused too."""
     path = write_manifest(tmp_path, merged(None, range(5)))
     told = json.loads(path.read_text())
     told["files"][3] |= of_entry
@@ -256,9 +254,14 @@ def test_entry_of_a_file_on_disk(tmp_path: Path) -> None:
     """The entry holds what the file says and the hash of its bytes."""
     key = make_key(3)
     path, content = write_scenario(tmp_path, key, facts={"energy": 0.5})
-    assert content == write_scenario(tmp_path / "plain", key)[1]
-    found = describe_file(tmp_path, key)
-    assert (found.content_sha256, found.frames, found.particles) == (content, 4, 8)
-    assert (found.path, found.bytes) == ("test/0003.nc", path.stat().st_size)
-    assert found.file_sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
-    assert found.facts == {"energy": 0.5}
+    _, content_without_facts = write_scenario(tmp_path / "plain", key)
+    assert content == content_without_facts
+    entry = describe_file(tmp_path, key)
+    assert entry.content_sha256 == content
+    assert entry.frames == 4
+    assert entry.particles == 8
+    assert entry.path == "test/0003.nc"
+    assert entry.bytes == path.stat().st_size
+    digest = hashlib.sha256(path.read_bytes())
+    assert entry.file_sha256 == digest.hexdigest()
+    assert entry.facts == {"energy": 0.5}

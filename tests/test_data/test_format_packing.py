@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scenario_factory import DIMS, make_key, write_scenario
 
-from lagbench.data.writer import rehash
+from lagbench.data.scenario import rehash
 
 KEY = make_key()
 
