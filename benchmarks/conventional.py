@@ -28,7 +28,7 @@ import numpy as np
 import taichi as ti
 
 from lagbench.data import WALLS
-from lagbench.generators.acceptance.experiment import (
+from validation.experiment import (
     Case,
     initial_state,
     plan,

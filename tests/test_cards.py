@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import DRAW
+from conftest import PAINT
 from hypothesis import given
 from hypothesis import strategies as st
 from swirls import write_swirl
@@ -24,8 +24,9 @@ from lagbench.data.layout import dataset_folder
 from lagbench.data.manifest import Manifest, describe_file, merge
 from lagbench.data.registry import Size
 from lagbench.draw.tables import escape, markdown
-from lagbench.make import cards
-from lagbench.make.cards import croissant_json
+from lagbench.make import cards, painting
+from lagbench.make.card_files import PICTURES
+from lagbench.make.croissant import croissant_json
 
 STATISTICS = {"position_mean": (0.5, 0.25), "velocity_std": (1.25e-3, 2.5e-3)}
 LOADER = """
@@ -85,11 +86,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size, manifest = make(root)
     assert manifest.complete
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cards, "_draw", DRAW)
+        patch.setattr(painting, "paint_pictures", PAINT)
         written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
     names = {p.relative_to(folder).as_posix() for p in written}
-    assert names == {"README.md", "croissant.json", *cards.PICTURES}
+    assert names == {"README.md", "croissant.json", *PICTURES}
     return folder
 
 
@@ -159,7 +160,7 @@ def test_the_card_says_all_that_it_must(folder: Path) -> None:
 def test_every_picture_of_the_card_is_there(folder: Path) -> None:
     """Links resolve, and each picture has words in its place."""
     links = re.findall(r"!\[([^\]]+)\]\(([^)]+)\)", (folder / "README.md").read_text())
-    assert [target for _, target in links] == list(cards.PICTURES)
+    assert [target for _, target in links] == list(PICTURES)
     for words, target in links:
         assert len(words) > 10
         assert (folder / target).stat().st_size < 300_000

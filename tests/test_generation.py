@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import DRAW, SIZE, SPLIT
+from conftest import PAINT, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
 from lagbench.data import WALLS
@@ -23,10 +23,11 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generators.batch import draw, substeps_of
+from lagbench.generators.batch import draw_initial_state, substep_count
 from lagbench.generators.draws import generator
-from lagbench.generators.simulate import active_frames, nudge
-from lagbench.make import cards
+from lagbench.generators.simulate import active_frames, draw_perturbation
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import SECONDS_TO_START, estimate, select
 from lagbench.work.progress import Progress
@@ -98,7 +99,7 @@ def test_a_file_holds_what_its_scenario_says(
         first = file.read("position", 0)
         material = file.read("material")
         velocity = file.read("velocity", 0)
-    state = draw(size, 3)
+    state = draw_initial_state(size, 3)
     np.testing.assert_array_equal(first, state.position.astype(np.float32))
     np.testing.assert_array_equal(velocity, state.velocity.astype(np.float32))
     np.testing.assert_array_equal(material, state.material)
@@ -116,7 +117,7 @@ def test_cavity_files_hold_the_walls_of_every_frame(
     """Row f of ``wall_velocity`` is what the program says of frame f, counted from
     where recording starts.
     """
-    state = draw(load().size("cavity", "tiny"), 3)
+    state = draw_initial_state(load().size("cavity", "tiny"), 3)
     with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
         walls = file.read("wall_velocity")
         start = file.header.parameters["start_frame"]
@@ -205,10 +206,10 @@ def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
     is drawn.
     """
     size = unmeasured.size(SPLIT, SIZE)
-    signs = nudge(size, 3) * 2**20
+    signs = draw_perturbation(size, 3) * 2**20
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert abs(signs.mean()) < 0.1
-    assert not np.array_equal(signs, nudge(size, 4) * 2**20)
+    assert not np.array_equal(signs, draw_perturbation(size, 4) * 2**20)
     plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
     assert not np.array_equal(signs > 0, plain >= 0.5)
 
@@ -331,7 +332,7 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
     )
     size = unmeasured.size(SPLIT, SIZE)
     simulating = [state for state in news if state.stage == "simulating"]
-    assert simulating[0].total == 2 * substeps_of(size, 3) == 2 * 25 * 12
+    assert simulating[0].total == 2 * substep_count(size, 3) == 2 * 25 * 12
     assert [state.done for state in simulating] == sorted(
         state.done for state in simulating
     )
@@ -346,7 +347,7 @@ def test_batches_start_each_scenario_at_its_own_frame(
     equal hashes.
     """
     size = load().size("cavity", "tiny")
-    assert len({draw(size, i).start_frame for i in range(3)}) == 3
+    assert len({draw_initial_state(size, i).start_frame for i in range(3)}) == 3
     batch = generate(
         "cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2"
     )
@@ -438,14 +439,14 @@ def test_a_registry_of_ones_own_is_all_that_counts(
     """A split that only the given registry knows is generated, drawn and described with
     its own title.
     """
-    monkeypatch.setattr(cards, "_draw", DRAW)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate(
         "own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own
     )
     assert "# Noise of our own" in (result.folder / "README.md").read_text()
-    assert all((result.folder / name).stat().st_size > 1000 for name in cards.PICTURES)
+    assert all((result.folder / name).stat().st_size > 1000 for name in PICTURES)
 
 
 WORKER = """

@@ -16,8 +16,8 @@ from click.testing import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, load
-from lagbench.generators.batch import SimulationJob, substeps_of
-from lagbench.generators.simulate import Pace, simulate, twin_substeps
+from lagbench.generators.batch import SimulationJob, substep_count
+from lagbench.generators.simulate import SimulationPace, simulate, perturbed_substep_count
 from lagbench.make.generate import generate
 from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 
@@ -44,9 +44,9 @@ PLAIN = reference_seconds(*WORK)
 GOOD = {"256": [2 * PLAIN, *WORK]}
 
 
-def pace(slowness: float) -> Pace:
+def pace(slowness: float) -> SimulationPace:
     """Return what so slow a machine measures."""
-    return Pace(seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1])
+    return SimulationPace(seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1])
 
 
 def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
@@ -67,8 +67,8 @@ def test_twins_of_test_scenarios_are_counted() -> None:
     """
     size = load().size("cavity", "mini")
     test = size.subsets["test"]
-    twins = [twin_substeps(size, i) for i in test]
-    alone = [substeps_of(size, i) for i in test]
+    twins = [perturbed_substep_count(size, i) for i in test]
+    alone = [substep_count(size, i) for i in test]
     assert sum(twins) < sum(alone)
     frames = sum(map(size.frame_count, test)) + len(test) * (
         size.task.input_frames + size.task.horizon
@@ -164,7 +164,7 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
     steps = size.frame_count(0) - 2
     substeps = steps * size.substeps_per_frame * size.particles
     # The clock says 10, 30, 60: before the first frame, after the second, in the end.
-    assert outcome.pace == Pace(seconds=30.0, particle_substeps=substeps, frames=steps)
+    assert outcome.pace == SimulationPace(seconds=30.0, particle_substeps=substeps, frames=steps)
 
 
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:

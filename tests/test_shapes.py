@@ -71,7 +71,7 @@ def test_shapes_by_hand() -> None:
 def test_seeds_lie_evenly_inside(name: str, count: int) -> None:
     """All inside, nearest neighbours between half and 1.5 times the mean spacing."""
     body = shapes.body_at(SHAPES[name], 0.5, 0.4)
-    position = shapes.seeds(source(), body, count)
+    position = shapes.sample_points(source(), body, count)
     assert position.shape == (count, 2)
     assert body.distance(position).max() <= 2.0**-20
     spacing = math.sqrt(body.shape.area / count)
@@ -84,14 +84,14 @@ def test_seeds_have_the_centre_and_spread_of_the_body() -> None:
     """Second moments of a 0.65 x 0.05 bar along (0.6, 0.8): length^2/12 and
     width^2/12.
     """
-    position = shapes.seeds(source(), shapes.body_at(SHAPES["rope"], 0.5, 0.5), 2500)
+    position = shapes.sample_points(source(), shapes.body_at(SHAPES["rope"], 0.5, 0.5), 2500)
     moments, axes = np.linalg.eigh(np.cov(position.T, bias=True))
     assert moments == pytest.approx([0.05**2 / 12, 0.65**2 / 12], rel=0.03)
     np.testing.assert_allclose(np.abs(axes[:, 1]), [0.6, 0.8], atol=0.003)
     np.testing.assert_allclose(position.mean(axis=0), 0.5, atol=0.003)
     # Two scenarios spread different points in the same body.
     body = shapes.body_at(SHAPES["disc"], 0.5, 0.5)
-    first, second = (shapes.seeds(source(k), body, 50) for k in (0, 1))
+    first, second = (shapes.sample_points(source(k), body, 50) for k in (0, 1))
     assert neighbours(second, 1, among=first)[0].min() > 0.0
 
 

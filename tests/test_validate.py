@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.errors import UsageError
-from lagbench.generators.acceptance import __main__, diagnostics, experiment
-from lagbench.generators.acceptance.experiment import Case, plan
+from validation import __main__, diagnostics, experiment
+from validation.experiment import Case, plan
 
 BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
 
