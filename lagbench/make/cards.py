@@ -14,7 +14,7 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Parameter, Size, Split, spell_ids
-from lagbench.draw.tables import escape, markdown
+from lagbench.figures.tables import escape, markdown
 
 from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
 from .croissant import KEYWORDS, croissant_json

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lagbench.data.manifest import FileEntry, Manifest
 from lagbench.data.registry import Registry, Size, Split
-from lagbench.draw.plot import contact_sheet, plot_frame
+from lagbench.figures.plot import contact_sheet, plot_frame
 
 from .card_files import PICTURES
 
