@@ -6,7 +6,8 @@ bits.
 
 A 2 x 2 deformation gradient is a scaled rotation plus a scaled reflection,
 
-    F = [[e, -g], [g, e]] + [[h, k], [k, -h]],    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
+    F = [[e, -g], [g, e]] + [[h, k], [k, -h]],
+    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
 
 The rotation R of the polar decomposition F = R S has cosine e/q and sine g/q; the
 principal stretches are q + r and q - r (negative when F inverts); det F = q^2 - r^2.
@@ -31,8 +32,8 @@ _SHEAR_EPSILON = 1e-12
 def lame(young: float, poisson: float) -> tuple[float, float]:
     """Return Lame's constants of plane strain, mu and lambda [mass/s^2].
 
-    mu = E / (2 (1 + nu)) and lambda = E nu / ((1 + nu) (1 - 2 nu)), with Young's modulus
-    E [mass/s^2] and Poisson's ratio nu below 1/2.
+    mu = E / (2 (1 + nu)) and lambda = E nu / ((1 + nu) (1 - 2 nu)), with Young's
+    modulus E [mass/s^2] and Poisson's ratio nu below 1/2.
 
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
@@ -107,8 +108,8 @@ def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
     """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
     With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
-    (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W. Lame's constants mu and lambda are in
-    [mass/s^2].
+    (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W. Lame's constants mu and lambda are
+    in [mass/s^2].
     """
     turn = rotation(f)
     cosine = turn[0]

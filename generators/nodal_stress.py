@@ -5,14 +5,16 @@ mirror images of the outermost interior nodes. Per substep, for particles of equ
 m, positions x_p, grid spacing dx and weights w_ip:
 
 1. P2G: n_i = sum w,  (n J)_i = sum w J_p,  (n v)_i = sum w (v_p + C_p (x_i - x_p)).
-2. Fold: ghosts give what they received to their mirror images, normal momentum reversed,
-   tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a free-slip wall. Then
-   v = (n v)/n,  Jbar = (n J)/n,  relative density r = n m / (rho dx^2); ghosts mirror them.
+2. Fold: ghosts give what they received to their mirror images, normal momentum
+   reversed, tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a
+   free-slip wall. Then v = (n v)/n,  Jbar = (n J)/n,  relative density
+   r = n m / (rho dx^2); ghosts mirror them.
 3. Forces: a = (E/rho) grad Jbar + nu lap v,  v <- v + dt a; ghosts mirror v and a.
-4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),  grad q = (4/dx^2) sum w q (x_i - x_p),
-   C = grad v, shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
-   v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s
-   x_p <- x_p + dt v* + s, kept in the box
+4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),
+   grad q = (4/dx^2) sum w q (x_i - x_p),  C = grad v,
+   shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
+   v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s,
+   x_p <- x_p + dt v* + s, kept in the box,
    J_p <- J_p (1 + dt tr C) + kappa (Jbar - J_p) + theta (1/r - Jbar).
 
 The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no

@@ -109,10 +109,10 @@ def fade(t: Jet) -> Jet:
 
 
 def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
-    """Return gradient noise of a lattice at points given in its cells (Eqs. 5.40, 5.41).
+    """Return gradient noise of a lattice at points in units of its cells.
 
-    It is 0 at every node and its slope there is the node's gradient. The lattice has
-    the shape [node, node, 2].
+    Eqs. 5.40 and 5.41 of the thesis. It is 0 at every node and its slope there is the
+    node's gradient. The lattice has the shape [node, node, 2].
     """
     last = len(lattice) - 2
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.

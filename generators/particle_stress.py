@@ -9,9 +9,11 @@ o = (x_i - x_p) / dx:
    Coulomb friction, at most ``friction`` times as much tangential velocity. Jbar = (n
    J)/n. Relative density r_i = n_i m / (rho dx^2), where n_i counts mirror images at
    the walls.
-3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,   x_p <- x_p + dt v_p, kept in the box.
-   Liquid: J <- J (1 + dt tr C) + kappa (Jbar - J), then J <- J + theta (1/max(r, 1) - J),
-   within [J_min, J_max]. Solids: F <- (I + dt C) F; snow then yields.
+3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,
+   x_p <- x_p + dt v_p, kept in the box.
+   Liquid: J <- J (1 + dt tr C) + kappa (Jbar - J), then
+   J <- J + theta (1/max(r, 1) - J), within [J_min, J_max].
+   Solids: F <- (I + dt C) F; snow then yields.
 
 The mass of a particle cancels everywhere but in r, so nodes count particles. Sums are
 integers (:mod:`.transfer`): no order of particles or threads changes a bit. The

@@ -62,7 +62,7 @@ class Rectangle:
 
     @classmethod
     def of_area(cls, area: float, aspect: float) -> Rectangle:
-        """Return the level rectangle of an area [length^2] and length over width [1]."""
+        """Return the level rectangle of an area [length^2] and an aspect ratio [1]."""
         length = math.sqrt(area * aspect)
         return cls(length, area / length)
 

@@ -23,7 +23,11 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generators.batch import draw_initial_state, substep_count
+from lagbench.generators.batch import (
+    draw_initial_state,
+    start_frame,
+    substep_count,
+)
 from lagbench.generators.draws import generator
 from lagbench.generators.simulate import active_frames, draw_perturbation
 from lagbench.make import painting
@@ -403,20 +407,115 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert expected.seconds(9) == expected.seconds(2)
 
 
-def test_a_few_drawn_scenarios_stand_for_all(unmeasured: Registry) -> None:
-    """Exact where none begins late; a cavity begins 60 to 120 frames before frame 0, so
-    that it is near.
+GENERATOR = """
+import os
+from pathlib import Path
+from lagbench.generators import cavity
+from lagbench.generators.cavity import solver_parameters, start_frame
+
+def initial_state(size, scenario, rng):
+    with Path(os.environ["DRAWS"]).open("a") as log:
+        log.write(f"{os.getpid()} {scenario}\\n")
+    return cavity.initial_state(size, scenario, rng)
+"""
+
+
+@pytest.fixture
+def draw_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file to which the module ``counted_cavity`` writes its draws, in any
+    process.
     """
-    fluid = unmeasured.size("fluid", "tiny")
-    cavity = unmeasured.size("cavity", "mini")
-    assert estimate(fluid, fluid.scenarios, drawn=1) == estimate(fluid, fluid.scenarios)
-    found, exact = (estimate(cavity, cavity.scenarios, drawn=n) for n in (2, None))
-    assert found.core_seconds == pytest.approx(exact.core_seconds, rel=0.25)
-    assert (found.scenarios, found.bytes, found.frames) == (
-        exact.scenarios,
-        exact.bytes,
-        exact.frames,
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    (modules / "counted_cavity.py").write_text(GENERATOR)
+    monkeypatch.syspath_prepend(modules)
+    log = tmp_path / "draws.txt"
+    log.touch()
+    monkeypatch.setenv("DRAWS", str(log))
+    return log
+
+
+@pytest.fixture
+def counted_registry() -> Registry:
+    """The cavity, drawn by a module that logs its draws."""
+    split = load().split("cavity").model_copy(update={"generator": "counted_cavity"})
+    return Registry({"cavity": split}, {})
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Perturbed runs of test start from the same draw; the parent draws nothing."""
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", workers=1, registry=counted_registry
     )
+    assert result.complete
+    lines = draw_log.read_text().splitlines()
+    processes = {line.split()[0] for line in lines}
+    drawn = sorted(int(line.split()[1]) for line in lines)
+    assert drawn == [0, 1, 2, 3, 4]
+    assert len(processes) == 1
+    assert str(os.getpid()) not in processes
+
+
+def test_planning_draws_no_scenario(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Estimate, dry run and the count of substeps need the first frame alone."""
+    size = counted_registry.size("cavity", SIZE)
+    counts = [substep_count(size, scenario) for scenario in size.scenarios]
+    assert estimate(size, size.scenarios).substeps == tuple(counts)
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", dry_run=True, registry=counted_registry
+    )
+    assert result.simulated == size.scenarios
+    assert draw_log.read_text() == ""
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+@pytest.mark.parametrize("tier", ["tiny", "mini"])
+def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> None:
+    size = load().size(split, tier)
+    for scenario in size.scenarios[:8]:
+        state = draw_initial_state(size, scenario)
+        assert start_frame(size, scenario) == state.start_frame
+
+
+def test_a_split_that_hides_its_first_frame_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late start without the function that tells of it would be planned too short."""
+    (tmp_path / "late_cavity.py").write_text(
+        "from lagbench.generators.cavity import initial_state, solver_parameters\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    size = load().size("cavity", SIZE)
+    late = size.model_copy(update={"generator": "late_cavity"})
+    with pytest.raises(UsageError) as caught:
+        draw_initial_state(late, 0)
+    assert caught.value.where == "late_cavity.initial_state, scenario 0"
+
+
+LOADED = """
+import sys
+from lagbench.make.generate import generate
+from lagbench.data.registry import load
+from pathlib import Path
+generate(sys.argv[1], sys.argv[2], root=sys.argv[3], registry=load(Path(sys.argv[4])))
+print(*(name for name in sys.modules if name.startswith("lagbench.figures.")))
+"""
+
+
+def test_a_generation_that_paints_nothing_loads_no_drawing_module(
+    copied: Callable[[], Path], unmeasured: Registry, unmeasured_path: Path
+) -> None:
+    """Where everything is there, the card's tables are formatted, and that is all."""
+    root = copied()
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    command = [sys.executable, "-c", LOADED, SPLIT, SIZE, root, unmeasured_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["lagbench.figures.tables"]
 
 
 @pytest.mark.parametrize("dry_run", [True, False])

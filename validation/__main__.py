@@ -29,7 +29,7 @@ from lagbench.data.checksums import round_digits
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError
 from lagbench.generators.solver import Device
 
-from .diagnostics import X, Y, CentreLines, box_of, centre_lines, draw_profiles
+from .diagnostics import CentreLines, X, Y, box_of, centre_lines, draw_profiles
 from .experiment import (
     Case,
     Experiment,

@@ -101,8 +101,9 @@ def _is_current(texts: Mapping[Path, bytes], pictures: list[Path]) -> bool:
     The card names every content hash. Where its text is right already, the pictures are
     of the same data.
     """
-    if not all(path.is_file() for path in (*texts, *pictures)):
-        return False
+    for path in (*texts, *pictures):
+        if not path.is_file():
+            return False
     return all(path.read_bytes() == text for path, text in texts.items())
 
 
@@ -173,10 +174,16 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
     if manifest.dataset_sha256:
         data_hash = f"`{manifest.dataset_sha256}`"
 
-    frame_counts = sorted({entry.frames for entry in manifest.files}) or [0]
-    frame_range = str(frame_counts[0])
-    if len(frame_counts) > 1:
-        frame_range = f"{frame_counts[0]} to {frame_counts[-1]}"
+    frame_counts = []
+    byte_count = 0
+    for entry in manifest.files:
+        frame_counts.append(entry.frames)
+        byte_count += entry.bytes
+    fewest = min(frame_counts, default=0)
+    most = max(frame_counts, default=0)
+    frame_range = str(fewest)
+    if most > fewest:
+        frame_range = f"{fewest} to {most}"
 
     sides = [f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds]
     rows = [
@@ -186,12 +193,12 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
         ("identity", manifest.identity),
         ("scenarios", len(manifest.files)),
         ("frames per scenario", frame_range),
-        ("frames together", sum(entry.frames for entry in manifest.files)),
+        ("frames together", sum(frame_counts)),
         ("particles", size.particles),
         ("frame interval", f"{size.frame_interval:.6g} s"),
         ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
         ("box", " x ".join(sides)),
-        ("bytes", sum(entry.bytes for entry in manifest.files)),
+        ("bytes", byte_count),
     ]
     return markdown(("", ""), rows)
 
@@ -199,13 +206,18 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
 def _subset_table(size: Size, manifest: Manifest) -> str:
     rows = []
     for name, ids in size.subsets.items():
-        entries = [entry for entry in manifest.files if entry.subset == name]
-        frame_count = sum(entry.frames for entry in entries)
-        byte_count = sum(entry.bytes for entry in entries)
+        entry_count = 0
+        frame_count = 0
+        byte_count = 0
+        for entry in manifest.files:
+            if entry.subset == name:
+                entry_count += 1
+                frame_count += entry.frames
+                byte_count += entry.bytes
         subset_hash = "incomplete"
         if name in manifest.subset_sha256:
             subset_hash = f"`{manifest.subset_sha256[name]}`"
-        present = f"{len(entries)} of {len(ids)}"
+        present = f"{entry_count} of {len(ids)}"
         row = (name, spell_ids(ids), present, frame_count, byte_count, subset_hash)
         rows.append(row)
     head = ("subset", "ids", "scenarios", "frames", "bytes", "hash")
@@ -301,7 +313,10 @@ def _verification_section(size: Size, manifest: Manifest) -> list[str]:
 
 
 def _scenario_table(manifest: Manifest) -> str:
-    names = sorted({name for entry in manifest.files for name in entry.facts})
+    stated_names: set[str] = set()
+    for entry in manifest.files:
+        stated_names.update(entry.facts)
+    names = sorted(stated_names)
     rows = [_scenario_row(entry, names) for entry in manifest.files]
     titles = [name.replace("_", " ") for name in names]
     table = markdown(("id", "file", "frames", *titles, "content hash"), rows)

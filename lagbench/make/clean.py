@@ -87,7 +87,8 @@ def _data_set_files(size: Size, folder: Path) -> set[Path]:
         for scenario in ids:
             paths.add(folder / subset / f"{scenario:04d}.nc")
     if size.simulated:
-        paths |= {folder / name for name in CARDS}
+        for name in CARDS:
+            paths.add(folder / name)
     else:
         # A local split has no cards; its description says nothing without its data.
         paths |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}

@@ -131,7 +131,10 @@ def _record_set(manifest: Manifest) -> dict[str, object]:
 
     records = []
     for entry in manifest.files:
-        records.append({f"scenarios/{name}": getattr(entry, name) for name in _FIELDS})
+        record = {}
+        for name in _FIELDS:
+            record[f"scenarios/{name}"] = getattr(entry, name)
+        records.append(record)
 
     return {
         "@type": "cr:RecordSet",

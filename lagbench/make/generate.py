@@ -212,7 +212,7 @@ def generate(
 
 
 def _find_device(name: str) -> Device:
-    names = [device.value for device in Device]
+    names = list(map(str, Device))
     if name not in names:
         raise UsageError(
             f"no device {name!r}", where="--device", fix=nearest(name, names)
@@ -376,11 +376,15 @@ def _scan_folder(
             quick=True,
             trusting=gathered is not None,
         )
-    paths = [setup.path(scenario) for scenario in suspects]
+    paths = map(setup.path, suspects)
     results = setup.read_files(run_inspection, inspections, paths)
 
-    hashed = [result.entry for result in results if result.entry]
-    bad_ids = set(suspects) - {entry.scenario for entry in hashed}
+    hashed = []
+    bad_ids = set(suspects)
+    for result in results:
+        if result.entry:
+            hashed.append(result.entry)
+            bad_ids.discard(result.scenario)
     old_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
     base = old.model_copy(update={"files": tuple(old_entries)})
 
@@ -433,21 +437,23 @@ def _simulate(
     """
     size = setup.size
     test_ids = size.subsets.get("test", ())
-    limited_ids = {
-        entry.scenario for entry in keeper.manifest.files if entry.twin_floor
-    }
+    # files that are right and have no predictability limit yet
     unlimited_ids = []
-    for scenario in scan.kept:
-        if scenario in test_ids and scenario not in limited_ids:
-            unlimited_ids.append(scenario)
+    for entry in keeper.manifest.files:
+        is_kept_test = entry.scenario in test_ids and entry.scenario in scan.kept
+        if is_kept_test and not entry.twin_floor:
+            unlimited_ids.append(entry.scenario)
     keeper.fetch(unlimited_ids)
 
     tasks = _simulation_tasks(setup, scan.to_do)
-    tasks += [_perturbation_task(setup, scenario) for scenario in unlimited_ids]
+    for scenario in unlimited_ids:
+        tasks.append(_perturbation_task(setup, scenario))
     if not tasks:
         return []
 
-    total = round(sum(task.cost for task in tasks))
+    total = 0
+    for task in tasks:
+        total += round(task.cost)
     for scenario in scan.to_do.scenarios:
         if scenario in test_ids:
             total += perturbed_substep_count(size, scenario)
@@ -466,12 +472,13 @@ def _simulate(
             elif event.task.function is measure_predictability:
                 _add_limits(keeper, event.value)
             else:
-                entries = _add_simulated(setup, keeper, event)
-                if setup.is_on_cores:
-                    paces += [s.pace for s in event.value if s.pace]
-                for entry in entries:
-                    if entry.subset == "test":
-                        team.submit(_perturbation_task(setup, entry.scenario))
+                _add_simulated(setup, keeper, event)
+                for simulated in event.value:
+                    if setup.is_on_cores and simulated.pace:
+                        paces.append(simulated.pace)
+                    if simulated.scenario in test_ids:
+                        task = _perturbation_task(setup, simulated.scenario)
+                        team.submit(task)
     return paces
 
 
@@ -526,19 +533,15 @@ def _task(
     return Task(name=full_name, function=function, arguments=(job,), cost=cost)
 
 
-def _add_simulated(
-    setup: _Setup, keeper: _ManifestKeeper, event: Event
-) -> list[FileEntry]:
-    """Put scenarios that a worker has simulated into the manifest; return their
-    entries.
-    """
+def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None:
+    """Put scenarios that a worker has simulated into the manifest."""
     simulated: Sequence[SimulatedScenario] = event.value
     machine = event.machine or environment_of(setup.device)
     environment = {**machine, "device": setup.device.value}
-    if promises_bits(environment):
-        keeper.promised += [result.scenario for result in simulated]
-
+    is_promised = promises_bits(environment)
     for result in simulated:
+        if is_promised:
+            keeper.promised.append(result.scenario)
         await_file(setup.path(result.scenario))
     entries = []
     for result in simulated:
@@ -546,7 +549,6 @@ def _add_simulated(
     note_entries(setup.folder, entries)
     keeper.add(entries, environment)
     setup.meter.count(scenarios=len(entries))
-    return entries
 
 
 def _add_limits(keeper: _ManifestKeeper, limits: Mapping[int, Sequence[float]]) -> None:
@@ -554,7 +556,7 @@ def _add_limits(keeper: _ManifestKeeper, limits: Mapping[int, Sequence[float]]) 
     entries = []
     for entry in keeper.manifest.files:
         if entry.scenario in limits:
-            rounded = tuple(round_digits(value) for value in limits[entry.scenario])
+            rounded = tuple(map(round_digits, limits[entry.scenario]))
             entries.append(entry.model_copy(update={"twin_floor": rounded}))
     keeper.add(entries)
 

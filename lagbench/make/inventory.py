@@ -86,11 +86,16 @@ def overview(size: Size, root: Path) -> Overview:
         is_measured = expected.measured
 
     present_ids = _present_scenarios(size, root)
+    counts: dict[str, int] = {}
     present: dict[str, int] = {}
     for subset, members in size.subsets.items():
+        counts[subset] = len(members)
         present[subset] = len(present_ids.intersection(members))
 
-    pictures = [folder / name for name in PICTURES if (folder / name).is_file()]
+    picture = None
+    for name in PICTURES:
+        if picture is None and (folder / name).is_file():
+            picture = folder / name
     dataset_sha256 = None
     if size.measured:
         dataset_sha256 = size.measured.dataset_sha256
@@ -98,15 +103,15 @@ def overview(size: Size, root: Path) -> Overview:
         split=size.split,
         size=size.name,
         version=size.version,
-        scenarios={subset: len(members) for subset, members in size.subsets.items()},
+        scenarios=counts,
         particles=size.particles,
-        frames=sum(size.frame_count(scenario) for scenario in ids),
-        bytes=sum(size.file_bytes(scenario) for scenario in ids),
+        frames=sum(map(size.frame_count, ids)),
+        bytes=sum(map(size.file_bytes, ids)),
         seconds=seconds,
         measured=is_measured,
         present=present,
         folder=folder,
-        picture=next(iter(pictures), None),
+        picture=picture,
         dataset_sha256=dataset_sha256,
     )
 

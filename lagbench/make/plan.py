@@ -65,7 +65,9 @@ def select(
         UsageError: an unknown subset, an id outside the subsets, or no id at all.
     """
     names = _subset_names(size, subset)
-    selectable = {scenario for name in names for scenario in size.subsets[name]}
+    selectable: set[int] = set()
+    for name in names:
+        selectable.update(size.subsets[name])
     if scenarios is None:
         return tuple(sorted(selectable))
 
@@ -156,7 +158,7 @@ def estimate(
     solver_constants(size)  # refuses parameters that the solver cannot use
 
     substeps = tuple(substep_count(size, scenario) for scenario in scenarios)
-    frames = sum(size.frame_count(scenario) for scenario in scenarios)
+    frames = sum(map(size.frame_count, scenarios))
 
     # Test scenarios are simulated a second time, perturbed, up to the horizon.
     total_substeps = sum(substeps)
@@ -175,7 +177,7 @@ def estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
-        bytes=sum(size.file_bytes(scenario) for scenario in scenarios),
+        bytes=sum(map(size.file_bytes, scenarios)),
         core_seconds=(ratio or 1.0) * seconds,
         measured=ratio is not None,
     )
@@ -245,9 +247,13 @@ def note_pace(size: Size, paces: Sequence[SimulationPace]) -> None:
     """
     if not paces:
         return
-    seconds = sum(pace.seconds for pace in paces)
-    particle_substeps = sum(pace.particle_substeps for pace in paces)
-    frames = sum(pace.frames for pace in paces)
+    seconds = 0.0
+    particle_substeps = 0
+    frames = 0
+    for pace in paces:
+        seconds += pace.seconds
+        particle_substeps += pace.particle_substeps
+        frames += pace.frames
 
     rates = _read_rates()
     kind = _solver_kind(size)
@@ -286,10 +292,9 @@ def _read_rates() -> dict[str, dict[int, RateRow]]:
         document = json.loads(data)
         if document["machine"] != platform.node():
             return {}
-        return {
-            kind: _parse_rows(document.get(kind, {}))
-            for kind in ("closed_box", "free_surface")
-        }
+        closed_box = _parse_rows(document.get("closed_box", {}))
+        free_surface = _parse_rows(document.get("free_surface", {}))
+        return {"closed_box": closed_box, "free_surface": free_surface}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
 

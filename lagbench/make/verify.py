@@ -320,8 +320,9 @@ def _compare_regenerated(
             references.append(recorded)
     if not references:
         return "nothing to compare with"
-    if any(content.startswith(reference) for reference in references):
-        return "identical"
+    for reference in references:
+        if content.startswith(reference):
+            return "identical"
     return "different"
 
 
@@ -336,9 +337,11 @@ def _subset_digests(size: Size, hashes: Mapping[int, str]) -> dict[str, str]:
 
 def _data_set_digest(size: Size, subset_digests: Mapping[str, str]) -> str | None:
     """Return the hash of a data set; None while a subset that it covers has none."""
-    covered = {name: subset_digests.get(name, "") for name in HASHED_SUBSETS}
-    if not all(covered.values()):
-        return None
+    covered = {}
+    for name in HASHED_SUBSETS:
+        if name not in subset_digests:
+            return None
+        covered[name] = subset_digests[name]
     return dataset_hash(size.split, size.name, size.major, covered)
 
 
