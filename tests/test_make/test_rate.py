@@ -17,7 +17,11 @@ from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, load
 from lagbench.generators.batch import SimulationJob, substep_count
-from lagbench.generators.simulate import SimulationPace, simulate, perturbed_substep_count
+from lagbench.generators.simulate import (
+    SimulationPace,
+    perturbed_substep_count,
+    simulate,
+)
 from lagbench.make.generate import generate
 from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 
@@ -46,7 +50,9 @@ GOOD = {"256": [2 * PLAIN, *WORK]}
 
 def pace(slowness: float) -> SimulationPace:
     """Return what so slow a machine measures."""
-    return SimulationPace(seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1])
+    return SimulationPace(
+        seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1]
+    )
 
 
 def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
@@ -164,7 +170,9 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
     steps = size.frame_count(0) - 2
     substeps = steps * size.substeps_per_frame * size.particles
     # The clock says 10, 30, 60: before the first frame, after the second, in the end.
-    assert outcome.pace == SimulationPace(seconds=30.0, particle_substeps=substeps, frames=steps)
+    assert outcome.pace == SimulationPace(
+        seconds=30.0, particle_substeps=substeps, frames=steps
+    )
 
 
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:

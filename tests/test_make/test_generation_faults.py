@@ -180,7 +180,8 @@ CALL = "from lagbench.__main__ import app; app()"
 
 INTERRUPTED = f"""
 import os, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+# a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from lagbench.make import generate
 write = generate.write_manifest
 def write_first(*arguments):

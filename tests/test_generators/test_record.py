@@ -27,7 +27,7 @@ from lagbench.generators.record import (
 )
 from lagbench.make.generate import GenerationResult
 
-RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
+RELEASED = Path(__file__).parents[1] / "data" / "released_hashes.json"
 
 
 def manifest_of(root: Path) -> Manifest:

@@ -554,10 +554,13 @@ from pathlib import Path
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.data.registry import load
-size = load(Path(sys.argv[1])).size(sys.argv[2], "full")
+registry, split, scenario, root = sys.argv[1:]
+size = load(Path(registry)).size(split, "full")
 short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
-simulate(SimulationJob(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
-heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"} & sys.modules.keys()
+job = SimulationJob(size=short, scenarios=(int(scenario),), root=Path(root))
+simulate(job, lambda units: None)
+heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"}
+heavy &= sys.modules.keys()
 # ru_maxrss would be that of the test process, from which this one was forked.
 peak = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]
 print(peak, sorted(heavy))

@@ -152,7 +152,9 @@ def test_a_twin_is_replayed_with_its_nudge(
     size = unmeasured.size(SPLIT, SIZE)
 
     monkeypatch.setattr(
-        simulation, "draw_perturbation", lambda size, _: np.full((size.particles, 2), np.nan, np.float32)
+        simulation,
+        "draw_perturbation",
+        lambda size, _: np.full((size.particles, 2), np.nan, np.float32),
     )
     job = SimulationJob(size=size, scenarios=(3,), root=copied())
     with pytest.raises(WorkFailedError, match="blew up") as caught:
