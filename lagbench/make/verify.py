@@ -463,5 +463,5 @@ def _different_statistics(size: Size, manifest: Manifest) -> list[str]:
         if stated.get(name) != recorded.get(name):
             names.append(name)
     if manifest.mean_twin_floor() != size.measured.twin_floor:
-        names.append("twin floor")
+        names.append("twin_floor")
     return names

@@ -143,11 +143,11 @@ def test_a_good_run_loads_its_states_once(
     assert loads == [1]
 
 
-def test_a_twin_is_replayed_with_its_nudge(
+def test_a_perturbed_run_is_replayed_with_its_perturbation(
     copied: Callable[[], Path], unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A nudge that is not a number breaks the twin, in the replay as well, one substep
-    later.
+    """A perturbation that is not a number breaks the run, in the replay as well, one
+    substep later.
     """
     size = unmeasured.size(SPLIT, SIZE)
 

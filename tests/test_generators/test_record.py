@@ -63,7 +63,7 @@ def run(root: Path, registry: Path, *options: str) -> int:
 def test_what_is_recorded_is_what_was_measured(
     generated: GenerationResult, registry: Path, unmeasured_path: Path
 ) -> None:
-    """Hashes, statistics and the mean twin floor come back; what was written by hand is
+    """Hashes, statistics and the mean limit come back; what was written by hand is
     untouched.
     """
     assert run(generated.root, registry) == 0

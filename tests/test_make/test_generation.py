@@ -179,8 +179,8 @@ def test_facts_of_the_manifest_follow_from_the_files(
     """Energies are sums over the stored velocities; speed, CFL number and J stay in
     their bounds.
 
-    A twin's RMSE is known for each predicted frame; after one frame it is still near
-    2^-20.
+    The predictability limit is known for each predicted frame; after one frame it is
+    still near 2^-20.
     """
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
     for entry in manifest_of(generated.root).files:
@@ -190,12 +190,13 @@ def test_facts_of_the_manifest_follow_from_the_files(
         energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
         facts = entry.facts
         last = energy[-1]
-        known = {"first": energy[0], "last": last, "mean": energy.mean()}
-        known = {f"kinetic_energy_{name}": value for name, value in known.items()}
-        for name, value in {
-            **known,
+        expected = {
+            "kinetic_energy_first": energy[0],
+            "kinetic_energy_last": last,
+            "kinetic_energy_mean": energy.mean(),
             "energy_last_over_max": last / energy.max(),
-        }.items():
+        }
+        for name, value in expected.items():
             assert facts[name] == pytest.approx(value, rel=1e-12), name
         assert facts["max_speed"] >= np.abs(velocity).max()
         assert 0.0 < facts["cfl"] < 1.0
@@ -205,7 +206,7 @@ def test_facts_of_the_manifest_follow_from_the_files(
         assert all(floor < 1e-4 for floor in entry.twin_floor)
 
 
-def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
+def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -> None:
     """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario
     is drawn.
     """
@@ -324,7 +325,7 @@ def test_a_dry_run_touches_nothing(
 
 
 def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> None:
-    """Substeps of the scenario and of its twin are counted, none twice."""
+    """Substeps of the scenario and of its perturbed run are counted, none twice."""
     news: list[Progress] = []
     generate(
         SPLIT,
@@ -384,9 +385,9 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
     assert select(size, scenarios=[5, 3, 5]) == (3, 5)
     assert [type(i) for i in select(size, scenarios=np.arange(3, 5))] == [int, int]
-    for odd in (3, [3.0], [None]):
+    for no_ids in (3, [3.0], [None]):
         with pytest.raises(UsageError):
-            select(size, scenarios=odd)  # type: ignore[arg-type]
+            select(size, scenarios=no_ids)  # type: ignore[arg-type]
     assert len(select(size)) == 87
 
 
@@ -399,9 +400,9 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert expected.substeps == (31 * 5, 31 * 5)
     assert expected.frames == 64
     assert expected.bytes == 2 * (32 * 256 * 16 + 65536)
-    one, two = (
-        expected.seconds(workers) - SECONDS_TO_START for workers in (1, 2)
-    )  # all compile
+    # all workers compile
+    one = expected.seconds(1) - SECONDS_TO_START
+    two = expected.seconds(2) - SECONDS_TO_START
     assert one == pytest.approx(2 * two)
     assert estimate(size, ()).seconds(1) == 0.0
     assert expected.seconds(9) == expected.seconds(2)
