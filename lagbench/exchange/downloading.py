@@ -207,11 +207,14 @@ class _Download:
         self._old = read_or_empty(size, root)
         meter.begin("checking", total=len(wanted), scenarios=len(wanted))
         findings = [
-            inspect_scenario(root, size, i, manifest=self._old, quick=True) for i in wanted
+            inspect_scenario(root, size, i, manifest=self._old, quick=True)
+            for i in wanted
         ]
         self._entries = [finding.entry for finding in findings if finding.entry]
         self.kept = [f.scenario for f in findings if f.state is DataSetState.GOOD]
-        self.missing = [f.scenario for f in findings if f.state is not DataSetState.GOOD]
+        self.missing = [
+            f.scenario for f in findings if f.state is not DataSetState.GOOD
+        ]
 
     def run(self, urls: Iterable[str]) -> Reason:
         """Fetch what is missing from stores in turn, unless one lies; return why

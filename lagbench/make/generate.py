@@ -388,19 +388,19 @@ def _scan_folder(
     old_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
     base = old.model_copy(update={"files": tuple(old_entries)})
 
-    kept = []
-    to_do = []
+    kept_ids = []
+    missing_ids = []
     for scenario in wanted_ids:
         is_there = scenario not in bad_ids or scenario in (gathered or ())
         if is_there and not force:
-            kept.append(scenario)
+            kept_ids.append(scenario)
         else:
-            to_do.append(scenario)
+            missing_ids.append(scenario)
     return _Scan(
         manifest=merged(size, base, [*hashed, *stored.values()]),
         hashed=tuple(hashed),
-        kept=tuple(kept),
-        to_do=estimate(size, to_do, on_cores=setup.is_on_cores),
+        kept=tuple(kept_ids),
+        to_do=estimate(size, missing_ids, on_cores=setup.is_on_cores),
     )
 
 

@@ -1,4 +1,4 @@
-"""Acceptance of the closed-box solver (design 4.3): Ghia's cavity, lid off, curl
+"""Acceptance of the closed-box solver: Ghia's cavity, lid off, curl
 noise.
 """
 
