@@ -32,7 +32,7 @@ Reals = NDArray[np.floating]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class SquareBox:
     """A square box whose walls lie half-way between nodes."""
 
     low: float  # coordinate of the left and bottom walls [length]
@@ -56,14 +56,14 @@ class Box:
         return np.asarray(self.low + self.spacing * middles, dtype=np.float64)
 
 
-def box_of(parameters: ClosedBoxParameters) -> Box:
+def box_of(parameters: ClosedBoxParameters) -> SquareBox:
     """Return the box that the parameters describe."""
     low = (parameters.wall + 0.5) / parameters.grid
     cells = parameters.grid - 2 * parameters.wall - 1
-    return Box(low=low, high=1.0 - low, cells=cells)
+    return SquareBox(low=low, high=1.0 - low, cells=cells)
 
 
-def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
+def occupancy(position: Reals, box: SquareBox) -> NDArray[np.int64]:
     """Return the particles in each cell, shape [cells, cells].
 
     A particle outside the box counts for the nearest cell.
@@ -74,7 +74,7 @@ def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
     return counts.reshape(box.cells, box.cells)
 
 
-def lid_corners(position: Reals, box: Box) -> NDArray[np.bool_]:
+def lid_corners(position: Reals, box: SquareBox) -> NDArray[np.bool_]:
     """Tell which particles lie in the 5 x 5 cells at either end of the top wall."""
     extent = CORNER_CELLS * box.spacing
     x = position[:, 0]
@@ -248,7 +248,9 @@ class Profiles:
         return CentreLines(u=np.asarray(self.u(Y)), v=np.asarray(self.v(X)))
 
 
-def extract(velocity: NDArray[np.floating], box: Box, lid_speed: float) -> Profiles:
+def extract(
+    velocity: NDArray[np.floating], box: SquareBox, lid_speed: float
+) -> Profiles:
     """Return the profiles of a nodal velocity between the walls.
 
     The velocity [length/s] has the shape [column, row, 2]. The profiles are cubic

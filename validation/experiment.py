@@ -237,7 +237,7 @@ def _check_lid(experiment: Experiment, sound_speed: float) -> None:
     )
 
 
-def _check_frequency(experiment: Experiment, box: diagnostics.Box) -> None:
+def _check_frequency(experiment: Experiment, box: diagnostics.SquareBox) -> None:
     frequency_max = min(box.cells // 2, _LARGEST_FREQUENCY)
     _require(
         1 <= experiment.frequency <= frequency_max,
@@ -249,7 +249,7 @@ def _check_frequency(experiment: Experiment, box: diagnostics.Box) -> None:
 
 
 def _check_reynolds(
-    experiment: Experiment, box: diagnostics.Box, reynolds: float
+    experiment: Experiment, box: diagnostics.SquareBox, reynolds: float
 ) -> None:
     _require(
         math.isfinite(reynolds) and reynolds > 0.0,
@@ -503,7 +503,7 @@ def _interior(parameters: ClosedBoxParameters) -> slice:
 
 
 def _check_state(
-    solver: ClosedBox, experiment: Experiment, box: diagnostics.Box, substep: int
+    solver: ClosedBox, experiment: Experiment, box: diagnostics.SquareBox, substep: int
 ) -> AcceptanceCheck:
     """Return the state of the box now."""
     position = solver.position()[0]

@@ -17,7 +17,7 @@ from lagbench.errors import UsageError
 from validation import __main__, diagnostics, experiment
 from validation.experiment import Case, plan
 
-BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
+BOX = diagnostics.SquareBox(low=0.0625, high=0.9375, cells=35)
 
 
 def _tabulated(
@@ -138,7 +138,7 @@ def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
 
     The middle lies on a node for 35 cells and between nodes for 34.
     """
-    box = diagnostics.Box(low=0.06, high=0.94, cells=cells)
+    box = diagnostics.SquareBox(low=0.06, high=0.94, cells=cells)
     s = (box.nodes - box.low) / box.width
     x, y = np.meshgrid(s, s, indexing="ij")
     u = 4.0 * x * (1.0 - x) * y**3
