@@ -2,7 +2,7 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """The closed box as one would write it in Taichi by habit: the yardstick of the solver.
 
-Same equations as ``lagbench.generators.closed_box`` (design 4.3), but the conventional
+Same equations as ``lagbench.generators.closed_box``, but the conventional
 way, after Taichi's own mpm128 example: one kernel launch per substep, every phase a
 parallel loop, float32 sums by atomics, Taichi's default fast math. Its sums depend on
 the order of threads, so no two runs agree to the bit.
@@ -28,13 +28,13 @@ import numpy as np
 import taichi as ti
 
 from lagbench.data import WALLS
-from lagbench.generators.acceptance.experiment import (
+from lagbench.generators.split import ClosedBoxParameters, InitialState
+from validation.experiment import (
     Case,
     initial_state,
     plan,
     solver_parameters,
 )
-from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
 @ti.data_oriented

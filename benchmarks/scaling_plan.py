@@ -30,7 +30,11 @@ from table_3_1 import THESIS, Row
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario
 from lagbench.data.statistics import file_moments
-from lagbench.generators.batch import Batch, SimulationJob, draw
+from lagbench.generators.batch import (
+    ScenarioBatch,
+    SimulationJob,
+    draw_initial_state,
+)
 from lagbench.generators.simulate import scenario_writer
 from lagbench.make.generate import generate
 
@@ -116,8 +120,8 @@ def measure_parts(row: Row, frames: int, root: Path) -> Parts:
     """Time the parts of a generation in this process."""
     size = registry_of(row, frames).size("fluid", "q")
     job = SimulationJob(size=size, scenarios=(0,), root=root)
-    drawing = min(timed(lambda: draw(size, 0)) for _ in range(3))
-    batch = Batch(job, lambda _: None)
+    drawing = min(timed(lambda: draw_initial_state(size, 0)) for _ in range(3))
+    batch = ScenarioBatch(job, lambda _: None)
     batch.solver.advance(1)
     solving = (
         min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3))

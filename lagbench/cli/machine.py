@@ -150,12 +150,12 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """
     tier = load().size(split, size)
     check_installed("taichi", extra="generate")
-    from lagbench.generators.batch import draw
+    from lagbench.generators.batch import draw_initial_state
     from lagbench.generators.constants import solver_constants
     from lagbench.generators.solver import build
 
     solver = build(solver_constants(tier))
-    solver.load([draw(tier, tier.subsets["test"][0])])
+    solver.load([draw_initial_state(tier, tier.subsets["test"][0])])
     solver.advance(WARM_UP * tier.substeps_per_frame)
     started = time.process_time()
     timed = 0

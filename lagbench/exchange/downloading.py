@@ -26,7 +26,11 @@ from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
-from lagbench.make.inventory import State, compare, examine
+from lagbench.make.inventory import (
+    DataSetState,
+    compare_hashes,
+    inspect_scenario,
+)
 from lagbench.make.plan import Scenarios, Selection, check_disk, select
 from lagbench.store.archive import (
     RELEASES,
@@ -142,7 +146,7 @@ def download(
             if store:
                 store.put_files(manifest, at_once=True)
         if not work.missing:
-            verdict = compare(tier, manifest)
+            verdict = compare_hashes(tier, manifest)
             if work.downloaded and tier.simulated:
                 if store:
                     store.fetch(held)
@@ -212,11 +216,14 @@ class _Download:
         self._old = read_or_empty(size, root)
         meter.begin("checking", total=len(wanted), scenarios=len(wanted))
         findings = [
-            examine(root, size, i, manifest=self._old, quick=True) for i in wanted
+            inspect_scenario(root, size, i, manifest=self._old, quick=True)
+            for i in wanted
         ]
         self._entries = [finding.entry for finding in findings if finding.entry]
-        self.kept = [f.scenario for f in findings if f.state is State.GOOD]
-        self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
+        self.kept = [f.scenario for f in findings if f.state is DataSetState.GOOD]
+        self.missing = [
+            f.scenario for f in findings if f.state is not DataSetState.GOOD
+        ]
 
     def run(self, urls: Iterable[str]) -> Reason:
         """Fetch what is missing from stores in turn, unless one lies; return why

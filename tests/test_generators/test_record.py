@@ -27,7 +27,7 @@ from lagbench.generators.record import (
 )
 from lagbench.make.generate import GenerationResult
 
-RELEASED = Path(__file__).parent / "data" / "released_hashes.json"
+RELEASED = Path(__file__).parents[1] / "data" / "released_hashes.json"
 
 
 def manifest_of(root: Path) -> Manifest:
@@ -63,7 +63,7 @@ def run(root: Path, registry: Path, *options: str) -> int:
 def test_what_is_recorded_is_what_was_measured(
     generated: GenerationResult, registry: Path, unmeasured_path: Path
 ) -> None:
-    """Hashes, statistics and the mean twin floor come back; what was written by hand is
+    """Hashes, statistics and the mean limit come back; what was written by hand is
     untouched.
     """
     assert run(generated.root, registry) == 0

@@ -1,7 +1,7 @@
-"""Quantities that tell whether a closed box simulates well: J, occupancy, energy,
-divergence, profiles.
+"""Quantities that tell whether a closed box simulates well.
 
-NumPy only; every function takes arrays, none a solver. Centre-line profiles of a
+These are J, occupancy, energy, divergence and profiles. NumPy only; every function
+takes arrays, none a solver. Centre-line profiles of a
 lid-driven cavity are compared with those of Ghia, Ghia & Shin:
 
 U. Ghia, K. N. Ghia, C. T. Shin, J. Comput. Phys. 48 (1982) 387-411, Tables I and II:
@@ -32,7 +32,7 @@ Reals = NDArray[np.floating]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Box:
+class SquareBox:
     """A square box whose walls lie half-way between nodes."""
 
     low: float  # coordinate of the left and bottom walls [length]
@@ -52,20 +52,21 @@ class Box:
     @property
     def nodes(self) -> NDArray[np.float64]:
         """Coordinates of the nodes between two walls [length], shape [cells]."""
-        return np.asarray(
-            self.low + self.spacing * (np.arange(self.cells) + 0.5), dtype=np.float64
-        )
+        middles = np.arange(self.cells) + 0.5
+        return np.asarray(self.low + self.spacing * middles, dtype=np.float64)
 
 
-def box_of(parameters: ClosedBoxParameters) -> Box:
+def box_of(parameters: ClosedBoxParameters) -> SquareBox:
     """Return the box that the parameters describe."""
     low = (parameters.wall + 0.5) / parameters.grid
-    return Box(low=low, high=1.0 - low, cells=parameters.grid - 2 * parameters.wall - 1)
+    cells = parameters.grid - 2 * parameters.wall - 1
+    return SquareBox(low=low, high=1.0 - low, cells=cells)
 
 
-def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
-    """Count the particles in each cell, shape [cells, cells]; one outside counts for
-    the nearest.
+def occupancy(position: Reals, box: SquareBox) -> NDArray[np.int64]:
+    """Return the particles in each cell, shape [cells, cells].
+
+    A particle outside the box counts for the nearest cell.
     """
     cell = np.floor((position - box.low) / box.spacing).astype(np.int64)
     column, row = np.clip(cell, 0, box.cells - 1).T
@@ -73,12 +74,15 @@ def occupancy(position: Reals, box: Box) -> NDArray[np.int64]:
     return counts.reshape(box.cells, box.cells)
 
 
-def lid_corners(position: Reals, box: Box) -> NDArray[np.bool_]:
+def lid_corners(position: Reals, box: SquareBox) -> NDArray[np.bool_]:
     """Tell which particles lie in the 5 x 5 cells at either end of the top wall."""
     extent = CORNER_CELLS * box.spacing
     x = position[:, 0]
     y = position[:, 1]
-    return (y > box.high - extent) & ((x < box.low + extent) | (x > box.high - extent))
+    is_at_top = y > box.high - extent
+    is_at_left = x < box.low + extent
+    is_at_right = x > box.high - extent
+    return is_at_top & (is_at_left | is_at_right)
 
 
 def kinetic_energy(velocity: Reals, mass: float) -> float:
@@ -87,42 +91,47 @@ def kinetic_energy(velocity: Reals, mass: float) -> float:
 
 
 def displacement_energy(after: Reals, before: Reals, mass: float) -> float:
-    """Return the kinetic energy of x(f) - x(f-1), taking the frame as the unit of
-    time.
-    """
-    return kinetic_energy(after.astype(np.float64) - before.astype(np.float64), mass)
+    """Return the kinetic energy of x(f) - x(f-1), with the frame as unit of time."""
+    displacement = after.astype(np.float64) - before.astype(np.float64)
+    return kinetic_energy(displacement, mass)
 
 
 @dataclass(frozen=True)
-class Rates:
-    """Velocity gradients of a flow."""
+class VelocityGradients:
+    """How much a flow diverges and turns."""
 
     divergence: float  # RMS of u_x + v_y [1/s]
     vorticity: float  # RMS of v_x - u_y [1/s]
 
     @property
     def ratio(self) -> float:
-        """Divergence over vorticity [1]; 0 for incompressible flow, NaN for a fluid at
-        rest.
+        """Divergence over vorticity [1].
+
+        It is 0 for incompressible flow, NaN for a fluid at rest.
         """
-        return (
-            self.divergence / self.vorticity if self.vorticity > 0.0 else float("nan")
-        )
+        if self.vorticity > 0.0:
+            return self.divergence / self.vorticity
+        return float("nan")
 
 
-def grid_rates(velocity: Reals, spacing: float) -> Rates:
-    """Return RMS divergence and vorticity of a nodal velocity [column, row, 2] by
-    central differences.
+def grid_rates(velocity: Reals, spacing: float) -> VelocityGradients:
+    """Return RMS divergence and vorticity of a nodal velocity by central differences.
+
+    The velocity has the shape [column, row, 2].
     """
     field = velocity.astype(np.float64)
     along_x = (field[2:, 1:-1] - field[:-2, 1:-1]) / (2.0 * spacing)
     along_y = (field[1:-1, 2:] - field[1:-1, :-2]) / (2.0 * spacing)
     divergence = along_x[..., 0] + along_y[..., 1]
     vorticity = along_x[..., 1] - along_y[..., 0]
-    return Rates(
-        divergence=float(np.sqrt(np.mean(divergence**2))),
-        vorticity=float(np.sqrt(np.mean(vorticity**2))),
+    return VelocityGradients(
+        divergence=_root_mean_square(divergence),
+        vorticity=_root_mean_square(vorticity),
     )
+
+
+def _root_mean_square(values: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 Array = NDArray[np.float64]
@@ -219,8 +228,8 @@ def deviation(
     measured: NDArray[np.float64], reference: NDArray[np.float64]
 ) -> Deviation:
     """Compare two profiles at the points where the reference has a value."""
-    known = ~np.isnan(reference)
-    difference = measured[known] - reference[known]
+    is_tabulated = ~np.isnan(reference)
+    difference = measured[is_tabulated] - reference[is_tabulated]
     return Deviation(
         rmse=float(np.sqrt(np.mean(difference**2))),
         maximum=float(np.max(np.abs(difference))),
@@ -229,9 +238,7 @@ def deviation(
 
 @dataclass(frozen=True)
 class Profiles:
-    """Velocity on the two centre lines, as splines in units of box width and lid
-    speed.
-    """
+    """Velocity on the two centre lines, in units of box width and lid speed."""
 
     u: CubicSpline  # u/U against height on x = 1/2
     v: CubicSpline  # v/U against abscissa on y = 1/2
@@ -241,33 +248,40 @@ class Profiles:
         return CentreLines(u=np.asarray(self.u(Y)), v=np.asarray(self.v(X)))
 
 
-def extract(velocity: NDArray[np.floating], box: Box, lid_speed: float) -> Profiles:
-    """Return the profiles of a nodal velocity between the walls [length/s], shape
-    [column, row, 2].
+def extract(
+    velocity: NDArray[np.floating], box: SquareBox, lid_speed: float
+) -> Profiles:
+    """Return the profiles of a nodal velocity between the walls.
 
-    Cubic splines through the nodes and the walls, where the fluid moves with the wall.
+    The velocity [length/s] has the shape [column, row, 2]. The profiles are cubic
+    splines through the nodes and the walls, where the fluid moves with the wall.
     """
     field = velocity.astype(np.float64) / lid_speed
     nodes = (box.nodes - box.low) / box.width
-    middle_u = _spline(nodes, field[:, :, 0], 0.0, 0.0)(0.5)
-    middle_v = _spline(nodes, field[:, :, 1].T, 0.0, 0.0)(0.5)
-    return Profiles(
-        u=_spline(nodes, middle_u, 0.0, 1.0), v=_spline(nodes, middle_v, 0.0, 0.0)
-    )
+    u = field[:, :, 0]
+    v = field[:, :, 1]
+    # u of every row on x = 1/2, v of every column on y = 1/2
+    u_on_line = _spline(nodes, u, 0.0, 0.0)(0.5)
+    v_on_line = _spline(nodes, v.T, 0.0, 0.0)(0.5)
+    u_profile = _spline(nodes, u_on_line, 0.0, 1.0)
+    v_profile = _spline(nodes, v_on_line, 0.0, 0.0)
+    return Profiles(u=u_profile, v=v_profile)
 
 
 def _spline(nodes: Array, values: Array, at_low: float, at_high: float) -> CubicSpline:
     """Interpolate along the first axis between a wall value at 0 and one at 1."""
-    low, high = (np.full((1, *values.shape[1:]), value) for value in (at_low, at_high))
-    return CubicSpline(
-        np.concatenate([[0.0], nodes, [1.0]]), np.concatenate([low, values, high])
-    )
+    wall_shape = (1, *values.shape[1:])
+    low = np.full(wall_shape, at_low)
+    high = np.full(wall_shape, at_high)
+    abscissae = np.concatenate([[0.0], nodes, [1.0]])
+    return CubicSpline(abscissae, np.concatenate([low, values, high]))
 
 
-def draw(
+def draw_profiles(
     profiles: Profiles, reference: CentreLines | None, title: str, path: Path
 ) -> None:
     """Draw u against height and v against abscissa, Ghia's points over them."""
+    # heavy: loaded only where a picture is asked for
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")

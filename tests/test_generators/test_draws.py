@@ -27,8 +27,10 @@ class Script:
 
     def random(self, size: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the next values in the wanted shape."""
-        taken = [self.values.pop(0) for _ in range(math.prod(size))]
-        return np.array(taken, dtype=np.float64).reshape(size)
+        count = math.prod(size)
+        first = self.values[:count]
+        del self.values[:count]
+        return np.array(first, dtype=np.float64).reshape(size)
 
 
 def source(name: str = "test") -> np.random.Generator:
@@ -64,17 +66,21 @@ def test_seed_text_rebuilds_the_stream() -> None:
     assert draws.entropy("curl-noise", "mini", 2, 11) == (int(digest[:16], 16), 2, 11)
     words = [int(word) for word in draws.seed_text("fluid", "tiny", 1, 3).split(", ")]
     again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
-    assert (
-        again.random(5).tolist()
-        == draws.generator("fluid", "tiny", 1, 3).random(5).tolist()
-    )
+    stream = draws.generator("fluid", "tiny", 1, 3)
+    assert again.random(5).tolist() == stream.random(5).tolist()
 
 
 def test_every_name_changes_the_stream() -> None:
     """Split, size, MAJOR and scenario each lead to other numbers."""
-    keys = [("cavity", "full", 1, 0), ("fluid", "full", 1, 0), ("cavity", "mini", 1, 0)]
-    keys += [("cavity", "full", 2, 0), ("cavity", "full", 1, 1)]
-    assert len({draws.generator(*key).random() for key in keys}) == len(keys)
+    keys = [
+        ("cavity", "full", 1, 0),
+        ("fluid", "full", 1, 0),
+        ("cavity", "mini", 1, 0),
+        ("cavity", "full", 2, 0),
+        ("cavity", "full", 1, 1),
+    ]
+    numbers = {draws.generator(*key).random() for key in keys}
+    assert len(numbers) == len(keys)
 
 
 @given(st.floats(-15.9, 15.9, allow_subnormal=False))
@@ -82,7 +88,9 @@ def test_quantise_rounds_to_the_nearest_exact_float32(value: float) -> None:
     """The result is a multiple of 2^-20, the nearest one, halves to even, exact in
     float32 and stable.
     """
-    assert draws.quantise([0.5 * 2.0**-20, 1.5 * 2.0**-20]).tolist() == [0.0, 2.0**-19]
+    quantum = 2.0**-20
+    halves = draws.quantise([0.5 * quantum, 1.5 * quantum])
+    assert halves.tolist() == [0.0, 2.0 * quantum]
     result = float(draws.quantise(value))
     assert (result * 2**20).is_integer()
     assert abs(result - value) <= 2.0**-21
@@ -105,7 +113,8 @@ def test_uniform_follows_its_law() -> None:
     """Kolmogorov-Smirnov against the uniform law, and both ends hold."""
     rng = source()
     values = [draws.uniform(rng, -0.3, 0.5) for _ in range(2000)]
-    assert stats.kstest(values, stats.uniform(-0.3, 0.8).cdf).pvalue > 0.01
+    law = stats.uniform(-0.3, 0.8)
+    assert stats.kstest(values, law.cdf).pvalue > 0.01
     assert draws.uniform(Script(0.0), -0.25, 0.5) == -0.25
     assert draws.uniform(Script(0.5), -0.25, 0.75) == 0.25
 
@@ -116,7 +125,8 @@ def test_log_uniform_follows_its_law() -> None:
     """
     rng = source()
     values = [draws.log_uniform(rng, 20.0, 400.0) for _ in range(2000)]
-    assert stats.kstest(values, stats.loguniform(20.0, 400.0).cdf).pvalue > 0.01
+    law = stats.loguniform(20.0, 400.0)
+    assert stats.kstest(values, law.cdf).pvalue > 0.01
     assert draws.log_uniform(Script(0.0), 20.0, 400.0) == 20.0
     # Half-way in the logarithm lies the geometric mean, sqrt(20 * 400).
     assert draws.log_uniform(Script(0.5), 20.0, 400.0) == math.sqrt(8000.0)
@@ -134,10 +144,10 @@ def test_log_uniform_agrees_with_extended_precision(
     """It is the 80-bit result of low (high/low)^u to one unit in the last place."""
     least = np.longdouble(low)
     most = np.longdouble(low * ratio)
-    wide = least * np.exp(np.log(most / least) * np.longdouble(u))
-    assert draws.log_uniform(Script(u), low, low * ratio) == pytest.approx(
-        float(wide), rel=2.3e-16, abs=0.0
-    )
+    span = np.log(most / least)
+    wide = least * np.exp(span * np.longdouble(u))
+    expected = pytest.approx(float(wide), rel=2.3e-16, abs=0.0)
+    assert draws.log_uniform(Script(u), low, low * ratio) == expected
 
 
 def test_normal_has_the_moments_of_twelve_uniforms() -> None:
@@ -150,9 +160,11 @@ def test_normal_has_the_moments_of_twelve_uniforms() -> None:
     assert abs(stats.skew(values)) < 0.03
     assert stats.kurtosis(values) == pytest.approx(-0.1, abs=0.05)
     assert stats.kstest(values[:2000], stats.norm.cdf).pvalue > 0.01
-    assert draws.normal(Script(*([0.0] * 12)), 0.5, (1,)).tolist() == [-3.0]
-    one, two = (draws.normal(source(), deviation, (50, 2)) for deviation in (0.35, 0.7))
-    assert (2.0 * one == two).all()
+    zeros = Script(*([0.0] * 12))
+    assert draws.normal(zeros, 0.5, (1,)).tolist() == [-3.0]
+    narrow = draws.normal(source(), 0.35, (50, 2))
+    wide = draws.normal(source(), 0.7, (50, 2))
+    assert (2.0 * narrow == wide).all()
 
 
 def test_choice_is_fair_and_never_reaches_its_count() -> None:
@@ -163,7 +175,8 @@ def test_choice_is_fair_and_never_reaches_its_count() -> None:
         assert draws.choice(Script(1.0 - 2.0**-53), count) == count - 1
         assert draws.choice(Script(0.0), count) == 0
     rng = source()
-    counts = np.bincount([draws.choice(rng, 6) for _ in range(3000)], minlength=6)
+    choices = [draws.choice(rng, 6) for _ in range(3000)]
+    counts = np.bincount(choices, minlength=6)
     assert stats.chisquare(counts).pvalue > 0.01
 
 

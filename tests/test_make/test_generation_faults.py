@@ -135,7 +135,7 @@ def test_a_worker_on_a_full_disk_names_the_file(
     tmp_path: Path, unmeasured: Registry
 ) -> None:
     """/dev/full answers every write with ENOSPC; the error carries the path and the
-    remedy.
+    suggest_repair.
     """
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
@@ -180,7 +180,8 @@ CALL = "from lagbench.__main__ import app; app()"
 
 INTERRUPTED = f"""
 import os, signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+# a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from lagbench.make import generate
 write = generate.write_manifest
 def write_first(*arguments):

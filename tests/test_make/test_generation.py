@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import DRAW, SIZE, SPLIT
+from conftest import PAINT, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
 from lagbench.data import WALLS
@@ -23,10 +23,15 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import DataError, UsageError, WorkFailedError
-from lagbench.generators.batch import draw, substeps_of
+from lagbench.generators.batch import (
+    draw_initial_state,
+    start_frame,
+    substep_count,
+)
 from lagbench.generators.draws import generator
-from lagbench.generators.simulate import active_frames, nudge
-from lagbench.make import cards
+from lagbench.generators.simulate import active_frames, draw_perturbation
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.plan import SECONDS_TO_START, estimate, select
 from lagbench.work.progress import Progress
@@ -98,7 +103,7 @@ def test_a_file_holds_what_its_scenario_says(
         first = file.read("position", 0)
         material = file.read("material")
         velocity = file.read("velocity", 0)
-    state = draw(size, 3)
+    state = draw_initial_state(size, 3)
     np.testing.assert_array_equal(first, state.position.astype(np.float32))
     np.testing.assert_array_equal(velocity, state.velocity.astype(np.float32))
     np.testing.assert_array_equal(material, state.material)
@@ -116,7 +121,7 @@ def test_cavity_files_hold_the_walls_of_every_frame(
     """Row f of ``wall_velocity`` is what the program says of frame f, counted from
     where recording starts.
     """
-    state = draw(load().size("cavity", "tiny"), 3)
+    state = draw_initial_state(load().size("cavity", "tiny"), 3)
     with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
         walls = file.read("wall_velocity")
         start = file.header.parameters["start_frame"]
@@ -174,8 +179,8 @@ def test_facts_of_the_manifest_follow_from_the_files(
     """Energies are sums over the stored velocities; speed, CFL number and J stay in
     their bounds.
 
-    A twin's RMSE is known for each predicted frame; after one frame it is still near
-    2^-20.
+    The predictability limit is known for each predicted frame; after one frame it is
+    still near 2^-20.
     """
     horizon = unmeasured.size(SPLIT, SIZE).task.horizon
     for entry in manifest_of(generated.root).files:
@@ -185,12 +190,13 @@ def test_facts_of_the_manifest_follow_from_the_files(
         energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
         facts = entry.facts
         last = energy[-1]
-        known = {"first": energy[0], "last": last, "mean": energy.mean()}
-        known = {f"kinetic_energy_{name}": value for name, value in known.items()}
-        for name, value in {
-            **known,
+        expected = {
+            "kinetic_energy_first": energy[0],
+            "kinetic_energy_last": last,
+            "kinetic_energy_mean": energy.mean(),
             "energy_last_over_max": last / energy.max(),
-        }.items():
+        }
+        for name, value in expected.items():
             assert facts[name] == pytest.approx(value, rel=1e-12), name
         assert facts["max_speed"] >= np.abs(velocity).max()
         assert 0.0 < facts["cfl"] < 1.0
@@ -200,15 +206,15 @@ def test_facts_of_the_manifest_follow_from_the_files(
         assert all(floor < 1e-4 for floor in entry.twin_floor)
 
 
-def test_the_nudge_has_a_stream_of_its_own(unmeasured: Registry) -> None:
+def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -> None:
     """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario
     is drawn.
     """
     size = unmeasured.size(SPLIT, SIZE)
-    signs = nudge(size, 3) * 2**20
+    signs = draw_perturbation(size, 3) * 2**20
     assert set(np.unique(signs)) == {-1.0, 1.0}
     assert abs(signs.mean()) < 0.1
-    assert not np.array_equal(signs, nudge(size, 4) * 2**20)
+    assert not np.array_equal(signs, draw_perturbation(size, 4) * 2**20)
     plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
     assert not np.array_equal(signs > 0, plain >= 0.5)
 
@@ -319,7 +325,7 @@ def test_a_dry_run_touches_nothing(
 
 
 def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> None:
-    """Substeps of the scenario and of its twin are counted, none twice."""
+    """Substeps of the scenario and of its perturbed run are counted, none twice."""
     news: list[Progress] = []
     generate(
         SPLIT,
@@ -331,7 +337,7 @@ def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> Non
     )
     size = unmeasured.size(SPLIT, SIZE)
     simulating = [state for state in news if state.stage == "simulating"]
-    assert simulating[0].total == 2 * substeps_of(size, 3) == 2 * 25 * 12
+    assert simulating[0].total == 2 * substep_count(size, 3) == 2 * 25 * 12
     assert [state.done for state in simulating] == sorted(
         state.done for state in simulating
     )
@@ -346,7 +352,7 @@ def test_batches_start_each_scenario_at_its_own_frame(
     equal hashes.
     """
     size = load().size("cavity", "tiny")
-    assert len({draw(size, i).start_frame for i in range(3)}) == 3
+    assert len({draw_initial_state(size, i).start_frame for i in range(3)}) == 3
     batch = generate(
         "cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2"
     )
@@ -379,9 +385,9 @@ def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
     assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
     assert select(size, scenarios=[5, 3, 5]) == (3, 5)
     assert [type(i) for i in select(size, scenarios=np.arange(3, 5))] == [int, int]
-    for odd in (3, [3.0], [None]):
+    for no_ids in (3, [3.0], [None]):
         with pytest.raises(UsageError):
-            select(size, scenarios=odd)  # type: ignore[arg-type]
+            select(size, scenarios=no_ids)  # type: ignore[arg-type]
     assert len(select(size)) == 87
 
 
@@ -394,28 +400,123 @@ def test_estimates_add_up(unmeasured: Registry) -> None:
     assert expected.substeps == (31 * 5, 31 * 5)
     assert expected.frames == 64
     assert expected.bytes == 2 * (32 * 256 * 16 + 65536)
-    one, two = (
-        expected.seconds(workers) - SECONDS_TO_START for workers in (1, 2)
-    )  # all compile
+    # all workers compile
+    one = expected.seconds(1) - SECONDS_TO_START
+    two = expected.seconds(2) - SECONDS_TO_START
     assert one == pytest.approx(2 * two)
     assert estimate(size, ()).seconds(1) == 0.0
     assert expected.seconds(9) == expected.seconds(2)
 
 
-def test_a_few_drawn_scenarios_stand_for_all(unmeasured: Registry) -> None:
-    """Exact where none begins late; a cavity begins 60 to 120 frames before frame 0, so
-    that it is near.
+GENERATOR = """
+import os
+from pathlib import Path
+from lagbench.generators import cavity
+from lagbench.generators.cavity import solver_parameters, start_frame
+
+def initial_state(size, scenario, rng):
+    with Path(os.environ["DRAWS"]).open("a") as log:
+        log.write(f"{os.getpid()} {scenario}\\n")
+    return cavity.initial_state(size, scenario, rng)
+"""
+
+
+@pytest.fixture
+def draw_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file to which the module ``counted_cavity`` writes its draws, in any
+    process.
     """
-    fluid = unmeasured.size("fluid", "tiny")
-    cavity = unmeasured.size("cavity", "mini")
-    assert estimate(fluid, fluid.scenarios, drawn=1) == estimate(fluid, fluid.scenarios)
-    found, exact = (estimate(cavity, cavity.scenarios, drawn=n) for n in (2, None))
-    assert found.core_seconds == pytest.approx(exact.core_seconds, rel=0.25)
-    assert (found.scenarios, found.bytes, found.frames) == (
-        exact.scenarios,
-        exact.bytes,
-        exact.frames,
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    (modules / "counted_cavity.py").write_text(GENERATOR)
+    monkeypatch.syspath_prepend(modules)
+    log = tmp_path / "draws.txt"
+    log.touch()
+    monkeypatch.setenv("DRAWS", str(log))
+    return log
+
+
+@pytest.fixture
+def counted_registry() -> Registry:
+    """The cavity, drawn by a module that logs its draws."""
+    split = load().split("cavity").model_copy(update={"generator": "counted_cavity"})
+    return Registry({"cavity": split}, {})
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Perturbed runs of test start from the same draw; the parent draws nothing."""
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", workers=1, registry=counted_registry
     )
+    assert result.complete
+    lines = draw_log.read_text().splitlines()
+    processes = {line.split()[0] for line in lines}
+    drawn = sorted(int(line.split()[1]) for line in lines)
+    assert drawn == [0, 1, 2, 3, 4]
+    assert len(processes) == 1
+    assert str(os.getpid()) not in processes
+
+
+def test_planning_draws_no_scenario(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Estimate, dry run and the count of substeps need the first frame alone."""
+    size = counted_registry.size("cavity", SIZE)
+    counts = [substep_count(size, scenario) for scenario in size.scenarios]
+    assert estimate(size, size.scenarios).substeps == tuple(counts)
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", dry_run=True, registry=counted_registry
+    )
+    assert result.simulated == size.scenarios
+    assert draw_log.read_text() == ""
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+@pytest.mark.parametrize("tier", ["tiny", "mini"])
+def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> None:
+    size = load().size(split, tier)
+    for scenario in size.scenarios[:8]:
+        state = draw_initial_state(size, scenario)
+        assert start_frame(size, scenario) == state.start_frame
+
+
+def test_a_split_that_hides_its_first_frame_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late start without the function that tells of it would be planned too short."""
+    (tmp_path / "late_cavity.py").write_text(
+        "from lagbench.generators.cavity import initial_state, solver_parameters\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    size = load().size("cavity", SIZE)
+    late = size.model_copy(update={"generator": "late_cavity"})
+    with pytest.raises(UsageError) as caught:
+        draw_initial_state(late, 0)
+    assert caught.value.where == "late_cavity.initial_state, scenario 0"
+
+
+LOADED = """
+import sys
+from lagbench.make.generate import generate
+from lagbench.data.registry import load
+from pathlib import Path
+generate(sys.argv[1], sys.argv[2], root=sys.argv[3], registry=load(Path(sys.argv[4])))
+print(*(name for name in sys.modules if name.startswith("lagbench.figures.")))
+"""
+
+
+def test_a_generation_that_paints_nothing_loads_no_drawing_module(
+    copied: Callable[[], Path], unmeasured: Registry, unmeasured_path: Path
+) -> None:
+    """Where everything is there, the card's tables are formatted, and that is all."""
+    root = copied()
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    command = [sys.executable, "-c", LOADED, SPLIT, SIZE, root, unmeasured_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["lagbench.figures.tables"]
 
 
 @pytest.mark.parametrize("dry_run", [True, False])
@@ -438,14 +539,14 @@ def test_a_registry_of_ones_own_is_all_that_counts(
     """A split that only the given registry knows is generated, drawn and described with
     its own title.
     """
-    monkeypatch.setattr(cards, "_draw", DRAW)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate(
         "own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own
     )
     assert "# Noise of our own" in (result.folder / "README.md").read_text()
-    assert all((result.folder / name).stat().st_size > 1000 for name in cards.PICTURES)
+    assert all((result.folder / name).stat().st_size > 1000 for name in PICTURES)
 
 
 WORKER = """
@@ -454,10 +555,13 @@ from pathlib import Path
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.data.registry import load
-size = load(Path(sys.argv[1])).size(sys.argv[2], "full")
+registry, split, scenario, root = sys.argv[1:]
+size = load(Path(registry)).size(split, "full")
 short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
-simulate(SimulationJob(size=short, scenarios=(int(sys.argv[3]),), root=Path(sys.argv[4])), lambda units: None)
-heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"} & sys.modules.keys()
+job = SimulationJob(size=short, scenarios=(int(scenario),), root=Path(root))
+simulate(job, lambda units: None)
+heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"}
+heavy &= sys.modules.keys()
 # ru_maxrss would be that of the test process, from which this one was forked.
 peak = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]
 print(peak, sorted(heavy))

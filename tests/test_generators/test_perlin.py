@@ -18,9 +18,8 @@ NUMBERS = st.floats(-2, 2, allow_subnormal=False)
 
 def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
     """Return reproducible points of a square."""
-    return low + (high - low) * np.random.Generator(np.random.PCG64(5)).random(
-        (count, 2)
-    )
+    rng = np.random.Generator(np.random.PCG64(5))
+    return low + (high - low) * rng.random((count, 2))
 
 
 def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
@@ -40,7 +39,9 @@ def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
 
     u = fade(x - i)
     w = fade(y - j)
-    return lerp(u, lerp(w, dot(0, 0), dot(0, 1)), lerp(w, dot(1, 0), dot(1, 1)))
+    left = lerp(w, dot(0, 0), dot(0, 1))
+    right = lerp(w, dot(1, 0), dot(1, 1))
+    return lerp(u, left, right)
 
 
 def psi_by_hand(
@@ -52,7 +53,8 @@ def psi_by_hand(
     value = scale * (HIGH - LOW) * noise_by_hand(x * frequency, y * frequency, lattice)
     for wall in (x, 1 - x, y, 1 - y):
         t = 2 * frequency * wall
-        value *= (15 * t - 10 * t**3 + 3 * t**5) / 8 if t < 1 else 1.0
+        if t < 1:
+            value *= (15 * t - 10 * t**3 + 3 * t**5) / 8
     return float(value)
 
 
@@ -77,21 +79,27 @@ def test_jets_differentiate_polynomials(
     exact = Polynomial(coefficients)
     first = exact.deriv(1)(x * y)
     second = exact.deriv(2)(x * y)
-    expected = [exact(x * y), y * first, x * first]
-    expected += [y * y * second, first + x * y * second, x * x * second]
-    found = [term[0] for term in (p.value, p.x, p.y, p.xx, p.xy, p.yy)]
-    assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
+    expected = [
+        exact(x * y),
+        y * first,
+        x * first,
+        y * y * second,
+        first + x * y * second,
+        x * x * second,
+    ]
+    terms = (p.value, p.x, p.y, p.xx, p.xy, p.yy)
+    derivatives = [term[0] for term in terms]
+    assert derivatives == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
     """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
     lattice = lattice_of(3)
-    node = np.array([(i, j) for i in range(4) for j in range(4)], dtype=np.float64)
-    found = noise.noise(*noise.coordinates(node), lattice)
-    np.testing.assert_allclose(found.value, 0.0, atol=1e-15)
-    np.testing.assert_allclose(
-        np.stack([found.x, found.y], -1), lattice.reshape(-1, 2), atol=1e-14
-    )
+    node = np.array(list(np.ndindex(4, 4)), dtype=np.float64)
+    field = noise.noise(*noise.coordinates(node), lattice)
+    np.testing.assert_allclose(field.value, 0.0, atol=1e-15)
+    slope = np.stack([field.x, field.y], -1)
+    np.testing.assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
     large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
     np.testing.assert_allclose(np.hypot(*large.T), 1.0, rtol=3e-16)
     assert len(np.unique(large, axis=0)) == 14 * 14
@@ -101,8 +109,10 @@ def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
 def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
     """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
     lattice = lattice_of(5)
-    found = noise.noise(*noise.coordinates(np.array([[x, y]])), lattice)
-    assert found.value[0] == pytest.approx(noise_by_hand(x, y, lattice), abs=1e-13)
+    point = noise.coordinates(np.array([[x, y]]))
+    field = noise.noise(*point, lattice)
+    expected = noise_by_hand(x, y, lattice)
+    assert field.value[0] == pytest.approx(expected, abs=1e-13)
 
 
 def test_ramp_joins_one_with_two_derivatives() -> None:
@@ -110,10 +120,11 @@ def test_ramp_joins_one_with_two_derivatives() -> None:
     on.
     """
     t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
-    found = noise.ramp(noise.coordinates(t)[0])
-    np.testing.assert_allclose(found.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
-    np.testing.assert_allclose(found.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
-    np.testing.assert_allclose(found.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
+    along_x, _ = noise.coordinates(t)
+    ramp = noise.ramp(along_x)
+    np.testing.assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(ramp.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
 
 
 @pytest.mark.parametrize("frequency", [1, 2, 4, 13])
@@ -126,13 +137,10 @@ def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
     position = points(60, LOW + 0.001, HIGH - 0.001)
     psi = stream(position, lattice)
     for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
-        above, below = (
-            np.array([psi_by_hand(p + sign * offset, lattice, 0.01) for p in position])
-            for sign in (1, -1)
-        )
-        np.testing.assert_allclose(
-            term, (above - below) / (2 * step), atol=2e-9 * frequency
-        )
+        above = np.array([psi_by_hand(p + offset, lattice, 0.01) for p in position])
+        below = np.array([psi_by_hand(p - offset, lattice, 0.01) for p in position])
+        slope = (above - below) / (2 * step)
+        np.testing.assert_allclose(term, slope, atol=2e-9 * frequency)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])
@@ -142,18 +150,15 @@ def test_hessian_by_numerical_differentiation(frequency: int) -> None:
     step = 1e-6
     position = points(200, LOW + 0.001, HIGH - 0.001)
     here = stream(position, lattice)
-    for (along_x, along_y), offset in zip(
-        ((here.xx, here.xy), (here.xy, here.yy)), np.eye(2) * step, strict=True
-    ):
+    tolerance = 2e-5 * frequency**2
+    rows = ((here.xx, here.xy), (here.xy, here.yy))
+    for (along_x, along_y), offset in zip(rows, np.eye(2) * step, strict=True):
         after = stream(position + offset, lattice)
         before = stream(position - offset, lattice)
-        for exact, difference in (
-            (along_x, after.x - before.x),
-            (along_y, after.y - before.y),
-        ):
-            np.testing.assert_allclose(
-                exact, difference / (2 * step), atol=2e-5 * frequency**2
-            )
+        slope_x = (after.x - before.x) / (2 * step)
+        slope_y = (after.y - before.y) / (2 * step)
+        np.testing.assert_allclose(along_x, slope_x, atol=tolerance)
+        np.testing.assert_allclose(along_y, slope_y, atol=tolerance)
 
 
 @pytest.mark.parametrize("frequency", [1, 4, 13])

@@ -20,7 +20,7 @@ SPLITS = tuple(load().splits)
 def test_tiny_is_made_to_the_bit(
     split: str, tiny_split: Callable[..., GenerationResult]
 ) -> None:
-    """All of tiny: scenario, subset and data set hashes, statistics and twin floor."""
+    """All of tiny: scenario, subset and data set hashes, statistics and limit."""
     size = load().size(split, "tiny")
     measured = size.measured
     assert measured is not None

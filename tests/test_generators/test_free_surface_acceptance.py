@@ -1,5 +1,4 @@
-"""Acceptance of the free-surface solver (design 4.4) on scenarios of the registry and
-set pieces.
+"""Acceptance of the free-surface solver on scenarios of the registry and set pieces.
 
 Sloshing is chaotic, so the bounds are statistical; every family and pair runs at least
 twice, in three commits.
@@ -72,9 +71,9 @@ def spacing(state: InitialState) -> float:
 @functools.cache
 def history(split: str, size: str, scenario_id: int, frames: int) -> History:
     """Run a scenario of the registry once for all tests."""
-    chosen = constants(split, size)
+    solver_parameters = constants(split, size)
     state = state_of(split, size, scenario_id)
-    solver = start(chosen, [state])
+    solver = start(solver_parameters, [state])
     substeps = registry.load().size(split, size).substeps_per_frame
     kinetic = []
     total = []
@@ -93,7 +92,7 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
             gap = max(gap, longest_edge(rope))
         energy = solver.energy()
     return History(
-        parameters=chosen,
+        parameters=solver_parameters,
         state=state,
         kinetic=np.array([*kinetic, energy.kinetic[0]]),
         total=np.array([*total, energy.total[0]]),
@@ -109,9 +108,8 @@ def longest_edge(position: Array) -> float:
     spanning tree.
     """
     triangles = Delaunay(position).simplices
-    first, second = np.concatenate(
-        [triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]
-    ).T
+    sides = [triangles[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]
+    first, second = np.concatenate(sides).T
     length = np.linalg.norm(position[first] - position[second], axis=1)
     graph = coo_matrix((length, (first, second)), shape=(len(position), len(position)))
     return float(minimum_spanning_tree(graph.tocsr()).data.max())
@@ -172,17 +170,18 @@ def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
     stays in one piece.
 
     Every particle of a rope has a neighbour within 2 spacings, and no gap grows by
-    half. The seeds themselves hang together by gaps of 2.0 to 2.4 spacings, the rows of
-    the R2 lattice, so the gap of the spanning tree is compared with its own start.
+    half. The first points themselves hang together by gaps of 2.0 to 2.4 spacings, the
+    rows of the R2 lattice, so the gap of the spanning tree is compared with its own
+    start.
     """
     run = history(split, "full", scenario_id, 600)
     assert_sound(run)
     assert run.kinetic[-1] <= 0.03 * run.kinetic.max()
     rope = run.state.material == Material.ROPE
     if rope.any():
-        neighbour = np.asarray(
-            cKDTree(run.position[rope]).query(run.position[rope], k=2)[0]
-        )[:, 1]
+        position = run.position[rope]
+        distance, _ = cKDTree(position).query(position, k=2)
+        neighbour = np.asarray(distance)[:, 1]
         assert neighbour.max() <= 2.0 * spacing(run.state)
         assert run.largest_gap <= 1.5 * longest_edge(run.state.position[rope])
 
@@ -201,17 +200,13 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
     low = p.wall * cell
     columns = 16
     width = 1.0 - 2.0 * low
-    column = np.clip(
-        (run.position[:, 0] - low) / width * columns, 0, columns - 1
-    ).astype(int)
-    top = (
-        np.array(
-            [np.quantile(run.position[column == c, 1], 0.98) for c in range(columns)]
-        )
-        - low
-    )
+    x, y = run.position.T
+    share = (x - low) / width
+    column = np.clip(share * columns, 0, columns - 1).astype(int)
+    heights = [np.quantile(y[column == c], 0.98) for c in range(columns)]
+    top = np.array(heights) - low
     np.testing.assert_allclose(top, run.state.area / width, rtol=0.25)
-    below = low + top[column] - run.position[:, 1]
+    below = low + top[column] - y
     deep = below > 2.0 * cell
     density = relative_density(run.position, run.state.area, p)[deep]
     assert abs(density.mean() - 1.0) <= 0.02
@@ -232,19 +227,19 @@ def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
     apart.
     """
     height = 3 / 64 + 0.45 + shape.reach[1]
-    state = scenario(
-        FULL, Part(Material.SNOW, shape, (0.5, height)), seed=seed, friction=0.3
-    )
+    snow = Part(Material.SNOW, shape, (0.5, height))
+    state = scenario(FULL, snow, seed=seed, friction=0.3)
     solver = start(FULL, [state])
     solver.advance(150 * FRAME)
-    assert 0.40 <= (solver.volume_ratio()[0] < 1.0).mean() <= 0.85
-    pairs = cKDTree(state.position).query_pairs(
-        1.5 * spacing(state), output_type="ndarray"
-    )
+    is_compacted = solver.volume_ratio()[0] < 1.0
+    assert 0.40 <= is_compacted.mean() <= 0.85
+
+    reach = 1.5 * spacing(state)
+    tree = cKDTree(state.position)
+    first, second = tree.query_pairs(reach, output_type="ndarray").T
     x = solver.position()[0].astype(np.float64)
-    torn = np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1) > 3.0 * spacing(
-        state
-    )
+    distance = np.linalg.norm(x[first] - x[second], axis=1)
+    torn = distance > 3.0 * spacing(state)
     assert torn.mean() >= 0.05
 
 
@@ -256,11 +251,8 @@ def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
     """
     radius = 0.126
     drop = 0.45
-    state = scenario(
-        FULL,
-        Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius)),
-        seed=seed,
-    )
+    ball = Part(Material.JELLY, Disc(radius), (0.5, 3 / 64 + drop + radius))
+    state = scenario(FULL, ball, seed=seed)
     solver = start(FULL, [state])
     heights = []
     for _ in range(120):
@@ -276,7 +268,8 @@ def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
     b = after - after.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     turn = u @ np.diag([1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    assert np.sqrt(((a @ turn - b) ** 2).sum(axis=1).mean()) <= 0.03 * radius
+    square = ((a @ turn - b) ** 2).sum(axis=1)
+    assert np.sqrt(square.mean()) <= 0.03 * radius
 
 
 @pytest.mark.slow

@@ -17,8 +17,8 @@ from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import WorkFailedError
 from lagbench.generators import batch
-from lagbench.generators import simulate as twin
-from lagbench.generators.batch import Batch, SimulationJob
+from lagbench.generators import simulate as simulation
+from lagbench.generators.batch import ScenarioBatch, SimulationJob
 from lagbench.generators.closed_box import ClosedBox
 from lagbench.generators.constants import split_module
 from lagbench.generators.simulate import simulate
@@ -63,7 +63,7 @@ def first_bad(size: Size, scenarios: tuple[int, ...]) -> tuple[int, int]:
         threads=1,
     )
     for scenario in scenarios:
-        solver.load([batch.draw(size, scenario)])
+        solver.load([batch.draw_initial_state(size, scenario)])
         for substep in range(1, 313):
             try:
                 solver.advance(1)
@@ -143,20 +143,22 @@ def test_a_good_run_loads_its_states_once(
     assert loads == [1]
 
 
-def test_a_twin_is_replayed_with_its_nudge(
+def test_a_perturbed_run_is_replayed_with_its_perturbation(
     copied: Callable[[], Path], unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A nudge that is not a number breaks the twin, in the replay as well, one substep
-    later.
+    """A perturbation that is not a number breaks the run, in the replay as well, one
+    substep later.
     """
     size = unmeasured.size(SPLIT, SIZE)
 
     monkeypatch.setattr(
-        twin, "nudge", lambda size, _: np.full((size.particles, 2), np.nan, np.float32)
+        simulation,
+        "draw_perturbation",
+        lambda size, _: np.full((size.particles, 2), np.nan, np.float32),
     )
     job = SimulationJob(size=size, scenarios=(3,), root=copied())
     with pytest.raises(WorkFailedError, match="blew up") as caught:
-        twin.twin_floors(job, lambda units: None)
+        simulation.measure_predictability(job, lambda units: None)
     start = (size.task.input_frames - 1) * size.substeps_per_frame
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 3, substep {start + 1}"
     assert caught.value.expected == "every number is finite"
@@ -168,7 +170,7 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
     """Where the replay passes (a bit that flipped), the range of the first report is
     all there is.
     """
-    running = Batch(
+    running = ScenarioBatch(
         SimulationJob(size=stiff, scenarios=(2,), root=tmp_path), lambda units: None
     )
     failed: list[int] = []

@@ -16,7 +16,7 @@ DX = 1.0 / 32.0
 
 
 @ti.kernel
-def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201
     x: ti.types.ndarray(),  # type: ignore[valid-type]
     rows: ti.types.ndarray(),  # type: ignore[valid-type]
     base: ti.types.ndarray(),  # type: ignore[valid-type]
@@ -29,7 +29,7 @@ def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201, D103
 
 
 @ti.kernel
-def evaluate(  # type: ignore[no-untyped-def] # noqa: ANN201, D103
+def evaluate(  # type: ignore[no-untyped-def] # noqa: ANN201
     value: ti.types.ndarray(),  # type: ignore[valid-type]
     fixed: ti.types.ndarray(),  # type: ignore[valid-type]
     out: ti.types.ndarray(),  # type: ignore[valid-type]
@@ -50,48 +50,67 @@ def test_weights_are_the_quadratic_b_spline() -> None:
     """Each weight is a product of SciPy's B-splines; moments are 1, 0 and dx^2/4; the
     rest fits.
     """
-    x = (np.random.default_rng(0).random((500, 2)) * 0.9 + 0.05).astype(np.float32)
-    rows = np.zeros((500, 3, 4), np.float32)
-    base = np.zeros(500, np.int32)
+    count = 500
+    unit = np.random.default_rng(0).random((count, 2))
+    x = (unit * 0.9 + 0.05).astype(np.float32)
+    rows = np.zeros((count, 3, 4), np.float32)
+    base = np.zeros(count, np.int32)
     evaluate_stencil(x, rows, base)
+
+    # distance of each of the three nodes per axis [cells], shape [point, 3, 2]
     node = np.stack(np.divmod(base, 33), axis=-1)
-    weight = rows[:, :, :3]
-    distance = (node[:, None, :] + np.arange(3)[None, :, None]) - x[:, None, :].astype(
-        np.float64
-    ) / DX
+    nodes = node[:, None, :] + np.arange(3)[None, :, None]
+    scaled = x[:, None, :].astype(np.float64) / DX
+    distance = nodes - scaled
     assert np.abs(distance).max() <= 1.5
-    spline = BSpline.basis_element([-1.5, -0.5, 0.5, 1.5], extrapolate=False)(distance)
-    np.testing.assert_allclose(
-        weight, spline[:, :, None, 0] * spline[:, None, :, 1], rtol=0, atol=2e-6
-    )
-    np.testing.assert_allclose(weight.sum(axis=(1, 2)), 1.0, rtol=0, atol=1e-6)
-    for axis, along in enumerate((weight.sum(axis=2), weight.sum(axis=1))):
-        np.testing.assert_allclose(
-            (along * distance[:, :, axis]).sum(axis=1), 0.0, rtol=0, atol=4e-6
-        )
-        np.testing.assert_allclose(
-            (along * distance[:, :, axis] ** 2).sum(axis=1), 0.25, rtol=0, atol=4e-6
-        )
-        np.testing.assert_allclose(
-            rows[:, axis + 1, 3], -distance[:, 1, axis], rtol=0, atol=1e-6
-        )
+
+    knots = [-1.5, -0.5, 0.5, 1.5]
+    basis = BSpline.basis_element(knots, extrapolate=False)
+    spline = basis(distance)
+    expected = spline[:, :, None, 0] * spline[:, None, :, 1]
+    weight = rows[:, :, :3]
+    np.testing.assert_allclose(weight, expected, rtol=0, atol=2e-6)
+    total = weight.sum(axis=(1, 2))
+    np.testing.assert_allclose(total, 1.0, rtol=0, atol=1e-6)
+    for axis in range(2):
+        along = weight.sum(axis=2 - axis)
+        offset = distance[:, :, axis]
+        first_moment = (along * offset).sum(axis=1)
+        second_moment = (along * offset**2).sum(axis=1)
+        np.testing.assert_allclose(first_moment, 0.0, rtol=0, atol=4e-6)
+        np.testing.assert_allclose(second_moment, 0.25, rtol=0, atol=4e-6)
+        stated_offset = rows[:, axis + 1, 3]
+        np.testing.assert_allclose(stated_offset, -offset[:, 1], rtol=0, atol=1e-6)
 
 
 def test_fixed_point_is_numpys_rint() -> None:
     """Any float32 within the range becomes the integer that NumPy rounds to: halves to
     the even one.
     """
-    by_hand = {0.5: 0, 1.5: 2, 2.5: 2, -0.5: 0, -1.5: -2, 3.0: 3, 1e-30: 0, 0.75: 1}
-    by_hand |= {-(2.0**50): -(2**50), 2.0**50: 2**50}
+    by_hand = {
+        0.5: 0,
+        1.5: 2,
+        2.5: 2,
+        -0.5: 0,
+        -1.5: -2,
+        3.0: 3,
+        1e-30: 0,
+        0.75: 1,
+        -(2.0**50): -(2**50),
+        2.0**50: 2**50,
+    }
+    count = 20_000
     rng = np.random.default_rng(1)
-    drawn = (rng.random(20_000) - 0.5) * 2.0 ** rng.integers(-5, 51, 20_000)
+    mantissa = rng.random(count) - 0.5
+    exponent = rng.integers(-5, 51, count)
+    drawn = mantissa * 2.0**exponent
     value = np.concatenate([list(by_hand), drawn]).astype(np.float32)
-    out = np.zeros(len(value), np.int64)
-    evaluate(value, out, np.zeros((len(value), 2), np.float32))
-    assert out[: len(by_hand)].tolist() == list(by_hand.values())
-    np.testing.assert_array_equal(
-        out, np.rint(value.astype(np.float64)).astype(np.int64)
-    )
+    fixed = np.zeros(len(value), np.int64)
+    bounds = np.zeros((len(value), 2), np.float32)
+    evaluate(value, fixed, bounds)
+    assert fixed[: len(by_hand)].tolist() == list(by_hand.values())
+    expected = np.rint(value.astype(np.float64))
+    np.testing.assert_array_equal(fixed, expected.astype(np.int64))
 
 
 def test_bounds_and_extremes_meet_nan() -> None:

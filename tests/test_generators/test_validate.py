@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from lagbench.errors import UsageError
-from lagbench.generators.acceptance import __main__, diagnostics, experiment
-from lagbench.generators.acceptance.experiment import Case, plan
+from validation import __main__, diagnostics, experiment
+from validation.experiment import Case, plan
 
-BOX = diagnostics.Box(low=0.0625, high=0.9375, cells=35)
+BOX = diagnostics.SquareBox(low=0.0625, high=0.9375, cells=35)
 
 
 def _tabulated(
@@ -28,12 +28,19 @@ def _tabulated(
     """
     lines = diagnostics.centre_lines(reynolds)
     assert lines is not None
-    points, values, lid = (
-        (diagnostics.Y, lines.u, 1.0) if name == "u" else (diagnostics.X, lines.v, 0.0)
-    )
-    known = ~np.isnan(values)
-    abscissae = np.concatenate([[0.0], np.array(points)[known][::-1], [1.0]])
-    return abscissae, np.concatenate([[0.0], values[known][::-1], [lid]])
+    if name == "u":
+        points = np.array(diagnostics.Y)
+        values = lines.u
+        lid = 1.0
+    else:
+        points = np.array(diagnostics.X)
+        values = lines.v
+        lid = 0.0
+    is_number = ~np.isnan(values)
+    # the tables begin at the lid
+    abscissae = np.concatenate([[0.0], points[is_number][::-1], [1.0]])
+    profile = np.concatenate([[0.0], values[is_number][::-1], [lid]])
+    return abscissae, profile
 
 
 @pytest.mark.parametrize("name", ["u", "v"])
@@ -46,21 +53,15 @@ def test_tabulated_profiles_have_no_slips(reynolds: int, name: str) -> None:
     the others.
     """
     abscissae, values = _tabulated(reynolds, name)
-    assert abs(CubicSpline(abscissae, values).integrate(0.0, 1.0)) < 0.004
-    crowded = [
-        i
-        for i in range(1, len(values) - 1)
-        if abscissae[i + 1] - abscissae[i - 1] < 0.017
-    ]
+    whole = CubicSpline(abscissae, values)
+    assert abs(whole.integrate(0.0, 1.0)) < 0.004
+    gaps = abscissae[2:] - abscissae[:-2]
+    crowded = np.flatnonzero(gaps < 0.017) + 1
     assert len(crowded) >= 3
     for i in crowded:
         others = np.arange(len(values)) != i
-        assert (
-            abs(
-                CubicSpline(abscissae[others], values[others])(abscissae[i]) - values[i]
-            )
-            < 0.006
-        )
+        spline = CubicSpline(abscissae[others], values[others])
+        assert abs(spline(abscissae[i]) - values[i]) < 0.006
 
 
 def test_misprints_are_left_out() -> None:
@@ -69,33 +70,31 @@ def test_misprints_are_left_out() -> None:
 
     Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4.
     """
-    missing = {
-        (reynolds, name, int(index))
-        for reynolds in diagnostics.REYNOLDS
-        for name in ("u", "v")
-        for index in np.flatnonzero(
-            np.isnan(getattr(diagnostics.centre_lines(reynolds), name))
-        )
-    }
+    missing = set()
+    for reynolds in diagnostics.REYNOLDS:
+        lines = diagnostics.centre_lines(reynolds)
+        for name in ("u", "v"):
+            is_missing = np.isnan(getattr(lines, name))
+            for index in np.flatnonzero(is_missing):
+                missing.add((reynolds, name, int(index)))
     assert missing == {
         (400, "v", diagnostics.X.index(0.9063)),
         (3200, "u", diagnostics.Y.index(0.4531)),
     }
     assert diagnostics.centre_lines(7.0) is None
-    found = diagnostics.deviation(
-        np.array([3.0, 9.0, -4.0]), np.array([0.0, np.nan, 0.0])
-    )
-    assert found.rmse == pytest.approx(math.sqrt(12.5))
-    assert found.maximum == 4.0
+    measured = np.array([3.0, 9.0, -4.0])
+    reference = np.array([0.0, np.nan, 0.0])
+    deviation = diagnostics.deviation(measured, reference)
+    assert deviation.rmse == pytest.approx(math.sqrt(12.5))
+    assert deviation.maximum == 4.0
 
 
 def test_occupancy_counts_every_particle_once() -> None:
     """One particle in each cell's middle gives all ones; one outside counts in the
     nearest cell.
     """
-    middles = np.stack(
-        np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij"), axis=-1
-    ).reshape(-1, 2)
+    x, y = np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij")
+    middles = np.stack([x.ravel(), y.ravel()], axis=-1)
     assert np.all(diagnostics.occupancy(middles, BOX) == 1)
     counts = diagnostics.occupancy(np.array([[0.0, 1.0]]), BOX)
     assert counts[0, -1] == 1
@@ -139,18 +138,18 @@ def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
 
     The middle lies on a node for 35 cells and between nodes for 34.
     """
-    box = diagnostics.Box(low=0.06, high=0.94, cells=cells)
+    box = diagnostics.SquareBox(low=0.06, high=0.94, cells=cells)
     s = (box.nodes - box.low) / box.width
     x, y = np.meshgrid(s, s, indexing="ij")
     u = 4.0 * x * (1.0 - x) * y**3
     v = 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
-    found = diagnostics.extract(0.2 * _nodal(u, v), box, 0.2).at_reference_points()
+    profiles = diagnostics.extract(0.2 * _nodal(u, v), box, 0.2)
+    lines = profiles.at_reference_points()
     heights = np.array(diagnostics.Y)
     abscissae = np.array(diagnostics.X)
-    assert found.u == pytest.approx(heights**3, abs=1e-12)
-    assert found.v == pytest.approx(
-        4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae), abs=1e-12
-    )
+    expected_v = 4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae)
+    assert lines.u == pytest.approx(heights**3, abs=1e-12)
+    assert lines.v == pytest.approx(expected_v, abs=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from scenario_draws import turn
 
 from lagbench.data.registry import Size, load
-from lagbench.generators.batch import Batch, SimulationJob
+from lagbench.generators.batch import ScenarioBatch, SimulationJob
 from lagbench.generators.solver import Device
 
 FIXED = (0, 26)
@@ -21,7 +21,7 @@ def _share_left(size: Size, scenario: int) -> float:
     job = SimulationJob(
         size=size, scenarios=(scenario,), root=Path("unused"), device=Device.CPU
     )
-    batch = Batch(job, lambda _: None, frames=[300])
+    batch = ScenarioBatch(job, lambda _: None, frames=[300])
     energy = [
         float((batch.frame(i)[1].astype(np.float64) ** 2).sum())
         for i, _ in batch.recordings()

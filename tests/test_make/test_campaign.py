@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import platform
-import re
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +19,7 @@ from lagbench.data.manifest import Manifest, read_manifest, write_manifest
 from lagbench.data.registry import Measured, Registry
 from lagbench.errors import DataError
 from lagbench.generators.record import measured_values
-from lagbench.make import cards
+from lagbench.make import painting
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.make.verify import verify
 from lagbench.work.progress import Progress
@@ -58,20 +57,19 @@ def test_all_hashes_are_compared(
     """Equal scenarios are not enough to be equal to datasets.yaml; an id without a hash
     equals nothing.
     """
-    listed = {i: digest for i, digest in right.scenario_sha256.items() if i != 2}
+    without_two = dict(right.scenario_sha256)
+    del without_two[2]
     root = copied()
-    for change, named in (
-        ({"dataset_sha256": "0" * 64}, "data set"),
+    changes = (
+        ({"dataset_sha256": "0" * 64}, "the data set"),
         ({"subset_sha256": {"train": "0" * 64}}, "train"),
-        (
-            {"scenario_sha256": listed},
-            "1 of 5 scenarios have another hash(?s:.*)scenarios 2",
-        ),
-    ):
+        ({"scenario_sha256": without_two}, "scenarios 2"),
+    )
+    for change, place in changes:
         registry = with_measured(unmeasured, right.model_copy(update=change))
-        with pytest.raises(DataError, match="another hash") as caught:
+        with pytest.raises(DataError) as caught:
             generate(SPLIT, SIZE, root=root, registry=registry)
-        assert re.search(named, str(caught.value))
+        assert place in str(caught.value.where)
         assert caught.value.exit_code == 4
 
 
@@ -169,9 +167,10 @@ def test_paths_of_a_manifest_are_not_published(
     """A manifest that names a file elsewhere is written anew from the files."""
     root = copied()
     folder = root / SPLIT / SIZE / "v2"
-    told = json.loads((folder / "manifest.json").read_text())
-    told["files"][3]["path"] = "../../../../../etc/passwd"
-    (folder / "manifest.json").write_text(json.dumps(told))
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["files"][3]["path"] = "../../../../../etc/passwd"
+    path.write_text(json.dumps(manifest))
     generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
     for name in ("manifest.json", "croissant.json", "README.md"):
         assert "passwd" not in (folder / name).read_text()
@@ -196,7 +195,7 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
 
     for module in ("make.inventory", "data.manifest"):
         monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
-    monkeypatch.setattr(cards, "_draw", refuse)
+    monkeypatch.setattr(painting, "paint_pictures", refuse)
     generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
     read.clear()
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
@@ -216,9 +215,10 @@ def test_values_are_hashed_once(
         pytest.fail("values are hashed again")
 
     root = copied()
-    for dry_run, allowed in ((True, False), (False, True), (False, False)):
+    calls = ((True, False), (False, True), (False, False))
+    for dry_run, may_hash in calls:
         with monkeypatch.context() as patch:
-            if not allowed:
+            if not may_hash:
                 patch.setattr("lagbench.make.inventory.check_scenario", refuse)
             result = generate(
                 SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run
@@ -231,10 +231,9 @@ def test_a_card_that_is_gone_or_changed_is_made_anew(
     name: str, copied: Copy, unmeasured: Registry
 ) -> None:
     """Only cards that are there and the same are left alone."""
-    path = copied() / SPLIT / SIZE / "v2" / name
+    root = copied()
+    path = root / SPLIT / SIZE / "v2" / name
     before = path.read_bytes()
     path.unlink()
-    generate(
-        SPLIT, SIZE, root=path.parents[4 if "/" in name else 3], registry=unmeasured
-    )
+    generate(SPLIT, SIZE, root=root, registry=unmeasured)
     assert path.read_bytes() == before

@@ -25,18 +25,17 @@ def falling(material: Material, friction: float = 0.0) -> InitialState:
     """Two bodies that hit opposite corners at once and come apart."""
     low = Part(material, SQUARE, (0.2, 0.18), (-1.5, -1.5))
     high = Part(material, Disc(0.1), (0.8, 0.8), (2.0, 1.0))
-    return scenario(
-        CONSTANTS, low, high, seed=int(material), friction=friction, spin=4.0
-    )
+    seed = int(material)
+    return scenario(CONSTANTS, low, high, seed=seed, friction=friction, spin=4.0)
 
 
 def cornered(gap: float, high: bool) -> InitialState:
     """One resting square of liquid that keeps a gap from two walls [cells]."""
-    near = (CONSTANTS.wall + gap) / CONSTANTS.grid + 0.1
-    centre = 1.0 - near if high else near
-    return scenario(
-        CONSTANTS, Part(Material.LIQUID, SQUARE, (centre, centre)), spin=4.0
-    )
+    centre = (CONSTANTS.wall + gap) / CONSTANTS.grid + 0.1
+    if high:
+        centre = 1.0 - centre
+    square = Part(Material.LIQUID, SQUARE, (centre, centre))
+    return scenario(CONSTANTS, square, spin=4.0)
 
 
 MIXED = scenario(
@@ -56,11 +55,15 @@ CASES = [pytest.param(state, id=name) for name, state in NAMED.items()]
 def arrays_of(reference: FreeSurfaceReference) -> list[NDArray[np.float32]]:
     """Return the arrays of the state in the order of a snapshot."""
     shape = (CONSTANTS.particles, 2, 2)
-    matrices = (
-        np.stack(rows, axis=1).reshape(shape)
-        for rows in (reference.affine, reference.deformation)
-    )
-    return [reference.position, reference.velocity, *matrices, reference.ratio]
+    affine = np.stack(reference.affine, axis=1).reshape(shape)
+    deformation = np.stack(reference.deformation, axis=1).reshape(shape)
+    return [
+        reference.position,
+        reference.velocity,
+        affine,
+        deformation,
+        reference.ratio,
+    ]
 
 
 @pytest.mark.parametrize("state", CASES)
@@ -73,9 +76,10 @@ def test_numpy_gives_the_same_bits(state: InitialState) -> None:
     for substeps in (1, 9, 90, 300):
         solver.advance(substeps)
         reference.advance(substeps)
-        theirs = arrays_of(reference)
-        assert {other.dtype for other in theirs} == {np.dtype(np.float32)}
-        np.testing.assert_equal([own[0] for own in snapshot(solver)], theirs)
+        expected = arrays_of(reference)
+        assert {array.dtype for array in expected} == {np.dtype(np.float32)}
+        computed = [array[0] for array in snapshot(solver)]
+        np.testing.assert_equal(computed, expected)
 
 
 @pytest.mark.parametrize("material", Material)
@@ -89,9 +93,9 @@ def test_scenarios_of_these_tests_reach_walls(material: Material) -> None:
     for _ in range(40):
         solver.advance(10)
         position = solver.position()[0]
-        touched |= (
-            np.concatenate([position.min(axis=0), 1.0 - position.max(axis=0)]) < near
-        )
+        low_gap = position.min(axis=0)
+        high_gap = 1.0 - position.max(axis=0)
+        touched |= np.concatenate([low_gap, high_gap]) < near
     assert touched.sum() >= 3
 
 
@@ -122,11 +126,11 @@ def test_rows_beyond_a_wall_are_never_stale(gap: float, high: bool) -> None:
     The serial driver visits only nodes near particles. Here a first scenario fills the
     rows beyond two walls; the second lies near these walls without touching those rows.
     """
-    parallel = run(
-        CONSTANTS, [cornered(gap, high)], 20, device=Device.PARALLEL, threads=1
-    )
+    state = cornered(gap, high)
+    parallel = run(CONSTANTS, [state], 20, device=Device.PARALLEL, threads=1)
     run(CONSTANTS, [cornered(0.05, high)], 5)
-    np.testing.assert_equal(run(CONSTANTS, [cornered(gap, high)], 20), parallel)
+    serial = run(CONSTANTS, [state], 20)
+    np.testing.assert_equal(serial, parallel)
 
 
 def test_batched_scenarios_do_not_touch_each_other() -> None:
@@ -136,28 +140,31 @@ def test_batched_scenarios_do_not_touch_each_other() -> None:
     states = [falling(Material.LIQUID), falling(Material.SNOW, friction=0.3), MIXED]
     together = run(CONSTANTS, states, 200, device=Device.PARALLEL)
     for index, state in enumerate(states):
-        np.testing.assert_equal(
-            [own[index : index + 1] for own in together], run(CONSTANTS, [state], 200)
-        )
+        member = [array[index : index + 1] for array in together]
+        alone = run(CONSTANTS, [state], 200)
+        np.testing.assert_equal(member, alone)
 
 
 @pytest.mark.parametrize("state", CASES)
 def test_order_of_particles_does_not_matter(state: InitialState) -> None:
     """Permuted particles give permuted results, bit for bit, over 400 substeps."""
     order = np.random.default_rng(4).permutation(CONSTANTS.particles)
-    names = ("position", "velocity", "affine", "material")
     permuted = dataclasses.replace(
-        state, **{name: getattr(state, name)[order] for name in names}
+        state,
+        position=state.position[order],
+        velocity=state.velocity[order],
+        affine=state.affine[order],
+        material=state.material[order],
     )
-    straight = [own[:, order] for own in run(CONSTANTS, [state], 400)]
-    np.testing.assert_equal(run(CONSTANTS, [permuted], 400), straight)
+    expected = [array[:, order] for array in run(CONSTANTS, [state], 400)]
+    np.testing.assert_equal(run(CONSTANTS, [permuted], 400), expected)
 
 
 def test_pauses_do_not_matter() -> None:
     """Reading out between substeps changes nothing: 7 + 93 substeps are 100."""
-    np.testing.assert_equal(
-        run(CONSTANTS, [MIXED], 7, 0, 93), run(CONSTANTS, [MIXED], 100)
-    )
+    paused = run(CONSTANTS, [MIXED], 7, 0, 93)
+    straight = run(CONSTANTS, [MIXED], 100)
+    np.testing.assert_equal(paused, straight)
 
 
 def test_a_solver_forgets_its_last_scenario() -> None:
@@ -169,4 +176,5 @@ def test_a_solver_forgets_its_last_scenario() -> None:
     reference = FreeSurfaceReference(CONSTANTS, MIXED)
     again.advance(100)
     reference.advance(100)
-    np.testing.assert_equal([own[0] for own in snapshot(again)], arrays_of(reference))
+    computed = [array[0] for array in snapshot(again)]
+    np.testing.assert_equal(computed, arrays_of(reference))

@@ -16,8 +16,12 @@ from click.testing import Result
 from conftest import SIZE, SPLIT
 
 from lagbench.data.registry import Registry, load
-from lagbench.generators.batch import SimulationJob, substeps_of
-from lagbench.generators.simulate import Pace, simulate, twin_substeps
+from lagbench.generators.batch import SimulationJob, substep_count
+from lagbench.generators.simulate import (
+    SimulationPace,
+    perturbed_substep_count,
+    simulate,
+)
 from lagbench.make.generate import generate
 from lagbench.make.plan import estimate, measured_ratio, note_pace, reference_seconds
 
@@ -44,9 +48,11 @@ PLAIN = reference_seconds(*WORK)
 GOOD = {"256": [2 * PLAIN, *WORK]}
 
 
-def pace(slowness: float) -> Pace:
+def pace(slowness: float) -> SimulationPace:
     """Return what so slow a machine measures."""
-    return Pace(seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1])
+    return SimulationPace(
+        seconds=slowness * PLAIN, particle_substeps=WORK[0], frames=WORK[1]
+    )
 
 
 def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
@@ -56,24 +62,23 @@ def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
     size = unmeasured.size("fluid", "tiny")
     assert not estimate(size, (0, 1)).measured
     noted(cache, free_surface={"256": [300.0, 3 * 2 * 155 * 256, 3 * 64]})
-    found = estimate(size, (0, 1))
-    assert found.measured
-    assert found.core_seconds == pytest.approx(100.0)
+    expected = estimate(size, (0, 1))
+    assert expected.measured
+    assert expected.core_seconds == pytest.approx(100.0)
 
 
-def test_twins_of_test_scenarios_are_counted() -> None:
-    """What generating simulates: every substep of scenarios and of twins, which end
-    with the horizon.
+def test_perturbed_runs_of_test_scenarios_are_counted() -> None:
+    """What generating simulates: every substep of scenarios and of perturbed runs,
+    which end with the horizon.
     """
     size = load().size("cavity", "mini")
     test = size.subsets["test"]
-    twins = [twin_substeps(size, i) for i in test]
-    alone = [substeps_of(size, i) for i in test]
-    assert sum(twins) < sum(alone)
-    frames = sum(map(size.frame_count, test)) + len(test) * (
-        size.task.input_frames + size.task.horizon
-    )
-    expected = reference_seconds((sum(alone) + sum(twins)) * size.particles, frames)
+    perturbed = sum(perturbed_substep_count(size, i) for i in test)
+    plain = sum(substep_count(size, i) for i in test)
+    assert perturbed < plain
+    perturbed_frames = len(test) * (size.task.input_frames + size.task.horizon)
+    frames = sum(map(size.frame_count, test)) + perturbed_frames
+    expected = reference_seconds((plain + perturbed) * size.particles, frames)
     assert estimate(size, test).core_seconds == pytest.approx(expected)
 
 
@@ -126,8 +131,9 @@ def test_damaged_rates_are_passed_over(
     size = unmeasured.size("fluid", "tiny")
     expected = estimate(size, (0,))
     cache.mkdir()
-    held = DAMAGED[damage]
-    text = held if isinstance(held, str) else json.dumps(held)
+    text = DAMAGED[damage]
+    if not isinstance(text, str):
+        text = json.dumps(text)
     (cache / "rates.json").write_bytes(text.encode(errors="surrogateescape"))
     assert estimate(size, (0,)) == expected
     note_pace(size, [pace(5.0)])
@@ -144,13 +150,13 @@ def test_notes_add_up_and_stay_few(cache: Path, unmeasured: Registry) -> None:
     assert measured_ratio(size) == pytest.approx(2.0)
     noted(cache, free_surface={str(n): GOOD["256"] for n in range(1000, 1200)})
     note_pace(size, paces)
-    held = json.loads((cache / "rates.json").read_text())
-    assert len(held["free_surface"]) <= 32
-    assert held["free_surface"]["256"] == pytest.approx(
-        [4 * PLAIN, 2 * WORK[0], 2 * WORK[1]]
-    )
+    rates_file = cache / "rates.json"
+    rates = json.loads(rates_file.read_text())
+    assert len(rates["free_surface"]) <= 32
+    expected = [4 * PLAIN, 2 * WORK[0], 2 * WORK[1]]
+    assert rates["free_surface"]["256"] == pytest.approx(expected)
     note_pace(size, [])
-    assert json.loads((cache / "rates.json").read_text()) == held
+    assert json.loads(rates_file.read_text()) == rates
 
 
 def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) -> None:
@@ -160,11 +166,12 @@ def test_a_worker_measures_what_it_does(tmp_path: Path, unmeasured: Registry) ->
     size = unmeasured.size(SPLIT, SIZE)
     job = SimulationJob(size=size, scenarios=(0,), root=tmp_path)
     times = itertools.accumulate(itertools.count(10, 10))
-    (outcome,) = simulate(job, lambda _: None, clock=lambda: float(next(times)))
+    (scenario,) = simulate(job, lambda _: None, clock=lambda: float(next(times)))
     steps = size.frame_count(0) - 2
     substeps = steps * size.substeps_per_frame * size.particles
     # The clock says 10, 30, 60: before the first frame, after the second, in the end.
-    assert outcome.pace == Pace(seconds=30.0, particle_substeps=substeps, frames=steps)
+    expected = SimulationPace(seconds=30.0, particle_substeps=substeps, frames=steps)
+    assert scenario.pace == expected
 
 
 def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
@@ -178,17 +185,19 @@ def test_generations_measure(run: Run, cache: Path, tmp_path: Path) -> None:
     assert json.loads(run(*plan, "--json").stdout)["measured"] is False
     assert not cache.exists()
     assert run(*plan[:4], *root, "--scenarios", "0").exit_code == 0
-    held = json.loads((cache / "rates.json").read_text())
-    ((particles, (seconds, particle_substeps, frames)),) = held["closed_box"].items()
-    assert held == {**HERE, "closed_box": held["closed_box"]}
+    rates = json.loads((cache / "rates.json").read_text())
+    assert rates.keys() == {"machine", "closed_box"}
+    ((particles, row),) = rates["closed_box"].items()
+    seconds, particle_substeps, frames = row
     assert json.loads(run(*plan, "--json").stdout)["measured"] is True
     assert "measured after the first generate" not in run(*plan).stdout
-    listed = json.loads(run("list", *root, "--json").stdout)["sizes"]
-    assert {one["split"] for one in listed if one["measured"]} == {"cavity", SPLIT}
-    assert json.loads(run("info", SPLIT, *root, "--json").stdout)["sizes"][SIZE][
-        "overview"
-    ]["measured"]
-    tiny = next(one for one in listed if (one["split"], one["size"]) == (SPLIT, SIZE))
+
+    sizes = json.loads(run("list", *root, "--json").stdout)["sizes"]
+    measured_splits = {size["split"] for size in sizes if size["measured"]}
+    assert measured_splits == {"cavity", SPLIT}
+    information = json.loads(run("info", SPLIT, *root, "--json").stdout)
+    tiny = information["sizes"][SIZE]["overview"]
+    assert tiny["measured"]
     assert int(particles) == tiny["particles"]
     assert seconds > 0.0
     assert particle_substeps == frames * 12 * 506

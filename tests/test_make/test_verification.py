@@ -243,7 +243,7 @@ def test_statistics_and_twin_floor_of_the_manifest_are_compared(
     )
     result = verify(SPLIT, SIZE, root=root, registry=measured)
     assert [line for line in result.warnings if "velocity_std" in line]
-    assert [line for line in result.warnings if "twin floor" in line]
+    assert [line for line in result.warnings if "twin_floor" in line]
     result.check()
 
 

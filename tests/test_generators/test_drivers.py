@@ -194,7 +194,8 @@ backend.start(Device.CPU)
 config = backend.ti.lang.impl.current_cfg()
 print(config.arch, config.opt_level, config.advanced_optimization, config.debug)
 import os
-print(sorted(name for name in os.environ if name.startswith("TI_") and "VERSION" not in name))
+names = [name for name in os.environ if name.startswith("TI_")]
+print(sorted(name for name in names if "VERSION" not in name))
 """
 
 HOSTILE = {"TI_ARCH": "vulkan", "TI_OPT_LEVEL": "0", "TI_ADVANCED_OPTIMIZATION": "0"}

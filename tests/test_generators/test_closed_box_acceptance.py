@@ -1,4 +1,4 @@
-"""Acceptance of the closed-box solver (design 4.3): Ghia's cavity, lid off, curl
+"""Acceptance of the closed-box solver: Ghia's cavity, lid off, curl
 noise.
 """
 
@@ -7,10 +7,10 @@ from __future__ import annotations
 import pytest
 from scenario_draws import of_this_turn
 
-from lagbench.generators.acceptance.experiment import (
+from validation.experiment import (
     CHECK_EVERY,
     Case,
-    Result,
+    ExperimentResult,
     plan,
     run,
 )
@@ -18,7 +18,7 @@ from lagbench.generators.acceptance.experiment import (
 pytestmark = pytest.mark.slow
 
 
-def _assert_sound(result: Result) -> None:
+def _assert_sound(result: ExperimentResult) -> None:
     """No cell is ever empty, and J stays near 1 away from the lid's corners."""
     assert [check.substep for check in result.checks[:-1]] == [
         CHECK_EVERY * (index + 1) for index in range(len(result.checks) - 1)
