@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
-from lagbench.draw.tables import markdown
+from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.table import COUNTING, REFERENCES

@@ -15,7 +15,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.draw.tables import Table, markdown
+from lagbench.figures.tables import Table, markdown
 
 from .plan import Plan
 

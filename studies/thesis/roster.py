@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from lagbench.draw.style import MUTED
+from lagbench.figures.colours import MUTED
 
 from .published import FRAME_MODELS, OPERATORS
 
