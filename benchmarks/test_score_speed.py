@@ -36,22 +36,36 @@ CELLS = 40
 Floats = NDArray[np.float64]
 
 CHILD = """
-import json, resource, sys, time
+import json, sys, time
 from pathlib import Path
-import lagbench.scoring.score, netCDF4
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
+import netCDF4
 from lagbench.data.registry import load
-folder, workers = Path(sys.argv[1]), int(sys.argv[2])
-who = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-cpu = lambda: sum(sum(resource.getrusage(one)[:2]) for one in who)
-wall, used = time.perf_counter(), cpu()
-card = lagbench.scoring.score.score(folder / "predictions.nc", root=folder / "root",
-                              registry=load(folder / "datasets.yaml"), workers=workers)
+from lagbench.scoring.score import score
+
+def cpu_seconds():
+    return sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN))
+
+def peak_kib():
+    # getrusage's maximum of this process is that of its parent before exec
+    status = Path("/proc/self/status").read_text()
+    own = int(status.split("VmHWM:")[1].split()[0])
+    return max(own, getrusage(RUSAGE_CHILDREN).ru_maxrss)
+
+folder = Path(sys.argv[1])
+registry = load(folder / "datasets.yaml")
+wall_start = time.perf_counter()
+cpu_start = cpu_seconds()
+card = score(
+    folder / "predictions.nc",
+    root=folder / "root",
+    registry=registry,
+    workers=int(sys.argv[2]),
+)
 print(json.dumps({
-    "wall": time.perf_counter() - wall,
-    "cpu": cpu() - used,
-    # the maximum that getrusage tells of this process is that of its parent before exec
-    "memory": 1024 * max(peak(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss),
+    "wall": time.perf_counter() - wall_start,
+    "cpu": cpu_seconds() - cpu_start,
+    "memory": 1024 * peak_kib(),
     "metrics": len(card.submission),
     "bytes": card.files[1].stat().st_size,
 }))
@@ -64,7 +78,7 @@ def run_ours(folder: Path, workers: int) -> dict[str, float]:
 
 
 def naive_scores(
-    truth: Path, predictions: Path, row: int, first: int, frames: int
+    truth: Path, predictions: Path, *, row: int, first: int, frames: int
 ) -> dict[str, float]:
     """Return five metrics of one scenario, means over frames.
 
@@ -137,30 +151,33 @@ def test_score_beside_a_naive_scorer(data: ScoreData) -> None:
     one = run_ours(folder, 1)
     two = run_ours(folder, 2)
     task = load_scored_task(data.registry.size("cavity", "full"), data.root)
-    start = time.perf_counter()
-    used = time.process_time()
+    wall_start = time.perf_counter()
+    cpu_start = time.process_time()
     for row, scenario in enumerate(task.scenarios[:2]):
-        naive_scores(task.truth.path(scenario), data.predictions, row, 6, NAIVE_FRAMES)
-    frames = len(task.scenarios) * 90
-    scale = frames / (2 * NAIVE_FRAMES)
-    naive = {
-        "wall": scale * (time.perf_counter() - start),
-        "cpu": scale * (time.process_time() - used),
-    }
-    for name, found in (("one worker", one), ("two workers", two)):
+        naive_scores(
+            task.truth.path(scenario),
+            data.predictions,
+            row=row,
+            first=6,
+            frames=NAIVE_FRAMES,
+        )
+    frame_count = len(task.scenarios) * 90
+    scale = frame_count / (2 * NAIVE_FRAMES)
+    naive_wall = scale * (time.perf_counter() - wall_start)
+    naive_cpu = scale * (time.process_time() - cpu_start)
+    for name, ours in (("one worker", one), ("two workers", two)):
         print(
-            f"\n{name}: {found['wall']:.2f} s, {found['cpu']:.2f} CPU-s, "
-            f"{found['memory'] / 1e6:.0f} MB,"
-            f" {found['metrics']} metrics, scores.nc {found['bytes'] / 1e3:.0f} kB"
-            f" (targets {MEMORY / 1e6:.0f} MB, 1 MB)"
+            f"\n{name}: {ours['wall']:.2f} s, {ours['cpu']:.2f} CPU-s, "
+            f"{ours['memory'] / 1e6:.0f} MB, {ours['metrics']} metrics, "
+            f"scores.nc {ours['bytes'] / 1e3:.0f} kB "
+            f"(targets {MEMORY / 1e6:.0f} MB, 1 MB)"
         )
     # Idle BLAS threads count as processor time of the naive side, other processes as
     # its wall time.
-    ratio = min(naive["cpu"], naive["wall"]) / one["cpu"]
+    ratio = min(naive_cpu, naive_wall) / one["cpu"]
     print(
-        f"naive, 5 metrics: {naive['wall']:.0f} s, {naive['cpu']:.0f} CPU-s,"
-        f" extrapolated from {2 * NAIVE_FRAMES} of {frames} frames: {ratio:.0f} "
-        f"times ours"
+        f"naive, 5 metrics: {naive_wall:.0f} s, {naive_cpu:.0f} CPU-s, extrapolated "
+        f"from {2 * NAIVE_FRAMES} of {frame_count} frames: {ratio:.0f} times ours"
     )
     assert ratio >= 10
     assert max(one["memory"], two["memory"]) <= MEMORY
