@@ -41,7 +41,7 @@ from studies.thesis.split_results import (
     format_budget,
 )
 
-BOARD = Path(__file__).parents[1] / "leaderboard"
+BOARD = Path(__file__).parents[2] / "leaderboard"
 
 
 @pytest.fixture(scope="session")

@@ -322,7 +322,7 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
 def test_skill_equals_that_of_the_score_files(split: str) -> None:
     """Every committed score file holds the best naive baseline of the same skill."""
-    board = Path(__file__).parents[1] / "leaderboard"
+    board = Path(__file__).parents[2] / "leaderboard"
     results = SplitResults(Sources(board=board), split, "mini")
     assert results.models
     for name, method in results.models.items():
