@@ -1,11 +1,10 @@
-"""Which materials meet where methods of the board err: the error by the materials of a
-test scenario.
+"""Print the error of methods of the board by the materials of a test scenario.
 
     python benchmarks/by_materials.py --size full --root DATA neuralmpm-projected
 
-prints, for the entries named (mean over their seeds) and the floors of a split, the
-metric that ranks in the mean over the test scenarios of each set of materials, and over
-all. Data are read for the materials alone.
+prints the metric that ranks, for the named entries (mean over their seeds) and for the
+reference predictors of a split: the mean over the test scenarios of each set of
+materials, and over all. Data are read for the materials alone.
 """
 
 from __future__ import annotations

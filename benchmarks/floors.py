@@ -128,8 +128,8 @@ def _is_hard_enough(
 
 def _print_active(size: Size, references: Mapping[str, ReferenceScores]) -> None:
     """Print for how many of the predicted frames the truth of a free surface moves."""
-    if "free-flight" in references:
-        active = references["free-flight"].scores["active_frames"].values
+    if "ballistic" in references:
+        active = references["ballistic"].scores["active_frames"].values
         where = f"{size.split} {size.name} | {np.median(active):g}"
         print(
             f"| {where} | {np.min(active):g} | {np.max(active):g} | "

@@ -2,7 +2,7 @@
 
     python benchmarks/skill_interval.py [--draws 400]
 
-Scores of a method and of a floor are drawn lognormal, with a correlation over
+Scores of a method and of a naive baseline are drawn lognormal, correlated over
 scenarios; each seed of the method has a factor of its own. Beside the shipped interval,
 on the logarithm of the ratio, stands that of the ratio itself. Prints the share of
 draws in which either 95 % interval holds the true skill, and the least and greatest end
