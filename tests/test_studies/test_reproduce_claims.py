@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reproduce_bench import a_method, known
+from reproduce_bench import a_method, made_up_results
 from scipy.stats import kendalltau
 
 from lagbench.data.registry import load
@@ -42,15 +42,17 @@ FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
 
 def six(**better: list[float]) -> SplitResults:
     """Return six operators at 0.5 in eight scenarios, some replaced."""
-    return known({name: better.get(name, [0.5] * 8) for name in thesis.OPERATORS})
+    return made_up_results(
+        {name: better.get(name, [0.5] * 8) for name in thesis.OPERATORS}
+    )
 
 
 def test_a_comparison_can_be_counted_by_hand() -> None:
     """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes
     first.
     """
-    evidence = known({"gns": [0.1] * 8, "gat": [0.2] * 8})
-    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
+    results = made_up_results({"gns": [0.1] * 8, "gat": [0.2] * 8})
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
     assert (row.means, row.win_count, row.seed_counts) == (
         pytest.approx((0.1, 0.2)),
         8,
@@ -58,28 +60,31 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     )
     assert row.p == row.test.p == 2 / 2**8
     assert row.verdict is Verdict.BETTER
-    (turned,) = compare_models(evidence, "gat", ["gns"], ["position_rmse"])
-    assert (turned.verdict, turned.win_count, turned.p) == (Verdict.WORSE, 0, row.p)
+    (turned,) = compare_models(results, "gat", ["gns"], ["position_rmse"])
+    assert turned.verdict is Verdict.WORSE
+    assert turned.win_count == 0
+    assert turned.p == row.p
     # Directions come from the metrics table; at a frame the values of that frame are
     # compared.
-    evidence = known({"gns": [0.9] * 8, "gat": [0.5] * 8})
-    (row,) = compare_models(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
-    assert (row.verdict, row.win_count, row.frame) == (Verdict.BETTER, 8, 54)
+    results = made_up_results({"gns": [0.9] * 8, "gat": [0.5] * 8})
+    (row,) = compare_models(results, "gns", ["gat"], ["vorticity_pearson"], frame=54)
+    assert row.verdict is Verdict.BETTER
+    assert row.win_count == 8
+    assert row.frame == 54
 
 
-def test_nothing_is_claimed_of_what_cannot_be_told() -> None:
+def test_an_undecided_comparison_claims_nothing() -> None:
     """Mixed signs leave a question open; fewer than six scenarios give no p-value at
     all.
     """
-    (mixed,) = compare_models(
-        known({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8}),
+    results = made_up_results({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8})
+    (mixed,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
+    assert mixed.verdict is Verdict.OPEN
+    (few,) = compare_models(
+        made_up_results({"gns": [0.1] * 5, "gat": [0.9] * 5}),
         "gns",
         ["gat"],
         ["position_rmse"],
-    )
-    assert mixed.verdict is Verdict.OPEN
-    (few,) = compare_models(
-        known({"gns": [0.1] * 5, "gat": [0.9] * 5}), "gns", ["gat"], ["position_rmse"]
     )
     assert few.verdict is Verdict.FEW
     assert math.isnan(few.p)
@@ -96,10 +101,8 @@ def test_first_place_takes_all_rivals() -> None:
     tied = claim_rows(FIRST, six(supergat=[0.1] * 8, gns=[0.05, 0.16] * 4))
     assert {row.second for row in tied if row.verdict is Verdict.OPEN} == {"gns"}
     assert answer(tied) not in ("yes", "no")
-    assert all(
-        row.verdict is Verdict.WORSE
-        for row in claim_rows(FIRST, six(supergat=[0.9] * 8))
-    )
+    last = claim_rows(FIRST, six(supergat=[0.9] * 8))
+    assert {row.verdict for row in last} == {Verdict.WORSE}
 
 
 @pytest.mark.parametrize(
@@ -112,12 +115,12 @@ def test_a_loss_is_judged_by_the_model_without_it(
     metric first.
     """
     (claim,) = (claim for claim in CLAIMS if claim.rivals == ("gns-novorticity",))
-    evidence = known({"gns": [0.5] * 8, "gns-novorticity": [without] * 8})
-    rows = claim_rows(claim, evidence)
+    results = made_up_results({"gns": [0.5] * 8, "gns-novorticity": [without] * 8})
+    rows = claim_rows(claim, results)
     assert answer(rows) == expected
-    assert rows[0].metric == evidence.ranking
+    assert rows[0].metric == results.ranking
     assert {row.metric for row in rows} == {
-        evidence.ranking,
+        results.ranking,
         *claim.metrics,
         *claim.at_key_frame,
     }
@@ -125,42 +128,36 @@ def test_a_loss_is_judged_by_the_model_without_it(
 
 def test_seeds_that_only_one_has_do_not_count() -> None:
     """Two models are compared over common seeds; where there are none, over all."""
-    evidence = known({})
-    evidence.methods["gns"] = a_method("gns", [0.5] * 8, [99.0] * 8)
-    evidence.methods["gat"] = a_method("gat", [0.9] * 8)
-    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
+    results = made_up_results({})
+    results.methods["gns"] = a_method("gns", [0.5] * 8, [99.0] * 8)
+    results.methods["gat"] = a_method("gat", [0.9] * 8)
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
     assert row.means == pytest.approx((0.5, 0.9))
-    (only,) = evidence.methods["gat"].trainings
-    evidence.methods["gat"] = Method(name="gat", trainings=(replace(only, seed=7),))
-    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
+    (only,) = results.methods["gat"].trainings
+    results.methods["gat"] = Method(name="gat", trainings=(replace(only, seed=7),))
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
     assert row.seed_counts == (2, 1)
 
 
-def test_models_stand_beside_the_best_naive() -> None:
-    """The floor of least error is the one that counts; skill is 1 - score / its
-    score.
-    """
+def test_skill_is_measured_from_the_best_naive_baseline() -> None:
+    """Skill is 1 - score / score of the naive baseline of least error."""
     scores = {"gns": 0.1, "gat": 0.9, "persistence": 0.5, "constant-velocity": 2.0}
-    evidence = known({name: [score] * 8 for name, score in scores.items()})
-    assert evidence.best_naive == "persistence"
-    assert evidence.skill("gns") == pytest.approx(0.8)
-    assert evidence.skill("gat") == pytest.approx(-0.8)
-    assert evidence.skill("persistence") == 0.0
-    rows = claim_rows(Claim(question="", first=""), evidence)
+    results = made_up_results({name: [score] * 8 for name, score in scores.items()})
+    assert results.best_naive == "persistence"
+    assert results.skill("gns") == pytest.approx(0.8)
+    assert results.skill("gat") == pytest.approx(-0.8)
+    assert results.skill("persistence") == 0.0
+    rows = claim_rows(Claim(question="", first=""), results)
     assert {row.second: row.verdict for row in rows} == {
         "gns": Verdict.WORSE,
         "gat": Verdict.BETTER,
     }
-    del evidence.methods["gns"]
-    ahead = leading_references([evidence])
-    assert evidence.ranking in {row[1] for row in ahead.rows}
-    assert {row[2] for row in ahead.rows} <= set(evidence.floors)
-    assert (
-        leading_references(
-            [known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]
-        ).rows
-        == ()
-    )
+    del results.methods["gns"]
+    ahead = leading_references([results])
+    assert results.ranking in {row[1] for row in ahead.rows}
+    assert {row[2] for row in ahead.rows} <= set(results.references)
+    equal = made_up_results({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})
+    assert leading_references([equal]).rows == ()
 
 
 @pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])
@@ -170,8 +167,9 @@ def test_every_claim_asks_what_can_be_answered(claim: Claim) -> None:
     """
     assert {*claim.metrics, *claim.at_key_frame} <= METRICS.keys()
     for models in ({}, {"gns-short": [0.5] * 8}):
-        rows = claim_rows(claim, known(models))
-        assert (rows, answer(rows)) == ([], "")
+        rows = claim_rows(claim, made_up_results(models))
+        assert rows == []
+        assert answer(rows) == ""
 
 
 def test_seeds_become_a_mean_per_scenario() -> None:
@@ -180,9 +178,8 @@ def test_seeds_become_a_mean_per_scenario() -> None:
     """
     method = a_method("gns", [1.0, 3.0], [3.0, 5.0])
     assert method.scores["position_rmse"].values.tolist() == [2.0, 4.0]
-    assert method.spread("position_rmse") == pytest.approx(
-        math.sqrt(2.0)
-    )  # of means 2 and 4
+    # the means are 2 and 4
+    assert method.spread("position_rmse") == pytest.approx(math.sqrt(2.0))
     assert method.at("position_rmse", 54, 1) == 4.0
     assert math.isnan(method.at("no_metric", 54))
     assert math.isnan(a_method("gns", [1.0]).spread("position_rmse"))
@@ -216,28 +213,27 @@ def test_printed_errors_agree_with_each_other() -> None:
     for row in thesis.TABLE_5_4.values():
         assert row["rmse"] == pytest.approx(math.sqrt(row["mse"]), rel=4e-3)
         assert row["mae"] < row["rmse"]
-    (printed,) = (
-        row
-        for row in thesis.TABLE_4_8["fluid"]
-        if row.scenario == thesis.TABLE_4_7.scenario
+    swapped = thesis.TABLE_4_7
+    (right,) = (
+        row for row in thesis.TABLE_4_8["fluid"] if row.scenario == swapped.scenario
     )
-    for i in (thesis.FRAME_MODELS.index(name) for name in ("mlp", "lstm-mlp")):
-        assert (printed.average[i], printed.end[i]) == (
-            thesis.TABLE_4_7.end[i],
-            thesis.TABLE_4_7.average[i],
-        )
+    for name in ("mlp", "lstm-mlp"):
+        i = thesis.FRAME_MODELS.index(name)
+        assert right.average[i] == swapped.end[i]
+        assert right.end[i] == swapped.average[i]
 
 
 def test_scenes_stand_for_their_own_kind() -> None:
     """Family (id % 4) or pair (id % 6) is the thesis's; T0 is the first."""
     registry = load()
-    for (split, rows), families in zip(thesis.TABLE_4_8.items(), (4, 6), strict=True):
-        for row in rows:
-            for name in ("full", "mini"):
-                found = scenario_of(registry.size(split, name), row.scenario)
-                assert found in registry.size(split, name).subsets["test"]
-                assert found is not None
-                assert found % families == row.scenario % families
+    for split, scene_count in (("fluid", 4), ("multimaterial", 6)):
+        for name in ("full", "mini"):
+            size = registry.size(split, name)
+            for row in thesis.TABLE_4_8[split]:
+                scenario = scenario_of(size, row.scenario)
+                assert scenario in size.subsets["test"]
+                assert scenario is not None
+                assert scenario % scene_count == row.scenario % scene_count
     cavity = registry.size("cavity", "mini")
     assert scenario_of(cavity, 0) == min(cavity.subsets["test"])
     assert scenario_of(cavity, 1000) is None
@@ -278,17 +274,16 @@ def test_errors_of_interpolated_fields() -> None:
 
 def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
     """What was logged comes back in the order of steps; no log gives no curve."""
-    writer = pytest.importorskip("torch.utils.tensorboard").SummaryWriter(
-        str(tmp_path / "tensorboard")
-    )
+    tensorboard = pytest.importorskip("torch.utils.tensorboard")
+    writer = tensorboard.SummaryWriter(str(tmp_path / "tensorboard"))
     for step in (10, 20, 30):
         writer.add_scalar("loss/total", 1.0 / step, step)
     writer.close()
-    steps, loss = loss_over_steps(tmp_path)
-    assert steps.tolist() == [10, 20, 30]
-    assert loss == pytest.approx([0.1, 0.05, 1 / 30])
-    assert loss_over_steps(tmp_path, "vorticity")[0].size == 0
-    assert loss_over_steps(tmp_path / "none")[0].size == 0
+    curve = loss_over_steps(tmp_path)
+    assert curve.steps.tolist() == [10, 20, 30]
+    assert curve.loss == pytest.approx([0.1, 0.05, 1 / 30])
+    assert loss_over_steps(tmp_path, "vorticity").steps.size == 0
+    assert loss_over_steps(tmp_path / "none").steps.size == 0
 
 
 def test_smoothing_is_a_centred_mean() -> None:
@@ -296,17 +291,18 @@ def test_smoothing_is_a_centred_mean() -> None:
     stay lines.
     """
     values = np.random.default_rng(2).random(60)
-    reach = [min(SMOOTHED // 2, i, 59 - i) for i in range(60)]
-    assert smooth(values) == pytest.approx(
-        [values[i - k : i + k + 1].mean() for i, k in enumerate(reach)]
-    )
+    means = []
+    for i in range(60):
+        reach = min(SMOOTHED // 2, i, 59 - i)
+        means.append(values[i - reach : i + reach + 1].mean())
+    assert smooth(values) == pytest.approx(means)
     assert smooth(np.arange(60.0)) == pytest.approx(np.arange(60.0))
 
 
 def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
-    evidence = SplitResults(Sources(board=None), "fluid", "full")
-    ids = tuple(sorted(evidence.size.subsets["test"]))
+    results = SplitResults(Sources(board=None), "fluid", "full")
+    ids = tuple(sorted(results.size.subsets["test"]))
     values = np.arange(len(ids), dtype=float)
     none = np.empty((len(ids), 0))
     scores = {
@@ -314,23 +310,22 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
         for m in ("mse_avg", "mse_end")
     }
     seed = ScoredTraining(seed=0, scores=scores, record={}, path=Path())
-    evidence.methods["mlp"] = Method(name="mlp", trainings=(seed,))
-    table = rollout_table(evidence, thesis.TABLE_4_8["fluid"])
+    results.methods["mlp"] = Method(name="mlp", trainings=(seed,))
+    table = rollout_table(results, thesis.TABLE_4_8["fluid"])
     circle = dict(zip(table.columns, table.rows[1], strict=True))
-    assert (circle["thesis's id"], circle["our id"]) == ("26", "38")
+    assert circle["thesis's id"] == "26"
+    assert circle["our id"] == "38"
     assert circle["average, MLP"] == f"{ids.index(38)} / 2.127"
     assert circle["average, LSTM"] == "- / 3.583"
 
 
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
-def test_skill_is_the_score_files(split: str) -> None:
-    """The skill of results is the one that each committed score file holds the floor
-    of.
-    """
-    board = Path(__file__).parents[1] / "leaderboard"
-    evidence = SplitResults(Sources(board=board), split, "mini")
-    assert evidence.models
-    for name, method in evidence.models.items():
+def test_skill_equals_that_of_the_score_files(split: str) -> None:
+    """Every committed score file holds the best naive baseline of the same skill."""
+    board = Path(__file__).parents[2] / "leaderboard"
+    results = SplitResults(Sources(board=board), split, "mini")
+    assert results.models
+    for name, method in results.models.items():
         stored = [read_statistics(held.path).skill() for held in method.trainings]
         values = [skill.value for skill in stored if skill is not None]
-        assert evidence.skill(name) == pytest.approx(np.mean(values), abs=1e-4)
+        assert results.skill(name) == pytest.approx(np.mean(values), abs=1e-4)
