@@ -32,6 +32,7 @@ from lagbench.references.shipped import shipped, shipped_path
 from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.submission.provenance import TrainingProvenance
 
 from .thesis import ROSTER
 
@@ -47,11 +48,6 @@ thesis.
 """
 
 RUN = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
-WORDS = re.compile(r"recipe (\S+), step \d+(?:, (?:predicted with )?(.*))?$")
-"""What predictions say of a training by one of our recipes: its name and what was
-changed.
-"""
-
 RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
 
@@ -434,13 +430,13 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
     """Return what an entry says of a training by one of our recipes, in the terms of
     training.json.
     """
-    words = WORDS.search(entry.get("training") or "")
+    provenance = TrainingProvenance.from_sentence(entry.get("training") or "")
     paid = made.get("budget") or {}
     if (
         not paid and len(entry["predictions"]) == 1
     ):  # of several seeds the entry has the mean
         paid = entry.get("budget") or {}
-    if not words or not paid.get("steps") or paid.get("cpu_hours") is None:
+    if provenance is None or not paid.get("steps") or paid.get("cpu_hours") is None:
         return {}
     device = paid.get("device") or entry.get("hardware")
     windows = paid.get("windows")
@@ -449,6 +445,7 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
         validations = paid.get("validations")
     else:
         validations = None
+    changed = provenance.describe_changes().removeprefix("predicted with ")
     told = {
         "step": paid["steps"],
         "cpu_seconds": 3600.0 * paid["cpu_hours"],
@@ -456,8 +453,8 @@ def _told(entry: Mapping[str, Any], made: Mapping[str, Any]) -> dict[str, Any]:
             {"step": step, metric: value} for step, value in validations or ()
         ],
         "recipe": {
-            "name": words[1],
-            "changed": words[2],
+            "name": provenance.recipe,
+            "changed": changed or None,
             "training": {"batch": round((windows or 0) / paid["steps"])},
         },
         "hardware": {
