@@ -26,8 +26,8 @@ PREDICTED_WITH = ", predicted with "
 # change ends a change.
 NEXT_CHANGE = re.compile(r", (?=started from |[a-z]\w*(?:\.\w+)*=)")
 
-Word = Annotated[str, StringConstraints(pattern=r"^\S{1,200}$")]
-Override = Annotated[str, StringConstraints(min_length=1, max_length=1000)]
+Word = Annotated[str, StringConstraints(pattern=r"^[!-~]{1,200}$")]
+Override = Annotated[str, StringConstraints(pattern=r"^[ -~]{1,1000}$")]
 Overrides = Annotated[tuple[Override, ...], Field(max_length=MOST_OVERRIDES)]
 
 
