@@ -197,6 +197,7 @@ class Browser:
         page.call("Emulation.setEmulatedMedia", features=[scheme])
         page.call("Page.navigate", url=path.absolute().as_uri())
         self.wait("Page.loadEventFired")
+        wait_for_script(page)
         return page
 
     def close(self) -> None:
@@ -289,17 +290,25 @@ def until(page: Page, condition: str) -> None:
     raise AssertionError(condition)
 
 
+def wait_for_script(page: Page) -> None:
+    """Wait until the script of a leaderboard has decompressed its data and drawn."""
+    has_data = "document.getElementById('page-data') !== null"
+    is_ready = "document.documentElement.dataset.ready !== undefined"
+    until(page, f"!({has_data}) || {is_ready}")
+
+
 def restored(page: Page, address: str) -> None:
     """Load the page anew at an address."""
     run(page, f"location.hash = {json.dumps(address)}")
     page.browser.events.clear()
     page.call("Page.reload")
     page.browser.wait("Page.loadEventFired")
+    wait_for_script(page)
 
 
 def seen(page: Page) -> list[list[str]]:
     """Return the texts of the table in view: rank, name, numbers."""
-    rows = "section.tab:not([hidden]) tr:is([data-entry], [data-floor]):not([hidden])"
+    rows = "section.tab:not([hidden]) tr:is([data-entry], [data-reference]):not([hidden])"
     found: list[list[str]] = page.value(
         f"[...document.querySelectorAll('{rows}')].map(tr =>"
         " [tr.cells[0], tr.querySelector('.name'),"

@@ -18,13 +18,13 @@ from lagbench.board.build import (
     RESIDUAL_BINS,
     build,
     collect,
-    curve,
-    residuals,
+    make_curve,
+    residual_histograms,
 )
 from lagbench.board.folder import Folder
-from lagbench.board.model import Board, Row
+from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
-from lagbench.board.show import as_plain, chosen_data_sets, tables
+from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
@@ -58,7 +58,7 @@ def card(bench: BoardBench) -> ScoreCard:
     return bench.data.card(bench.predict(noisy, "again"))
 
 
-def row_of(board: Board, method: str) -> Row:
+def row_of(board: Board, method: str) -> BoardRow:
     """Return a row of the only tab."""
     return next(row for row in board.tabs[0].rows if row.id == method)
 
@@ -89,7 +89,7 @@ def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> 
     """Every floor of the scorer is there, with the scores that it has beside any
     submission.
     """
-    floors = {floor.name: floor for floor in board.tabs[0].floors}
+    floors = {floor.name: floor for floor in board.tabs[0].references}
     assert set(floors) == set(card.scores) - {SUBMISSION}
     assert set(floors) < set(REFERENCES)
     for name, floor in floors.items():
@@ -196,7 +196,7 @@ def test_residual_histograms(card: ScoreCard) -> None:
     histogram.
     """
     for found, (truth, prediction) in zip(
-        residuals(card.preview),
+        residual_histograms(card.preview),
         np.swapaxes(card.preview.vorticity.astype(float), 0, 1),
         strict=True,
     ):
@@ -229,7 +229,7 @@ def test_curves_keep_the_ends() -> None:
     """
     frames = np.stack([np.arange(598.0), 3.0 * np.arange(598.0)])
     frames[0, 0] = np.nan
-    found = curve(made_up(frames))
+    found = make_curve(made_up(frames))
     assert len(found.frames) == CURVE_FRAMES
     assert (found.frames[0], found.frames[-1]) == (10, 607)
     assert found.mean[0] == 0.0
@@ -244,7 +244,7 @@ def test_curves_of_sampled_metrics_are_lines() -> None:
     """
     frames = np.full((2, 298), np.nan)
     frames[:, 9::10] = np.arange(29.0)
-    found = curve(made_up(frames))
+    found = make_curve(made_up(frames))
     assert found.frames == tuple(range(19, 308, 10))
     assert list(found.mean) == list(range(29))
 
@@ -255,7 +255,7 @@ def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """
     paths = ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
     held = [read_statistics(bench.folder / path) for path in paths]
-    found = combine(held)["vorticity_pearson"]
+    found = combine([scores.tallies for scores in held])["vorticity_pearson"]
     assert np.array_equal(
         found.score.values, held[0].scores()["vorticity_pearson"].values
     )
@@ -295,7 +295,7 @@ def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
     some = collect(
         own.folder, only=Folder(own.folder).data_sets(), registry=own.registry
     )
-    assert as_plain(some) == as_plain(board)
+    assert to_plain(some) == to_plain(board)
     own.entry("noisy").write_text("no entry")
     nothing = collect(own.folder, only=[("cavity", "mini")], registry=own.registry)
     assert (nothing.tabs, nothing.empty) == ((), (("cavity", "mini"),))
@@ -316,13 +316,13 @@ def test_tables_and_json(board: Board) -> None:
         "position_rmse",
     )
     rows = {row[1]: row for row in table.rows}
-    measured = sorted(floor.name for floor in board.tabs[0].floors)
+    measured = sorted(floor.name for floor in board.tabs[0].references)
     for name in measured:
         assert (rows[name][0], rows[name][-1]) == ("-", "floor")
     assert rows["damped"][0] == str(row_of(board, "damped").rank)
     assert " ± " in rows["damped"][3]
     assert rows["damped"][5:7] == ("0.5", "4")
-    (plain,) = as_plain(board)["tabs"]
+    (plain,) = to_plain(board)["tabs"]
     means = {
         row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain["rows"]
     }
@@ -334,7 +334,7 @@ def test_tables_and_json(board: Board) -> None:
         "speed_up"
     ] == 4.0
     with pytest.raises(UsageError, match="did you mean 'cavity tiny'"):
-        chosen_data_sets([("cavity", "tiny")], "cavity", "tyni")
+        choose_data_sets([("cavity", "tiny")], "cavity", "tyni")
     with pytest.raises(UsageError, match="no metric"):
         list(tables(board, ["position_rmsee"]))
 
@@ -351,5 +351,5 @@ def test_boards_without_an_entry_are_named(
     empty = collect(tmp_path, registry=bench.registry)
     assert empty.tabs == ()
     assert set(board.empty) <= set(empty.empty)
-    assert chosen_data_sets([], None, None) == ()
+    assert choose_data_sets([], None, None) == ()
     assert build(tmp_path, registry=bench.registry).rows == 0

@@ -19,7 +19,7 @@ from conftest import SIZE, SPLIT
 from typer.testing import Result
 
 from lagbench.board.entry import Entry, EntryBudget, Meta
-from lagbench.board.findings import CHECKS
+from lagbench.board.issues import CHECKS
 from lagbench.make.generate import GenerationResult
 
 DOCS = Path(__file__).parent.parent / "docs"

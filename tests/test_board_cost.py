@@ -15,7 +15,7 @@ from board_worlds import make_board
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
-from lagbench.board.cost import Mark, draw, front, marks_of
+from lagbench.board.cost import CostPoint, draw, find_front, points_of
 from lagbench.board.model import Tab
 from lagbench.data.registry import load
 from lagbench.references import shipped, solver_seconds
@@ -28,18 +28,18 @@ def tab() -> Tab:
     return make_board((("cavity", "mini"),)).tabs[0]
 
 
-def mark(seconds: float, error: float, kind: str = "entry") -> Mark:
+def mark(seconds: float, error: float, kind: str = "entry") -> CostPoint:
     """Return a mark named after its place."""
-    return Mark(name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind)
+    return CostPoint(name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind)
 
 
 def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
     """An entry twice as fast as the solver on its own machine costs half of the solver
     here.
     """
-    raw = {one.name: one.seconds for one in marks_of(tab)}
+    raw = {one.name: one.seconds for one in points_of(tab)}
     here = {
-        one.name: one.seconds for one in marks_of(replace(tab, solver_seconds=0.02))
+        one.name: one.seconds for one in points_of(replace(tab, solver_seconds=0.02))
     }
     for row in tab.rows:
         if row.active and row.entry.cost is not None:
@@ -57,7 +57,7 @@ def test_the_front_holds_what_no_other_beats() -> None:
     better.
     """
     marks = [mark(2, 5), mark(1, 4), mark(3, 4), mark(4, 1), mark(5, 0.5)]
-    assert [(one.seconds, one.error) for one in front(marks)] == [
+    assert [(one.seconds, one.error) for one in find_front(marks)] == [
         (1, 4),
         (4, 1),
         (5, 0.5),
@@ -158,7 +158,7 @@ def test_a_crowd_at_the_edge_keeps_its_names() -> None:
         "persistence": (4e-6, 1.0),
     }
     marks = [
-        Mark(name=name, seconds=s, error=e, kind="entry")
+        CostPoint(name=name, seconds=s, error=e, kind="entry")
         for name, (s, e) in crowd.items()
     ]
     svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))

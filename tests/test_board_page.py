@@ -19,8 +19,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from lagbench.board.entry import Cost, Flag, Weights
-from lagbench.board.model import Board, Row
+from lagbench.board.entry import EntryCost, EntryFlag, Weights
+from lagbench.board.model import Board, BoardRow
 from lagbench.board.page import BUDGET, FEWEST, render
 from lagbench.board.payload import (
     FINENESS,
@@ -51,7 +51,7 @@ def page(board: Board) -> str:
     return render(board)
 
 
-def with_rows(board: Board, *rows: Row, **changes: Any) -> str:
+def with_rows(board: Board, *rows: BoardRow, **changes: Any) -> str:
     """Return the page of the first tab with other rows."""
     return render(replace(board, tabs=(replace(board.tabs[0], rows=rows, **changes),)))
 
@@ -212,7 +212,7 @@ def test_every_number_stands_in_the_table(board: Board, page: str) -> None:
         for metric, value in row.values.items():
             told = float(cells.get(metric, "nan"))
             assert told == pytest.approx(value.mean, rel=1e-8, nan_ok=True)
-        if isinstance(row, Row):
+        if isinstance(row, BoardRow):
             assert cells["checked"] == ("verified" if row.verified else "as submitted")
 
 
@@ -248,10 +248,10 @@ def test_floors_are_judged_like_entries(board: Board) -> None:
     from them.
     """
     tab = board.tabs[0]
-    floor = tab.floors[0]
+    floor = tab.references[0]
     best = {name: replace(value, mean=1e-9) for name, value in floor.values.items()}
     page = with_rows(
-        board, *tab.rows, floors=(replace(floor, values=best), *tab.floors[1:])
+        board, *tab.rows, references=(replace(floor, values=best), *tab.references[1:])
     )
     (first,) = re.findall(r"<tbody>(<tr class=\"floor\"[^>]*>.*?</tr>)", page)
     assert f'data-floor="{floor.name}"' in first
@@ -274,7 +274,7 @@ def test_beside_and_beyond_an_aim_do_not_cancel(board: Board) -> None:
             row.values["energy_ratio"], mean=sum(scenarios) / 2, per_scenario=scenarios
         )
         rows.append(replace(row, values={**row.values, "energy_ratio": value}))
-    page = with_rows(board, *rows, floors=())
+    page = with_rows(board, *rows, references=())
     cells = re.findall(
         r'<td(?: class="([^"]*)")?[^>]*data-value="(1|0.9|0.5)" data-loss="([^"]*)"',
         page,
@@ -325,7 +325,7 @@ def test_skill_below_nothing_is_not_shaded_as_skill(board: Board) -> None:
         for row, skill in zip(board.tabs[0].rows, (0.8, 0.1, -50.0), strict=False)
         if row.skill
     ]
-    page = with_rows(board, *rows, floors=())
+    page = with_rows(board, *rows, references=())
     shades = re.findall(
         r'<td class="(?:[^"]* )?(\w+)"[^>]*data-value="(0\.8|0\.1|-50)"', page
     )
@@ -339,7 +339,7 @@ def test_a_warning_tells_a_few_reasons_and_a_flag_all(board: Board) -> None:
     reasons = tuple(f"reason {number}" for number in range(9))
     row = board.tabs[0].rows[0]
     names = {"flags": "copy_suspect", "warnings": "max_displacement"}
-    raised = {kind: (Flag(name=name, reasons=reasons),) for kind, name in names.items()}
+    raised = {kind: (EntryFlag(name=name, reasons=reasons),) for kind, name in names.items()}
     files = (row.entry.score.files[0].model_copy(update=raised),)
     page = with_rows(
         board,
@@ -379,7 +379,7 @@ def test_speed_is_told_against_the_solver(
     """The tile of the fastest entry says what 1 stands for, and on which side of it the
     entry is.
     """
-    cost = Cost(
+    cost = EntryCost(
         seconds_per_frame=2.0, device="a machine", solver_seconds_per_frame=2.0 * speed
     )
     page = with_rows(board, with_entry(board.tabs[0].rows[0], cost=cost))

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.data.checksums import round_digits
 
 LEVELS = 4000
-"""Steps between the least and the greatest value of an array."""
+"""Steps between the least and the greatest value of an array, unless told otherwise."""
 
 MISSING = -(2**15)
 """Level that stands for NaN."""
@@ -57,8 +57,13 @@ class Scale:
 WHOLE_NUMBERS = Scale(zero=0.0, step=1.0, is_logarithmic=False)
 
 
-def scale_for(values: NDArray[np.float64], *, prefer_logarithmic: bool) -> Scale:
-    """Return a scale that spans some values.
+def scale_for(
+    values: NDArray[np.float64],
+    *,
+    prefer_logarithmic: bool = False,
+    levels: int = LEVELS,
+) -> Scale:
+    """Return a scale of so many steps that spans some values.
 
     A logarithmic one needs values >= 0; zeros and very small values become the least
     value of its range.
@@ -72,7 +77,7 @@ def scale_for(values: NDArray[np.float64], *, prefer_logarithmic: bool) -> Scale
     if is_logarithmic:
         low = math.log(known[known > SMALLEST_SHARE * high].min())
         high = math.log(high)
-    step = (high - low) / LEVELS
+    step = (high - low) / levels
     if step == 0.0:
         step = 1.0
     return Scale(
@@ -91,7 +96,11 @@ class ArrayStore:
     _starts: dict[bytes, int] = field(default_factory=dict)
 
     def add(
-        self, values: ArrayLike, *, prefer_logarithmic: bool = False
+        self,
+        values: ArrayLike,
+        *,
+        prefer_logarithmic: bool = False,
+        levels: int = LEVELS,
     ) -> dict[str, float | bool]:
         """Add an array, shape [row] or [row, column], NaN where values are missing.
 
@@ -99,7 +108,9 @@ class ArrayStore:
             The reference that page/data.js reads: place, shape and scale.
         """
         array = np.asarray(values, np.float64)
-        scale = scale_for(array, prefer_logarithmic=prefer_logarithmic)
+        scale = scale_for(
+            array, prefer_logarithmic=prefer_logarithmic, levels=levels
+        )
         return self._store(array, scale)
 
     def add_whole(self, numbers: ArrayLike) -> dict[str, float | bool]:

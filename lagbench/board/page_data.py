@@ -24,8 +24,9 @@ from .model import BoardRow, Curve, Histogram, Pictures, ReferenceRow, Value
 from .sampling import coarsen, spaced
 from .table_view import Line, TableView, target_loss
 
-FILM_FRAMES = 24  # most frames of a film
-FILM_PARTICLES = 144  # most particles of a film
+FILM_FRAMES = 26  # most frames of a film
+FILM_PARTICLES = 160  # most particles of a film
+FILM_LEVELS = 2000  # steps across a film: four to a pixel
 MAP_FRAMES = 4  # most frames of vorticity maps and histograms
 MAP_NODES = 20  # most nodes of a map, a side
 
@@ -217,7 +218,9 @@ class _TabWriter:
             "histograms": [self._histogram(pictures.histograms[i]) for i in maps],
             "filmFrames": [pictures.film_frames[i] for i in frames],
             "material": pictures.material[particles].tolist(),
-            "film": self._arrays.add(film.reshape(len(frames), -1)),
+            "film": self._arrays.add(
+                film.reshape(len(frames), -1), levels=FILM_LEVELS
+            ),
         }
 
 
