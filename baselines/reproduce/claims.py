@@ -16,7 +16,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm
 from lagbench.metrics.table import CHOSEN

@@ -17,7 +17,10 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
 from lagbench.data.scenario import ScenarioFile
-from lagbench.draw.panels import (
+from lagbench.errors import require
+from lagbench.figures.canvas import figure, pixels_of, png_bytes
+from lagbench.figures.colours import INK
+from lagbench.figures.panels import (
     Panel,
     colour_bar,
     colour_scale,
@@ -25,10 +28,8 @@ from lagbench.draw.panels import (
     draw_walls,
     limit_of,
 )
-from lagbench.draw.recording import Recording, Scene, open_recording
-from lagbench.draw.style import INK, figure, pixels_of, png_bytes
-from lagbench.draw.tables import Table, markdown
-from lagbench.errors import require
+from lagbench.figures.recording import Recording, Scene, open_recording
+from lagbench.figures.tables import Table, markdown
 from lagbench.metrics.frame import FramePair, Scenario, Snapshot
 from lagbench.submission.predictions import Predictions, open_predictions
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import METRICS

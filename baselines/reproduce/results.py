@@ -18,8 +18,8 @@ from itertools import combinations
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.draw.tables import Table, markdown
 from lagbench.errors import LagbenchError
+from lagbench.figures.tables import Table, markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.table import REFERENCES

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.manifest import read_manifest
-from lagbench.draw.tables import Table
 from lagbench.errors import DataError
+from lagbench.figures.tables import Table
 from lagbench.metrics.distributions import kl, normalised
 from lagbench.metrics.table import METRICS
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from lagbench.data.registry import Size
-from lagbench.draw.style import MUTED
+from lagbench.figures.colours import MUTED
 
 
 @dataclass(frozen=True)

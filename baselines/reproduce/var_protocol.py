@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from lagbench.atomic import write_atomically
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 
 from .drawing import Figure, Sheet
 from .plan import Plan

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lagbench.figures.html import MISSING, sentence, text, words
 from lagbench.metrics.metric import Direction, Metric, mean
-from lagbench.report.html import MISSING, sentence, text, words
 
 from .entry import EntryBudget, EntryCost
 from .model import BoardRow, ReferenceRow, Tab, Value

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
+from lagbench.figures.chart import WIDTH, Plot, Spot, close_logarithmic
+from lagbench.figures.html import Markup, tag, text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
-from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
-from lagbench.report.html import Markup, tag, text, words
 
 from .entry import EntryCost
 from .model import Board, Tab
@@ -148,7 +148,9 @@ def draw(
     if solver:
         plot.upright(solver, "the solver itself")
     front = find_front(points)
-    plot.front([point.seconds for point in front], [point.error for point in front])
+    front_times = [point.seconds for point in front]
+    front_errors = [point.error for point in front]
+    plot.line(front_times, front_errors, "front")
     plot.spots([_spot_of(point, ranking, is_best=point in front) for point in points])
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
@@ -175,7 +177,7 @@ def _spot_of(point: CostPoint, ranking: str, *, is_best: bool) -> Spot:
         x=point.seconds,
         y=point.error,
         name=point.name,
-        said=description,
+        description=description,
         kind=kind,
         href=point.href,
     )

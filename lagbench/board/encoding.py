@@ -108,9 +108,7 @@ class ArrayStore:
             The reference that page/data.js reads: place, shape and scale.
         """
         array = np.asarray(values, np.float64)
-        scale = scale_for(
-            array, prefer_logarithmic=prefer_logarithmic, levels=levels
-        )
+        scale = scale_for(array, prefer_logarithmic=prefer_logarithmic, levels=levels)
         return self._store(array, scale)
 
     def add_whole(self, numbers: ArrayLike) -> dict[str, float | bool]:

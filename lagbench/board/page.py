@@ -18,8 +18,18 @@ from dataclasses import dataclass
 from importlib.resources import files
 from itertools import groupby
 
+from lagbench.figures.colours import DARK, LIGHT, format_variables
+from lagbench.figures.html import (
+    Markup,
+    clipped,
+    escaped,
+    join,
+    load_style_sheet,
+    tag,
+    text,
+    words,
+)
 from lagbench.metrics.metric import Direction, Metric
-from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import format_value, leader_of, value_of
 from .cost import cost_figure
@@ -152,13 +162,11 @@ def _script() -> str:
 
 
 def _style_sheet() -> str:
-    """Return the report's style sheet, schemes that a reader may choose, our rules."""
-    report = files("lagbench.report").joinpath("style.css").read_text("utf-8")
-    light, dark = re.findall(r":root\{([^}]*)\}", report)[:2]
-    light = light.replace("color-scheme:light dark", "color-scheme:light")
-    dark = f"color-scheme:dark;{dark.strip()}"
+    """Return the rules of all pages, schemes that a reader may choose, and our rules."""
+    light = f"color-scheme:light;{format_variables(LIGHT)}"
+    dark = f"color-scheme:dark;{format_variables(DARK)}"
     schemes = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
-    return report + schemes + _read_part("page.css")
+    return load_style_sheet() + schemes + _read_part("page.css")
 
 
 def _policy(*, scripts: Sequence[str], style: str) -> str:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from lagbench.data.checksums import round_digits
-from lagbench.draw.style import MATERIAL_COLOURS
-from lagbench.report.html import MISSING, text, words
+from lagbench.figures.colours import MATERIAL_COLOURS
+from lagbench.figures.html import MISSING, text, words
 
 from .encoding import ArrayStore
 from .entry import Entry
@@ -218,9 +218,7 @@ class _TabWriter:
             "histograms": [self._histogram(pictures.histograms[i]) for i in maps],
             "filmFrames": [pictures.film_frames[i] for i in frames],
             "material": pictures.material[particles].tolist(),
-            "film": self._arrays.add(
-                film.reshape(len(frames), -1), levels=FILM_LEVELS
-            ),
+            "film": self._arrays.add(film.reshape(len(frames), -1), levels=FILM_LEVELS),
         }
 
 

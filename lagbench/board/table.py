@@ -6,8 +6,8 @@ cells by the page data; it reads no number from the table.
 
 from __future__ import annotations
 
+from lagbench.figures.html import MISSING, Markup, interval, join, tag, text
 from lagbench.metrics.metric import Direction
-from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column
 from .model import BoardRow, ReferenceRow, Tab

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from lagbench.data.checksums import round_digits
+from lagbench.figures.html import text
 from lagbench.metrics.metric import Direction, Metric
-from lagbench.report.html import text
 
 from .columns import (
     SKILL,

@@ -1,4 +1,4 @@
-"""Tables of text, and how Markdown spells them: escaped and aligned."""
+"""Tables of text, and their Markdown: escaped and aligned."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Table:
     title: str  # what it shows
     columns: tuple[str, ...]  # names of the columns, perhaps in lines
     rows: tuple[tuple[str, ...], ...]  # cells, row by row
-    keys: int = 1  # how many columns say what a row is
+    keys: int = 1  # number of columns that say what a row is
 
 
 def escape(text: object) -> str:
@@ -25,24 +25,31 @@ def escape(text: object) -> str:
     >>> print(escape("a_b | <c>"))
     a\_b \| \<c\>
     """
-    return _SPECIAL.sub(r"\\\1", " ".join(str(text).split()))
+    one_line = " ".join(str(text).split())
+    return _SPECIAL.sub(r"\\\1", one_line)
 
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """Return a table in Markdown; numbers are set flush right, everything is escaped.
+    """Return a table in Markdown, all text escaped.
 
-    Cells that start and end with a backtick are code and stay as they are.
+    Columns of numbers are set flush right. Cells that start and end with a backtick
+    are code and stay as they are.
     """
-    numeric = [
-        all(isinstance(row[i], int | float) for row in rows) and bool(rows)
-        for i in range(len(head))
-    ]
-    lines = [map(escape, head), ("---:" if right else "---" for right in numeric)]
-    lines += [map(_cell, row) for row in rows]
+    rules = []
+    for column in range(len(head)):
+        is_numeric = all(isinstance(row[column], int | float) for row in rows)
+        if is_numeric and rows:
+            rules.append("---:")
+        else:
+            rules.append("---")
+
+    lines = [[escape(name) for name in head], rules]
+    for row in rows:
+        lines.append([_format_cell(value) for value in row])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def _cell(value: object) -> str:
+def _format_cell(value: object) -> str:
     if isinstance(value, bool):
         if value:
             return "yes"
@@ -52,12 +59,7 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.9g}"
     text = str(value)
-    is_code = (
-        len(text) > 2
-        and text.startswith("`")
-        and text.endswith("`")
-        and "`" not in text[1:-1]
-    )
-    if is_code:
+    is_quoted = len(text) > 2 and text.startswith("`") and text.endswith("`")
+    if is_quoted and "`" not in text[1:-1]:
         return text.replace("|", "\\|")
     return escape(text)
