@@ -219,7 +219,9 @@ class _World:
         energy = self.banded(np.full(len(f), 1e-9) if still else moved, 0.1)
         return {"values": values, "curves": curves, "energy": energy}
 
-    def row(self, name: str, place: int, split: str, size: str, *, skill: bool) -> BoardRow:
+    def row(
+        self, name: str, place: int, split: str, size: str, *, skill: bool
+    ) -> BoardRow:
         """Return the row of the method in a place."""
         bad = 1.0 + 0.35 * place
         rng = np.random.Generator(np.random.PCG64([self.seed, place]))
@@ -333,8 +335,12 @@ def make_entry(
     """Return an entry that says a little of everything."""
     seeds: list[int | None] = [0, 1, 2] if place % 2 == 0 else [None]
     hashes = [f"{k}f" * 32 for k in range(len(seeds))]
-    flags = {4: EntryFlag(name="physics", reasons=("14 times the truth's kinetic energy",))}
-    flags[6] = EntryFlag(name="copy_suspect", reasons=("the error drops within one frame",))
+    flags = {
+        4: EntryFlag(name="physics", reasons=("14 times the truth's kinetic energy",))
+    }
+    flags[6] = EntryFlag(
+        name="copy_suspect", reasons=("the error drops within one frame",)
+    )
     outside = EntryFlag(
         name="in_domain", reasons=("41 positions lie outside the box",), share=0.059
     )
@@ -401,7 +407,9 @@ def make_entry(
 def _cost(bad: float, rng: np.random.Generator) -> EntryCost:
     seconds = 0.08 / bad**1.2 * (0.5 + rng.random())
     device = "NVIDIA H200" if rng.random() < 0.5 else "AMD EPYC 9354, 2 cores"
-    return EntryCost(seconds_per_frame=seconds, device=device, solver_seconds_per_frame=0.21)
+    return EntryCost(
+        seconds_per_frame=seconds, device=device, solver_seconds_per_frame=0.21
+    )
 
 
 def _metrics(kind: str) -> list[str]:

@@ -329,7 +329,8 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
         )
         chosen = [columns[key] for key in keys]
         expected = [
-            [format_value(value_of(row, one), one.form) for one in chosen] for row in shown
+            [format_value(value_of(row, one), one.form) for one in chosen]
+            for row in shown
         ]
         assert [row[2:] for row in seen(page)] == expected
         pressed = "document.querySelector('section:not([hidden]) [aria-pressed=true]').textContent"
@@ -537,7 +538,8 @@ def test_csv_equals_the_table(
         for key, cell, said in zip(keys, line[3:-2], texts[2:], strict=True):
             form = columns[key].form
             assert (
-                format_value(cell if form == "text" else float(cell or "nan"), form) == said
+                format_value(cell if form == "text" else float(cell or "nan"), form)
+                == said
             )
         value = values[line[1]]["vorticity_rmse"]
         assert float(line[3 + keys.index("vorticity_rmse")]) == pytest.approx(

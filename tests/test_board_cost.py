@@ -30,7 +30,9 @@ def tab() -> Tab:
 
 def mark(seconds: float, error: float, kind: str = "entry") -> CostPoint:
     """Return a mark named after its place."""
-    return CostPoint(name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind)
+    return CostPoint(
+        name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind
+    )
 
 
 def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:

@@ -162,7 +162,7 @@ def _script() -> str:
 
 
 def _style_sheet() -> str:
-    """Return the rules of all pages, schemes that a reader may choose, and our rules."""
+    """Return the rules of all pages, two schemes to choose from, and our rules."""
     light = f"color-scheme:light;{format_variables(LIGHT)}"
     dark = f"color-scheme:dark;{format_variables(DARK)}"
     schemes = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
