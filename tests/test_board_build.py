@@ -318,7 +318,7 @@ def test_tables_and_json(board: Board) -> None:
     rows = {row[1]: row for row in table.rows}
     measured = sorted(floor.name for floor in board.tabs[0].references)
     for name in measured:
-        assert (rows[name][0], rows[name][-1]) == ("-", "floor")
+        assert (rows[name][0], rows[name][-1]) == ("-", "reference")
     assert rows["damped"][0] == str(row_of(board, "damped").rank)
     assert " ± " in rows["damped"][3]
     assert rows["damped"][5:7] == ("0.5", "4")
