@@ -267,7 +267,7 @@ def test_hostile_text_does_nothing(
     for hash_ in ("", f"entry={bad.id}", f"entry={long.id}"):
         restored(page, f"#tab=cavity-full&{hash_}")
         assert page.value("document.images.length") == 0
-        assert page.value("document.scripts.length") == 3
+        assert page.value("document.scripts.length") == 4
         assert page.value(
             "[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))"
         )

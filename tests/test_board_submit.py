@@ -176,7 +176,7 @@ def test_predictions_are_submitted_once(
             {"method": "noisy"},
             {"method": "persistence"},
         ),
-        *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
+        *({"name": "NO\u0406SY"}, {"name": "Persistence"}),
         *(
             {"urls": ("https://a.org/1", "https://a.org/2")},
             {"date": datetime.date(2999, 1, 1)},
