@@ -12,7 +12,7 @@ from lagbench.submission.findings import Finding, Severity
 RESCORE = (
     "submit the predictions again: lagbench submit; the score block is not for editing"
 )
-REFERENCES_ANEW = "remove the file: `lagbench submit` writes the floors anew"
+REFERENCES_ANEW = "remove the file: `lagbench submit` writes it anew"
 
 
 class BoardCheck(NamedTuple):
@@ -69,7 +69,8 @@ CHECKS: Mapping[str, BoardCheck] = {
         "date: the day of the submission",
     ),
     "name": BoardCheck(
-        "two active entries, or an entry and a floor, whose names look alike",
+        "two active entries, or an entry and a reference predictor, whose names "
+        "look alike",
         "two names look alike",
         "a name of its own",
         "choose another name, or say what differs, as in 'GNS, six terms'",
@@ -120,7 +121,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     "weights": BoardCheck(
         "weights that are missing, edited, out of place, without an entry or of two; "
         "more than 40 MB of"
-        " them; a long or broken record of a training",
+        " them; a long or broken log of a training",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "
@@ -140,10 +141,10 @@ CHECKS: Mapping[str, BoardCheck] = {
         "add its entry, or remove it",
     ),
     "floor": BoardCheck(
-        "scores of a floor that are unknown, cannot be read, or belong to "
-        "something else",
-        "no floor of the scorer",
-        "scores of a floor that `lagbench submit` wrote",
+        "scores of a reference predictor that are unknown, cannot be read, or "
+        "belong to something else",
+        "no reference predictor of the scorer",
+        "scores of a reference predictor that `lagbench submit` wrote",
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
@@ -165,8 +166,9 @@ CHECKS: Mapping[str, BoardCheck] = {
         "what the scorer gives",
     ),
     "measured": BoardCheck(
-        "a shipped score of a floor that is not what the data give, measured again",
-        "the shipped scores of a floor are not those of the data",
+        "a shipped score of a reference predictor that is not what the data give, "
+        "measured again",
+        "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
         "lagbench.scoring.record",

@@ -22,7 +22,7 @@ from lagbench.board.entry import Entry, EntryBudget, Meta
 from lagbench.board.issues import CHECKS
 from lagbench.make.generate import GenerationResult
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 TOY = DOCS / "examples" / "toy_model"
 Run = Callable[..., Result]
 

@@ -27,7 +27,7 @@ from lagbench.board.entry_file import (
 )
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 
-LEADERBOARD = Path(__file__).parent.parent / "leaderboard"
+LEADERBOARD = Path(__file__).parents[2] / "leaderboard"
 HASH = "0123456789abcdef" * 4
 
 
