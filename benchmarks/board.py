@@ -35,6 +35,7 @@ from lagbench.board.entry import (
     ScoredFile,
     Status,
 )
+from lagbench.board.entry_file import entry_bytes
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.ranking import combine, summarise, write_references
 from lagbench.cli.output import spell_bytes
@@ -182,7 +183,9 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_stored(path).scores.tallies for path in paths])),
+            metrics=summarise(
+                combine([read_stored(path).scores.tallies for path in paths])
+            ),
         ),
     )
     (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)

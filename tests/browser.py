@@ -98,7 +98,8 @@ class Page:
         """
         self.value("document.activeElement.blur(), 0")
         box = self.value(
-            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
+            f"(e => {{ e.scrollIntoView({{block: 'center'}});"
+            " const b = e.getBoundingClientRect();"
             " return {x: b.x + scrollX - 6, y: b.y + scrollY - 6, width: b.width + "
             "12, height: b.height + 12}"
             f" }})(document.querySelector({json.dumps(selector)}))"
@@ -109,7 +110,8 @@ class Page:
             picture = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
             pictures.append(np.asarray(picture, np.int16))
             self.value(
-                f"document.querySelector({json.dumps(selector)}).focus({{preventScroll: true}}), 0"
+                f"document.querySelector({json.dumps(selector)})"
+                ".focus({preventScroll: true}), 0"
             )
         return bool((abs(pictures[1] - pictures[0]) > CLEAR).sum() >= MARKED)
 
@@ -308,7 +310,9 @@ def restored(page: Page, address: str) -> None:
 
 def seen(page: Page) -> list[list[str]]:
     """Return the texts of the table in view: rank, name, numbers."""
-    rows = "section.tab:not([hidden]) tr:is([data-entry], [data-reference]):not([hidden])"
+    rows = (
+        "section.tab:not([hidden]) tr:is([data-entry], [data-reference]):not([hidden])"
+    )
     found: list[list[str]] = page.value(
         f"[...document.querySelectorAll('{rows}')].map(tr =>"
         " [tr.cells[0], tr.querySelector('.name'),"

@@ -326,7 +326,7 @@ class Entry(About):
 
     @model_validator(mode="after")
     def _check_consistency(self) -> Self:
-        seeds = [prediction.seed for prediction in self.predictions]
+        seeds = self.seeds
         if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
             raise ValueError("predictions: several need seeds that differ")
 

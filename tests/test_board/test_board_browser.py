@@ -169,7 +169,8 @@ def test_every_line_of_the_charts_is_drawn(page: Page, board: Board) -> None:
     """
     for tab in board.tabs:
         go(page, tab)
-        shown = "document.querySelectorAll('section:not([hidden]) [data-figure=lines] path.line')"
+        lines = "section:not([hidden]) [data-figure=lines] path.line"
+        shown = f"document.querySelectorAll('{lines}')"
         paths = page.value(f"[...{shown}].map(line => line.getAttribute('d'))")
         assert paths
         assert all({"L", "H"} & {*path} for path in paths)
@@ -333,8 +334,9 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
             for row in shown
         ]
         assert [row[2:] for row in seen(page)] == expected
-        pressed = "document.querySelector('section:not([hidden]) [aria-pressed=true]').textContent"
-        assert page.value(pressed) == name
+        pressed = "section:not([hidden]) [aria-pressed=true]"
+        label = f"document.querySelector('{pressed}').textContent"
+        assert page.value(label) == name
 
 
 @pytest.mark.parametrize(
@@ -410,7 +412,10 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     run(page, "document.querySelector('.tabs a').focus()")
     press(page, "ArrowRight")
     press(page, "ArrowRight")
-    shown = "[...document.querySelectorAll('section.tab')].filter(s => !s.hidden).map(s => s.id)"
+    shown = (
+        "[...document.querySelectorAll('section.tab')]"
+        ".filter(section => !section.hidden).map(section => section.id)"
+    )
     assert page.value(shown) == ["cavity-mini"]
     press(page, "End")
     assert page.value(shown) == ["fluid-mini"]

@@ -9,7 +9,9 @@ import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 from board_worlds import make_board
 from typer.testing import CliRunner
@@ -28,8 +30,8 @@ def tab() -> Tab:
     return make_board((("cavity", "mini"),)).tabs[0]
 
 
-def mark(seconds: float, error: float, kind: str = "entry") -> CostPoint:
-    """Return a mark named after its place."""
+def point(seconds: float, error: float, kind: str = "entry") -> CostPoint:
+    """Return a point named after its place."""
     return CostPoint(
         name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind
     )
@@ -58,7 +60,7 @@ def test_the_front_holds_what_no_other_beats() -> None:
     """By hand: (2, 5) is beaten by (1, 4); (3, 4) costs more than (1, 4) and is no
     better.
     """
-    marks = [mark(2, 5), mark(1, 4), mark(3, 4), mark(4, 1), mark(5, 0.5)]
+    marks = [point(2, 5), point(1, 4), point(3, 4), point(4, 1), point(5, 0.5)]
     assert [(one.seconds, one.error) for one in find_front(marks)] == [
         (1, 4),
         (4, 1),
@@ -66,91 +68,114 @@ def test_the_front_holds_what_no_other_beats() -> None:
     ]
 
 
+def classes_of(element: ElementTree.Element) -> list[str]:
+    """Return the classes of an element."""
+    return element.attrib.get("class", "").split()
+
+
+def place_of(circle: ElementTree.Element) -> tuple[float, float]:
+    """Return the middle of a circle."""
+    return float(circle.attrib["cx"]), float(circle.attrib["cy"])
+
+
 def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
     """Ten times the cost is the same step to the right; every dot has words and the
     keyboard reaches it.
     """
-    marks = [
-        mark(0.001, 1.0),
-        mark(0.01, 0.5),
-        mark(0.1, 0.25, "coarse"),
-        mark(0.05, 0.9, "floor"),
+    points = [
+        point(0.001, 1.0),
+        point(0.01, 0.5),
+        point(0.1, 0.25, "coarse"),
+        point(0.05, 0.9, "floor"),
     ]
-    svg = ElementTree.fromstring(draw(marks, 0.02, "vorticity_nrmse", "title"))
-    dots = [e for e in svg.iter() if "dot" in e.attrib.get("class", "").split()]
-    places = [(float(e[1].attrib["cx"]), float(e[1].attrib["cy"])) for e in dots]
-    (x0, y0), (x1, y1), (x2, y2), _ = places
-    assert x1 - x0 == pytest.approx(x2 - x1, abs=0.2)
-    assert y1 - y0 == pytest.approx(y2 - y1, abs=0.2)
-    assert y1 > y0  # less error stands lower
-    for one, dot in zip(marks, dots, strict=True):
+    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    dots = [element for element in svg.iter() if "dot" in classes_of(element)]
+    first, second, third, _ = [place_of(dot[1]) for dot in dots]
+    first_step = np.subtract(second, first)
+    second_step = np.subtract(third, second)
+    assert first_step == pytest.approx(second_step, abs=0.2)
+    assert first_step[1] > 0  # less error stands lower
+
+    for one, dot in zip(points, dots, strict=True):
         assert dot.attrib["aria-label"].startswith(one.name)
         assert dot.attrib["tabindex"] == "0"
     assert svg.attrib["role"] == "group"
-    assert "script" not in {e.tag for e in svg.iter()}
+    assert svg.find(".//script") is None
 
 
-def boxes(
-    svg: ElementTree.Element, kind: str, letter: float
-) -> list[tuple[float, float, float, float]]:
-    """Return left, top, right and bottom of every name, with so many pixels to a
-    letter.
-    """
-    found = []
+class Box(NamedTuple):
+    """A rectangle on the picture; y grows downwards."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def overlaps(self, other: Box) -> bool:
+        """Tell whether two rectangles share an area."""
+        is_beside = self.right <= other.left or other.right <= self.left
+        is_above = self.bottom <= other.top or other.bottom <= self.top
+        return not is_beside and not is_above
+
+
+def text_boxes(
+    svg: ElementTree.Element, kind: str, letter_width: float = 6.0
+) -> list[Box]:
+    """Return the boxes of the texts of a kind."""
+    boxes = []
     for text in svg.iter("text"):
-        classes = text.attrib["class"].split()
-        width = letter * len(text.text or "")
-        if classes[0] == kind:
-            share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
-            left = float(text.attrib["x"]) - share * width
-            base = float(text.attrib["y"])
-            found.append((left, base - 9, left + width, base + 2))
-    return found
+        classes = classes_of(text)
+        if classes[0] != kind:
+            continue
+        width = letter_width * len(text.text or "")
+        share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
+        left = float(text.attrib["x"]) - share * width
+        base = float(text.attrib["y"])
+        boxes.append(Box(left, base - 9, left + width, base + 2))
+    return boxes
 
 
-def apart(
-    one: tuple[float, float, float, float], other: tuple[float, float, float, float]
-) -> bool:
-    """Tell whether two boxes do not overlap."""
-    return (
-        one[2] <= other[0]
-        or other[2] <= one[0]
-        or one[3] <= other[1]
-        or other[3] <= one[1]
-    )
+def dot_boxes(svg: ElementTree.Element) -> list[Box]:
+    """Return the boxes of all circles."""
+    boxes = []
+    for circle in svg.iter("circle"):
+        x, y = place_of(circle)
+        boxes.append(Box(x - 3, y - 3, x + 3, y + 3))
+    return boxes
 
 
 def test_names_do_not_meet_names_or_dots() -> None:
-    """Twenty dots in one place and five near it: whatever is named, no name covers
-    another or a dot.
-    """
-    marks = [mark(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
-    marks += [mark(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
-    svg = ElementTree.fromstring(draw(marks, 0.02, "vorticity_nrmse", "title"))
-    texts = boxes(svg, "name", 6.0) + boxes(svg, "note", 6.0)
-    dots = [(float(e.attrib["cx"]), float(e.attrib["cy"])) for e in svg.iter("circle")]
+    """Twenty dots in one place and five near it: no name covers another or a dot."""
+    points = [point(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
+    points += [point(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
+    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    texts = text_boxes(svg, "name") + text_boxes(svg, "note")
     assert len(texts) > 3
-    for number, one in enumerate(texts):
-        circles = [(x - 3, y - 3, x + 3, y + 3) for x, y in dots]
-        assert all(apart(one, other) for other in (*texts[:number], *circles))
+    dots = dot_boxes(svg)
+    for number, text in enumerate(texts):
+        for other in (*texts[:number], *dots):
+            assert not text.overlaps(other)
 
 
 def test_a_crowd_at_the_edge_keeps_its_names() -> None:
-    """Five dots close together near the right edge: each has its name."""
-    crowd = {"VAR(1)": (0.052, 50.0), "SuperGAT": (0.075, 1.2), "GNS": (0.045, 0.89)}
-    crowd |= {
+    """Six dots, five of them close together near the right edge: each has its name."""
+    places = {
+        "VAR(1)": (0.052, 50.0),
+        "SuperGAT": (0.075, 1.2),
+        "GNS": (0.045, 0.89),
         "GNS, noise 1e-3": (0.036, 0.59),
         "analog": (0.0245, 1.5),
         "persistence": (4e-6, 1.0),
     }
-    marks = [
-        CostPoint(name=name, seconds=s, error=e, kind="entry")
-        for name, (s, e) in crowd.items()
-    ]
-    svg = ElementTree.fromstring(draw(marks, None, "vorticity_nrmse", "title"))
-    assert {
-        e.text for e in svg.iter("text") if e.attrib["class"].startswith("name")
-    } == set(crowd)
+    points = []
+    for name, (seconds, error) in places.items():
+        points.append(CostPoint(name=name, seconds=seconds, error=error, kind="entry"))
+    svg = ElementTree.fromstring(draw(points, None, "vorticity_nrmse", "title"))
+    names = set()
+    for text in svg.iter("text"):
+        if classes_of(text)[0] == "name":
+            names.add(text.text)
+    assert names == set(places)
 
 
 def test_axes_end_past_their_values() -> None:

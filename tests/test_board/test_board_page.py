@@ -189,7 +189,7 @@ def test_references_are_judged_like_entries(board: Board) -> None:
 
 
 def test_values_below_and_above_an_aim_do_not_cancel(board: Board) -> None:
-    """Energy ratios 0 and 2 have the mean 1 and reach no aim: 0.9 and 0.9 are nearer."""
+    """Energy ratios 0 and 2 have the mean 1; 0.9 and 0.9 are nearer to the aim."""
     rows = []
     scenario_means = ((0.0, 2.0), (0.9, 0.9), (0.5, 0.5))
     for row, per_scenario in zip(board.tabs[0].rows, scenario_means, strict=False):

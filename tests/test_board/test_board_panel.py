@@ -35,7 +35,10 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
 )
 
-HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+HOSTILE = (
+    "</script><script>console.error(1)</script>"
+    "<img src=http://example.com/x onerror=console.error(2)>"
+)
 
 
 @pytest.fixture(scope="module")

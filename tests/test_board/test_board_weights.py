@@ -582,7 +582,10 @@ def test_each_seed_has_its_own_step_and_start(
     own: BoardBench, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Trainings that differ in these alone belong together, on the command line too."""
-    words = "cavity tiny train, recipe cavity/tiny, step {}, started from cavity/mini, weights {}"
+    words = (
+        "cavity tiny train, recipe cavity/tiny, step {}, "
+        "started from cavity/mini, weights {}"
+    )
     own.submit(
         own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")),
         name="My model",
