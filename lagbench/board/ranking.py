@@ -127,11 +127,12 @@ def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
 
     The package ships their scores on our splits. On other splits the scorer measures
     them beside a submission, and :func:`write_references` keeps them in the folder:
-    they are equal whoever submits. Scores on another data set are left out.
+    they are equal whoever submits. Scores on another data set are left out, and so are
+    scores of a predictor that is no longer in the table.
     """
     shipped_scores = shipped(size)
     if shipped_scores:
-        return tuple(shipped_scores.values())
+        return tuple(r for r in shipped_scores.values() if r.name in KNOWN)
 
     references = []
     for path in folder.reference_files(size.split, size.name):
