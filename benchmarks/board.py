@@ -25,17 +25,17 @@ import numpy as np
 from lagbench.board.build import build
 from lagbench.board.check import check_board
 from lagbench.board.entry import (
-    Cost,
     DataSet,
     Entry,
     EntryBudget,
-    Flag,
+    EntryCost,
+    EntryFlag,
     Prediction,
     ScoreBlock,
     ScoredFile,
     Status,
 )
-from lagbench.board.entry_file import spell
+from lagbench.board.entry_file import entry_bytes
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.ranking import combine, summarise, write_references
 from lagbench.cli.output import spell_bytes
@@ -122,7 +122,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
     ]
     paths = [target / path for path in score_paths(place, seeds)]
     if number % 7 == 0:
-        flags = (Flag(name="physics", reasons=("made up",)),)
+        flags = (EntryFlag(name="physics", reasons=("made up",)),)
     else:
         flags = ()
     for card, path in zip(cards, paths, strict=True):
@@ -156,7 +156,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
         parameters=int(10.0 ** rng.uniform(4, 8)),
         hardware="none",
         command=f"python benchmarks/board.py  # number {number}",
-        cost=Cost(
+        cost=EntryCost(
             seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
             device="a machine",
             solver_seconds_per_frame=0.05 if number % 3 else None,
@@ -183,11 +183,13 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_stored(path).scores for path in paths])),
+            metrics=summarise(
+                combine([read_stored(path).scores.tallies for path in paths])
+            ),
         ),
     )
     (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)
-    (target / entry.yaml_path).write_bytes(spell(entry))
+    (target / entry.yaml_path).write_bytes(entry_bytes(entry))
 
 
 def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:

@@ -64,7 +64,15 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
 OUTCOMES = scored._outcomes
 PAINT = painting.paint_pictures
 Names = tuple[str, ...]
-READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
+READERS = (
+    "build",
+    "folder_checks",
+    "identity",
+    "publish",
+    "ranking",
+    "rescoring",
+    "seeds",
+)
 
 SPLIT = "curl-noise"
 SIZE = "tiny"

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
+from lagbench.board.publish import SubmitResult
 from lagbench.board.ranking import combine, summarise
-from lagbench.board.submit import SubmitResult, submit
+from lagbench.board.submit import submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Registry, Size, default_path, load
@@ -310,7 +311,7 @@ class BoardBench:
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [read_stored(self.folder / path).scores for path in entry.score_paths]
+        stored = [read_stored(self.folder / path).scores.tallies for path in entry.score_paths]
         plain = {
             name: summary.model_dump()
             for name, summary in summarise(combine(stored)).items()

@@ -29,6 +29,7 @@ from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
+from .provenance import TrainingProvenance
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
@@ -59,6 +60,7 @@ OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
     "training": str,
     "solver_seconds_per_frame": float,
     "budget": str,
+    "provenance": str,
 }
 """Attributes that a file may have: cost, provenance and size of the model."""
 
@@ -128,6 +130,8 @@ class Header:
     # of our solver on one core of the same machine [s]
     solver_seconds_per_frame: float | None = None
     budget: Budget | None = None  # what the training took
+    # the training that made the model; of older files read from the words
+    provenance: TrainingProvenance | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,6 +160,8 @@ def kind_of(name: str) -> str:
         return f"printable text of 1 to {MAX_NAME} characters"
     if name == "budget":
         return "JSON of a training's budget"
+    if name == "provenance":
+        return "JSON of a training's provenance"
     return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
 
 
@@ -183,6 +189,10 @@ def fits(name: str, value: object) -> bool:
         return isinstance(value, (int, float)) and 0 < value < math.inf
     if name == "budget":
         return isinstance(value, str) and budget_in(value) is not None
+    if name == "provenance":
+        return (
+            isinstance(value, str) and TrainingProvenance.from_json(value) is not None
+        )
     return isinstance(value, OPTIONAL[name]) and not (
         name == "parameters" and int(value) < 0
     )
@@ -261,6 +271,10 @@ def header_of(anatomy: Anatomy) -> Header:
         labels["budget"] = budget_in(labels["budget"])
     else:
         labels["budget"] = None
+    if labels["provenance"]:
+        labels["provenance"] = TrainingProvenance.from_json(labels["provenance"])
+    elif labels["training"]:
+        labels["provenance"] = TrainingProvenance.from_sentence(labels["training"])
     return Header(
         **labels,
         scenarios=scenarios,

@@ -103,7 +103,7 @@ class PredictionsWriter:
         Args:
             **labels: seconds_per_frame [s], device, seed, parameters (trainable, a
                 number >= 0), training (in words), solver_seconds_per_frame [s], budget
-                (JSON, docs/predictions.md).
+                and provenance (JSON, docs/predictions.md).
 
         Raises:
             UsageError: there is no such label, or it cannot have that value.

@@ -19,10 +19,10 @@ from conftest import SIZE, SPLIT
 from typer.testing import Result
 
 from lagbench.board.entry import Entry, EntryBudget, Meta
-from lagbench.board.findings import CHECKS
+from lagbench.board.issues import CHECKS
 from lagbench.make.generate import GenerationResult
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 TOY = DOCS / "examples" / "toy_model"
 Run = Callable[..., Result]
 

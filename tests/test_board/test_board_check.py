@@ -17,10 +17,11 @@ import pytest
 import yaml
 from made_up import PLACE, SCORES, BoardBench, copied, master, reform, scale, set_mean
 
-from lagbench.board import check as checking
+from lagbench.board import folder_checks
 from lagbench.board.build import build
 from lagbench.board.check import check_board
-from lagbench.board.findings import CHECKS, skeleton
+from lagbench.board.identity import confusable_key
+from lagbench.board.issues import CHECKS
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError
 
@@ -281,14 +282,14 @@ def test_one_bad_file_hides_nothing(
     """An error that nobody thought of, in one entry, leaves the findings on the
     others.
     """
-    original = checking.load_plain
+    original = folder_checks.load_plain
 
     def failing(path: Path) -> Any:
         if path.stem == "damped":
             raise OverflowError("too large")
         return original(path)
 
-    monkeypatch.setattr(checking, "load_plain", failing)
+    monkeypatch.setattr(folder_checks, "load_plain", failing)
     own.edit("noisy", set_mean)
     assert found(own) == ["readable", "score"]
 
@@ -316,8 +317,8 @@ def test_later_entries_may_supersede_twins(own: BoardBench) -> None:
 )
 def test_names_that_look_alike(one: str, other: str) -> None:
     """Other scripts, wide letters, accents, case, hyphens, and digits like letters."""
-    assert skeleton(one) == skeleton(other)
-    assert skeleton(one) != skeleton(f"{other} b")
+    assert confusable_key(one) == confusable_key(other)
+    assert confusable_key(one) != confusable_key(f"{other} b")
 
 
 def test_withdrawn_entries_may_be_old(own: BoardBench) -> None:

@@ -18,13 +18,13 @@ from lagbench.board.build import (
     RESIDUAL_BINS,
     build,
     collect,
-    curve,
-    residuals,
+    make_curve,
+    residual_histograms,
 )
 from lagbench.board.folder import Folder
-from lagbench.board.model import Board, Row
+from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
-from lagbench.board.show import as_plain, chosen_data_sets, tables
+from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
@@ -58,7 +58,7 @@ def card(bench: BoardBench) -> ScoreCard:
     return bench.data.card(bench.predict(noisy, "again"))
 
 
-def row_of(board: Board, method: str) -> Row:
+def row_of(board: Board, method: str) -> BoardRow:
     """Return a row of the only tab."""
     return next(row for row in board.tabs[0].rows if row.id == method)
 
@@ -70,54 +70,60 @@ def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
     values = row_of(board, "noisy").values
     assert set(values) == set(card.submission)
     for name, score in card.submission.items():
-        held = values[name]
-        assert digits(held.mean) == digits(score.mean)
-        assert [digits(held.low), digits(held.high)] == [
-            digits(bound) for bound in score.interval
-        ]
-        assert np.array_equal(held.per_scenario, score.values, equal_nan=True)
-        assert held.undefined == sum(score.undefined)
-        assert math.isnan(held.std)
-        for frame, value in held.at.items():
-            defined = score.at(frame)[~np.isnan(score.at(frame))]
-            assert digits(value) == digits(
-                float(np.mean(defined)) if defined.size else math.nan
-            )
+        value = values[name]
+        low, high = score.interval
+        assert digits(value.mean) == digits(score.mean)
+        assert digits(value.low) == digits(low)
+        assert digits(value.high) == digits(high)
+        np.testing.assert_array_equal(value.per_scenario, score.values)
+        assert value.undefined == sum(score.undefined)
+        assert math.isnan(value.std)
+        for frame, mean in value.at.items():
+            scenario_values = score.at(frame)
+            defined = scenario_values[~np.isnan(scenario_values)]
+            expected = math.nan
+            if defined.size:
+                expected = float(np.mean(defined))
+            assert digits(mean) == digits(expected)
 
 
-def test_floors_stand_as_the_scorer_sees_them(board: Board, card: ScoreCard) -> None:
-    """Every floor of the scorer is there, with the scores that it has beside any
-    submission.
-    """
-    floors = {floor.name: floor for floor in board.tabs[0].floors}
-    assert set(floors) == set(card.scores) - {SUBMISSION}
-    assert set(floors) < set(REFERENCES)
-    for name, floor in floors.items():
-        assert set(floor.values) == set(card.scores[name])
-        for metric, score in card.scores[name].items():
-            assert digits(floor.values[metric].mean) == digits(score.mean)
-            assert floor.values[metric].per_scenario == pytest.approx(
-                score.values, rel=1e-6, nan_ok=True
-            )
+def test_references_stand_as_the_scorer_sees_them(
+    board: Board, card: ScoreCard
+) -> None:
+    """Every reference predictor of the scorer is there, with its scores."""
+    references = {row.name: row for row in board.tabs[0].references}
+    assert set(references) == set(card.scores) - {SUBMISSION}
+    assert set(references) < set(REFERENCES)
+    for name, reference in references.items():
+        scores = card.scores[name]
+        assert set(reference.values) == set(scores)
+        for metric, score in scores.items():
+            value = reference.values[metric]
+            expected = pytest.approx(score.values, rel=1e-6, nan_ok=True)
+            assert digits(value.mean) == digits(score.mean)
+            assert value.per_scenario == expected
 
 
 def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
     """Mean over seeds per scenario, sample deviation over seeds, interval over both."""
-    files = [bench.folder / f"scores/cavity/tiny/damped_{seed}.nc" for seed in (0, 3)]
-    first, second = (read_statistics(path).scores() for path in files)
+    folder = bench.folder / "scores/cavity/tiny"
+    first = read_statistics(folder / "damped_0.nc").scores()
+    second = read_statistics(folder / "damped_3.nc").scores()
     row = row_of(board, "damped")
-    assert [made.seed for made in row.entry.predictions] == [0, 3]
+    assert row.entry.seeds == (0, 3)
     for name in ("vorticity_rmse", "position_rmse", "energy_error"):
-        one = first[name].values
-        two = second[name].values
-        held = row.values[name]
-        assert held.per_scenario == pytest.approx((one + two) / 2.0)
-        assert held.mean == pytest.approx((one + two).mean() / 2.0)
-        assert held.std == pytest.approx(abs(one.mean() - two.mean()) / math.sqrt(2.0))
-        assert (held.low, held.high) == bootstrap_interval(np.stack([one, two]))
-    assert row.seed_means == pytest.approx(
-        (first["vorticity_nrmse"].mean, second["vorticity_nrmse"].mean)
-    )
+        a = first[name].values
+        b = second[name].values
+        value = row.values[name]
+        mean = (a + b) / 2.0
+        deviation = abs(a.mean() - b.mean()) / math.sqrt(2.0)
+        assert value.per_scenario == pytest.approx(mean)
+        assert value.mean == pytest.approx(mean.mean())
+        assert value.std == pytest.approx(deviation)
+        assert (value.low, value.high) == bootstrap_interval(np.stack([a, b]))
+    ranking = "vorticity_nrmse"
+    means = (first[ranking].mean, second[ranking].mean)
+    assert row.seed_means == pytest.approx(means)
 
 
 def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
@@ -130,15 +136,15 @@ def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
 
 
 def test_few_scenarios_decide_nothing(board: Board) -> None:
-    """With two scenarios there is no p-value, so no sign, and the tab says so; ranks
-    are the order.
-    """
+    """With two scenarios there is no p-value and no sign; ranks are the order."""
     (tab,) = board.tabs
     assert not tab.decided
     ranked = [row for row in tab.rows if row.rank is not None]
     assert {row.id for row in ranked} == {"damped", "noisy", "flipping"}
     assert [row.rank for row in ranked] == [1, 2, 3]
-    assert all(math.isnan(row.p) and not row.tied for row in ranked)
+    for row in ranked:
+        assert math.isnan(row.p)
+        assert not row.tied
     means = [row.values[tab.ranking].mean for row in ranked]
     assert means == sorted(means)
 
@@ -177,35 +183,35 @@ def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> No
     """Film and maps come back within half a step of their packing; energy is the
     scorer's.
     """
-    detail = row_of(board, "noisy")
-    assert np.abs(detail.pictures.film - card.preview.film[1]).max() <= 2.0 / 65534
-    known = ~np.isnan(card.preview.vorticity[1])
-    span = np.nanmax(card.preview.vorticity) - np.nanmin(card.preview.vorticity)
-    apart = np.abs(detail.pictures.vorticity - card.preview.vorticity[1])[known]
-    assert apart.max() <= span / 65534
-    assert detail.energy.mean == pytest.approx(
-        card.submission["energy_predicted"].per_frame.mean(axis=0)
-    )
-    assert board.tabs[0].energy.mean == pytest.approx(
-        card.submission["energy_true"].per_frame.mean(axis=0)
-    )
+    row = row_of(board, "noisy")
+    film_error = np.abs(row.pictures.film - card.preview.film[1])
+    assert film_error.max() <= 2.0 / 65534
+
+    vorticity = card.preview.vorticity
+    span = np.nanmax(vorticity) - np.nanmin(vorticity)
+    map_error = np.abs(row.pictures.vorticity - vorticity[1])
+    assert np.nanmax(map_error) <= span / 65534
+
+    predicted = card.submission["energy_predicted"].per_frame
+    true = card.submission["energy_true"].per_frame
+    assert row.energy.mean == pytest.approx(predicted.mean(axis=0))
+    assert board.tabs[0].energy.mean == pytest.approx(true.mean(axis=0))
 
 
 def test_residual_histograms(card: ScoreCard) -> None:
-    """Shares of predicted minus true vorticity over its own range, against NumPy's
-    histogram.
+    """Shares of predicted minus true vorticity over its own range, as NumPy has
+    them.
     """
-    for found, (truth, prediction) in zip(
-        residuals(card.preview),
-        np.swapaxes(card.preview.vorticity.astype(float), 0, 1),
-        strict=True,
-    ):
-        r = (prediction - truth)[~np.isnan(truth)]
-        end = np.abs(r).max()
-        half = end / (RESIDUAL_BINS - 1)
-        counts, _ = np.histogram(r, bins=RESIDUAL_BINS, range=(-end - half, end + half))
-        assert (found.low, found.high) == (-end, end)
-        assert found.shares == pytest.approx(counts / r.size)
+    truth, prediction = card.preview.vorticity.astype(float)
+    histograms = residual_histograms(card.preview)
+    for histogram, difference in zip(histograms, prediction - truth, strict=True):
+        residual = difference[~np.isnan(difference)]
+        greatest = np.abs(residual).max()
+        half_bin = greatest / (RESIDUAL_BINS - 1)
+        end = greatest + half_bin
+        counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
+        assert (histogram.low, histogram.high) == (-greatest, greatest)
+        assert histogram.shares == pytest.approx(counts / residual.size)
 
 
 def made_up(per_frame: NDArray[np.float64]) -> Score:
@@ -227,26 +233,30 @@ def test_curves_keep_the_ends() -> None:
     """At most 120 frames, first and last among them; mean, lowest and highest of the
     scenarios.
     """
-    frames = np.stack([np.arange(598.0), 3.0 * np.arange(598.0)])
-    frames[0, 0] = np.nan
-    found = curve(made_up(frames))
-    assert len(found.frames) == CURVE_FRAMES
-    assert (found.frames[0], found.frames[-1]) == (10, 607)
-    assert found.mean[0] == 0.0
-    assert found.low[1:] == pytest.approx(np.array(found.frames[1:]) - 10.0)
-    assert found.high == pytest.approx(3.0 * (np.array(found.frames) - 10.0))
-    assert found.mean[1:] == pytest.approx(2.0 * (np.array(found.frames[1:]) - 10.0))
+    steps = np.arange(598.0)
+    per_frame = np.stack([steps, 3.0 * steps])
+    per_frame[0, 0] = np.nan
+    curve = make_curve(made_up(per_frame))
+    assert len(curve.frames) == CURVE_FRAMES
+    assert curve.frames[0] == 10
+    assert curve.frames[-1] == 607
+
+    chosen_steps = np.array(curve.frames) - 10.0
+    assert curve.mean[0] == 0.0
+    assert curve.low[1:] == pytest.approx(chosen_steps[1:])
+    assert curve.high == pytest.approx(3.0 * chosen_steps)
+    assert curve.mean[1:] == pytest.approx(2.0 * chosen_steps[1:])
 
 
 def test_curves_of_sampled_metrics_are_lines() -> None:
     """A metric that is measured at every tenth frame has these frames, and no gaps
     between them.
     """
-    frames = np.full((2, 298), np.nan)
-    frames[:, 9::10] = np.arange(29.0)
-    found = curve(made_up(frames))
-    assert found.frames == tuple(range(19, 308, 10))
-    assert list(found.mean) == list(range(29))
+    per_frame = np.full((2, 298), np.nan)
+    per_frame[:, 9::10] = np.arange(29.0)
+    curve = make_curve(made_up(per_frame))
+    assert curve.frames == tuple(range(19, 308, 10))
+    assert list(curve.mean) == list(range(29))
 
 
 def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
@@ -255,7 +265,7 @@ def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
     """
     paths = ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
     held = [read_statistics(bench.folder / path) for path in paths]
-    found = combine(held)["vorticity_pearson"]
+    found = combine([scores.tallies for scores in held])["vorticity_pearson"]
     assert np.array_equal(
         found.score.values, held[0].scores()["vorticity_pearson"].values
     )
@@ -292,21 +302,22 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
 
 def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
     """What was not asked for is not even read; what was is as in the whole board."""
-    some = collect(
-        own.folder, only=Folder(own.folder).data_sets(), registry=own.registry
-    )
-    assert as_plain(some) == as_plain(board)
+
+    def collect_only(*data_sets: tuple[str, str]) -> Board:
+        return collect(own.folder, only=data_sets, registry=own.registry)
+
+    known = Folder(own.folder).data_sets()
+    assert to_plain(collect_only(*known)) == to_plain(board)
     own.entry("noisy").write_text("no entry")
-    nothing = collect(own.folder, only=[("cavity", "mini")], registry=own.registry)
-    assert (nothing.tabs, nothing.empty) == ((), (("cavity", "mini"),))
+    nothing = collect_only(("cavity", "mini"))
+    assert nothing.tabs == ()
+    assert nothing.empty == (("cavity", "mini"),)
     with pytest.raises(LagbenchError):
-        collect(own.folder, only=[("cavity", "tiny")], registry=own.registry)
+        collect_only(("cavity", "tiny"))
 
 
-def test_tables_and_json(board: Board) -> None:
-    """The terminal shows ranks, spread, cost, floors and flags; JSON has the same
-    numbers.
-    """
+def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
+    """Reference predictors stand there without a rank."""
     (table,) = tables(board, ["position_rmse"])
     assert table.columns[:5] == (
         "rank",
@@ -316,27 +327,35 @@ def test_tables_and_json(board: Board) -> None:
         "position_rmse",
     )
     rows = {row[1]: row for row in table.rows}
-    measured = sorted(floor.name for floor in board.tabs[0].floors)
-    for name in measured:
-        assert (rows[name][0], rows[name][-1]) == ("-", "floor")
-    assert rows["damped"][0] == str(row_of(board, "damped").rank)
-    assert " ± " in rows["damped"][3]
-    assert rows["damped"][5:7] == ("0.5", "4")
-    (plain,) = as_plain(board)["tabs"]
-    means = {
-        row["id"]: row["metrics"]["position_rmse"]["mean"] for row in plain["rows"]
-    }
-    assert means["damped"] == digits(
-        row_of(board, "damped").values["position_rmse"].mean
-    )
-    assert [floor["id"] for floor in plain["floors"]] == measured
-    assert {row["id"]: row["cost"] for row in plain["rows"]}["damped"][
-        "speed_up"
-    ] == 4.0
-    with pytest.raises(UsageError, match="did you mean 'cavity tiny'"):
-        chosen_data_sets([("cavity", "tiny")], "cavity", "tyni")
-    with pytest.raises(UsageError, match="no metric"):
+    for reference in board.tabs[0].references:
+        row = rows[reference.name]
+        assert row[0] == "-"
+        assert row[-1] == "reference"
+    damped = rows["damped"]
+    assert damped[0] == str(row_of(board, "damped").rank)
+    assert " ± " in damped[3]
+    assert damped[5:7] == ("0.5", "4")
+
+
+def test_json_has_the_numbers_of_the_board(board: Board) -> None:
+    """Digits are those of scores.json."""
+    (plain,) = to_plain(board)["tabs"]
+    rows = {row["id"]: row for row in plain["rows"]}
+    mean = row_of(board, "damped").values["position_rmse"].mean
+    assert rows["damped"]["metrics"]["position_rmse"]["mean"] == digits(mean)
+    assert rows["damped"]["cost"]["speed_up"] == 4.0
+    names = sorted(reference.name for reference in board.tabs[0].references)
+    assert sorted(floor["id"] for floor in plain["floors"]) == names
+
+
+def test_unknown_names_are_refused(board: Board) -> None:
+    """The nearest known name is in the message."""
+    with pytest.raises(UsageError) as caught:
+        choose_data_sets([("cavity", "tiny")], "cavity", "tyni")
+    assert "cavity tiny" in str(caught.value.fix)
+    with pytest.raises(UsageError) as caught:
         list(tables(board, ["position_rmsee"]))
+    assert caught.value.where == "--metric"
 
 
 def test_boards_without_an_entry_are_named(
@@ -351,5 +370,5 @@ def test_boards_without_an_entry_are_named(
     empty = collect(tmp_path, registry=bench.registry)
     assert empty.tabs == ()
     assert set(board.empty) <= set(empty.empty)
-    assert chosen_data_sets([], None, None) == ()
+    assert choose_data_sets([], None, None) == ()
     assert build(tmp_path, registry=bench.registry).rows == 0

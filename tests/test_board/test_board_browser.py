@@ -30,8 +30,8 @@ from browser import (
 )
 from PIL import Image
 
-from lagbench.board.columns import columns_of, presets_of, value_of, written
-from lagbench.board.model import Board, ReferenceRow, Row, Tab
+from lagbench.board.columns import columns_of, format_value, presets_of, value_of
+from lagbench.board.model import Board, BoardRow, ReferenceRow, Tab
 from lagbench.board.page import render
 from lagbench.metrics import METRICS, Direction
 
@@ -88,7 +88,7 @@ def test_page_opens_in_silence(
     scrolling; its scheme.
     """
     page = running.open(file, width=width, dark=dark)
-    until(page, "Number(document.querySelector('#stage input').value) > 0")
+    until(page, "Number(document.querySelector('#hero input').value) > 0")
     go(page, board.tabs[0])
     press(page, "Tab")
     assert page.focus_shows("section:not([hidden]) [data-figure=cost] a.dot")
@@ -169,7 +169,8 @@ def test_every_line_of_the_charts_is_drawn(page: Page, board: Board) -> None:
     """
     for tab in board.tabs:
         go(page, tab)
-        shown = "document.querySelectorAll('section:not([hidden]) [data-figure=lines] path.line')"
+        lines = "section:not([hidden]) [data-figure=lines] path.line"
+        shown = f"document.querySelectorAll('{lines}')"
         paths = page.value(f"[...{shown}].map(line => line.getAttribute('d'))")
         assert paths
         assert all({"L", "H"} & {*path} for path in paths)
@@ -179,13 +180,13 @@ def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None
     """Truth beside the leader of the tab, in view at once on both widths; a key pauses
     it.
     """
-    play = "document.querySelector('#stage .play')"
-    at = "Number(document.querySelector('#stage input').value)"
+    play = "document.querySelector('#hero .play')"
+    at = "Number(document.querySelector('#hero input').value)"
     for width, height in ((1280, 800), (390, 844)):
         page = running.open(file, width=width, height=height)
         assert (
             page.value(
-                "document.querySelector('#stage .films').getBoundingClientRect().bottom"
+                "document.querySelector('#hero .films').getBoundingClientRect().bottom"
             )
             <= height
         )
@@ -197,7 +198,7 @@ def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None
         time.sleep(0.2)
         assert 0 < page.value(at) == stopped
         drawn = (
-            "[...document.querySelectorAll('#stage canvas')].map(c =>"
+            "[...document.querySelectorAll('#hero canvas')].map(c =>"
             " new Set(c.getContext('2d').getImageData(0, 0, c.width, "
             "c.height).data).size)"
         )
@@ -205,7 +206,7 @@ def test_film_above_the_fold(running: Browser, file: Path, board: Board) -> None
         for tab in board.tabs:
             go(page, tab)
             assert tab.rows[0].entry.name in page.value(
-                "document.querySelector('#stage').textContent"
+                "document.querySelector('#hero').textContent"
             )
             assert (
                 page.value(f"{play}.textContent") == "Play"
@@ -220,13 +221,13 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
     """With reduced motion nothing moves by itself; the film plays when asked, and rests
     under a panel.
     """
-    label = "document.querySelector('#stage .play').textContent"
-    at = "document.querySelector('#stage input').value"
+    label = "document.querySelector('#hero .play').textContent"
+    at = "document.querySelector('#hero input').value"
     restored(page, board.tabs[0].id)
     assert (page.value(label), page.value(at)) == ("Play", "0")
-    run(page, "document.querySelector('#stage .play').click()")
+    run(page, "document.querySelector('#hero .play').click()")
     until(page, f"{at} > 0")
-    run(page, "document.querySelector('#stage figcaption a').click()")
+    run(page, "document.querySelector('#hero figcaption a').click()")
     until(page, "document.getElementById('panel').open")
     assert page.value(label) == "Play"
     run(page, "document.getElementById('panel').close()")
@@ -235,7 +236,7 @@ def test_film_above_the_fold_waits_where_motion_is_unwanted(
 
 def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> None:
     """After three ends one picture is asked for per picture of the screen, not four."""
-    slider = "document.querySelector('#stage input')"
+    slider = "document.querySelector('#hero input')"
     restored(page, board.tabs[0].id)
     run(
         page,
@@ -245,7 +246,7 @@ def test_a_film_that_begins_again_runs_no_faster(page: Page, board: Board) -> No
         " window.tick = () => { window.ticks += 1; window.plain(window.tick); }, "
         "window.tick()",
     )
-    run(page, "document.querySelector('#stage .play').click()")
+    run(page, "document.querySelector('#hero .play').click()")
     for _ in range(3):
         run(
             page,
@@ -271,7 +272,7 @@ def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
     rows = {row[0]: row[1:] for row in page.value(cells)}
     ranked = [row for row in board.tabs[1].rows if row.rank is not None]
     for row in ranked:
-        skill = written(row.skill.mean, "number") if row.skill else ""
+        skill = format_value(row.skill.mean, "number") if row.skill else ""
         assert (
             rows[row.entry.name][2]
             == f"{skill}rank {row.rank}{' ≈' if row.tied else ''} of {len(ranked)}"
@@ -329,11 +330,13 @@ def test_every_preset_shows_the_board(page: Page, board: Board) -> None:
         )
         chosen = [columns[key] for key in keys]
         expected = [
-            [written(value_of(row, one), one.form) for one in chosen] for row in shown
+            [format_value(value_of(row, one), one.form) for one in chosen]
+            for row in shown
         ]
         assert [row[2:] for row in seen(page)] == expected
-        pressed = "document.querySelector('section:not([hidden]) [aria-pressed=true]').textContent"
-        assert page.value(pressed) == name
+        pressed = "section:not([hidden]) [aria-pressed=true]"
+        label = f"document.querySelector('{pressed}').textContent"
+        assert page.value(label) == name
 
 
 @pytest.mark.parametrize(
@@ -353,7 +356,7 @@ def test_sorting(page: Page, board: Board, key: str) -> None:
     )
     direction = METRICS[key].direction if key in METRICS else Direction.HIGHER
 
-    def loss(row: Row) -> float:
+    def loss(row: BoardRow) -> float:
         if (
             direction is Direction.TARGET
         ):  # too much here and too little there do not cancel
@@ -378,7 +381,7 @@ def test_sorting(page: Page, board: Board, key: str) -> None:
         )
         == 1
     )
-    assert len(seen(page)) == len(rows) + len(tab.floors)
+    assert len(seen(page)) == len(rows) + len(tab.references)
 
 
 def test_filter_by_keyboard(page: Page, board: Board) -> None:
@@ -409,7 +412,10 @@ def test_tabs_by_keyboard(page: Page, board: Board) -> None:
     run(page, "document.querySelector('.tabs a').focus()")
     press(page, "ArrowRight")
     press(page, "ArrowRight")
-    shown = "[...document.querySelectorAll('section.tab')].filter(s => !s.hidden).map(s => s.id)"
+    shown = (
+        "[...document.querySelectorAll('section.tab')]"
+        ".filter(section => !section.hidden).map(section => section.id)"
+    )
     assert page.value(shown) == ["cavity-mini"]
     press(page, "End")
     assert page.value(shown) == ["fluid-mini"]
@@ -531,13 +537,14 @@ def test_csv_equals_the_table(
     assert [line[1] for line in lines] == [row[1] for row in shown]
     assert [line[0] for line in lines] == [row[0].rstrip("≈") for row in shown]
     values = {row.entry.name: row.values for row in tab.rows} | {
-        row.name: row.values for row in tab.floors
+        row.name: row.values for row in tab.references
     }
     for line, texts in zip(lines, shown, strict=True):
         for key, cell, said in zip(keys, line[3:-2], texts[2:], strict=True):
             form = columns[key].form
             assert (
-                written(cell if form == "text" else float(cell or "nan"), form) == said
+                format_value(cell if form == "text" else float(cell or "nan"), form)
+                == said
             )
         value = values[line[1]]["vorticity_rmse"]
         assert float(line[3 + keys.index("vorticity_rmse")]) == pytest.approx(

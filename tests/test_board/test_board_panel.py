@@ -26,8 +26,8 @@ from browser import (
     until,
 )
 
-from lagbench.board.cost import marks_of
-from lagbench.board.entry import Flag
+from lagbench.board.cost import points_of
+from lagbench.board.entry import EntryFlag
 from lagbench.board.model import Board
 from lagbench.board.page import render
 
@@ -35,7 +35,10 @@ pytestmark = pytest.mark.skipif(
     CHROMIUM is None, reason="no Chromium here: apt-get install chromium"
 )
 
-HOSTILE = "</script><script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+HOSTILE = (
+    "</script><script>console.error(1)</script>"
+    "<img src=http://example.com/x onerror=console.error(2)>"
+)
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +127,7 @@ def test_panel_draws_everything(page: Page, board: Board) -> None:
         "distribution",
     ]
     count = "document.querySelectorAll('#panel [data-figure={}] {}').length"
-    lines = 1 + (tab.rows[0].id != "gns") + len(tab.floors)
+    lines = 1 + (tab.rows[0].id != "gns") + len(tab.references)
     assert page.value(count.format("errors", ".line:not(.swatch *)")) == lines
     assert page.value(count.format("errors", ".band")) == 1
     assert page.value(count.format("scenarios", ".chart .spot.s0")) == len(
@@ -218,7 +221,7 @@ def test_scatter_leads_to_entries(page: Page, board: Board) -> None:
         row for row in board.tabs[0].rows if row.active and row.entry.cost is not None
     ]
     assert len(dots) == len(rows)
-    marks = {mark.name: (mark.seconds, mark.error) for mark in marks_of(board.tabs[0])}
+    marks = {mark.name: (mark.seconds, mark.error) for mark in points_of(board.tabs[0])}
     points = {row.id: marks[row.entry.name] for row in rows}
     best = {
         i
@@ -255,7 +258,7 @@ def test_hostile_text_does_nothing(
         code="javascript:console.error(3)",
         paper="data:text/html,<script>console.error(4)</script>",
     )
-    flag = Flag.model_construct(name="__proto__", reasons=(HOSTILE,), share=None)
+    flag = EntryFlag.model_construct(name="__proto__", reasons=(HOSTILE,), share=None)
     odd = bad.entry.score.files[0].model_copy(update={"flags": (flag,)})
     bad = with_entry(bad, score=bad.entry.score.model_copy(update={"files": (odd,)}))
     long = with_entry(tab.rows[1], name="=1+1" + "W" * 10_000)
@@ -267,7 +270,7 @@ def test_hostile_text_does_nothing(
     for hash_ in ("", f"entry={bad.id}", f"entry={long.id}"):
         restored(page, f"#tab=cavity-full&{hash_}")
         assert page.value("document.images.length") == 0
-        assert page.value("document.scripts.length") == 3
+        assert page.value("document.scripts.length") == 4
         assert page.value(
             "[...document.links].every(a => ['file:', 'https:'].includes(a.protocol))"
         )

@@ -19,15 +19,15 @@ from hypothesis import strategies as st
 from lagbench.board.entry import About, Entry, Meta
 from lagbench.board.entry_file import (
     MAX_ENTRY_BYTES,
+    entry_bytes,
     examine,
     read_entry,
     read_meta,
     schema_bytes,
-    spell,
 )
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
 
-LEADERBOARD = Path(__file__).parent.parent / "leaderboard"
+LEADERBOARD = Path(__file__).parents[2] / "leaderboard"
 HASH = "0123456789abcdef" * 4
 
 
@@ -280,12 +280,12 @@ def test_any_text_survives_yaml(
     file.
     """
     entry = Entry.model_validate(plain(name=name, notes=name, affiliation=name))
-    data = spell(entry)
+    data = entry_bytes(entry)
     path = tmp_path_factory.getbasetemp() / "entry.yaml"
     path.write_bytes(data)
     again = read_entry(path)
     assert again == entry
-    assert spell(again) == data
+    assert entry_bytes(again) == data
 
 
 def bomb() -> str:

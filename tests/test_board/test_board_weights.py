@@ -20,7 +20,8 @@ from lagbench.board import weights as kept
 from lagbench.board.check import check_board
 from lagbench.board.entry import EntryBudget, Meta
 from lagbench.board.entry_file import read_entry
-from lagbench.board.submit import SubmitResult, submit
+from lagbench.board.publish import SubmitResult
+from lagbench.board.submit import submit
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
     ChecksFailedError,
@@ -290,7 +291,7 @@ def test_a_full_disk_leaves_the_entry_before(own: BoardBench, first: Path) -> No
     second = trained(own, 0, share=0.3)
     before = own.state()
     (second / "training.json").write_text(
-        json.dumps({"step": 6, "note": "x" * (kept.MOST_RECORD - 100)})
+        json.dumps({"step": 6, "note": "x" * (kept.MOST_LOG_BYTES - 100)})
     )
     room = 1000 + max(
         path.stat().st_size for path in (own.folder / "scores").rglob("drift*")
@@ -399,7 +400,7 @@ DAMAGE: dict[str, Callable[[BoardBench], object]] = {
         b.folder / "weights/cavity/tiny/other_0.pt"
     ).write_bytes(b"1"),
     "weights: long record": put(
-        "json", json.dumps({"note": "x" * kept.MOST_RECORD}).encode()
+        "json", json.dumps({"note": "x" * kept.MOST_LOG_BYTES}).encode()
     ),
     "weights: record nested far deeper than one is": put("json", b"[" * 100_000),
     "weights: JSON that is no record": put("json", b"[1]"),
@@ -431,7 +432,7 @@ def test_what_is_no_record_is_not_copied(
     run = trained(own, 0)
     (run / "training.json").unlink()
     for name, held in (
-        ("training.json", {"note": "x" * kept.MOST_RECORD}),
+        ("training.json", {"note": "x" * kept.MOST_LOG_BYTES}),
         ("weights.json", {"seconds_per_frame": 1.0}),
     ):
         (run / name).write_text(json.dumps(held))
@@ -581,7 +582,10 @@ def test_each_seed_has_its_own_step_and_start(
     own: BoardBench, run: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Trainings that differ in these alone belong together, on the command line too."""
-    words = "cavity tiny train, recipe cavity/tiny, step {}, started from cavity/mini, weights {}"
+    words = (
+        "cavity tiny train, recipe cavity/tiny, step {}, "
+        "started from cavity/mini, weights {}"
+    )
     own.submit(
         own.predict(nearer, "mine", seed=0, training=words.format(6, "0123abcd")),
         name="My model",

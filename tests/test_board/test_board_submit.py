@@ -13,6 +13,7 @@ import pytest
 from made_up import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
 
 from lagbench import __version__
+from lagbench.board import publish
 from lagbench.board import submit as submitting
 from lagbench.board.check import check_board
 from lagbench.board.entry import Meta
@@ -175,7 +176,7 @@ def test_predictions_are_submitted_once(
             {"method": "noisy"},
             {"method": "persistence"},
         ),
-        *({"name": "NO\u0406SY"}, {"name": "Free Flight"}),
+        *({"name": "NO\u0406SY"}, {"name": "Persistence"}),
         *(
             {"urls": ("https://a.org/1", "https://a.org/2")},
             {"date": datetime.date(2999, 1, 1)},
@@ -322,7 +323,7 @@ def test_a_score_file_that_is_too_long_is_not_published(
     own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """More than 1 MB: the work failed, and nothing is left behind."""
-    monkeypatch.setattr(submitting, "MAX_SCORE_BYTES", 1000)
+    monkeypatch.setattr(publish, "MAX_SCORE_BYTES", 1000)
     before = tree(own.folder)
     with pytest.raises(WorkFailedError, match="too long"):
         own.submit(predictions)
