@@ -11,7 +11,7 @@ from submission_data import Bench, small
 
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
-from lagbench.submission.findings import quoted
+from lagbench.submission.issues import quote
 from lagbench.work.machine import in_child
 
 ROOM = {"seconds": 5.0, "wall": 600.0}
@@ -123,9 +123,9 @@ def test_a_stray_module_in_the_current_folder_is_not_run(
 
 def test_text_of_strangers_is_shown_escaped_and_short() -> None:
     """Control characters never reach the terminal."""
-    assert quoted("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
-    assert len(quoted("x" * 10**6)) == 80
-    assert len(quoted([16**5000])) < 80
+    assert quote("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
+    assert len(quote("x" * 10**6)) == 80
+    assert len(quote([16**5000])) < 80
 
 
 def test_the_document_names_every_check() -> None:

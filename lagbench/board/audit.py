@@ -29,7 +29,7 @@ from lagbench.scoring.score_file import (
     write_statistics,
 )
 from lagbench.scoring.stored import read_stored
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, Prediction, ScoredFile
 from .entry_file import MAX_ENTRY_BYTES
@@ -66,7 +66,7 @@ class Rescoring:
     card: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmed: list[Confirmation] = field(default_factory=list)
 
-    def of_file(self, path: str | Path) -> Iterator[Finding]:
+    def of_file(self, path: str | Path) -> Iterator[ValidationIssue]:
         """Yield where predictions differ from what the leaderboard says, or that they
         are not valid.
         """
@@ -109,7 +109,7 @@ class Rescoring:
         made: Prediction,
         inner: Path,
         said: ScoredFile,
-    ) -> Iterator[Finding]:
+    ) -> Iterator[ValidationIssue]:
         """Yield where a score card differs from a score file and what the entry says of
         it.
         """
@@ -231,7 +231,9 @@ def _listed(names: Sequence[str]) -> str:
 KEYS = "status", "superseded_by"
 
 
-def check_base(folder: Folder, base: str, own: Collection[str]) -> Iterator[Finding]:
+def check_base(
+    folder: Folder, base: str, own: Collection[str]
+) -> Iterator[ValidationIssue]:
     """Yield the entries of others that a change touches, removes, supersedes or alters
     in status.
     """

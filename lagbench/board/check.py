@@ -31,7 +31,7 @@ from lagbench.scoring.stored import (
     read_stored,
     unreadable_in_child,
 )
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 from lagbench.work.progress import Progress
 
 from .audit import TOLERANCE, Confirmation, Rescoring, check_base
@@ -50,7 +50,7 @@ class CheckResult:
 
     folder: Path
     entries: int  # entries that were looked at
-    findings: tuple[Finding, ...]
+    findings: tuple[ValidationIssue, ...]
     # whether the page was compared; it is not while anything else is wrong
     page_checked: bool
     # predictions that gave the same when scored again
@@ -171,7 +171,7 @@ class _Look:
     registry: Registry
     # files that cannot be read, and why, as a child process found
     broken: Mapping[Path, str]
-    found: list[Finding] = field(default_factory=list)
+    found: list[ValidationIssue] = field(default_factory=list)
     known: list[Entry] = field(default_factory=list)
     sound: set[Path] = field(default_factory=set)  # score files that were read
     # by what was predicted

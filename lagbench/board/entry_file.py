@@ -27,7 +27,7 @@ from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
 from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
-from lagbench.submission.findings import quoted
+from lagbench.submission.issues import quote
 
 from .entry import PATTERNS, Entry, Meta, Status, Verification
 from .folder import VERIFIED, Folder, Place, entry_path
@@ -171,8 +171,8 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
     place = item["loc"]
-    given = quoted(item["input"])
-    where = quoted(".".join(map(str, place)))[1:-1] or "the file"
+    given = quote(item["input"])
+    where = quote(".".join(map(str, place)))[1:-1] or "the file"
     if item["type"] == "extra_forbidden":
         for key in place[:-1]:
             if (

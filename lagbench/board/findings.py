@@ -18,7 +18,7 @@ from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
-from lagbench.submission.findings import Finding, Severity
+from lagbench.submission.issues import Severity, ValidationIssue
 
 from .entry import Entry
 from .folder import Folder
@@ -206,12 +206,12 @@ def finding(
     what: str | None = None,
     expected: object = None,
     fix: str | None = None,
-) -> Finding:
+) -> ValidationIssue:
     """Return something that rejects a pull request; what is not said is the check's own
     wording.
     """
     own = CHECKS[check]
-    return Finding(
+    return ValidationIssue(
         check=check,
         severity=Severity.ERROR,
         what=what or own.what,
@@ -222,7 +222,7 @@ def finding(
     )
 
 
-def finding_of(check: str, error: LagbenchError, where: object) -> Finding:
+def finding_of(check: str, error: LagbenchError, where: object) -> ValidationIssue:
     """Return an error as a finding."""
     return finding(
         check, where, error.got, what=error.what, expected=error.expected, fix=error.fix

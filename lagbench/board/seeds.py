@@ -10,8 +10,8 @@ from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.scoring.stored import read_stored
-from lagbench.submission.findings import quoted
 from lagbench.submission.format import Header
+from lagbench.submission.issues import quote
 
 from .entry import LONGEST_TEXT, MOST_SEEDS, Entry, Meta, Status
 from .entry_file import is_there, read_entry
@@ -133,8 +133,8 @@ def extendable(
             raise UsageError(
                 f"the files differ from the entry in {name}",
                 where=str(path),
-                expected=quoted(theirs),
-                got=quoted(ours),
+                expected=quote(theirs),
+                got=quote(ours),
                 fix=f"{OWN}, by another --method; {anew}",
             )
     return entry

@@ -31,8 +31,8 @@ from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
 from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
 from lagbench.submission.checks import outside_share
-from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE, Header
+from lagbench.submission.issues import ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress

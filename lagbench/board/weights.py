@@ -21,8 +21,8 @@ from lagbench.errors import (
     check_installed,
     check_regular,
 )
-from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, Prediction, Status, Weights
 from .entry_file import is_there
@@ -223,7 +223,9 @@ def unfit_record(path: Path) -> str | None:
     return "no JSON object"
 
 
-def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
+def check_weights(
+    folder: Folder, entries: Sequence[Entry]
+) -> Iterator[ValidationIssue]:
     """Yield weights that are missing, edited, out of place, without an entry, or too
     many; unfit records.
     """

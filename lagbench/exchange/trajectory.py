@@ -23,7 +23,7 @@ from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.submission.findings import quoted
+from lagbench.submission.issues import quote
 
 from .mistakes import misplaced_axes
 
@@ -155,13 +155,13 @@ def _checked(given: object, *, where: str) -> Wishes:
     except ValidationError as error:
         first = error.errors()[0]
         value = first["input"]
-        key = quoted(".".join(map(str, first["loc"])))[1:-1]
+        key = quote(".".join(map(str, first["loc"])))[1:-1]
         strange = first["type"] == "extra_forbidden"
         raise UsageError(
             "this does not describe data",
             where=f"{where}{key or '(whole file)'}",
             expected=first["msg"],
-            got=quoted(value)
+            got=quote(value)
             if isinstance(value, str | int | float)
             else f"a {type(value).__name__}",
             fix=nearest(key, Wishes.__annotations__)
