@@ -45,9 +45,7 @@ def h5(tmp_path: Path) -> Path:
 def imported(source: Path) -> LocalSplit:
     """Import from the folder of a fixture."""
     form = "gns-npz" if list(source.glob("*.npz")) else "lagrangebench-h5"
-    return import_split(
-        source, format=form, output=source.parent / "own", allow_pickle=True
-    )
+    return import_split(source, format=form, output=source.parent / "own")
 
 
 def adopted(bad: Path, **wishes: Any) -> LocalSplit:
@@ -124,9 +122,7 @@ def test_a_malicious_pickle_is_never_run(
     assert isinstance(caught.value, UnreadableFileError if allow else UsageError)
     assert ("wants to call" if allow else "--allow-pickle") in str(caught.value)
     assert not (tmp_path / "own").exists()
-    with np.load(
-        gns / "train.npz", allow_pickle=True
-    ) as file:  # numpy's own reader does run it
+    with np.load(gns / "train.npz") as file:  # numpy's own reader does run it
         file["simulation_0"]
     assert (tmp_path / "trace").exists()
 
@@ -549,7 +545,6 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
         str(source),
         "--format",
         "gns-npz",
-        "--allow-pickle",
         "-o",
         str(tmp_path / "own"),
     ]

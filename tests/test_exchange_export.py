@@ -410,9 +410,7 @@ def test_readers_see_the_lid_move(
     if form == "lagrangebench-h5":
         assert ((raw >= 0) & (raw < np.array(metadata["bounds"])[:, 1])).all()
     # An import of our own export leaves them out: they are no material.
-    back = import_split(
-        tmp_path / "out", format=form, output=tmp_path / "back", allow_pickle=True
-    )
+    back = import_split(tmp_path / "out", format=form, output=tmp_path / "back")
     assert back.particles == (40, 40)
     came = stored("back", tmp_path, "full")
     np.testing.assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)

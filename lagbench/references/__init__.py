@@ -14,7 +14,6 @@ from .table import REFERENCES, references_of
 __all__ = [
     "REFERENCES",
     "ReferencePredictor",
-    "ReferencePredictor",
     "ReferenceScores",
     "Given",
     "references_of",

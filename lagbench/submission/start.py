@@ -35,12 +35,14 @@ class StartFrames:
     @property
     def last_given(self) -> Positions:
         """The last given frame [length], shape [particle, space]."""
-        return self.truth[0]
+        position: Positions = self.truth[0]
+        return position
 
     @property
     def first_true(self) -> Positions:
         """The truth of the first predicted frame [length], shape [particle, space]."""
-        return self.truth[1]
+        position: Positions = self.truth[1]
+        return position
 
     @cached_property
     def true_displacement(self) -> float:
