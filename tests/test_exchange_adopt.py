@@ -28,9 +28,9 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.exchange import adopt, import_split, local_split
-from lagbench.exchange.adoption import _by_subset
+from lagbench.exchange.adoption import _divide_into_subsets
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.exchange.trajectory import Measure, estimate_spacing
+from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
 from lagbench.work.progress import Progress
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
@@ -47,10 +47,10 @@ def save_runs(folder: Path, runs: Runs) -> list[Path]:
     return paths
 
 
-def adopted(folder: Path, runs: Runs, **wishes: Any) -> LocalSplit:
+def adopted(folder: Path, runs: Runs, **options: Any) -> LocalSplit:
     """Adopt each trajectory from a file of its own."""
     return adopt(
-        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **wishes}
+        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **options}
     )
 
 
@@ -172,11 +172,11 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     given = [tmp_path / name for name in names]
     wanted = {"train": ["run0", "run1", "run2"], "valid": ["run10"], "test": ["run11"]}
     for paths in (given, [tmp_path]):
-        found = _by_subset(paths, valid=1, test=1)
+        found = _divide_into_subsets(paths, valid=1, test=1)
         assert {
             subset: [path.stem for path, _ in rows] for subset, rows in found.items()
         } == wanted
-    found = _by_subset(given[::-1], valid=1, test=1)
+    found = _divide_into_subsets(given[::-1], valid=1, test=1)
     assert [path.stem for path, _ in found["test"]] == ["run0"]
 
 
@@ -310,13 +310,15 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
         (((7.0, 7.5), (7.0, 7.25)), 8.0, (0.0, 0.0)),
     ],
 )
-def test_measures_hold_the_box(
+def test_a_fitted_box_lies_in_the_unit_box(
     bounds: Any, scale: float, corner: tuple[float, float]
 ) -> None:
     """Scale and corner are the least that bring a box into the unit box."""
-    measure = Measure.fitting(bounds)
-    assert (measure.scale, measure.corner) == (scale, corner)
-    assert all(0.0 <= value <= 1.0 for pair in measure.box(bounds) for value in pair)
+    transform = BoxTransform.fit(bounds)
+    assert (transform.scale, transform.corner) == (scale, corner)
+    box = np.array(transform.transform_box(bounds))
+    assert box.min() >= 0.0
+    assert box.max() <= 1.0
 
 
 def test_the_spacing_of_a_lattice_is_found() -> None:
@@ -341,6 +343,7 @@ BROKEN: dict[
         DataError,
         "3 components",
     ),
+    "transposed": (lambda run: run.swapaxes(1, 2), DataError, "40 components"),
     "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
     "single": (lambda run: run[:1], DataError, "too little"),
     "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
@@ -381,7 +384,7 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         ({"input_frames": 1}, "where: --input-frames"),
         ({"input_frames": 12}, "too short for the task"),
         ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
-        ({"rescale": True}, "fit the unit box"),
+        ({"rescale": True}, "where: --rescale"),
         ({"bounds": ((1.0, 0.0), (0.0, 1.0))}, "low to high"),
         ({"bounds": ((0.0, 0.3), (0.0, 1.0))}, "outside the stated bounds"),
         ({"output": "My Data"}, "--output my-data"),
