@@ -121,9 +121,7 @@ def download(
         dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait),
         publication(entry, folder) as store,
     ):
-        published = [
-            scenario for scenario in selected if store and scenario in store.held
-        ]
+        published = set(selected).intersection(store.held if store else ())
         job = DownloadJob(
             entry,
             folder,
@@ -141,7 +139,7 @@ def download(
             verdict = compare(entry, manifest)
             if job.downloaded and entry.simulated:
                 if store:
-                    store.bring(published)
+                    store.bring(sorted(published))
                 cards = write_cards(folder, entry, splits.split(entry.split), manifest)
                 if store:
                     store.finish(manifest, cards)

@@ -136,18 +136,14 @@ def export(
         _check_walls(entry, is_closed=is_closed, has_unit_box=has_unit_box)
         walls = WallParticles(entry.bounds, spacing)
     wall_thickness = None if walls is None else walls.thickness
-    # What is taken off every position, so that none is below 0 where bounds start
-    # there.
     origin = (0.0, 0.0)
-    if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or wall_particles):
-        (left, _), (bottom, _) = entry.bounds
-        thickness = wall_thickness or 0.0
-        origin = (round_down(left - thickness), round_down(bottom - thickness))
+    if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
+        origin = _lower_corner(entry, wall_thickness or 0.0)
 
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
         (target / NAME).unlink()
     meter = Meter(progress)
-    scenario_count = sum(len(files) for files in frames_of.values())
+    scenario_count = sum(map(len, frames_of.values()))
     meter.begin("exporting", total=len(frames_of), scenarios=scenario_count)
     shapes: dict[str, list[tuple[int, int]]] = {}
     for subset, frames in frames_of.items():
@@ -173,10 +169,13 @@ def export(
     )
     metadata_path = write_metadata(target, describe_export(entry, form, shapes, info))
 
+    trajectory_counts = {}
     frame_counts = {}
+    left_out = 0
     for subset, subset_shapes in shapes.items():
+        trajectory_counts[subset] = len(subset_shapes)
         frame_counts[subset] = sum(frames for frames, _ in subset_shapes)
-    all_frames = sum(sum(frames.values()) for frames in frames_of.values())
+        left_out += sum(frames_of[subset].values()) - frame_counts[subset]
     written = (*file_of.values(), metadata_path)
     return ExportResult(
         format=form.value,
@@ -184,11 +183,20 @@ def export(
         size=entry.name,
         folder=target,
         files=written,
-        trajectories={subset: len(rows) for subset, rows in shapes.items()},
+        trajectories=trajectory_counts,
         frames=frame_counts,
-        left_out=all_frames - sum(frame_counts.values()),
+        left_out=left_out,
         bytes=sum(path.stat().st_size for path in written),
     )
+
+
+def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, float]:
+    """Return what is taken off every position of lagrangebench-h5 [length].
+
+    No position is below 0 then, where the bounds start.
+    """
+    (left, _), (bottom, _) = size.bounds
+    return round_down(left - wall_thickness), round_down(bottom - wall_thickness)
 
 
 def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:

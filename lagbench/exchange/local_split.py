@@ -43,6 +43,7 @@ from lagbench.work.progress import Meter, Progress
 from .trajectory import (
     FEWEST_CELLS,
     MOST_CELLS,
+    Box,
     Description,
     Trajectory,
     estimate_spacing,
@@ -387,17 +388,14 @@ class SplitBuilder:
         """Write manifest and description; return the manifest."""
         name = self.description.name
         short_hashes = {}
+        train_paths = []
+        ids: dict[str, list[int]] = {subset: [] for subset in HASHED_SUBSETS}
         for entry in self.entries:
+            ids[entry.subset].append(entry.scenario)
             short_hashes[entry.scenario] = entry.content_sha256[:16]
-        ids: dict[str, list[int]] = {}
-        for subset in HASHED_SUBSETS:
-            ids[subset] = [
-                entry.scenario for entry in self.entries if entry.subset == subset
-            ]
-        train_paths = [
-            scenario_path(self.root, self._key(scenario, "train"))
-            for scenario in ids["train"]
-        ]
+            if entry.subset == "train":
+                key = self._key(entry.scenario, entry.subset)
+                train_paths.append(scenario_path(self.root, key))
         manifest = merge(
             None,
             self.entries,
@@ -507,11 +505,12 @@ class SplitBuilder:
             ),
         ]
 
+    def _test_entries(self) -> list[FileEntry]:
+        return [entry for entry in self.entries if entry.subset == "test"]
+
     def _particle_count(self) -> int:
         """Return the particles of a test scenario; the most of any if they differ."""
-        test_counts = {
-            entry.particles for entry in self.entries if entry.subset == "test"
-        }
+        test_counts = {entry.particles for entry in self._test_entries()}
         if len(test_counts) == 1:
             return test_counts.pop()
         return max(entry.particles for entry in self.entries)
@@ -519,30 +518,27 @@ class SplitBuilder:
     def _bounds(self) -> list[list[float]]:
         """Return the stated walls [length], else the extent of the positions."""
         description = self.description
+        left, bottom = self.low
+        right, top = self.high
+        sides: Box = ((left, right), (bottom, top))
         if description.bounds:
             sides = description.transform.transform_box(description.bounds)
-            return [[float(low), float(high)] for low, high in sides]
-        extent = zip(self.low, self.high, strict=True)
-        return [[float(low), float(high)] for low, high in extent]
+        return [[float(low), float(high)] for low, high in sides]
 
     def _describe_frames(self) -> int | dict[int, str]:
         """Return the number of frames; by scenario ids where it differs."""
         scenarios_of: dict[int, list[int]] = {}
-        for frame_count in sorted({entry.frames for entry in self.entries}):
-            scenarios_of[frame_count] = [
-                entry.scenario for entry in self.entries if entry.frames == frame_count
-            ]
-        if len(scenarios_of) == 1:
-            return next(iter(scenarios_of))
-        return {
-            frame_count: spell_ids(scenarios)
-            for frame_count, scenarios in scenarios_of.items()
-        }
+        for entry in self.entries:
+            scenarios_of.setdefault(entry.frames, []).append(entry.scenario)
+        frame_counts = sorted(scenarios_of)
+        if len(frame_counts) == 1:
+            return frame_counts[0]
+        return {count: spell_ids(scenarios_of[count]) for count in frame_counts}
 
     def _describe_task(self) -> dict[str, Any]:
         """Return the task, as far as the shortest test scenario allows one."""
         description = self.description
-        shortest = min(entry.frames for entry in self.entries if entry.subset == "test")
+        shortest = min(entry.frames for entry in self._test_entries())
         horizon = description.horizon
         if horizon is None:
             horizon = shortest - description.input_frames
@@ -598,9 +594,7 @@ class SplitBuilder:
 
     def _read_clouds(self, frames: tuple[int, int]) -> Iterator[Cloud]:
         """Yield the particles of some frames of every test scenario."""
-        for entry in self.entries:
-            if entry.subset != "test":
-                continue
+        for entry in self._test_entries():
             key = self._key(entry.scenario, "test")
             with read_scenario(scenario_path(self.root, key)) as file:
                 for frame in frames:

@@ -314,11 +314,14 @@ def _gns_metadata(size: Size, shapes: Shapes) -> dict[str, object]:
 def _lagrangebench_metadata(
     size: Size, shapes: Shapes, info: ExportInfo
 ) -> dict[str, object]:
-    parameters = {name: parameter.value for name, parameter in size.parameters.items()}
-    frame_counts = {subset: rows[0][0] for subset, rows in shapes.items()}
-    particle_counts = []
-    for subset_shapes in shapes.values():
-        particle_counts += [particle_count for _, particle_count in subset_shapes]
+    viscosity = size.parameters.get("liquid_viscosity")
+    gravity = size.parameters.get("gravity")
+    frame_counts = {}
+    most_particles = 0
+    for subset, subset_shapes in shapes.items():
+        frame_counts[subset] = subset_shapes[0][0]
+        for _, particle_count in subset_shapes:
+            most_particles = max(most_particles, particle_count)
 
     metadata: dict[str, object] = {
         "case": size.split.upper(),
@@ -328,9 +331,9 @@ def _lagrangebench_metadata(
         "dt": size.dt,  # of the solver
         "write_every": size.substeps_per_frame,
         "t_end": (max(frame_counts.values()) - 1) * size.frame_interval,
-        "viscosity": parameters.get("liquid_viscosity"),
+        "viscosity": None if viscosity is None else viscosity.value,
         "p_bg_factor": 0.0,
-        "g_ext_magnitude": parameters.get("gravity", 0.0),
+        "g_ext_magnitude": 0.0 if gravity is None else gravity.value,
         "artificial_alpha": 0.0,
         "free_slip": info.is_free_slip,
         "is_bc_trick": False,
@@ -341,7 +344,7 @@ def _lagrangebench_metadata(
         metadata[f"sequence_length_{subset}"] = frame_counts[subset] - 1
     for subset in ("train", "test"):
         metadata[f"num_trajs_{subset}"] = len(shapes[subset])
-    metadata["num_particles_max"] = max(particle_counts)
+    metadata["num_particles_max"] = most_particles
     metadata["periodic_boundary_conditions"] = [False, False]
 
     # Its cell lists start at 0 and are as long as the bounds are apart: particles
