@@ -215,7 +215,7 @@ def import_split(
         **_merge_options(metadata, options),
     )
 
-    user_kinds = dict.fromkeys(metadata.own.wall_particle_type, DROP)
+    user_kinds = dict.fromkeys(metadata.lagbench.wall_particle_type, DROP)
     user_kinds.update(kinds or {})
     read = gns_npz.read_trajectories
     if form is Format.LAGRANGEBENCH_H5:
@@ -251,17 +251,17 @@ def _merge_options(metadata: SourceMetadata, options: DataOptions) -> dict[str, 
     The user's options win over what our own exports add, which wins over the rest of
     the metadata.
     """
-    own = metadata.own
+    keys = metadata.lagbench
     if "input_frames" in options or "horizon" in options:
         # The frames of interest belong to the exported task.
-        own = own.model_copy(update={"frames_of_interest": None})
+        keys = keys.model_copy(update={"frames_of_interest": None})
     merged: dict[str, Any] = metadata.model_dump(
-        exclude={"periodic", "own"}, exclude_none=True
+        exclude={"periodic", "lagbench"}, exclude_none=True
     )
-    merged |= own.model_dump(
+    merged |= keys.model_dump(
         exclude={"origin", "placement", "wall_particle_type"}, exclude_none=True
     )
-    merged["full_box"] = own.placement == "cell_centres"
+    merged["full_box"] = keys.placement == "cell_centres"
     merged |= options
     if "frame_interval" not in merged:
         raise UsageError(
@@ -313,7 +313,7 @@ def _parse_group(
         user_kinds=kinds,
         where=name,
     )
-    origin = np.asarray(metadata.own.origin, np.float32)
+    origin = np.asarray(metadata.lagbench.origin, np.float32)
 
     def read() -> Iterator[Frame]:
         before: NDArray[np.floating] | None = None

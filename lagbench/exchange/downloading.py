@@ -167,7 +167,7 @@ def download(
         folder=entry.folder(folder),
         mirror=job.url,
         downloaded=tuple(sorted(job.downloaded)),
-        kept=tuple(sorted((*published, *job.kept))),
+        kept=tuple(sorted((*published, *job.present))),
         generated=tuple(job.missing),
         bytes=job.byte_count,
         seconds=time.monotonic() - started,
@@ -210,7 +210,7 @@ class DownloadJob:
 
         self._old_manifest = read_or_empty(size, root)
         self._entries: list[FileEntry] = []
-        self.kept: list[int] = []
+        self.present: list[int] = []
         self.missing: list[int] = []
         meter.begin("checking", total=len(selected), scenarios=len(selected))
         for scenario in selected:
@@ -220,7 +220,7 @@ class DownloadJob:
             if inspected.entry:
                 self._entries.append(inspected.entry)
             if inspected.state is State.GOOD:
-                self.kept.append(scenario)
+                self.present.append(scenario)
             else:
                 self.missing.append(scenario)
 
@@ -266,21 +266,21 @@ class DownloadJob:
         """
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
         claims = self._read_claims(url)
-        wanted = self._list_wanted(url, claims or {})
+        requests = self._list_requests(url, claims or {})
         byte_count = sum(
             item.length or self.size.file_bytes(scenario)
-            for scenario, item in wanted.items()
+            for scenario, item in requests.items()
         )
-        self._meter.begin("downloading", total=byte_count, scenarios=len(wanted))
+        self._meter.begin("downloading", total=byte_count, scenarios=len(requests))
         try:
             if claims is None:
                 # A store without a manifest may have the archive of the data set.
-                if self._fetch_archive(url, wanted):
+                if self._fetch_archive(url, requests):
                     return None
                 claims = {}
                 for scenario in self.downloaded:
-                    wanted.pop(scenario, None)
-            return self._fetch_files(url, wanted, claims)
+                    requests.pop(scenario, None)
+            return self._fetch_files(url, requests, claims)
         finally:
             self.missing = [
                 scenario for scenario in self.missing if scenario not in self.downloaded
@@ -307,15 +307,15 @@ class DownloadJob:
         refuse_strangers(manifest, strangers, where=place, remedy=HINT)
         return claims
 
-    def _list_wanted(
+    def _list_requests(
         self, url: str, claims: Mapping[int, FileEntry]
     ) -> dict[int, Wanted]:
         """Return what to fetch from a store, and how to check it, by scenario."""
-        wanted = {}
+        requests = {}
         for scenario in self.missing:
             key = self.size.key(scenario)
             claim = claims.get(scenario)
-            wanted[scenario] = Wanted(
+            requests[scenario] = Wanted(
                 url=address_of(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
                 target=scenario_path(self.root, key),
                 limit=self.size.longest_file(scenario),
@@ -324,15 +324,15 @@ class DownloadJob:
                 file_sha256=claim.file_sha256 if claim else None,
                 remedy=HINT,
             )
-        return wanted
+        return requests
 
-    def _fetch_archive(self, url: str, wanted: Mapping[int, Wanted]) -> bool:
+    def _fetch_archive(self, url: str, requests: Mapping[int, Wanted]) -> bool:
         """Take files from the archive of the data set; return whether there is one."""
         longest_files = map(self.size.longest_file, self.size.scenarios)
         archive = fetch_archive(
             self.size,
             url,
-            wanted,
+            requests,
             self._count,
             limit=sum(longest_files) + MANIFEST_LIMIT,
             remedy=HINT,
@@ -346,11 +346,11 @@ class DownloadJob:
         return True
 
     def _fetch_files(
-        self, url: str, wanted: Mapping[int, Wanted], claims: Mapping[int, FileEntry]
+        self, url: str, requests: Mapping[int, Wanted], claims: Mapping[int, FileEntry]
     ) -> NotInStoreError | None:
         """Fetch files side by side; return the error of the last one not there."""
         last_absent = None
-        arrivals = fetch_scenarios(wanted, self._count, connections=self._connections)
+        arrivals = fetch_scenarios(requests, self._count, connections=self._connections)
         with closing(arrivals):
             for scenario, absent in arrivals:
                 if absent is None:

@@ -214,7 +214,7 @@ def parse_kinds(text: str | None) -> dict[int, str]:
     return kinds
 
 
-class OwnMetadata(BaseModel):
+class LagbenchKeys(BaseModel):
     """What our own exports add: where the box lies and what the task is."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -247,7 +247,7 @@ class SourceMetadata(BaseModel):
     spacing: Length | None = Field(alias="dx")
     # along x and y
     periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")
-    own: OwnMetadata = Field(alias="lagbench")  # what our own exports add
+    lagbench: LagbenchKeys  # what our own exports add
 
 
 def round_down(value: float) -> float:
@@ -282,7 +282,7 @@ def describe_export(
         metadata |= _gns_metadata(size, shapes)
     else:
         metadata |= _lagrangebench_metadata(size, shapes, info)
-    metadata[OWN_KEY] = _own_metadata(size, form, info)
+    metadata[OWN_KEY] = _lagbench_keys(size, form, info)
     return metadata
 
 
@@ -359,7 +359,7 @@ def _lagrangebench_metadata(
     return metadata
 
 
-def _own_metadata(size: Size, form: Format, info: ExportInfo) -> dict[str, object]:
+def _lagbench_keys(size: Size, form: Format, info: ExportInfo) -> dict[str, object]:
     task = size.task
     wall_numbers: list[int] = []
     if info.wall_thickness is not None:

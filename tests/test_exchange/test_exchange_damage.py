@@ -53,7 +53,12 @@ def adopted(bad: Path, **options: Any) -> LocalSplit:
     for number, run in enumerate(straight_runs(2)):
         np.save(bad.parent / f"{number}.npy", run)
     files = [*sorted(bad.parent.glob("?.npy")), bad]
-    return adopt(files, output=bad.parent / "own", **BASIC, **options)
+    return adopt(
+        files,
+        output=bad.parent / "own",
+        **BASIC,
+        **options,
+    )
 
 
 def save_parts(folder: Path, *parts: Any) -> None:
@@ -80,7 +85,11 @@ def array_file(
             )
             member = "simulation_0.npy" if kind == "|O" else "position.npy"
             stream = stack.enter_context(archive.open(member, "w"))
-        header = {"descr": kind, "fortran_order": False, "shape": shape}
+        header = {
+            "descr": kind,
+            "fortran_order": False,
+            "shape": shape,
+        }
         np.lib.format.write_array_header_1_0(stream, header)
         yield stream
 
@@ -137,8 +146,14 @@ MANY = [np.zeros(1)] * 4
             _Reduced(np.float64(0).__reduce__()[0], (OBJECTS, ADDRESSES[:8])),
             "wants to call",
         ),
-        (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
-        (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
+        (
+            _Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))),
+            "make an array by itself",
+        ),
+        (
+            _Reduced(codecs.encode, ("x", "punycode")),
+            "wants to call",
+        ),
         ("text", "holds a str"),
         (MANY, "holds a list"),
     ],
@@ -221,10 +236,16 @@ def test_an_empty_hdf5_file_of_many_particles_is_refused(
     """Arrays of 10^11 particles without a chunk."""
     with h5py.File(h5 / "train.h5", "w") as file:
         file.create_dataset(
-            "00000/position", shape=(12, 10**11, 2), dtype="f4", chunks=(1, 1000, 2)
+            "00000/position",
+            shape=(12, 10**11, 2),
+            dtype="f4",
+            chunks=(1, 1000, 2),
         )
         file.create_dataset(
-            "00000/particle_type", shape=(10**11,), dtype="i8", chunks=(1000,)
+            "00000/particle_type",
+            shape=(10**11,),
+            dtype="i8",
+            chunks=(1000,),
         )
     with refused(tmp_path, "00000/"):
         imported(h5)
@@ -253,11 +274,26 @@ def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
             {"lagbench": {"frames_of_interest": [-1]}},
             "frame of interest is not predicted",
         ),
-        ({"lagbench": {"cells": 10**9}}, "--cells"),
-        ({"bounds": [[-1e308, 1e308], [0, 1]]}, "--bounds"),
-        ({"default_connectivity_radius": 1e300}, "--radius"),
-        ({"default_connectivity_radius": 1e-20}, "have no neighbours"),
-        ({"dt": 1e-320}, "--frame-interval"),
+        (
+            {"lagbench": {"cells": 10**9}},
+            "--cells",
+        ),
+        (
+            {"bounds": [[-1e308, 1e308], [0, 1]]},
+            "--bounds",
+        ),
+        (
+            {"default_connectivity_radius": 1e300},
+            "--radius",
+        ),
+        (
+            {"default_connectivity_radius": 1e-20},
+            "have no neighbours",
+        ),
+        (
+            {"dt": 1e-320},
+            "--frame-interval",
+        ),
     ],
 )
 def test_numbers_that_do_not_compute(
@@ -274,18 +310,66 @@ def test_numbers_that_do_not_compute(
 @pytest.mark.parametrize(
     ("fault", "error", "words"),
     [
-        ("no metadata", UnreadableFileError, "cannot read the metadata"),
-        ("no json", UnreadableFileError, "cannot read the metadata"),
-        ("no radius", UnreadableFileError, "key default_connectivity_radius"),
-        ("array for a group", UnreadableFileError, "no trajectory"),
-        ("nothing in an array", UnreadableFileError, "no values"),
-        ("3D", UnreadableFileError, "not plane"),
-        ("no test", UnreadableFileError, "files are missing"),
-        ("half a file", UnreadableFileError, "cannot read the file"),
-        ("no positions", UnreadableFileError, "no trajectory"),
-        ("too few kinds", UnreadableFileError, "no kinds of particles"),
-        ("empty", DataError, "a subset is empty"),
-        ("no time", UsageError, "no time between frames"),
+        (
+            "no metadata",
+            UnreadableFileError,
+            "cannot read the metadata",
+        ),
+        (
+            "no json",
+            UnreadableFileError,
+            "cannot read the metadata",
+        ),
+        (
+            "no radius",
+            UnreadableFileError,
+            "key default_connectivity_radius",
+        ),
+        (
+            "array for a group",
+            UnreadableFileError,
+            "no trajectory",
+        ),
+        (
+            "nothing in an array",
+            UnreadableFileError,
+            "no values",
+        ),
+        (
+            "3D",
+            UnreadableFileError,
+            "not plane",
+        ),
+        (
+            "no test",
+            UnreadableFileError,
+            "files are missing",
+        ),
+        (
+            "half a file",
+            UnreadableFileError,
+            "cannot read the file",
+        ),
+        (
+            "no positions",
+            UnreadableFileError,
+            "no trajectory",
+        ),
+        (
+            "too few kinds",
+            UnreadableFileError,
+            "no kinds of particles",
+        ),
+        (
+            "empty",
+            DataError,
+            "a subset is empty",
+        ),
+        (
+            "no time",
+            UsageError,
+            "no time between frames",
+        ),
     ],
 )
 def test_damaged_sources_leave_nothing(
@@ -445,7 +529,11 @@ def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
                 ["x", "y"], object
             )
             file.createGroup("more").createVariable("note", "i4", ())
-    assert adopted(path).scenarios == {"train": 1, "valid": 1, "test": 1}
+    assert adopted(path).scenarios == {
+        "train": 1,
+        "valid": 1,
+        "test": 1,
+    }
 
 
 WALLS = np.zeros((4, 2))
@@ -455,18 +543,54 @@ WALLS = np.zeros((4, 2))
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("wall_velocity", np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS)),
-        ("wall_velocity", WALLS + np.inf),
-        ("wall_velocity", WALLS + 1e300),  # beyond float32, as which it is stored
-        ("wall_velocity", WALLS + 1j),
-        ("wall_velocity", WALLS.astype(str)),
-        ("wall_velocity", WALLS > 1),
-        ("wall_velocity", WALLS[:3]),
-        ("velocity", np.zeros((12, 40, 2), complex)),
-        ("velocity", np.full((12, 40, 2), "fast")),
-        ("velocity", np.full((12, 40, 2), np.nan)),
-        ("material", np.full(40, "liquid")),
-        ("position", np.full((12, 40, 2), "here")),
+        (
+            "wall_velocity",
+            np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS),
+        ),
+        (
+            "wall_velocity",
+            WALLS + np.inf,
+        ),
+        (
+            "wall_velocity",
+            WALLS + 1e300,
+        ),  # beyond float32, as which it is stored
+        (
+            "wall_velocity",
+            WALLS + 1j,
+        ),
+        (
+            "wall_velocity",
+            WALLS.astype(str),
+        ),
+        (
+            "wall_velocity",
+            WALLS > 1,
+        ),
+        (
+            "wall_velocity",
+            WALLS[:3],
+        ),
+        (
+            "velocity",
+            np.zeros((12, 40, 2), complex),
+        ),
+        (
+            "velocity",
+            np.full((12, 40, 2), "fast"),
+        ),
+        (
+            "velocity",
+            np.full((12, 40, 2), np.nan),
+        ),
+        (
+            "material",
+            np.full(40, "liquid"),
+        ),
+        (
+            "position",
+            np.full((12, 40, 2), "here"),
+        ),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(
@@ -558,8 +682,14 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
 @pytest.mark.parametrize(
     "parts",
     [
-        (5, (1, np.array([1.0, 2.0]))),  # ragged
-        ((1, np.array([1, 2])), 0.5),
+        (
+            5,
+            (1, np.array([1.0, 2.0])),
+        ),  # ragged
+        (
+            (1, np.array([1, 2])),
+            0.5,
+        ),
         (5, 10**400),  # beyond any float
         (10**5000, 0.5),  # beyond what Python spells
         (5, float("nan")),

@@ -43,11 +43,20 @@ def test_an_export_comes_back(
         "registry": unmeasured,
         "from_walls": bool(walls),
     }
-    export("curl-noise", "tiny", format=name, output=tmp_path / "out", **options)
+    export(
+        "curl-noise",
+        "tiny",
+        format=name,
+        output=tmp_path / "out",
+        **options,
+    )
     made = import_split(tmp_path / "out", format=name, output=tmp_path / "back")
     for subset in SUBSETS:
         with lagbench.open_split(
-            "curl-noise", subset=subset, size="tiny", root=generated.root
+            "curl-noise",
+            subset=subset,
+            size="tiny",
+            root=generated.root,
         ) as data:
             np.testing.assert_array_equal(
                 positions(made.folder, subset), data["position"].values
@@ -90,7 +99,12 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
         "radius": None,
         "bounds": None,
     }
-    own = import_split(source, format="gns-npz", output=tmp_path / "b", **options)
+    own = import_split(
+        source,
+        format="gns-npz",
+        output=tmp_path / "b",
+        **options,
+    )
     interest = [
         locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)
     ]
@@ -110,7 +124,11 @@ def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
         zipfile.ZipFile(source / "train.npz", "w") as archive,
         archive.open("gns_data.npy", "w") as stream,
     ):
-        header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+        header = {
+            "descr": "|O",
+            "fortran_order": False,
+            "shape": (2,),
+        }
         np.lib.format.write_array_header_1_0(stream, header)
         pickle.dump(joint, stream, protocol=protocol)
     made = import_split(source, format="gns-npz", output=tmp_path / "own")
@@ -132,10 +150,16 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
     named = import_split(
-        source, format="lagrangebench-h5", output=tmp_path / "a", kinds={1: "rope"}
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "a",
+        kinds={1: "rope"},
     )
     dropped = import_split(
-        source, format="lagrangebench-h5", output=tmp_path / "b", kinds={1: "drop"}
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "b",
+        kinds={1: "drop"},
     )
     assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
     np.testing.assert_array_equal(

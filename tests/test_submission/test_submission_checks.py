@@ -105,11 +105,15 @@ def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
     source = truth_of(bench)
     limit = 10 * source.largest_displacement(3, enough=np.inf)
     flagged: list[list[float]] = []
-    steps = np.diff(np.concatenate([source.given_frames(3), truth(3)]).astype("f8"), axis=0)
+    steps = np.diff(
+        np.concatenate([source.given_frames(3), truth(3)]).astype("f8"), axis=0
+    )
     assert limit == pytest.approx(10 * np.sqrt((steps**2).sum(-1)).max())
     for factor in (0.9, 1.1):
         result = changed(
-            bench, source.given_frames(3)[-1] + np.array([factor * limit, 0], np.float32), 0
+            bench,
+            source.given_frames(3)[-1] + np.array([factor * limit, 0], np.float32),
+            0,
         )
         assert result.exit_code == 0
         flagged.append(
@@ -166,7 +170,12 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
     assert required.exit_code == 4
     with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
         required.check()
-    result = validate(bench.valid, root=tmp_path, registry=unmeasured, isolated=False)
+    result = validate(
+        bench.valid,
+        root=tmp_path,
+        registry=unmeasured,
+        isolated=False,
+    )
     flag = next(f for f in result.findings if f.check == "dataset")
     assert (flag.severity, "datasets.yaml" in flag.got) == (Severity.WARNING, True)
 
@@ -174,9 +183,18 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        ("truncated_half", UnreadableFileError),
-        ("stale_hash", DataError),
-        ("one_nan", ChecksFailedError),
+        (
+            "truncated_half",
+            UnreadableFileError,
+        ),
+        (
+            "stale_hash",
+            DataError,
+        ),
+        (
+            "one_nan",
+            ChecksFailedError,
+        ),
     ],
 )
 def test_check_raises_the_error_of_the_exit_code(
@@ -242,7 +260,11 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(
         path.write_bytes(path.read_bytes()[:3000])
     elif damage == "another scenario":
         write_scenario(
-            own.root, make_key(4), frames=FRAMES, particles=PARTICLES, seed="another"
+            own.root,
+            make_key(4),
+            frames=FRAMES,
+            particles=PARTICLES,
+            seed="another",
         )
     else:
         change(path)
@@ -321,10 +343,24 @@ def test_the_scorer_refuses_a_changed_truth(
     root = copied()
     verify("curl-noise", "tiny", root=root, registry=unmeasured)
     made = template(
-        "curl-noise", "tiny", output=tmp_path / "p.nc", root=root, registry=unmeasured
+        "curl-noise",
+        "tiny",
+        output=tmp_path / "p.nc",
+        root=root,
+        registry=unmeasured,
     )
-    score(made.path, root=root, registry=unmeasured, write=False)
+    score(
+        made.path,
+        root=root,
+        registry=unmeasured,
+        write=False,
+    )
     change(Truth(unmeasured.size("curl-noise", "tiny"), root).path(4), keep_times=True)
     with pytest.raises(DataError) as caught:
-        score(made.path, root=root, registry=unmeasured, write=False)
+        score(
+            made.path,
+            root=root,
+            registry=unmeasured,
+            write=False,
+        )
     assert caught.value.exit_code == 4

@@ -55,11 +55,26 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ("burn", "no end within the computing time"),
-        ("fill", "more than 768 MiB"),
-        ("exit", "exit code 0x5"),
-        ("SIGABRT", "crashed: Aborted"),
-        ("SIGSEGV", "crashed: Segmentation fault"),
+        (
+            "burn",
+            "no end within the computing time",
+        ),
+        (
+            "fill",
+            "more than 768 MiB",
+        ),
+        (
+            "exit",
+            "exit code 0x5",
+        ),
+        (
+            "SIGABRT",
+            "crashed: Aborted",
+        ),
+        (
+            "SIGSEGV",
+            "crashed: Segmentation fault",
+        ),
     ],
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:

@@ -49,7 +49,11 @@ class World:
     def validate(self, path: Path, predict: Predict) -> ValidationResult:
         """Write predictions and validate them."""
         writer = PredictionsWriter(
-            path, split=self.size.split, size="tiny", method="m", root=self.root
+            path,
+            split=self.size.split,
+            size="tiny",
+            method="m",
+            root=self.root,
         )
         with writer:
             for scenario in self.positions:
