@@ -1,4 +1,4 @@
-"""Readers of the two exchange formats that know only their description; runs to adopt."""
+"""Readers of the two exchange formats that know only their description; test runs."""
 
 from __future__ import annotations
 
