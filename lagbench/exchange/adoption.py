@@ -92,13 +92,16 @@ def adopt(
     rows_of = _divide_into_subsets(paths, valid=valid, test=test)
     _refuse_duplicates(list(chain(*rows_of.values())))
 
-    counts = {subset: len(rows) for subset, rows in rows_of.items()}
+    counts = {}
+    subsets = {}
+    for subset, rows in rows_of.items():
+        counts[subset] = len(rows)
+        subsets[subset] = map(open_trajectory, rows)
     description = Description(
         name=output_name(output),
         source=f"{sum(counts.values())} trajectories of the user's own",
         **options,
     )
-    subsets = {subset: map(open_trajectory, rows) for subset, rows in rows_of.items()}
     return make_local_split(
         description,
         subsets,
@@ -205,10 +208,10 @@ def import_split(
     options = check_options(options)
     form = parse_format(format)
     folder = Path(source)
-    files = {subset: folder / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
-    _require_files(folder, list(files.values()))
+    names = _file_names(form)
+    _require_files(folder, names)
     metadata = read_metadata(folder, form)
-    digests = [f"{path.name} {file_sha256(path)[:16]}" for path in files.values()]
+    digests = [f"{name} {file_sha256(folder / name)[:16]}" for name in names]
     description = Description(
         name=output_name(output),
         source=f"{form.value}: {', '.join(digests)}",
@@ -220,26 +223,37 @@ def import_split(
     read = gns_npz.read_trajectories
     if form is Format.LAGRANGEBENCH_H5:
         read = partial(_read_h5, metadata=metadata)
-    subsets = {subset: read(path, user_kinds) for subset, path in files.items()}
+    subsets = {}
+    for subset, name in zip(HASHED_SUBSETS, names, strict=True):
+        subsets[subset] = read(folder / name, user_kinds)
     return make_local_split(
         description, subsets, output, command="import", progress=progress
     )
 
 
-def _require_files(folder: Path, files: Sequence[Path]) -> None:
+def _file_names(form: Format) -> list[str]:
+    """Return the names of train, valid and test in a format."""
+    return [f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS]
+
+
+def _missing_files(folder: Path, names: Sequence[str]) -> list[str]:
+    return [name for name in names if not (folder / name).is_file()]
+
+
+def _require_files(folder: Path, names: Sequence[str]) -> None:
     """Refuse a folder without the files of a format; name the format that it has."""
-    missing = [path.name for path in files if not path.is_file()]
+    missing = _missing_files(folder, names)
     if not missing:
         return
     fix = None
-    for form, ending in ENDINGS.items():
-        names = [f"{subset}{ending}" for subset in HASHED_SUBSETS]
-        if all((folder / name).is_file() for name in names):
-            fix = f"the folder holds {names[0]}: --format {form.value}"
+    for form in Format:
+        form_names = _file_names(form)
+        if not _missing_files(folder, form_names):
+            fix = f"the folder holds {form_names[0]}: --format {form.value}"
     raise UnreadableFileError(
         "files are missing",
         where=str(folder),
-        expected=", ".join(path.name for path in files),
+        expected=", ".join(names),
         got=f"no {', no '.join(missing)}",
         fix=fix,
     )

@@ -152,10 +152,16 @@ def _summarise(
     folder: Path, size: Size, manifest: Manifest, *, spacing: float
 ) -> LocalSplit:
     """Return what is told of a local split that was made."""
-    particle_counts = [entry.particles for entry in manifest.files]
-    test_counts = [
-        entry.particles for entry in manifest.files if entry.subset == "test"
-    ]
+    particle_counts = []
+    test_counts = []
+    frame_count = 0
+    byte_count = 0
+    for entry in manifest.files:
+        particle_counts.append(entry.particles)
+        frame_count += entry.frames
+        byte_count += entry.bytes
+        if entry.subset == "test":
+            test_counts.append(entry.particles)
     notes = []
     if len(set(test_counts)) > 1:
         notes.append(
@@ -168,12 +174,12 @@ def _summarise(
         name=size.split,
         size=size.name,
         scenarios={name: len(ids) for name, ids in size.subsets.items()},
-        frames=sum(entry.frames for entry in manifest.files),
+        frames=frame_count,
         particles=(min(particle_counts), max(particle_counts)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
         spacing=spacing,
-        bytes=sum(entry.bytes for entry in manifest.files),
+        bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
         notes=tuple(notes),
     )

@@ -131,8 +131,9 @@ def find_materials(
     """
     _check_kinds(form, numbers, particle_count, where=where)
     numbers = np.broadcast_to(numbers, (particle_count,))
-    name_of = {number: name for name, number in NUMBERS[form].items()}
-    name_of[PADDING] = DROP
+    name_of = {PADDING: DROP}
+    for name, number in NUMBERS[form].items():
+        name_of[number] = name
     name_of.update(user_kinds)
     code_of = {number: _material_code(name) for number, name in name_of.items()}
 
@@ -307,7 +308,8 @@ def _common_metadata(size: Size, info: ExportInfo) -> dict[str, object]:
 def _gns_metadata(size: Size, shapes: Shapes) -> dict[str, object]:
     frame_counts = []
     for subset_shapes in shapes.values():
-        frame_counts += [frame_count for frame_count, _ in subset_shapes]
+        for frame_count, _ in subset_shapes:
+            frame_counts.append(frame_count)
     return {"sequence_length": min(frame_counts), "dt": size.frame_interval}
 
 
