@@ -41,7 +41,7 @@ from lagbench.scoring.score_file import StoredScores, read_statistics
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
-from lagbench.submission.format import Anatomy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 from lagbench.work.run import ONE_THREAD
@@ -184,7 +184,7 @@ def references_once() -> Iterator[None]:
     def outcomes(
         task: ScoredTask,
         path: Path,
-        anatomy: Anatomy,
+        anatomy: FileInfo,
         metrics: Names,
         floors: Names,
         *others: Any,

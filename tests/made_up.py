@@ -311,7 +311,9 @@ class BoardBench:
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [read_stored(self.folder / path).scores.tallies for path in entry.score_paths]
+        stored = [
+            read_stored(self.folder / path).scores.tallies for path in entry.score_paths
+        ]
         plain = {
             name: summary.model_dump()
             for name, summary in summarise(combine(stored)).items()

@@ -20,7 +20,7 @@ from lagbench.references.shipped import shipped_path
 from lagbench.scoring.references import measured_again
 from lagbench.scoring.score import score
 from lagbench.scoring.stored import unreadable_in_child
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 from lagbench.work.progress import Progress
 
 from .base import check_base
@@ -41,7 +41,7 @@ class CheckResult:
 
     folder: Path
     entries: int  # entries that were checked
-    findings: tuple[Finding, ...]
+    findings: tuple[ValidationIssue, ...]
     # whether the page was compared; it is not while anything else is wrong
     page_checked: bool
     # predictions that gave the same when scored again
@@ -156,7 +156,7 @@ def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
 
 def _issues_of_measured(
     size: Size, differing: Mapping[str, Sequence[str]]
-) -> list[Finding]:
+) -> list[ValidationIssue]:
     """Return the reference predictors whose shipped scores are not those measured."""
     issues = []
     for name, metrics in differing.items():

@@ -14,7 +14,7 @@ from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.score_file import StoredScores
 from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, EntryBudget, Prediction, Status, Summary
 from .entry_file import examine, load_plain
@@ -45,7 +45,7 @@ class FolderChecks:
     folder: Folder
     registry: Registry
     unreadable: Mapping[Path, str]  # files that a child process cannot read, and why
-    issues: list[Finding] = field(default_factory=list)
+    issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     readable_score_files: set[Path] = field(default_factory=set)
     # entries by content hash and by fingerprint of their predictions

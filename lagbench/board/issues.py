@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from lagbench.errors import LagbenchError
 from lagbench.scoring.stored import MAX_SCORE_BYTES
-from lagbench.submission.findings import Finding, Severity
+from lagbench.submission.issues import Severity, ValidationIssue
 
 RESCORE = (
     "submit the predictions again: lagbench submit; the score block is not for editing"
@@ -191,7 +191,7 @@ def make_issue(
     what: str | None = None,
     expected: object = None,
     fix: str | None = None,
-) -> Finding:
+) -> ValidationIssue:
     """Return an issue that rejects a pull request.
 
     Words that are not given are those of the check.
@@ -199,7 +199,7 @@ def make_issue(
     defaults = CHECKS[check]
     if expected is None:
         expected = defaults.expected
-    return Finding(
+    return ValidationIssue(
         check=check,
         severity=Severity.ERROR,
         what=what or defaults.what,
@@ -210,7 +210,9 @@ def make_issue(
     )
 
 
-def issue_from_error(check: str, error: LagbenchError, where: object) -> Finding:
+def issue_from_error(
+    check: str, error: LagbenchError, where: object
+) -> ValidationIssue:
     """Return an error as an issue."""
     return make_issue(
         check, where, error.got, what=error.what, expected=error.expected, fix=error.fix

@@ -19,7 +19,7 @@ from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, write_statistics
 from lagbench.scoring.stored import Stored, read_stored
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
@@ -71,7 +71,7 @@ class Rescoring:
     score: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmations: list[Confirmation] = field(default_factory=list)
 
-    def rescore(self, path: str | Path) -> Iterator[Finding]:
+    def rescore(self, path: str | Path) -> Iterator[ValidationIssue]:
         """Yield where predictions differ from the leaderboard, or their faults."""
         try:
             # the scorer alone opens them, after its checks in a child process
@@ -111,7 +111,7 @@ class Rescoring:
                     files.append(EntryFile(entry, prediction, score_path, file))
         return files
 
-    def _compare_references(self, card: ScoreCard) -> Iterator[Finding]:
+    def _compare_references(self, card: ScoreCard) -> Iterator[ValidationIssue]:
         header = card.header
         for path in self.folder.reference_files(header.split, header.size):
             if path.stem not in card.tallies or path.stem == SUBMISSION:
@@ -126,7 +126,7 @@ class Rescoring:
 
     def _compare(
         self, path: Path, card: ScoreCard, file: EntryFile
-    ) -> Iterator[Finding]:
+    ) -> Iterator[ValidationIssue]:
         """Yield where a score card differs from an entry and its score file."""
         stored = read_stored(self.folder.path / file.score_path)
         extras = _extras_of(stored)
@@ -202,7 +202,7 @@ def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:
 
 def _compare_remarks(
     path: Path, card: ScoreCard, new_file: ScoredFile, file: EntryFile
-) -> Iterator[Finding]:
+) -> Iterator[ValidationIssue]:
     """Yield where flags, warnings, diverged scenarios or the budget differ."""
     old_file = file.scored_file
     pairs: dict[str, tuple[object, object]] = {

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, UsageError
 from lagbench.scoring.stored import read_stored
-from lagbench.submission.findings import quoted
 from lagbench.submission.format import Header
+from lagbench.submission.issues import quote
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Meta, Status
@@ -171,8 +171,8 @@ def _require_same_method(
             raise UsageError(
                 f"the files differ from the entry in {name}",
                 where=str(folder.path / entry.yaml_path),
-                expected=quoted(expected),
-                got=quoted(got),
+                expected=quote(expected),
+                got=quote(got),
                 fix=f"{SUBMIT_APART}, by another --method; {SUBMIT_ANEW}",
             )
 

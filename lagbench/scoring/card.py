@@ -39,8 +39,8 @@ from lagbench.metrics.frame import Setting
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.significance import Comparison, compare
 from lagbench.metrics.table import available
-from lagbench.submission.findings import Finding
 from lagbench.submission.format import MAX_NAME, Header
+from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
 
@@ -184,7 +184,8 @@ class ScoreCard:
     # `scores`; None where no floor that counts has a score
     skill: Skill | None
     flags: tuple[Flag, ...]  # what a reader should know
-    warnings: tuple[Finding, ...]  # findings of the validation that do not reject
+    # issues of the validation that do not reject
+    warnings: tuple[ValidationIssue, ...]
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 

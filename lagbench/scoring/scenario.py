@@ -28,7 +28,7 @@ from lagbench.references.predictor import (
 )
 from lagbench.references.table import REFERENCES
 from lagbench.store.copy import update_working_copy
-from lagbench.submission.format import Anatomy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.predictions import open_predictions
 from lagbench.work.pool import Report
 
@@ -102,7 +102,7 @@ class ScenarioJob:
     task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
-    anatomy: Anatomy  # what its headers say
+    anatomy: FileInfo  # what its headers say
     metrics: tuple[str, ...]  # names of the metrics
     floors: tuple[str, ...] = ()  # names of the floors to measure beside it
     pictured: bool = False  # whether to take the preview
@@ -129,7 +129,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     try:
         with (
             job.task.opened(number) as truth,
-            open_predictions(job.predictions, checked=job.anatomy) as predictions,
+            open_predictions(job.predictions, info=job.anatomy) as predictions,
         ):
             scenario = truth.scenario
             frames = (

@@ -19,8 +19,8 @@ from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import shipped
 from lagbench.references.table import COUNTING
-from lagbench.submission.findings import Finding, ValidationResult
-from lagbench.submission.format import Anatomy, Header
+from lagbench.submission.format import FileInfo, Header
+from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.machine import available_cores
@@ -110,7 +110,7 @@ def score(
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header = opened.header
-        anatomy = opened.anatomy
+        anatomy = opened.info
         content = result.sha256 or opened.content_sha256()
     if write:
         _check_own(folder / JSON_NAME, header)
@@ -193,7 +193,9 @@ def _check_own(path: Path, header: Header) -> None:
         )
 
 
-def _undefined(task: ScoredTask, held: Mapping[int, Tally]) -> Iterator[Finding]:
+def _undefined(
+    task: ScoredTask, held: Mapping[int, Tally]
+) -> Iterator[ValidationIssue]:
     """Warn where the vorticity of all scenarios, or of any where it ranks, has too few
     nodes throughout.
     """
@@ -240,7 +242,7 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
 def _outcomes(
     task: ScoredTask,
     path: Path,
-    anatomy: Anatomy,
+    anatomy: FileInfo,
     metrics: tuple[str, ...],
     floors: tuple[str, ...],
     workers: int | None,

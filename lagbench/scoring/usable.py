@@ -19,7 +19,7 @@ from lagbench.errors import LagbenchError
 from lagbench.metrics.coverage import Cloud, covered_nodes, fitting_cells
 from lagbench.metrics.metric import MINIMUM_NODES
 from lagbench.metrics.table import ranking_metric
-from lagbench.submission.findings import Finding, Severity
+from lagbench.submission.issues import Severity, ValidationIssue
 
 from .task import ScoredTask, load_scored_task
 
@@ -27,7 +27,7 @@ OF_NODES = "vorticity_nrmse"
 """The ranking metric that needs nodes."""
 
 
-def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
+def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> ValidationIssue:
     """Return how many nodes scenarios without any vorticity cover, and a grid of which
     all cover enough.
     """
@@ -55,7 +55,7 @@ def few_nodes(task: ScoredTask, scenarios: Collection[int]) -> Finding:
         fix = f"a {word} grid: {here}--cells {cells} of lagbench adopt and import"
     least = min(counts)
     most = max(counts)
-    return Finding(
+    return ValidationIssue(
         check="undefined",
         severity=Severity.WARNING,
         what="the vorticity has no value in any frame",
