@@ -29,7 +29,7 @@ from lagbench.data.grid import Grid, fields
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.metrics import FramePair, Scenario, snapshots
-from lagbench.scoring.flags import Trace, Tracer, copy_suspect, evidence
+from lagbench.scoring.flags import Trace, Tracer, analyse_error, judge_copying
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import Predictions, open_predictions
 
@@ -51,8 +51,8 @@ class Case:
     def __init__(self, scenario: Scenario, positions: Floats, other: Floats) -> None:
         self.scenario = scenario
         self.other = other
-        self.n = scenario.setting.input_frames
-        self.h = scenario.setting.horizon
+        self.n = scenario.config.input_frames
+        self.h = scenario.config.horizon
         self.all = positions[: self.n + self.h + 2]
         self.truth = positions[self.n : self.n + self.h]
         self.rng = np.random.Generator(np.random.PCG64(0))
@@ -81,8 +81,8 @@ class Case:
         """
         x = self.all[first - 1]
         u = self.all[first - 1] - self.all[first - 2]
-        grid = self.scenario.setting.grid
-        velocity = fields(x, u, grid, full=self.scenario.full).velocity
+        grid = self.scenario.config.grid
+        velocity = fields(x, u, grid, full=self.scenario.full_weight).velocity
         for _ in range(count):
             x = x + sample(velocity, x, grid)
             yield x
@@ -177,7 +177,7 @@ def trace_of(case: Case, predicted: Floats) -> Trace:
     scenario = case.scenario
     sides = (snapshots(scenario, positions) for positions in (case.truth, predicted))
     for frame, true, guess in zip(
-        scenario.setting.predicted_frames, *sides, strict=True
+        scenario.config.predicted_frames, *sides, strict=True
     ):
         tracer.add(FramePair(scenario, frame, true, guess))
     return tracer.result()
@@ -259,7 +259,7 @@ def main() -> int:
 def tell(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
     """Print the line of a prediction; return its numbers by scenario."""
     numbers = [numbers_of(trace) for trace in traces]
-    if copy_suspect(traces).raised:
+    if judge_copying(traces).raised:
         raised = "raised"
     else:
         raised = "-"
@@ -269,7 +269,7 @@ def tell(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
 
 def numbers_of(trace: Trace) -> list[float]:
     """Return the numbers of one scenario, in the order of the columns."""
-    found = evidence(trace)
+    found = analyse_error(trace)
     energy = float(np.mean(trace.predicted_motion) / np.mean(trace.motion))
     return [
         *(float(getattr(found, column)) for column in COLUMNS),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement
-from lagbench.metrics import FramePair, Scenario, Setting, aggregate, select, tally
+from lagbench.metrics import FramePair, Scenario, TaskConfig, aggregate, select, tally
 
 Floats = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ def pair_of(
     x: Floats, u: Floats, y: Floats, v: Floats, placement: Placement
 ) -> FramePair:
     """Return the pair of a truth (positions, velocities) and a prediction."""
-    setting = Setting(
+    config = TaskConfig(
         grid=Grid(40, placement),
         input_frames=2,
         horizon=1,
@@ -65,11 +65,11 @@ def pair_of(
         radius=0.03,
     )
     scenario = Scenario(
-        setting=setting,
-        given=np.stack([x - 2 * u, x - u]),
+        config=config,
+        input_positions=np.stack([x - 2 * u, x - u]),
         material=np.zeros(len(x), np.int8),
         particle_mass=1.0 / len(x),
-        area=1.0 if setting.full_box else 0.12,
+        area=1.0 if config.is_full_box else 0.12,
     )
     return FramePair(
         scenario, 2, scenario.snapshot(x, x - u), scenario.snapshot(y, y - v)
@@ -78,7 +78,7 @@ def pair_of(
 
 def scores(pair: FramePair) -> str:
     """Return the shown scores of a pair, one line each."""
-    names = SHOWN[Placement(pair.scenario.setting.grid.placement)]
+    names = SHOWN[Placement(pair.scenario.config.grid.placement)]
     metrics = select(names)
     found = aggregate(metrics, {0: tally([pair], metrics, (2,))})
     return "\n".join(
@@ -142,7 +142,7 @@ def main() -> int:
     limit = float(np.max(np.abs(rows[0]["truth"].true_vorticity)))
     for line, row in zip(axes, rows, strict=True):
         for ax, (name, pair) in zip(line, row.items(), strict=True):
-            if pair.scenario.setting.full_box:
+            if pair.scenario.config.is_full_box:
                 ax.imshow(
                     pair.predicted_fields.vorticity.T,
                     origin="lower",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import skill
+from lagbench.scoring.skill import compute_skill
 
 CASES = (
     (1.9, 0.6, 0.6, 0.3),
@@ -83,7 +83,7 @@ def main() -> int:
                     else:
                         factor = np.ones(1)
                     own = ratio * factor[:, None] * ours
-                    found = skill(
+                    found = compute_skill(
                         [score_of(row) for row in own], {"persistence": score_of(base)}
                     )
                     if found is None:

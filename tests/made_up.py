@@ -28,7 +28,7 @@ from lagbench.data.yamlfile import read_yaml, spell_yaml
 from lagbench.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
@@ -309,7 +309,7 @@ class BoardBench:
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [read_stored(self.folder / path).scores for path in entry.score_paths]
+        stored = [read_score_file(self.folder / path).scores for path in entry.score_paths]
         plain = {
             name: summary.model_dump()
             for name, summary in summarise(combine(stored)).items()

@@ -442,7 +442,7 @@ def test_tables_show_floors_undefined_and_units(
     rows = {row[0].split()[0]: row for row in horizon.rows}
     assert list(rows)[:2] == ["skill", card.ranking]
     assert [column.replace("\n", "") for column in horizon.columns[2:]] == [
-        card.skill.floor
+        card.skill.reference
     ]
     assert rows["vorticity_pearson"][1].endswith("†")
     assert rows["vorticity_rmse"][0].endswith("[1/frame]")

@@ -46,8 +46,9 @@ from lagbench.references.frozen_field import decay
 from lagbench.references.predictor import linear_field, mirrored
 from lagbench.references.shipped import FOLDER, shipped_path
 from lagbench.references.table import COUNTING
-from lagbench.scoring.card import SUBMISSION, best_floor
+from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.references import measurable
+from lagbench.scoring.skill import best_reference
 
 Floats = NDArray[np.float64]
 
@@ -481,7 +482,7 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
         assert score.mean > 0.0
         assert floor.correlation.shape == score.values.shape
     assert (
-        best_floor(
+        best_reference(
             {name: held[name].scores[ranking] for name in COUNTING.intersection(held)}
         )
         is not None

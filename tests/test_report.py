@@ -37,7 +37,7 @@ import lagbench.report
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
-from lagbench.metrics import METRICS, Setting, Tally, aggregate
+from lagbench.metrics import METRICS, TaskConfig, Tally, aggregate
 from lagbench.report.html import Markup, tag, text
 from lagbench.report.maps import inside
 from lagbench.report.report import write_report
@@ -363,10 +363,10 @@ def subject_on(split: str, size_name: str) -> Subject:
         name: getattr(size.task, name)
         for name in ("input_frames", "horizon", "frames_of_interest", "radius")
     }
-    setting = Setting(
+    config = TaskConfig(
         grid=Grid(size.task.score_grid.cells), attribute_std=(1.0,) * 4, **told
     )
-    scored = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
+    scored = ScoredTask(truth=Truth(size, Path()), config=config, density=1.0)
     return Subject(task=scored, title=split, entries=())
 
 
@@ -382,7 +382,7 @@ def test_frames_are_those_of_the_thesis(split: str, frame: int, size: str) -> No
     among them; Fig. 5.18 shows frames 6, 9, 18, 21, 48 and 51.
     """
     subject = subject_on(split, size)
-    predicted = subject.task.setting.predicted_frames
+    predicted = subject.task.config.predicted_frames
     assert size == "tiny" or subject.key_frame == frame
     first, *between, last = subject.times
     assert (first, len(between), last) == (predicted[0], 4, predicted[-1])

@@ -72,7 +72,7 @@ class Rollouts:
         """Return positions [length], [particle, 2], of the truth (None, and given
         frames) or a prediction.
         """
-        if name is None or frame < self.scenario.setting.predicted_frames[0]:
+        if name is None or frame < self.scenario.config.predicted_frames[0]:
             return np.asarray(self.file.read("position", frame), np.float64)
         return np.asarray(
             self.predictions[name].frames(self.recording.scenario, frame, 1)[0],

@@ -30,8 +30,8 @@ from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.shipped import shipped, shipped_path
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.skill import best_reference
 
 from .thesis import ROSTER
 
@@ -386,7 +386,7 @@ class Evidence:
             for n, m in self.methods.items()
             if n in COUNTING and self.ranking in m.scores
         }
-        return best_floor({n: m.scores[self.ranking] for n, m in counting.items()})
+        return best_reference({n: m.scores[self.ranking] for n, m in counting.items()})
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best floor`` by the ranking metric: 1

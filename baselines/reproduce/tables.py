@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lagbench.data.manifest import read_manifest
 from lagbench.draw.tables import Table
 from lagbench.errors import DataError
-from lagbench.metrics.distributions import kl, normalised
+from lagbench.metrics.distributions import kl, normalise
 from lagbench.metrics.table import METRICS
 
 from .drawing import (
@@ -254,7 +254,7 @@ def cubic_errors(truth: Floats, prediction: Floats) -> Mapping[str, float]:
         "mae": float(np.mean(np.abs(predicted - true))),
         "mse": mse,
         "rmse": mse**0.5,
-        "kl": kl(normalised(true), normalised(predicted)),
+        "kl": kl(normalise(true), normalise(predicted)),
         "pearson": math.nan if still else float(np.corrcoef(true, predicted)[0, 1]),
     }
 

@@ -25,10 +25,10 @@ from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import (
     FILM_RANGE,
     LEVELS,
-    StoredScores,
+    SubmissionStatistics,
     write_statistics,
 )
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.findings import Finding
 
 from .entry import Entry, Prediction, ScoredFile
@@ -82,7 +82,7 @@ class Rescoring:
         for inner in self.folder.reference_files(card.header.split, card.header.size):
             if inner.stem not in card.tallies or inner.stem == SUBMISSION:
                 continue
-            kept = read_stored(self.folder.path / inner).scores
+            kept = read_score_file(self.folder.path / inner).scores
             same = kept.identity["dataset_sha256"] == card.header.dataset_sha256
             if same and (unlike := _unlike(card.tallies[inner.stem], kept)[0]):
                 yield finding("rescored", inner, _listed(unlike), fix=REFERENCES_ANEW)
@@ -114,7 +114,7 @@ class Rescoring:
         it.
         """
         where = str(path)
-        theirs = read_stored(self.folder.path / inner)
+        theirs = read_score_file(self.folder.path / inner)
         statistics = next(iter(theirs.scores.tallies.values())).names
         measured = {METRICS[name].extra for name in statistics if name in METRICS}
         if extras := sorted(extra for extra in measured if extra is not None):
@@ -130,7 +130,7 @@ class Rescoring:
             file = Path(scratch) / "scores.nc"
             write_statistics(card, file)
             ours = scored_file(card, file)
-            stored = read_stored(file)
+            stored = read_score_file(file)
         differing, difference = _unlike(stored.scores.tallies, theirs.scores)
         step = max(stored.precision, theirs.precision)
         for name, room in {"vorticity": 1.01 * step, "film": 1.01 * FILM_STEP}.items():
@@ -162,7 +162,7 @@ class Rescoring:
             )
 
 
-def _unlike(ours: Mapping[int, Tally], theirs: StoredScores) -> tuple[list[str], float]:
+def _unlike(ours: Mapping[int, Tally], theirs: SubmissionStatistics) -> tuple[list[str], float]:
     """Return the names of statistics that differ, and the greatest relative difference
     of the others.
     """

@@ -35,8 +35,13 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import COUNTING, REFERENCES
 from lagbench.report.html import tag
-from lagbench.scoring.card import Preview, skill
-from lagbench.scoring.stored import Stored, read_stored, reported_frames
+from lagbench.scoring.card import Preview
+from lagbench.scoring.score_file_checks import (
+    ScoreFile,
+    read_score_file,
+    reported_frames,
+)
+from lagbench.scoring.skill import compute_skill
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Cost, Entry, Status, Verification
@@ -95,7 +100,7 @@ class _Held:
 
     entry: Entry
     current: bool
-    stored: Sequence[Stored]  # score file of each seed
+    stored: Sequence[ScoreFile]  # score file of each seed
     scores: Mapping[str, Combined]  # by metric, all seeds together
 
 
@@ -137,7 +142,7 @@ def collect(
         current = is_current(entry.dataset, size)
         try:
             stored = [
-                read_stored(place.path / path, size) for path in entry.score_paths
+                read_score_file(place.path / path, size) for path in entry.score_paths
             ]
         except UnreadableFileError:
             if current:
@@ -251,7 +256,7 @@ def _row(
         if f.name in COUNTING and ranking in f.scores
     }
     better = None
-    if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
+    if held.current and (found := compute_skill(held.scores[ranking].seeds, known)) is not None:
         low, high = found.interval
         better = Value(
             mean=found.value,

@@ -23,13 +23,13 @@ from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.references.shipped import shipped_path
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.references import measured_again
+from lagbench.scoring.references import remeasure
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import (
+from lagbench.scoring.score_file_checks import (
     MAX_SCORE_BYTES,
-    Stored,
-    read_stored,
-    unreadable_in_child,
+    ScoreFile,
+    read_score_file,
+    find_unreadable,
 )
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress
@@ -100,7 +100,7 @@ def check_board(
         for path in (*folder.score_files(), *folder.reference_files())
     ]
     if isolated:
-        broken = unreadable_in_child(files)
+        broken = find_unreadable(files)
     else:
         broken = {}
     look = _Look(folder=folder, registry=described, broken=broken)
@@ -117,7 +117,7 @@ def check_board(
         look.found += again.of_file(one)
     measured = {}
     for size in floors:
-        names, unlike = measured_again(size, resolve_root(root), progress=progress)
+        names, unlike = remeasure(size, resolve_root(root), progress=progress)
         measured[f"{size.split} {size.name}"] = names
         for name, metrics in unlike.items():
             if len(metrics) > 3:
@@ -363,7 +363,7 @@ class _Look:
                 "score", where, got, expected=f"{name}: {_spelt(formed.get(name))}"
             )
 
-    def _read(self, path: Path, sha256: str, task: Size | None) -> Stored | None:
+    def _read(self, path: Path, sha256: str, task: Size | None) -> ScoreFile | None:
         """Return a score file; None, and a finding, where it cannot be one."""
         file = self.folder.path / path
         if not file.is_file() or self.folder.link_in(path) is not None:
@@ -380,7 +380,7 @@ class _Look:
             self.add("score_file", path, self.broken[file])
         else:
             try:
-                held = read_stored(file, task)
+                held = read_score_file(file, task)
             except UnreadableFileError as error:
                 self.add("score_file", path, f"{error.what}: {error.got}")
             else:
@@ -396,7 +396,7 @@ class _Look:
                 got = self.broken.get(self.folder.path / path, "an unknown name")
                 self.add("floor", path, got, expected=", ".join(REFERENCES))
                 return
-            identity = read_stored(self.folder.path / path, size).scores.identity
+            identity = read_score_file(self.folder.path / path, size).scores.identity
             if not is_current(dataset_of(identity), size):
                 self.add(
                     "floor",

@@ -17,7 +17,11 @@ from lagbench.errors import LagbenchError, UnreadableFileError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
 from lagbench.submission.findings import Finding, Severity
 
 from .entry import Entry
@@ -186,7 +190,7 @@ CHECKS: Mapping[str, Check] = {
         "the shipped scores of a floor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
-        "lagbench.scoring.record",
+        "lagbench.scoring.measure_references",
     ),
     "page": Check(
         "a page or schema.json that is not what the submissions give",
@@ -252,11 +256,11 @@ def prints_of(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
     found = {}
     for path in (path for entry in others.values() for path in entry.score_paths):
         with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            found[print_of(read_stored(folder.path / path).scores.tallies)] = str(path)
+            found[print_of(read_score_file(folder.path / path).scores.tallies)] = str(path)
     return found
 
 
-def impossible(held: Stored) -> Iterator[str]:
+def impossible(held: ScoreFile) -> Iterator[str]:
     """Yield values that no prediction can have, whoever wrote them.
 
     Errors and distances are never negative, correlations never above one; and where one

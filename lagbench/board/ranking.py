@@ -28,8 +28,8 @@ from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import REFERENCES as KNOWN
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
-from lagbench.scoring.score_file import StoredScores, write_statistics
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file import SubmissionStatistics, write_statistics
+from lagbench.scoring.score_file_checks import read_score_file
 
 from .entry import LONGEST_TEXT, OUTSIDE, DataSet, Flag, ScoredFile, Summary
 from .folder import REFERENCES, Folder
@@ -53,7 +53,7 @@ class Combined:
         return bootstrap_interval(np.stack([seed.values for seed in self.seeds]))
 
 
-def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
+def combine(seeds: Sequence[SubmissionStatistics]) -> dict[str, Combined]:
     """Return the scores of a method by metric: those of ours, not of packages, that all
     seeds have.
     """
@@ -119,10 +119,10 @@ def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
         return tuple(known.values())
     found = []
     for path in folder.reference_files(size.split, size.name):
-        scores = read_stored(folder.path / path).scores
+        scores = read_score_file(folder.path / path).scores
         if path.stem not in KNOWN or not is_current(dataset_of(scores.identity), size):
             continue
-        read_stored(folder.path / path, size)
+        read_score_file(folder.path / path, size)
         held = {name: made.score for name, made in combine([scores]).items()}
         found.append(
             ReferenceScores(
@@ -162,7 +162,7 @@ def write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
         path = folder.path / REFERENCES / header.split / header.size / f"{name}.nc"
         with suppress(UnreadableFileError):
             if (
-                read_stored(path).scores.identity["dataset_sha256"]
+                read_score_file(path).scores.identity["dataset_sha256"]
                 == header.dataset_sha256
             ):
                 continue

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.findings import quoted
 from lagbench.submission.format import Header
 
@@ -118,7 +118,7 @@ def extendable(
                 fix=f"restore {'it' if inner.suffix == '.nc' else 'them'}, as `git "
                 f"checkout` does, {anew}",
             )
-    label = read_stored(folder.path / entry.score_paths[0]).scores.identity["method"]
+    label = read_score_file(folder.path / entry.score_paths[0]).scores.identity["method"]
     told: dict[str, tuple[object, object]] = {
         "method": (label, first.method),
         "dataset_sha256": (entry.dataset.sha256, first.dataset_sha256),

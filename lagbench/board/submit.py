@@ -29,7 +29,7 @@ from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.score_file import write_statistics
-from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from lagbench.submission.checks import outside_share
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE, Header
@@ -484,7 +484,7 @@ def _publish(plan: _Plan, cards: Sequence[ScoreCard], folder: Folder) -> SubmitR
             ranking_metric=cards[0].ranking,
             files=files,
             metrics=summarise(
-                combine([read_stored(target).scores for target in staged])
+                combine([read_score_file(target).scores for target in staged])
             ),
         )
         said = dict(plan.about) | {

@@ -130,7 +130,7 @@ def _by_method(
     series = [(row.name, row.kind, _mean(row.scores[name])) for row in rows]
     if (true := rows[0].scores.get(f"{name}_true")) is not None:
         series.insert(0, ("truth", "truth", _mean(true)))
-    twin = np.asarray(subject.task.twin_floor if name == "position_rmse" else ())
+    twin = np.asarray(subject.task.predictability_limit if name == "position_rmse" else ())
     twinned = len(twin) == len(subject.frames)
     drawn = [*(values for _, _, values in series), *([twin] if twinned else [])]
     if name == "connectivity":

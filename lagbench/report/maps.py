@@ -101,8 +101,8 @@ _SEQUENTIAL = _ramp(FAST, FAST)
 
 def inside(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    axis = task.setting.grid.axis
-    room = 0.26 * task.setting.grid.spacing  # nodes in a wall are not seen
+    axis = task.config.grid.axis
+    room = 0.26 * task.config.grid.spacing  # nodes in a wall are not seen
     kept = [
         (axis >= low - room) & (axis <= high + room) for low, high in task.size.bounds
     ]

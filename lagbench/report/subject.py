@@ -20,7 +20,7 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
-from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
+from lagbench.scoring.card import SUBMISSION, ScoreCard, number_methods
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import open_predictions
 
@@ -105,7 +105,7 @@ class Subject:
     @property
     def full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.task.setting.full_box
+        return self.task.config.is_full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -115,7 +115,7 @@ class Subject:
     @property
     def frames(self) -> NDArray[np.int64]:
         """Absolute numbers of the predicted frames, shape [frame]."""
-        return np.array(self.task.setting.predicted_frames)
+        return np.array(self.task.config.predicted_frames)
 
     @property
     def key_frame(self) -> int:
@@ -128,9 +128,9 @@ class Subject:
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
         """Frames of interest, the last predicted one if there are none."""
-        predicted = self.task.setting.predicted_frames
+        predicted = self.task.config.predicted_frames
         known = sorted(
-            set(self.task.setting.frames_of_interest).intersection(predicted)
+            set(self.task.config.frames_of_interest).intersection(predicted)
         )
         return tuple(known) or (predicted[-1],)
 
@@ -149,7 +149,7 @@ class Subject:
         """Frames of the pictures over time, the first and the last predicted one among
         them.
         """
-        predicted = self.task.setting.predicted_frames
+        predicted = self.task.config.predicted_frames
         many = len(self.frames_of_interest) >= TIMES
         if many:
             chosen = _spaced(self.frames_of_interest, TIMES - 1)
@@ -199,7 +199,7 @@ def subject_of(
                 raise UsageError(what, where=str(path), expected=one, got=two, fix=fix)
     described = rooted(folder, registry)
     task = load_scored_task(described.size(header.split, header.size), folder)
-    names = told_apart([card.header.method for card in cards], taken=cards[0].scores)
+    names = number_methods([card.header.method for card in cards], taken=cards[0].scores)
     entries = [
         Entry(number=i, name=name, card=card, predictions=Path(path))
         for i, (name, card, path) in enumerate(
@@ -288,8 +288,8 @@ def open_gallery(subject: Subject) -> Gallery:
                     true = scenario.snapshot(now, before)
                     pairs = []
                     for file in files:
-                        if frame == scenario.setting.input_frames:
-                            before = scenario.given[-1]
+                        if frame == scenario.config.input_frames:
+                            before = scenario.input_positions[-1]
                             now = file.frames(number, frame, 1)[0]
                         else:
                             before, now = file.frames(number, frame - 1, 2)

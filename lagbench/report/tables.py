@@ -273,7 +273,7 @@ def head(subject: Subject) -> Markup:
     """Return the top of the page."""
     size = subject.task.size
     header = subject.entries[0].card.header
-    setting = subject.task.setting
+    setting = subject.task.config
     many = len(subject.entries) > 1
     names = " · ".join(entry.name for entry in subject.entries)
     lede = (
@@ -295,7 +295,7 @@ def head(subject: Subject) -> Markup:
     else:
         found = None
     if found is not None:
-        said = f"1 - score / score of {found.floor}"
+        said = f"1 - score / score of {found.reference}"
         tiles.append(_card(f"{whose}skill", found.value, found.interval, said))
     tiles.append(
         _tile(f"{whose}{words(ranking)}", best.scores[ranking], _beside(subject, best))
