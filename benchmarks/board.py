@@ -42,7 +42,7 @@ from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.metrics import METRICS, Direction, TaskConfig, Tally, aggregate
+from lagbench.metrics import METRICS, Direction, Tally, TaskConfig, aggregate
 from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric

@@ -37,7 +37,11 @@ from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
 from lagbench.scoring.score_file import SubmissionStatistics, read_statistics
-from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, ScoreFile, read_score_file
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
 from lagbench.submission.format import Anatomy
@@ -190,7 +194,12 @@ def references_once() -> Iterator[None]:
                 task, path, anatomy, metrics=metrics, references=references, **options
             )
         files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        key = metrics, references, repr((task.size, task.config)), *map(file_sha256, files)
+        key = (
+            metrics,
+            references,
+            repr((task.size, task.config)),
+            *map(file_sha256, files),
+        )
         found = OUTCOMES(
             task,
             path,
@@ -243,7 +252,7 @@ def stored_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in READERS:
             patch.setattr(f"lagbench.board.{module}.read_score_file", read)
-        reader = "lagbench.baselines.reproduce.evidence.read_statistics"
+        reader = "studies.thesis.split_results.read_statistics"
         patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
         yield
 

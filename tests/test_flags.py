@@ -17,10 +17,10 @@ from lagbench.scoring.flags import (
     SHIFTS,
     Trace,
     Tracer,
-    judge_predictability,
-    judge_copying,
     analyse_error,
+    judge_copying,
     judge_physics,
+    judge_predictability,
 )
 
 HORIZON = 6

@@ -32,11 +32,11 @@ from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.measure_references import measure_and_ship
 from lagbench.scoring.references import (
     differences,
-    saved_folder,
     measurable,
     measure,
-    remeasure,
     measured_sizes,
+    remeasure,
+    saved_folder,
 )
 from lagbench.scoring.score_file import read_statistics
 from lagbench.scoring.tables import card_tables

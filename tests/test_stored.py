@@ -15,7 +15,7 @@ from made_up import SCORES, BoardBench, copied
 from lagbench.board.check import check_board
 from lagbench.errors import UnreadableFileError
 from lagbench.scoring import stored as isolation
-from lagbench.scoring.score_file_checks import read_score_file, find_unreadable
+from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
 
 PACKAGE = Path(isolation.__file__).parents[2]
 

@@ -22,8 +22,8 @@ from lagbench.errors import WorkFailedError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.metrics.coverage import Cloud, covered_nodes
-from lagbench.scoring.score import score
 from lagbench.scoring.scorability import check_scorability
+from lagbench.scoring.score import score
 
 GIVEN = 2
 FRAMES = 5

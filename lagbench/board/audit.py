@@ -162,7 +162,9 @@ class Rescoring:
             )
 
 
-def _unlike(ours: Mapping[int, Tally], theirs: SubmissionStatistics) -> tuple[list[str], float]:
+def _unlike(
+    ours: Mapping[int, Tally], theirs: SubmissionStatistics
+) -> tuple[list[str], float]:
     """Return the names of statistics that differ, and the greatest relative difference
     of the others.
     """

@@ -23,6 +23,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
+from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -34,7 +35,6 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.report.html import tag
 from lagbench.scoring.card import Preview
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
@@ -256,7 +256,10 @@ def _row(
         if f.name in COUNTING and ranking in f.scores
     }
     better = None
-    if held.current and (found := compute_skill(held.scores[ranking].seeds, known)) is not None:
+    if (
+        held.current
+        and (found := compute_skill(held.scores[ranking].seeds, known)) is not None
+    ):
         low, high = found.interval
         better = Value(
             mean=found.value,

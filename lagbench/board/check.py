@@ -28,8 +28,8 @@ from lagbench.scoring.score import score
 from lagbench.scoring.score_file_checks import (
     MAX_SCORE_BYTES,
     ScoreFile,
-    read_score_file,
     find_unreadable,
+    read_score_file,
 )
 from lagbench.submission.findings import Finding
 from lagbench.work.progress import Progress

@@ -256,7 +256,9 @@ def prints_of(folder: Folder, others: Mapping[Path, Entry]) -> dict[str, str]:
     found = {}
     for path in (path for entry in others.values() for path in entry.score_paths):
         with suppress(UnreadableFileError):  # `leaderboard check` tells of those
-            found[print_of(read_score_file(folder.path / path).scores.tallies)] = str(path)
+            found[print_of(read_score_file(folder.path / path).scores.tallies)] = str(
+                path
+            )
     return found
 
 

@@ -118,7 +118,9 @@ def extendable(
                 fix=f"restore {'it' if inner.suffix == '.nc' else 'them'}, as `git "
                 f"checkout` does, {anew}",
             )
-    label = read_score_file(folder.path / entry.score_paths[0]).scores.identity["method"]
+    label = read_score_file(folder.path / entry.score_paths[0]).scores.identity[
+        "method"
+    ]
     told: dict[str, tuple[object, object]] = {
         "method": (label, first.method),
         "dataset_sha256": (entry.dataset.sha256, first.dataset_sha256),

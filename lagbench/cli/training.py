@@ -165,7 +165,9 @@ def _warn_of_scores(
     plan = recipe_for(
         find(baseline), tier.split, tier.name, variant=variant, settings=settings
     )
-    reasons = list(check_scorability(tier, home, validated=plan.training.validate_every != 0))
+    reasons = list(
+        check_scorability(tier, home, validated=plan.training.validate_every != 0)
+    )
     if reasons:
         warning = "warning: what is trained here cannot be scored as it should"
         typer.echo("\n  ".join([warning, *reasons]), err=True)
