@@ -183,7 +183,9 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_score_file(path).scores for path in paths])),
+            metrics=summarise(
+                combine([read_score_file(path).scores for path in paths])
+            ),
         ),
     )
     (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)

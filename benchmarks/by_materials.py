@@ -24,7 +24,7 @@ from lagbench.errors import LagbenchError, nearest
 from lagbench.figures.tables import markdown
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped
-from lagbench.scoring.score_file_checks import published
+from lagbench.scoring.score_file_checks import read_published_scores
 
 BOARD = Path(__file__).parent.parent / "leaderboard"
 
@@ -72,7 +72,10 @@ def main() -> int:
                 f"no entry {method!r} of {asked.split} {asked.size}: "
                 f"{nearest(method, known)}"
             )
-        seeds = [read_published_scores(path).scores["submission"][metric].values for path in files]
+        seeds = [
+            read_published_scores(path).scores["submission"][metric].values
+            for path in files
+        ]
         rows[method] = np.mean(seeds, axis=0)
     sets = sorted(set(kinds))
     lines = []

@@ -298,7 +298,7 @@ def test_floors_that_are_not_at_hand(scored: dict[str, Path], tmp_path: Path) ->
     """A floor goes second; a scores.nc holds the best one; a file that is empty is no
     submission.
     """
-    with pytest.raises(UsageError, match="give the floor last"):
+    with pytest.raises(UsageError, match="persistence"):
         compare("persistence", scored["still"])
     with pytest.raises(UsageError) as caught:
         compare(scored["still"] / "scores.nc", "analog")

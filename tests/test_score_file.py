@@ -22,8 +22,8 @@ from lagbench.scoring.card import (
     SUBMISSION,
     ScoreCard,
     digits,
-    read_scores,
 )
+from lagbench.scoring.published_scores import read_scores
 from lagbench.scoring.score_file import read_statistics, write_statistics
 
 

@@ -39,6 +39,7 @@ from lagbench.scoring.references import (
     saved_folder,
 )
 from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.skill import best_reference, compute_skill
 from lagbench.scoring.tables import card_tables
 
 
@@ -60,7 +61,10 @@ def test_skill_is_one_minus_the_ratio_of_means() -> None:
     both.
     """
     floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
-    found = [compute_skill([scored(v)], floors) for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])]
+    found = [
+        compute_skill([scored(v)], floors)
+        for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])
+    ]
     assert [(one.reference, one.value) for one in found] == [
         ("frozen-field", v) for v in (0.75, 1.0, -1.0)
     ]
@@ -249,8 +253,8 @@ def test_a_floor_that_a_data_set_lacks_is_not_measured(
 ) -> None:
     """A coarse solver at tiny: nothing is written."""
     with pytest.raises(UsageError):
-        record(
-            recorded(bench.size), bench.root, folder=tmp_path, floors=["coarse-solver"]
+        measure_and_ship(
+            recorded(bench.size), bench.root, folder=tmp_path, names=["coarse-solver"]
         )
     assert not list(tmp_path.iterdir())
 
@@ -295,9 +299,7 @@ def test_a_forged_shipped_score_is_found(
         "position_rmse": replace(score, values=1.01 * score.values),
     }
     held["persistence"] = replace(still, scores=forged)
-    assert remeasure(bench.size, bench.root)[1] == {
-        "persistence": ("position_rmse",)
-    }
+    assert remeasure(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
 
 
 def test_an_interrupted_measurement_goes_on(
@@ -308,14 +310,14 @@ def test_an_interrupted_measurement_goes_on(
     """
     size = recorded(bench.size)
     root = copied()
-    first = measure(size, root, floors=["persistence"], resume=True)
+    first = measure(size, root, names=["persistence"], resume=True)
     kept = sorted(saved_folder(size, root).glob("*.npz"))
     assert len(kept) == len(size.subsets["test"])
     with np.load(kept[0]) as held:
         values = dict(held)
     np.savez(kept[0], **{**values, "total": 4.0 * values["total"]})
-    again = measure(size, root, floors=["persistence"], resume=True)
-    fresh = measure(size, root, floors=["persistence"])
+    again = measure(size, root, names=["persistence"], resume=True)
+    fresh = measure(size, root, names=["persistence"])
     one, two, three = (
         m["persistence"].scores["position_mse"].values for m in (first, again, fresh)
     )
@@ -354,5 +356,8 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert REFERENCES[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert (again.reference, again.value) == (standing.skill.reference, standing.skill.value)
+    assert (again.reference, again.value) == (
+        standing.skill.reference,
+        standing.skill.value,
+    )
     assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")

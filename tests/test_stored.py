@@ -14,7 +14,7 @@ from made_up import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
 from lagbench.errors import UnreadableFileError
-from lagbench.scoring import stored as isolation
+from lagbench.scoring import score_file_checks as isolation
 from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
 
 PACKAGE = Path(isolation.__file__).parents[2]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
@@ -130,7 +130,13 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     Raises:
         ValueError: the content does not have the form of a scores.json.
     """
-    checked = _ScoresContent.model_validate(content)
+    try:
+        checked = _ScoresContent.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = "/".join(map(str, first["loc"]))
+        raise ValueError(f"{ascii(place)}: {first['msg']}") from error
+
     metrics = available()
     rows = {}
     for row, scores in checked.rows.items():
