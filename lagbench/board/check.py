@@ -17,9 +17,9 @@ from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError
 from lagbench.references.shipped import shipped_path
-from lagbench.scoring.references import measured_again
+from lagbench.scoring.references import remeasure
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import unreadable_in_child
+from lagbench.scoring.score_file_checks import find_unreadable
 from lagbench.submission.issues import ValidationIssue
 from lagbench.work.progress import Progress
 
@@ -120,7 +120,7 @@ def check_board(
 
     measured = {}
     for size in floors:
-        names, differing = measured_again(size, resolve_root(root), progress=progress)
+        names, differing = remeasure(size, resolve_root(root), progress=progress)
         measured[f"{size.split} {size.name}"] = names
         issues += _issues_of_measured(size, differing)
 
@@ -151,7 +151,7 @@ def check_board(
 def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
     """Return the score files that a child process cannot read, and why."""
     paths = (*folder.score_files(), *folder.reference_files())
-    return unreadable_in_child([folder.path / path for path in paths])
+    return find_unreadable([folder.path / path for path in paths])
 
 
 def _issues_of_measured(

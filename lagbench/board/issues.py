@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from lagbench.errors import LagbenchError
-from lagbench.scoring.stored import MAX_SCORE_BYTES
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES
 from lagbench.submission.issues import Severity, ValidationIssue
 
 RESCORE = (
@@ -171,7 +171,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
-        "lagbench.scoring.record",
+        "lagbench.scoring.measure_references",
     ),
     "page": BoardCheck(
         "a page or schema.json that is not what the submissions give",
