@@ -83,7 +83,7 @@ def require_weights(
             )
         seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
         belong = attrgetter("split", "size", "dataset_sha256")
-        got = belong(held.facts)
+        got = belong(held.info)
         expected = belong(headers[0])
         if got != expected or seed not in seeds:
             raise UsageError(
@@ -114,7 +114,7 @@ def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
     """Refuse weights of which the predictions say nothing, or that others than these
     made.
     """
-    from lagbench.baselines.checkpoint import rounded_parameters
+    from lagbench.baselines.checkpoint import count_rounded_parameters
     from lagbench.baselines.predict import fits, told_by_us, training_words
 
     words = header.training or ""
@@ -127,7 +127,7 @@ def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
             "the model has",
             fix="predict with these weights: lagbench predict; or leave them out",
         )
-    count = rounded_parameters(held) or said
+    count = count_rounded_parameters(held) or said
     if not fits(words, held) or said not in (None, count):
         raise UsageError(
             "the weights did not make these predictions",

@@ -301,7 +301,7 @@ def predict(
             threads=threads,
             batch=batch,
             method=method,
-            solver=time_solver if solver else None,
+            time_solver=time_solver if solver else None,
             progress=draw,
         )
     told = _predicted(result, timed, replaced, f" --root {root}" if root else "")
