@@ -20,7 +20,7 @@ from lagbench.data import MATERIALS
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.data.scenario import read_scenario
-from lagbench.draw.tables import markdown
+from lagbench.figures.tables import markdown
 from lagbench.errors import LagbenchError, nearest
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped

@@ -28,7 +28,7 @@ from lagbench.baselines.projection import Density, Shape
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
-from lagbench.draw.tables import markdown
+from lagbench.figures.tables import markdown
 from lagbench.submission.predictions import Predictions, open_predictions
 
 SPLIT = "multimaterial"

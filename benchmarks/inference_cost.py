@@ -26,7 +26,7 @@ from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
 from lagbench.data.registry import load
-from lagbench.draw.tables import markdown
+from lagbench.figures.tables import markdown
 
 SPLIT = "curl-noise"
 SIZE = "mini"

@@ -3,7 +3,7 @@
 As many rows per dimension as in the thesis's own case: 70 % of 19,200 frames for 10,000
 dimensions. Both sides use as many threads as their linear algebra takes; rounds
 alternate and the best of each side counts. 10,000 dimensions on real data, with their
-memory, are measured by ``python -m lagbench.baselines.reproduce.var_protocol``.
+memory, are measured by ``python -m studies.thesis.var_protocol``.
 """
 
 from __future__ import annotations

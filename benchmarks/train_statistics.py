@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import argparse
 
-from lagbench.baselines.reproduce.thesis import STATISTICS
 from lagbench.data.registry import load
+from studies.thesis.published import STATISTICS
 
 
 def main() -> int:

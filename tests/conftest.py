@@ -232,7 +232,7 @@ def stored_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for module in READERS:
             patch.setattr(f"lagbench.board.{module}.read_stored", read)
-        reader = "lagbench.baselines.reproduce.evidence.read_statistics"
+        reader = "studies.thesis.split_results.read_statistics"
         patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
         yield
 

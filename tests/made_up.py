@@ -25,7 +25,7 @@ from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.data.writer import ScenarioWriter, scenario_path
 from lagbench.data.yamlfile import read_yaml, spell_yaml
-from lagbench.report.report import write_report
+from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
 from lagbench.scoring.stored import read_stored

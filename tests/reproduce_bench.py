@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from score_bench import Floats, Predict, ScoreBench
 
-from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
 from lagbench.metrics import METRICS, Score
+from studies.thesis.split_results import Method, ScoredTraining, Sources, SplitResults
 
 SPLIT = "cavity"
 SIZE = "tiny"
@@ -60,7 +60,7 @@ def a_score(values: list[float], metric: str) -> Score:
 def a_method(name: str, *seeds: list[float]) -> Method:
     """Return a model whose every metric has these values, one list per seed."""
     held = [
-        Seeded(
+        ScoredTraining(
             seed=i,
             scores={m: a_score(values, m) for m in METRICS},
             record={},
@@ -68,12 +68,12 @@ def a_method(name: str, *seeds: list[float]) -> Method:
         )
         for i, values in enumerate(seeds)
     ]
-    return Method(name=name, seeds=tuple(held))
+    return Method(name=name, trainings=tuple(held))
 
 
-def known(models: Mapping[str, list[float]]) -> Evidence:
+def known(models: Mapping[str, list[float]]) -> SplitResults:
     """Return what is known of the mini cavity: models and floors of one seed each."""
-    evidence = Evidence(Sources(board=None), SPLIT, "mini")
+    evidence = SplitResults(Sources(board=None), SPLIT, "mini")
     evidence.methods = {name: a_method(name, values) for name, values in models.items()}
     return evidence
 

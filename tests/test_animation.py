@@ -18,12 +18,14 @@ from PIL import ImageSequence
 from PIL.GifImagePlugin import GifImageFile
 from swirls import OMEGA, write_swirl
 
-from lagbench.draw import animate as animation
-from lagbench.draw import style
-from lagbench.draw.animate import Painter, animate, halve, pack, unpack
-from lagbench.draw.panels import Panel
-from lagbench.draw.recording import Scene, open_recording
 from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.figures import animate as animation
+from lagbench.figures import colours
+from lagbench.figures.animate import animate
+from lagbench.figures.encoders import encode_mp4
+from lagbench.figures.painter import Painter, halve, pack, unpack
+from lagbench.figures.panels import Panel
+from lagbench.figures.recording import Scene, open_recording
 
 SIDE = animation.SIDE + 2 * animation.MARGIN
 
@@ -67,13 +69,13 @@ def paint(path: Path, panel: Panel, frame: int, side: int = 128) -> NDArray[np.u
 def test_dots_lie_where_the_particles_are(swirl: Path) -> None:
     """A disc of radius 0.4 is coloured inside, paper outside, and its box has walls."""
     image = paint(swirl, Panel.MATERIAL, 0)
-    blue = (image == style.rgb(style.MATERIAL_COLOURS[0])).all(axis=-1)
+    blue = (image == colours.parse_rgb(colours.MATERIAL_COLOURS[0])).all(axis=-1)
     y, x = np.mgrid[0:128, 0:128] / 128.0 - 0.5
     radius = np.hypot(x, y)
     assert blue[radius < 0.35].mean() > 0.9
     assert not blue[radius > 0.44].any()
-    assert tuple(image[64, 1]) == tuple(style.rgb(style.WALL))
-    assert tuple(image[1, 20]) == tuple(style.rgb(style.MOVING))
+    assert tuple(image[64, 1]) == tuple(colours.parse_rgb(colours.WALL))
+    assert tuple(image[1, 20]) == tuple(colours.parse_rgb(colours.MOVING))
 
 
 def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
@@ -82,10 +84,10 @@ def test_the_first_row_is_the_top_of_the_box(tmp_path: Path) -> None:
     """
     path = write_swirl(tmp_path, "multimaterial", 0, walls=None, materials=2)
     image = paint(path, Panel.MATERIAL, 0)
-    assert tuple(image[64, 64]) == tuple(style.rgb(style.MATERIAL_COLOURS[0]))
+    assert tuple(image[64, 64]) == tuple(colours.parse_rgb(colours.MATERIAL_COLOURS[0]))
     # 0.35 above the middle: the second material
     rim = image[64 - int(0.35 * 128), 60:68]
-    assert (rim == style.rgb(style.MATERIAL_COLOURS[1])).all(axis=-1).any()
+    assert (rim == colours.parse_rgb(colours.MATERIAL_COLOURS[1])).all(axis=-1).any()
 
 
 def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
@@ -93,7 +95,7 @@ def test_vorticity_of_a_rotating_disc_is_red_inside(swirl: Path) -> None:
     image = paint(swirl, Panel.VORTICITY, 3).astype(int)
     middle = image[52:76, 52:76].reshape(-1, 3)  # clear of the rim on the 8 x 8 grid
     assert (middle[:, 0] > middle[:, 2] + 60).all()
-    assert tuple(image[12, 115]) == tuple(style.rgb(style.PAPER))
+    assert tuple(image[12, 115]) == tuple(colours.parse_rgb(colours.PAPER))
 
 
 def test_speeds_are_symmetric_about_the_middle(swirl: Path) -> None:

@@ -18,8 +18,8 @@ from lagbench.__main__ import app
 from lagbench.board.cost import Mark, draw, front, marks_of
 from lagbench.board.model import Tab
 from lagbench.data.registry import load
+from lagbench.figures.chart import close_logarithmic
 from lagbench.references import shipped, solver_seconds
-from lagbench.report.chart import close_logarithmic
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from lagbench.board.payload import (
     payload,
 )
 from lagbench.board.table import MOST_REASONS
-from lagbench.report.html import text
+from lagbench.figures.html import text
 
 DIGITS = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_"
 

@@ -23,7 +23,7 @@ from lagbench.data import registry
 from lagbench.data.layout import dataset_folder
 from lagbench.data.manifest import Manifest, describe_file, merge
 from lagbench.data.registry import Size
-from lagbench.draw.tables import escape, markdown
+from lagbench.figures.tables import escape, markdown
 from lagbench.make import cards
 from lagbench.make.cards import croissant_json
 

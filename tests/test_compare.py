@@ -17,8 +17,8 @@ from score_bench import ScoreBench, half_right, still, straight
 from typer.testing import Result
 
 from lagbench.cli import output
-from lagbench.draw.tables import Table
 from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.figures.tables import Table
 from lagbench.metrics import differ
 from lagbench.scoring.card import digits
 from lagbench.scoring.compare import ComparisonResult, compare

@@ -27,11 +27,11 @@ from lagbench.baselines.frame_model import FrameNetwork, FrameState, FrameWindow
 from lagbench.baselines.lstm import LSTM, LSTMWithMLP
 from lagbench.baselines.mlp import MLP
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.reproduce.thesis import STUDIES, Study
 from lagbench.data import grid as gridding
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
+from studies.thesis.published import MLP_STUDIES, MLPStudy
 
 SCENARIOS = rotations(4)
 FACTS = facts_of(SCENARIOS)
@@ -41,9 +41,9 @@ Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(
-    "study", STUDIES, ids=lambda study: f"{study.table}-{study.row}"
+    "study", MLP_STUDIES, ids=lambda study: f"{study.table}-{study.row}"
 )
-def test_parameters_of_the_thesis(study: Study) -> None:
+def test_parameters_of_the_thesis(study: MLPStudy) -> None:
     """The recipes of Tables 4.2 to 4.5 have as many parameters as the thesis prints."""
     split = "fluid" if study.table < "4.4" else "multimaterial"
     # what tells a row's recipe from the others of its table

@@ -98,9 +98,9 @@ def test_many_particles_are_drawn_by_some(tmp_path: Path) -> None:
     """150,000 particles make 50,000 dots of three times the area; a few make one
     each.
     """
-    from lagbench.draw.panels import Panel, draw
-    from lagbench.draw.recording import open_recording
-    from lagbench.draw.style import figure
+    from lagbench.figures.canvas import figure
+    from lagbench.figures.panels import Panel, draw
+    from lagbench.figures.recording import open_recording
 
     drawn = {}
     for particles in (1500, 150_000):

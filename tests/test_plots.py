@@ -21,13 +21,19 @@ from PIL import Image
 from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 
 from lagbench import errors
-from lagbench.draw import style
-from lagbench.draw.panels import Panel, draw_walls, limit_of
-from lagbench.draw.plot import KINDS, contact_sheet, describe, plot_frame
-from lagbench.draw.recording import open_recording
-from lagbench.draw.style import figure, pixels_of
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.exchange import adopt
+from lagbench.figures import colours
+from lagbench.figures.canvas import (
+    build_palette,
+    build_speed_map,
+    build_vorticity_map,
+    figure,
+    pixels_of,
+)
+from lagbench.figures.panels import Panel, draw_walls, limit_of
+from lagbench.figures.plot import KINDS, contact_sheet, describe, plot_frame
+from lagbench.figures.recording import open_recording
 from lagbench.store.dataset import open_split
 
 
@@ -184,7 +190,7 @@ def test_a_figure_has_one_unit_of_time(
         )
         return output
 
-    monkeypatch.setattr("lagbench.draw.plot.save", look)
+    monkeypatch.setattr("lagbench.figures.plot.save", look)
     source = (
         swirl
         if split == "cavity"
@@ -272,9 +278,9 @@ def test_moving_walls_are_marked_and_point_where_they_slide(tmp_path: Path) -> N
     left = drawn["left"]
     side = len(drawn["right"])
     band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
-    assert tuple(right[band, int(0.2 * side)]) == tuple(style.rgb(style.MOVING))
-    assert tuple(right[-band, side // 2]) == tuple(style.rgb(style.WALL))
-    assert tuple(right[side // 2, side // 2]) == tuple(style.rgb(style.PAPER))
+    assert tuple(right[band, int(0.2 * side)]) == tuple(colours.parse_rgb(colours.MOVING))
+    assert tuple(right[-band, side // 2]) == tuple(colours.parse_rgb(colours.WALL))
+    assert tuple(right[side // 2, side // 2]) == tuple(colours.parse_rgb(colours.PAPER))
     assert np.abs(right[:, ::-1] - left).mean() < 0.2 * np.abs(right - left).mean()
 
 
@@ -344,7 +350,7 @@ def test_sheet_of_driven_scenarios(tmp_path: Path) -> None:
     )
     assert again.read_bytes() == path.read_bytes()
     # each of the five panels shows the orange of its moving top wall
-    orange = (five == style.rgb(style.MOVING)).all(axis=-1).any(axis=0)
+    orange = (five == colours.parse_rgb(colours.MOVING)).all(axis=-1).any(axis=0)
     assert np.count_nonzero(np.diff(orange.astype(int)) == 1) >= 5
 
 
@@ -376,8 +382,8 @@ def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
     image = pixels(
         contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path)
     )
-    for material, colour in enumerate(style.MATERIAL_COLOURS):
-        assert (image == style.rgb(colour)).all(axis=-1).any() == (material < 3)
+    for material, colour in enumerate(colours.MATERIAL_COLOURS):
+        assert (image == colours.parse_rgb(colour)).all(axis=-1).any() == (material < 3)
 
 
 def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
@@ -395,17 +401,17 @@ def test_all_that_is_drawn_is_in_the_palette() -> None:
     """Every level of both maps and every flat colour keeps its exact value in a
     file.
     """
-    table = {tuple(colour) for colour in style.colours().tolist()}
-    assert style.colours().shape == (256, 3)
+    table = {tuple(colour) for colour in build_palette().tolist()}
+    assert build_palette().shape == (256, 3)
     flat = (
-        style.PAPER,
-        style.INK,
-        style.MUTED,
-        style.WALL,
-        style.MOVING,
-        *style.MATERIAL_COLOURS,
+        colours.PAPER,
+        colours.INK,
+        colours.MUTED,
+        colours.WALL,
+        colours.MOVING,
+        *colours.MATERIAL_COLOURS,
     )
-    assert {tuple(style.rgb(colour).tolist()) for colour in flat} <= table
-    for levels in (style.speed_map(), style.vorticity_map()):
+    assert {tuple(colours.parse_rgb(colour).tolist()) for colour in flat} <= table
+    for levels in (build_speed_map(), build_vorticity_map()):
         drawn = (np.asarray(levels.colors)[:, :3] * 255.0).round().astype(int)
         assert {tuple(colour) for colour in drawn.tolist()} <= table

@@ -33,16 +33,16 @@ from made_up import (
 from numpy.typing import NDArray
 from PIL import Image
 
-import lagbench.report
+import lagbench.figures.report
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import load
 from lagbench.errors import UsageError
+from lagbench.figures.html import Markup, tag, text
+from lagbench.figures.report.maps import inside
+from lagbench.figures.report.report import write_report
+from lagbench.figures.report.subject import Subject, limit_of
+from lagbench.figures.report.tables import stable_of
 from lagbench.metrics import METRICS, Setting, Tally, aggregate
-from lagbench.report.html import Markup, tag, text
-from lagbench.report.maps import inside
-from lagbench.report.report import write_report
-from lagbench.report.subject import Subject, limit_of
-from lagbench.report.tables import stable_of
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth
@@ -449,11 +449,11 @@ def test_style_sheet_is_packaged() -> None:
     data = tomllib.loads((root / "pyproject.toml").read_text())["tool"]["setuptools"][
         "package-data"
     ]
-    folder = Path(str(lagbench.report.__file__)).parent
+    folder = Path(str(lagbench.figures.report.__file__)).parent
     others = [p.name for p in folder.iterdir() if p.is_file() and p.suffix != ".py"]
     assert "style.css" in others
     assert all(
-        any(fnmatch(name, pattern) for pattern in data["lagbench.report"])
+        any(fnmatch(name, pattern) for pattern in data["lagbench.figures.report"])
         for name in others
     )
 

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 
-from lagbench.draw.style import MATERIAL_COLOURS
-from lagbench.report.chart import Bar, Plot, bar_chart, linear, logarithmic, spanning
-from lagbench.report.curves import shares_of
-from lagbench.report.flow import streamlines
-from lagbench.report.html import interval, text
-from lagbench.report.maps import LEVELS, SIDE, diverging, paint, sequential
+from lagbench.figures.canvas import MATERIAL_COLOURS
+from lagbench.figures.chart import Bar, Plot, bar_chart, linear, logarithmic, spanning
+from lagbench.figures.html import interval, text
+from lagbench.figures.report.curves import shares_of
+from lagbench.figures.report.flow import streamlines
+from lagbench.figures.report.maps import LEVELS, SIDE, diverging, paint, sequential
 
 
 def pixels(png: bytes) -> np.ndarray:
@@ -263,7 +263,7 @@ CVD = {
 }
 """What a deficiency makes of a linear colour."""
 
-SHEET = files("lagbench.report").joinpath("style.css").read_text("utf-8")
+SHEET = files("lagbench.figures.report").joinpath("style.css").read_text("utf-8")
 
 
 def linear_rgb(digits: str) -> Colour:

@@ -21,24 +21,24 @@ from reproduce_bench import NOISE, SIZE, SPLIT, markdown_rows, pretend
 from score_bench import ScoreBench, bench_of
 
 from lagbench.baselines.checkpoint import load as load_checkpoint
-from lagbench.baselines.reproduce import results
-from lagbench.baselines.reproduce.__main__ import main
-from lagbench.baselines.reproduce.catalogue import FIGURES
-from lagbench.baselines.reproduce.drawing import opened
-from lagbench.baselines.reproduce.evidence import (
-    Evidence,
-    Method,
-    Seeded,
-    Sources,
-    budget,
-)
-from lagbench.baselines.reproduce.plan import Plan
-from lagbench.baselines.reproduce.runs import make_runs
-from lagbench.baselines.reproduce.thesis import EXPECTED, ROSTER
 from lagbench.data.grid import fields
 from lagbench.data.registry import Registry, Size, load
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score_file import read_statistics
+from studies import results
+from studies.thesis.__main__ import main
+from studies.thesis.catalogue import ITEMS
+from studies.thesis.drawing import open_rollouts
+from studies.thesis.plan import Plan
+from studies.thesis.roster import EXPECTED, ROSTER
+from studies.thesis.runs import make_runs
+from studies.thesis.split_results import (
+    Method,
+    ScoredTraining,
+    Sources,
+    SplitResults,
+    format_budget,
+)
 
 
 @pytest.fixture(scope="session")
@@ -66,12 +66,12 @@ def plan(cavity: ScoreBench, runs: Path, tmp_path: Path) -> Plan:
 
 def test_runs_are_read_with_their_costs(plan: Plan) -> None:
     """Scores, hours, parameters and seconds are those of the files."""
-    found = plan.evidence(SPLIT)
+    found = plan.results(SPLIT)
     assert list(found.models) == sorted(NOISE)
     held = found.methods["gns"]
-    direct = read_statistics(held.seeds[0].path).scores()["vorticity_mse"]
+    direct = read_statistics(held.trainings[0].path).scores()["vorticity_mse"]
     assert held.at("vorticity_mse", 15) == pytest.approx(float(np.mean(direct.at(15))))
-    assert (held.parameters, held.seeds[0].cpu_hours) == (123, 2.0)
+    assert (held.parameters, held.trainings[0].cpu_hours) == (123, 2.0)
     assert held.cost is not None
     assert held.cost.seconds_per_frame == 0.5
     assert held.cost.speed_up is None
@@ -82,10 +82,11 @@ def test_runs_are_read_with_their_costs(plan: Plan) -> None:
         {},
     ]
     seeds = [
-        Seeded(seed=i, scores={}, record=one, path=Path()) for i, one in enumerate(told)
+        ScoredTraining(seed=i, scores={}, record=one, path=Path())
+        for i, one in enumerate(told)
     ]
-    assert Method(name="gns", seeds=tuple(seeds)).hours_per_seed == 2.0
-    assert Method(name="gns", seeds=tuple(seeds[2:])).hours_per_seed is None
+    assert Method(name="gns", trainings=tuple(seeds)).hours_per_seed == 2.0
+    assert Method(name="gns", trainings=tuple(seeds[2:])).hours_per_seed is None
 
 
 def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
@@ -106,9 +107,9 @@ def test_the_board_comes_first(plan: Plan, tmp_path: Path) -> None:
     sources = Sources(
         board=board, weights=weights, runs=plan.runs, registry=plan.described
     )
-    held = Evidence(sources, SPLIT, SIZE).methods
-    assert held["gns"].seeds[0].path == scores
-    assert held["gns"].seeds[0].cpu_hours == 1.0
+    held = SplitResults(sources, SPLIT, SIZE).methods
+    assert held["gns"].trainings[0].path == scores
+    assert held["gns"].trainings[0].cpu_hours == 1.0
     assert held["gns"].parameters == 7
     assert held["gns"].cost is not None
     assert held["gns"].cost.speed_up == pytest.approx(0.5)
@@ -123,23 +124,23 @@ def test_an_entry_tells_what_its_record_tells(split: str, tmp_path: Path) -> Non
     same without records.
     """
     board = Path(__file__).parent.parent / "leaderboard"
-    recorded = Evidence(
+    recorded = SplitResults(
         Sources(board=board, weights=board / "weights"), split, "mini"
     ).models
-    told = Evidence(Sources(board=board, weights=tmp_path), split, "mini").models
+    told = SplitResults(Sources(board=board, weights=tmp_path), split, "mini").models
     compared = 0
     for name, method in recorded.items():
-        for held, other in zip(method.seeds, told[name].seeds, strict=True):
+        for held, other in zip(method.trainings, told[name].trainings, strict=True):
             if not held.record.get("validation") or not other.record.get("validation"):
                 continue  # older trainings kept none, or their entry
             compared += 1
             assert other.cpu_hours == pytest.approx(held.cpu_hours, rel=1e-5)
-            assert budget(other.record) == budget(held.record)
+            assert format_budget(other.record) == format_budget(held.record)
             for key in ("windows", "validation"):
                 assert other.record.get(key) == held.record.get(key)
             # an entry's words are those of one of its seeds
             assert other.record["recipe"]["name"] in {
-                s.record["recipe"]["name"] for s in method.seeds
+                s.record["recipe"]["name"] for s in method.trainings
             }
     assert compared > 3
 
@@ -156,7 +157,7 @@ def test_scores_of_other_data_are_left_out(runs: Path) -> None:
             measured = held.measured.model_copy(update={"dataset_sha256": "0" * 64})
             return held.model_copy(update={"measured": measured})
 
-    found = Evidence(Elsewhere(board=None, runs=runs), SPLIT, SIZE)
+    found = SplitResults(Elsewhere(board=None, runs=runs), SPLIT, SIZE)
     assert not found.methods
     assert len(found.stale) == len(NOISE)
 
@@ -174,7 +175,9 @@ def test_runs_of_another_recipe_are_a_variant(
         sources = Sources(
             board=None, runs=tmp_path, recipe=recipe, registry=cavity.registry
         )
-        assert list(Evidence(sources, SPLIT, SIZE).methods) == ([name] if name else [])
+        assert list(SplitResults(sources, SPLIT, SIZE).methods) == (
+            [name] if name else []
+        )
 
 
 @pytest.fixture
@@ -244,9 +247,7 @@ def test_what_is_missing_is_listed_with_its_command(
     assert ROSTER["mlp"].label in refused
     assert ROSTER["supergat-unlinked"].label in absent
     for split in EXPECTED:
-        command = (
-            f"python -m lagbench.baselines.reproduce --size {SIZE} --split {split}"
-        )
+        command = f"python -m studies.thesis --size {SIZE} --split {split}"
         assert sum(command in line for line in missing) == 1
 
 
@@ -313,7 +314,9 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
     """
     scenario = cavity.size.subsets["test"][0]
     truth = cavity.truth(scenario).astype(float)
-    with opened(plan, SPLIT, scenario, ("supergat", "gns", "mlp")) as rollouts:
+    with open_rollouts(
+        plan, SPLIT, scenario=scenario, names=("supergat", "gns", "mlp")
+    ) as rollouts:
         assert tuple(rollouts.predictions) == ("supergat", "gns")  # mlp has no run
         assert np.array_equal(rollouts.position("gns", 5), truth[5])  # given
         assert not np.array_equal(rollouts.position("gns", 6), truth[6])
@@ -343,8 +346,8 @@ def test_every_figure_of_the_contract_is_there() -> None:
     wanted = {
         f"{chapter}_{number}" for chapter, held in numbers.items() for number in held
     }
-    assert set(FIGURES) == wanted | {"section_3_2_2", "section_4_8_3"}
-    for figure in FIGURES.values():
+    assert set(ITEMS) == wanted | {"section_3_2_2", "section_4_8_3"}
+    for figure in ITEMS.values():
         for split, names in figure.needs.items():
             assert set(names) <= set(EXPECTED[split])
     assert {name for names in EXPECTED.values() for name in names} <= set(ROSTER)
@@ -406,7 +409,7 @@ def test_tables_and_figures_are_written(plan: Plan, cavity: ScoreBench) -> None:
     assert "cavity, GNS: seeds 0; 40 x 2 steps x windows; 2 CPU hours per seed" in text
     with (drawn / "table_5_4-1.csv").open() as file:
         rows = {row["model"]: row for row in csv.DictReader(file)}
-    expected = plan.evidence(SPLIT).methods["gns"].at("vorticity_mae", 15)
+    expected = plan.results(SPLIT).methods["gns"].at("vorticity_mae", 15)
     assert float(rows["GNS"]["MAE ours mean"]) == pytest.approx(expected, rel=5e-3)
     assert rows["GNS"]["MAE thesis"] == "0.009757"
     assert float(rows["SuperGAT"]["MAE ours mean"]) == 0.0
@@ -436,7 +439,7 @@ def test_unknown_names_are_answered_with_the_nearest(
 
 def test_a_reader_that_leaves_stops_nothing() -> None:
     """``--list | head -1``: exit code 0 and no traceback."""
-    words = [sys.executable, "-m", "lagbench.baselines.reproduce", "--list"]
+    words = [sys.executable, "-m", "studies.thesis", "--list"]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as child:
@@ -506,7 +509,7 @@ def test_an_interrupt_says_how_to_go_on(
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lagbench.baselines.reproduce.__main__.make_runs", stop)
+    monkeypatch.setattr("studies.thesis.__main__.make_runs", stop)
     assert main(options(plan, "--only", "table_5_4"), registry=cavity.registry) == 130
     assert "goes on" in capsys.readouterr().err
 
@@ -535,7 +538,7 @@ def test_everything_is_made_at_tiny(
     short = [*places, "--threads", "1", "--set", "training.steps=2"]
     frames = {
         name
-        for name, figure in FIGURES.items()
+        for name, figure in ITEMS.items()
         if {"fluid", "multimaterial"} & figure.needs.keys()
     }
     # untrained networks of states start so far off that the validation refuses them
@@ -543,12 +546,12 @@ def test_everything_is_made_at_tiny(
     assert main([*short, *near], registry=unmeasured) == 0
     assert (
         main(
-            [*short, "--only", ",".join(sorted(FIGURES.keys() - frames))],
+            [*short, "--only", ",".join(sorted(ITEMS.keys() - frames))],
             registry=unmeasured,
         )
         == 0
     )
-    for name in FIGURES:
+    for name in ITEMS:
         assert "no run" not in (folder / f"{name}.md").read_text()
     assert (
         "| - |"

@@ -14,32 +14,33 @@ import pytest
 from reproduce_bench import a_method, known
 from scipy.stats import kendalltau
 
-from lagbench.baselines.reproduce import thesis
-from lagbench.baselines.reproduce.claims import (
+from lagbench.data.registry import load
+from lagbench.metrics import METRICS, Score
+from lagbench.scoring.score_file import read_statistics
+from studies.result_tables import kendall_tau
+from studies.thesis import published as thesis
+from studies.thesis.cases import scenario_of
+from studies.thesis.claims import (
     CLAIMS,
     Claim,
     Verdict,
     answer,
     claim_rows,
-    compared,
-    floors_ahead,
+    compare_models,
+    leading_references,
 )
-from lagbench.baselines.reproduce.drawing import SMOOTHED, loss_over_steps, smoothed
-from lagbench.baselines.reproduce.evidence import Evidence, Method, Seeded, Sources
-from lagbench.baselines.reproduce.results import agreement
-from lagbench.baselines.reproduce.tables import (
+from studies.thesis.drawing import SMOOTHED, loss_over_steps, smooth
+from studies.thesis.split_results import Method, ScoredTraining, Sources, SplitResults
+from studies.thesis.tables import (
     cubic_errors,
     cubic_vorticity,
     rollout_table,
 )
-from lagbench.data.registry import load
-from lagbench.metrics import METRICS, Score
-from lagbench.scoring.score_file import read_statistics
 
 FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
 
 
-def six(**better: list[float]) -> Evidence:
+def six(**better: list[float]) -> SplitResults:
     """Return six operators at 0.5 in eight scenarios, some replaced."""
     return known({name: better.get(name, [0.5] * 8) for name in thesis.OPERATORS})
 
@@ -49,31 +50,35 @@ def test_a_comparison_can_be_counted_by_hand() -> None:
     first.
     """
     evidence = known({"gns": [0.1] * 8, "gat": [0.2] * 8})
-    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
-    assert (row.means, row.won, row.seeds) == (pytest.approx((0.1, 0.2)), 8, (1, 1))
+    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
+    assert (row.means, row.win_count, row.seed_counts) == (
+        pytest.approx((0.1, 0.2)),
+        8,
+        (1, 1),
+    )
     assert row.p == row.test.p == 2 / 2**8
     assert row.verdict is Verdict.BETTER
-    (turned,) = compared(evidence, "gat", ["gns"], ["position_rmse"])
-    assert (turned.verdict, turned.won, turned.p) == (Verdict.WORSE, 0, row.p)
+    (turned,) = compare_models(evidence, "gat", ["gns"], ["position_rmse"])
+    assert (turned.verdict, turned.win_count, turned.p) == (Verdict.WORSE, 0, row.p)
     # Directions come from the metrics table; at a frame the values of that frame are
     # compared.
     evidence = known({"gns": [0.9] * 8, "gat": [0.5] * 8})
-    (row,) = compared(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
-    assert (row.verdict, row.won, row.frame) == (Verdict.BETTER, 8, 54)
+    (row,) = compare_models(evidence, "gns", ["gat"], ["vorticity_pearson"], frame=54)
+    assert (row.verdict, row.win_count, row.frame) == (Verdict.BETTER, 8, 54)
 
 
 def test_nothing_is_claimed_of_what_cannot_be_told() -> None:
     """Mixed signs leave a question open; fewer than six scenarios give no p-value at
     all.
     """
-    (mixed,) = compared(
+    (mixed,) = compare_models(
         known({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8}),
         "gns",
         ["gat"],
         ["position_rmse"],
     )
     assert mixed.verdict is Verdict.OPEN
-    (few,) = compared(
+    (few,) = compare_models(
         known({"gns": [0.1] * 5, "gat": [0.9] * 5}), "gns", ["gat"], ["position_rmse"]
     )
     assert few.verdict is Verdict.FEW
@@ -123,21 +128,21 @@ def test_seeds_that_only_one_has_do_not_count() -> None:
     evidence = known({})
     evidence.methods["gns"] = a_method("gns", [0.5] * 8, [99.0] * 8)
     evidence.methods["gat"] = a_method("gat", [0.9] * 8)
-    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
+    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
     assert row.means == pytest.approx((0.5, 0.9))
-    (only,) = evidence.methods["gat"].seeds
-    evidence.methods["gat"] = Method(name="gat", seeds=(replace(only, seed=7),))
-    (row,) = compared(evidence, "gns", ["gat"], ["position_rmse"])
-    assert row.seeds == (2, 1)
+    (only,) = evidence.methods["gat"].trainings
+    evidence.methods["gat"] = Method(name="gat", trainings=(replace(only, seed=7),))
+    (row,) = compare_models(evidence, "gns", ["gat"], ["position_rmse"])
+    assert row.seed_counts == (2, 1)
 
 
-def test_models_stand_beside_the_best_floor() -> None:
+def test_models_stand_beside_the_best_naive() -> None:
     """The floor of least error is the one that counts; skill is 1 - score / its
     score.
     """
     scores = {"gns": 0.1, "gat": 0.9, "persistence": 0.5, "constant-velocity": 2.0}
     evidence = known({name: [score] * 8 for name, score in scores.items()})
-    assert evidence.best_floor == "persistence"
+    assert evidence.best_naive == "persistence"
     assert evidence.skill("gns") == pytest.approx(0.8)
     assert evidence.skill("gat") == pytest.approx(-0.8)
     assert evidence.skill("persistence") == 0.0
@@ -147,11 +152,13 @@ def test_models_stand_beside_the_best_floor() -> None:
         "gat": Verdict.BETTER,
     }
     del evidence.methods["gns"]
-    ahead = floors_ahead([evidence])
+    ahead = leading_references([evidence])
     assert evidence.ranking in {row[1] for row in ahead.rows}
     assert {row[2] for row in ahead.rows} <= set(evidence.floors)
     assert (
-        floors_ahead([known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]).rows
+        leading_references(
+            [known({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})]
+        ).rows
         == ()
     )
 
@@ -188,18 +195,18 @@ def test_orders_agree_as_scipy_says() -> None:
     draw = np.random.default_rng(1)
     for count in (2, 3, 6):
         one, two = draw.random((2, count))
-        assert agreement(one, two) == pytest.approx(kendalltau(one, two).statistic)
+        assert kendall_tau(one, two) == pytest.approx(kendalltau(one, two).statistic)
 
 
 def test_printed_parameters_follow_from_the_widths() -> None:
     """Every printed parameter count of Tables 4.2 to 4.5 is that of dense layers 10,000
     -> ... -> 10,000.
     """
-    for study in thesis.STUDIES:
+    for study in thesis.MLP_STUDIES:
         widths = (10_000, *study.widths, 10_000)
         assert study.parameters == sum(a * b + b for a, b in pairwise(widths)), study
-    assert [study.table for study in thesis.STUDIES].count("4.3") == 6
-    assert len(thesis.STUDIES) == 19
+    assert [study.table for study in thesis.MLP_STUDIES].count("4.3") == 6
+    assert len(thesis.MLP_STUDIES) == 19
 
 
 def test_printed_errors_agree_with_each_other() -> None:
@@ -227,13 +234,13 @@ def test_scenes_stand_for_their_own_kind() -> None:
     for (split, rows), families in zip(thesis.TABLE_4_8.items(), (4, 6), strict=True):
         for row in rows:
             for name in ("full", "mini"):
-                found = thesis.scenario_of(registry.size(split, name), row.scenario)
+                found = scenario_of(registry.size(split, name), row.scenario)
                 assert found in registry.size(split, name).subsets["test"]
                 assert found is not None
                 assert found % families == row.scenario % families
     cavity = registry.size("cavity", "mini")
-    assert thesis.scenario_of(cavity, 0) == min(cavity.subsets["test"])
-    assert thesis.scenario_of(cavity, 1000) is None
+    assert scenario_of(cavity, 0) == min(cavity.subsets["test"])
+    assert scenario_of(cavity, 1000) is None
 
 
 @pytest.mark.parametrize(("spin", "strain"), [(0.3, 0.0), (-0.2, 0.5)])
@@ -290,15 +297,15 @@ def test_smoothing_is_a_centred_mean() -> None:
     """
     values = np.random.default_rng(2).random(60)
     reach = [min(SMOOTHED // 2, i, 59 - i) for i in range(60)]
-    assert smoothed(values) == pytest.approx(
+    assert smooth(values) == pytest.approx(
         [values[i - k : i + k + 1].mean() for i, k in enumerate(reach)]
     )
-    assert smoothed(np.arange(60.0)) == pytest.approx(np.arange(60.0))
+    assert smooth(np.arange(60.0)) == pytest.approx(np.arange(60.0))
 
 
 def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
     """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
-    evidence = Evidence(Sources(board=None), "fluid", "full")
+    evidence = SplitResults(Sources(board=None), "fluid", "full")
     ids = tuple(sorted(evidence.size.subsets["test"]))
     values = np.arange(len(ids), dtype=float)
     none = np.empty((len(ids), 0))
@@ -306,8 +313,8 @@ def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
         m: Score(METRICS[m], ids, (), none, values, (0,) * len(ids))
         for m in ("mse_avg", "mse_end")
     }
-    seed = Seeded(seed=0, scores=scores, record={}, path=Path())
-    evidence.methods["mlp"] = Method(name="mlp", seeds=(seed,))
+    seed = ScoredTraining(seed=0, scores=scores, record={}, path=Path())
+    evidence.methods["mlp"] = Method(name="mlp", trainings=(seed,))
     table = rollout_table(evidence, thesis.TABLE_4_8["fluid"])
     circle = dict(zip(table.columns, table.rows[1], strict=True))
     assert (circle["thesis's id"], circle["our id"]) == ("26", "38")
@@ -321,9 +328,9 @@ def test_skill_is_the_score_files(split: str) -> None:
     of.
     """
     board = Path(__file__).parents[1] / "leaderboard"
-    evidence = Evidence(Sources(board=board), split, "mini")
+    evidence = SplitResults(Sources(board=board), split, "mini")
     assert evidence.models
     for name, method in evidence.models.items():
-        stored = [read_statistics(held.path).skill() for held in method.seeds]
+        stored = [read_statistics(held.path).skill() for held in method.trainings]
         values = [skill.value for skill in stored if skill is not None]
         assert evidence.skill(name) == pytest.approx(np.mean(values), abs=1e-4)

@@ -14,14 +14,14 @@ import netCDF4
 import pytest
 
 from lagbench.baselines import catalogue
-from lagbench.baselines.reproduce import __main__ as command
-from lagbench.baselines.reproduce import runs, tables
-from lagbench.baselines.reproduce.plan import TABLES, Plan, known_studies
-from lagbench.baselines.reproduce.thesis import STUDIES
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 from lagbench.scoring.score_file import read_statistics
+from studies.thesis import __main__ as command
+from studies.thesis import runs, tables
+from studies.thesis.plan import TABLES, Plan, read_studies
+from studies.thesis.published import MLP_STUDIES
 
 pytest.importorskip("torch", reason="the extra 'baselines' is not installed")
 
@@ -122,7 +122,7 @@ def test_studies_are_what_was_asked_for(
     """
     monkeypatch.setitem(TABLES, "table_4_2", ("4.2", SPLIT))
     for module in (runs, tables):
-        monkeypatch.setattr(module, "study_rows", lambda _: STUDIES[:1])
+        monkeypatch.setattr(module, "study_rows", lambda _: MLP_STUDIES[:1])
     places = {
         "root": generated.root,
         "runs": tmp_path / "runs",
@@ -142,18 +142,18 @@ def test_studies_are_what_was_asked_for(
     first = {path: path.stat().st_mtime_ns for path in home.rglob("*.*")}
     runs.make_studies(plan, "table_4_2")
     assert {path: path.stat().st_mtime_ns for path in home.rglob("*.*")} == first
-    known = known_studies([home], plan.hash(SPLIT))
+    known = read_studies([home], plan.hash(SPLIT))
     held = known["mlp-4-2-1"]
     assert held["train"] > 0.0
     assert held["training"]["step"] == 1
     (row,) = tables.studies_beside_thesis("table_4_2", "tiny", known).tables[0].rows
     assert f"{held['valid']:.3g}" in row
-    assert known_studies([home], "f" * 64) == {}
+    assert read_studies([home], "f" * 64) == {}
     stale = {**held, "training": {"dataset_sha256": "f" * 64}}
     later = {**held, "train": 9.0}
     for other, expected in ((stale, held), (later, later)):
         (tmp_path / "mlp_studies.json").write_text(json.dumps({"mlp-4-2-1": other}))
-        assert known_studies([home, tmp_path], plan.hash(SPLIT)) == {
+        assert read_studies([home, tmp_path], plan.hash(SPLIT)) == {
             "mlp-4-2-1": expected
         }
     with pytest.raises(UsageError):

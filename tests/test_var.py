@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from simple_models import batch_of, facts_of, rolled, rotations, share_of_persistence
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 
-from lagbench.baselines.reproduce import var_protocol
 from lagbench.baselines.var import (
     BLOCK,
     VAR,
@@ -26,6 +25,7 @@ from lagbench.baselines.var import (
 )
 from lagbench.errors import WorkFailedError
 from lagbench.make.generate import GenerationResult
+from studies.thesis import var_protocol
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -327,4 +327,6 @@ def test_the_protocol_of_the_thesis_runs(
         **found,
         "mse_at": {int(frame): value for frame, value in found["mse_at"].items()},
     }
-    assert "| 3.5e+18 |" in var_protocol.table(var_protocol.ProtocolResult(**ours))
+    assert "| 3.5e+18 |" in var_protocol.result_markdown(
+        var_protocol.ProtocolResult(**ours)
+    )

@@ -23,6 +23,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
+from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -34,7 +35,6 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.report.html import tag
 from lagbench.scoring.card import Preview, skill
 from lagbench.scoring.stored import Stored, read_stored, reported_frames
 from lagbench.submission.task_checks import frames_to_predict

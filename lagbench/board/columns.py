@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from lagbench.figures.html import MISSING, sentence, text, words
 from lagbench.metrics.metric import Direction, Metric, mean
-from lagbench.report.html import MISSING, sentence, text, words
 
 from .entry import EntryBudget
 from .model import ReferenceRow, Row, Tab, Value

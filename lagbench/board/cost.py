@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 from lagbench.data.registry import Size
 from lagbench.errors import DataError
+from lagbench.figures.chart import WIDTH, Plot, Spot, close_logarithmic
+from lagbench.figures.html import Markup, tag, text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
-from lagbench.report.chart import WIDTH, Plot, Spot, close_logarithmic
-from lagbench.report.html import Markup, tag, text, words
 
 from .model import Board, Tab
 
@@ -132,7 +132,9 @@ def draw(
     if solver:
         plot.upright(solver, "the solver itself")
     best = front(marks)
-    plot.front([mark.seconds for mark in best], [mark.error for mark in best])
+    plot.line(
+        [mark.seconds for mark in best], [mark.error for mark in best], "front"
+    )
     told = {
         "entry": "",
         "floor": ", a floor",
@@ -144,7 +146,7 @@ def draw(
                 x=mark.seconds,
                 y=mark.error,
                 name=mark.name,
-                said=f"{mark.name}{told[mark.kind]}: {text(mark.seconds)} s per frame,"
+                description=f"{mark.name}{told[mark.kind]}: {text(mark.seconds)} s per frame,"
                 f" {words(ranking)} {text(mark.error)}",
                 kind=f"{mark.kind} best"
                 if mark in best and mark.kind == "entry"

@@ -18,8 +18,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import groupby
 
+from lagbench.figures.colours import DARK, LIGHT, format_variables
+from lagbench.figures.html import (
+    Markup,
+    clipped,
+    escaped,
+    join,
+    load_style_sheet,
+    tag,
+    text,
+    words,
+)
 from lagbench.metrics.metric import Direction, Metric
-from lagbench.report.html import Markup, clipped, escaped, join, tag, text, words
 
 from .columns import columns_of, presets_of, value_of, written
 from .cost import cost_figure
@@ -62,13 +72,11 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     theme = _part("theme.js")
     parts = "\n".join(_part(f"{name}.js") for name in SCRIPTS)
     script = f'(() => {{\n"use strict";\n{parts}}})();\n'
-    report = files("lagbench.report").joinpath("style.css").read_text("utf-8")
-    # colours by choice of the reader are those of the report's style sheet once more
-    light, dark = re.findall(r":root\{([^}]*)\}", report)[:2]
-    light = light.replace("color-scheme:light dark", "color-scheme:light")
-    dark = f"color-scheme:dark;{dark.strip()}"
+    # colours by choice of the reader are those of the two schemes once more
+    light = f"color-scheme:light;{format_variables(LIGHT)}"
+    dark = f"color-scheme:dark;{format_variables(DARK)}"
     chosen = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
-    style = report + chosen + _part("page.css")
+    style = load_style_sheet() + chosen + _part("page.css")
     allowed = " ".join(_source(one) for one in (theme, script))
     held = {
         "policy": f"default-src 'none'; script-src {allowed}; style-src "

@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.checksums import round_digits
-from lagbench.report.html import MISSING as NOTHING
-from lagbench.report.html import text, words
+from lagbench.figures.html import MISSING as NOTHING
+from lagbench.figures.html import text, words
 
 from .model import Board, Curve, Histogram, Pictures, ReferenceRow, Row, Tab
 

@@ -6,8 +6,8 @@ import math
 from collections.abc import Collection, Iterator
 from typing import Any
 
-from lagbench.draw.tables import Table
 from lagbench.errors import UsageError, nearest
+from lagbench.figures.tables import Table
 from lagbench.scoring.card import digits
 
 from .columns import held

@@ -10,8 +10,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from lagbench.data.checksums import round_digits
+from lagbench.figures.html import MISSING, Markup, interval, join, tag, text
 from lagbench.metrics.metric import Direction, Metric
-from lagbench.report.html import MISSING, Markup, interval, join, tag, text
 
 from .columns import Column, columns_of, held, loss_of, presets_of, value_of, written
 from .folder import weights_path

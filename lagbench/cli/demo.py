@@ -96,7 +96,7 @@ def demo_split(
     """
     from lagbench.data.local import resolve_root
     from lagbench.data.registry import load
-    from lagbench.draw.plot import plot_frame
+    from lagbench.figures.plot import plot_frame
     from lagbench.make.generate import generate
     from lagbench.make.verify import verify
 

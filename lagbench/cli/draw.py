@@ -133,8 +133,8 @@ def plot(
 ) -> None:
     """Draw one frame of a scenario: particles, vorticity, streamlines."""
     from lagbench.data.local import locate
-    from lagbench.draw.plot import check_kind, contact_sheet, plot_frame
-    from lagbench.draw.recording import open_recording
+    from lagbench.figures.plot import check_kind, contact_sheet, plot_frame
+    from lagbench.figures.recording import open_recording
 
     if sheet:
         chosen_split = chosen(name, split)
@@ -181,8 +181,8 @@ def animate(
     quiet: QuietFlag = False,
 ) -> None:
     """Turn a scenario into an MP4 or GIF film; two scenarios stand side by side."""
-    from lagbench.draw.animate import animate as run
-    from lagbench.draw.animate import check_ending
+    from lagbench.figures.animate import animate as run
+    from lagbench.figures.animate import check_ending
 
     if output is not None:
         check_ending(output)

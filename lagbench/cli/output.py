@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 from lagbench.work.progress import watched
 
 if TYPE_CHECKING:

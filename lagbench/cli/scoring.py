@@ -150,7 +150,7 @@ def score(
 
     together = _checked_together(predictions, root) if len(predictions) > 1 else [None]
     if report is not None:
-        from lagbench.report.report import check_folder
+        from lagbench.figures.report.report import check_folder
 
         check_folder(report)
     cards: list[ScoreCard] = []
@@ -173,7 +173,7 @@ def score(
         if (
             report is not None
         ):  # before a word is printed: a reader such as head may close the pipe
-            from lagbench.report.report import write_report
+            from lagbench.figures.report.report import write_report
 
             written = write_report(report, cards, predictions, root=root)
     finally:

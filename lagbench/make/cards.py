@@ -17,7 +17,7 @@ from pathlib import Path
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import Manifest
 from lagbench.data.registry import Registry, Size, Split, spell_ids
-from lagbench.draw.tables import escape, markdown
+from lagbench.figures.tables import escape, markdown
 
 LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
 KEYWORDS = (
@@ -234,7 +234,7 @@ def _pictures(manifest: Manifest) -> list[str]:
 
 
 def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
-    from lagbench.draw.plot import contact_sheet, plot_frame
+    from lagbench.figures.plot import contact_sheet, plot_frame
 
     splits = Registry({size.split: split}, {})
     folder = size.folder(root)

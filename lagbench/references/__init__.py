@@ -1,8 +1,9 @@
 """Floors: predictions that cost no learning, and their scores on our data sets.
 
 Rows of every table, report and board, none of which is ranked. :data:`REFERENCES` names
-them, :func:`references_of` says which of them a split and size has, ``ReferencePredictor.counts`` which
-may be the best one, :func:`shipped` what they score there.
+them, :func:`references_of` says which of them a split and size has,
+``ReferencePredictor.counts`` which may be the best one, :func:`shipped` what they score
+there.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from .table import REFERENCES, references_of
 
 __all__ = [
     "REFERENCES",
-    "ReferencePredictor",
     "ReferencePredictor",
     "ReferenceScores",
     "Given",

@@ -1,18 +1,17 @@
-"""Analog: the scenario of train that starts most like this one, its future as the
-answer.
+"""Analog: the scenario of train that starts most like this one, its future the answer.
 
-After Lorenz, J. Atmos. Sci. 26 (1969) 636. Scenarios are compared at the last given
-frame by
+After Lorenz, J. Atmos. Sci. 26 (1969) 636. Scenarios and their mirror images are
+compared at the last given frame by
 
     d^2 = W2^2(positions) / std(x)^2 + mean |u_a - u_b|^2 / mean |u_a|^2,
 
 the sliced Wasserstein distance of their clouds (material by material where both have
 the same), over the variance of a cloud along a direction (wherever in the box it is),
 and the difference of their velocity fields on the score grid over the square of those
-given here. In a full box the analog's motion carries the particles: from frame to frame
-they move as the analog does where they are. On a free surface the analog's particles
-are assigned to those given so that the sum of squared distances is least, and their
-paths are the answer.
+given here. In a full box the motion of the analog carries the particles: from frame to
+frame they move as the analog does where they are. On a free surface the particles of
+the analog are assigned to those given so that the sum of squared distances is least,
+and their paths are the answer.
 
 Memorising looks like this, and so does a leak from train to test.
 """
@@ -22,23 +21,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement, node_velocity, transfer
 from lagbench.data.scenario import ScenarioFile, read_scenario
-from lagbench.errors import DataError
 
+from .assignment import assign_particles
 from .predictor import (
     Floats,
     Given,
+    Kind,
     Prediction,
     ReferencePredictor,
     fills_box,
     given_in,
     linear_field,
-    mirrored,
     wall_motion,
+    with_wall_images,
 )
+from .train_library import Mirror, long_enough, mirrors_of
 
 ANGLES = np.arange(64) * (np.pi / 64)
 DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
@@ -46,122 +46,116 @@ DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
 
 LEVELS = (np.arange(256) + 0.5) / 256
 """Levels at which distributions along a direction are compared; clouds may differ in
-number.
-"""
+number."""
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class InitialCloud:
     """How a scenario starts, as scenarios are compared."""
 
-    # quantiles along each direction by material [length], [level, direction]
+    # quantiles along each direction by material [length], each [level, direction]
     clouds: dict[int, Floats]
     shares: dict[int, float]  # share of each material in the particles [1]
     field: Floats  # velocity at the nodes [length/frame], shape [x node, y node, 2]
 
 
-def start_of(given: Given) -> Start:
-    """Return how a scenario starts."""
-    task = given.size.task.score_grid
-    grid = Grid(task.cells, Placement(task.placement))
-    clouds = {
-        int(kind): np.quantile(
-            given.last[given.material == kind] @ DIRECTIONS, LEVELS, axis=0
-        )
-        for kind in np.unique(given.material)
-    }
-    shares = {kind: float(np.mean(given.material == kind)) for kind in clouds}
-    sums = transfer(given.last, given.step, grid)
-    return Start(clouds, shares, node_velocity(sums, float(sums.weight.max())))
+def describe_start(given: Given, mirror: Mirror | None = None) -> InitialCloud:
+    """Return how a scenario, or a mirror image of it, starts."""
+    score_grid = given.size.task.score_grid
+    grid = Grid(score_grid.cells, Placement(score_grid.placement))
+    position = given.last
+    velocity = given.step
+    if mirror is not None:
+        position = mirror.positions(position)
+        velocity = mirror.velocities(velocity)
+    clouds = {}
+    shares = {}
+    for kind in np.unique(given.material).tolist():
+        members = given.material == kind
+        projections = position[members] @ DIRECTIONS
+        clouds[kind] = np.quantile(projections, LEVELS, axis=0)
+        shares[kind] = float(np.mean(members))
+    sums = transfer(position, velocity, grid)
+    field = node_velocity(sums, float(sums.weight.max()))
+    return InitialCloud(clouds, shares, field)
 
 
-def distance(one: Start, other: Start) -> float:
-    """Return how unlike two starts are, in units of the first one's spread; infinite
-    for other materials.
+def distance(start: InitialCloud, other: InitialCloud) -> float:
+    """Return how unlike two starts are, in units of the first one's spread [1].
+
+    Infinite for starts of other materials.
     """
-    if one.clouds.keys() != other.clouds.keys():
+    if start.clouds.keys() != other.clouds.keys():
         return float("inf")
-    apart = sum(
-        one.shares[k] * np.mean((c - other.clouds[k]) ** 2)
-        for k, c in one.clouds.items()
-    )
-    spread = sum(
-        one.shares[k] * np.mean(np.var(c, axis=0)) for k, c in one.clouds.items()
-    )
-    differ = np.mean((one.field - other.field) ** 2)
-    speed = np.mean(one.field**2)
-    return float(np.sqrt(apart / spread + differ / (speed or 1.0)))
+    squared_distance = 0.0
+    variance = 0.0
+    for kind, cloud in start.clouds.items():
+        share = start.shares[kind]
+        squared_distance += share * float(np.mean((cloud - other.clouds[kind]) ** 2))
+        variance += share * float(np.mean(np.var(cloud, axis=0)))
+    difference = float(np.mean((start.field - other.field) ** 2))
+    squared_speed = float(np.mean(start.field**2)) or 1.0
+    return float(np.sqrt(squared_distance / variance + difference / squared_speed))
 
 
-def nearest(given: Given) -> int:
-    """Return the id of the scenario of train that starts most like this one; all must
-    be at hand.
+def find_analog(given: Given) -> tuple[int, Mirror]:
+    """Return the scenario of train, and its mirror image, that starts most like this.
+
+    Raises:
+        DataError: no scenario of train is as long as the task.
     """
     size = given.size
-    own = start_of(given)
-    needed = size.task.input_frames + size.task.horizon
-    found = {}
-    for scenario in size.subsets["train"]:
-        if size.frame_count(scenario) >= needed:
-            with _open(given, scenario) as file:
-                found[scenario] = distance(
-                    own, start_of(given_in(file, size, given.root))
-                )
-    if not found:
-        what = "no scenario of train is as long as the task"
-        where = f"{size.split} {size.name}"
-        raise DataError(what, where=where, expected=f"{needed} frames")
-    return min(found, key=lambda scenario: (found[scenario], scenario))
+    start = describe_start(given)
+    best = None
+    for scenario in long_enough(size):
+        with _open(given, scenario) as file:
+            candidate = given_in(file, size, given.root)
+        for number, mirror in enumerate(mirrors_of(size)):
+            unlikeness = distance(start, describe_start(candidate, mirror))
+            rank = (unlikeness, scenario, number)
+            if best is None or rank < best[0]:
+                best = (rank, scenario, mirror)
+    if best is None:  # long_enough has refused an empty train
+        raise AssertionError
+    return best[1:]
 
 
 def predict(given: Given) -> Prediction:
     """Yield where the analog takes the particles."""
-    frames = given.predicted_frames
-    now = given.last
-    with _open(given, nearest(given)) as file:
-        before = _frame(file, frames[0] - 1)
-        if not fills_box(given.size):
-            partner = assigned(now, before, given.material, file.read("material"))
-            for frame in frames:
-                yield _frame(file, frame)[partner].astype("float32")
-            return
-        walls = wall_motion(file, given.size, frames.stop)
-        for frame in frames:
-            after = _frame(file, frame)
-            field = linear_field(*mirrored(given, before, after - before, walls[frame]))
-            now = given.inside(now + field(now))
-            before = after
-            yield now.astype("float32")
-
-
-def assigned(
-    position: Floats,
-    theirs: Floats,
-    material: NDArray[np.integer],
-    of_theirs: NDArray[np.integer],
-) -> NDArray[np.intp]:
-    """Return a particle of theirs for each of ours: least sum of squared distances,
-    material by material.
-
-    Where there are fewer or more of theirs, some are taken more than once, or not at
-    all, evenly over their numbers. A material that they lack is matched to all of
-    theirs.
-    """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist
-
-    partner = np.empty(len(position), np.intp)
-    for kind in np.unique(material):
-        ours = np.flatnonzero(material == kind)
-        pool = np.flatnonzero(of_theirs == kind)
-        if pool.size:
-            pool = pool
+    scenario, mirror = find_analog(given)
+    with _open(given, scenario) as file:
+        if fills_box(given.size):
+            yield from _carry(given, file, mirror)
         else:
-            pool = np.arange(len(theirs))
-        chosen = pool[np.arange(len(ours)) * len(pool) // len(ours)]
-        cost = cdist(position[ours], theirs[chosen], "sqeuclidean")
-        partner[ours] = chosen[linear_sum_assignment(cost)[1]]
-    return partner
+            yield from _follow(given, file, mirror)
+
+
+def _carry(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
+    """Yield where the velocity field of the analog carries the particles."""
+    frames = given.predicted_frames
+    walls = mirror.walls(wall_motion(file, given.size, frames.stop))
+    position = given.last
+    before = mirror.positions(_frame(file, frames[0] - 1))
+    for frame in frames:
+        after = mirror.positions(_frame(file, frame))
+        points, velocities = with_wall_images(
+            given, before, after - before, walls[frame]
+        )
+        field = linear_field(points, velocities)
+        position = given.inside(position + field(position))
+        before = after
+        yield position.astype("float32")
+
+
+def _follow(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
+    """Yield the paths of the analog's particles that are nearest to those given."""
+    frames = given.predicted_frames
+    before = mirror.positions(_frame(file, frames[0] - 1))
+    partner = assign_particles(
+        given.last, before, given.material, file.read("material")
+    )
+    for frame in frames:
+        yield mirror.positions(_frame(file, frame))[partner].astype("float32")
 
 
 def _frame(file: ScenarioFile, frame: int) -> Floats:
@@ -175,10 +169,10 @@ def _open(given: Given, scenario: int) -> ScenarioFile:
 PREDICTOR = ReferencePredictor(
     name="analog",
     title="Analog",
-    definition="The scenario of train whose given frames are nearest to those given "
-    "here: its motion carries"
-    " the particles of a full box, its matched particles are the answer on a free "
-    "surface.",
+    kind=Kind.NAIVE,
+    definition="The scenario of train, or a mirror image of one, whose last given frame"
+    " is nearest: its motion carries the particles of a full box, its matched particles"
+    " are the answer on a free surface.",
     predict=predict,
     reads_train=True,
 )

@@ -1,12 +1,12 @@
-"""Coarse solver: the same equations on the grid of the next smaller size, with its time
-step.
+"""Coarse solver: the same equations on a coarser grid, with its longer time step.
 
-What a surrogate must be compared with: accuracy against cost. It learns nothing either,
-but it knows the equations, the viscosity, the materials and the motion of the walls to
-the end. A seeded subset of the particles, as many as the smaller size has and as evenly
-spread as they are, carries the mass. In a full box the others move as those around them
-do (see :mod:`.floor`); on a free surface each keeps its offset to the nearest of its
-material that carries mass.
+What a surrogate must be compared with: accuracy against cost. It learns nothing, but it
+knows the equations, the viscosity, the materials and the motion of the walls to the
+end. Its grid and time step are those of a smaller size of the split: half as many cells
+along each axis, or a quarter. A seeded subset of the particles, as many as the smaller
+size has and as evenly spread as they are, carries the mass. In a full box the others
+move as those around them do (see :mod:`.predictor`); on a free surface each keeps its
+offset to the nearest particle of its material that carries mass.
 
 The solver starts from displacements alone: in full boxes the velocity of the last given
 frame is extrapolated from two of them, ``(3 u(f) - u(f-1)) / 2``; in free fall it is
@@ -29,11 +29,12 @@ from lagbench.errors import require
 from .predictor import (
     Floats,
     Given,
+    Kind,
     Prediction,
     ReferencePredictor,
     fills_box,
     linear_field,
-    mirrored,
+    with_wall_images,
 )
 
 if TYPE_CHECKING:
@@ -44,34 +45,43 @@ if TYPE_CHECKING:
         InitialState,
     )
 
-NEXT = {"full": "mini", "mini": "tiny"}
-"""The next smaller size of each size."""
-
-SPLITS = {
-    "cavity": ("full",),
-    "fluid": ("full", "mini"),
-    "multimaterial": ("full", "mini"),
+SMALLER = {
+    ("full", 2): "mini",
+    ("full", 4): "tiny",
+    ("mini", 2): "tiny",
 }
-"""Sizes that are solved; the effective viscosity of curl noise is its grid's, so it is
-not.
-"""
+"""Size whose grid is used, by size and by how many times fewer cells are asked for."""
+
+SOLVED = ("fluid", "multimaterial")
+"""Splits that are solved; in full boxes the projection solver is cheaper and better."""
 
 
-def coarser(size: Size) -> Size | None:
-    """Return the size whose grid is used; None where a size is not solved or has no
-    coarser grid.
+def coarser(size: Size, times: int) -> Size | None:
+    """Return the size whose grid has so many times fewer cells along each axis.
+
+    None where a split is not solved or no size has such a grid.
+
+    Args:
+        size: the split and size that is predicted.
+        times: cells of its grid over those of the coarser one, 2 or 4.
     """
-    if size.name not in SPLITS.get(size.split, ()):
+    name = SMALLER.get((size.name, times))
+    if size.split not in SOLVED or name is None:
         return None
-    found = load().size(size.split, NEXT[size.name])
-    if found.grid < size.grid:
-        return found
-    return None
+    smaller = load().size(size.split, name)
+    if smaller.grid * times != size.grid:
+        return None
+    return smaller
 
 
-def predict(given: Given) -> Prediction:
-    """Yield positions that the solver on the coarser grid finds."""
-    if (coarse := coarser(given.size)) is None:
+def predict(given: Given, times: int) -> Prediction:
+    """Yield positions that the solver on a coarser grid finds.
+
+    Raises:
+        ValueError: the split and size has no such grid.
+    """
+    coarse = coarser(given.size, times)
+    if coarse is None:
         raise ValueError(f"{given.size.split} {given.size.name} has no coarser size")
     return predict_with(given, coarse)
 
@@ -82,28 +92,29 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
     from lagbench.generators.constants import solver_constants
 
     count = min(coarse.particles, len(given.last))
-    now = given.last.copy()
-    carriers = spread_subset(now, given.material, count)
-    others = np.setdiff1d(np.arange(len(now)), carriers)
+    position = given.last.copy()
+    carriers = spread_subset(position, given.material, count)
+    others = np.setdiff1d(np.arange(len(position)), carriers)
     leader = _leaders(given, carriers, others)
-    offset = now[others] - now[carriers][leader]
-    before = now[carriers]
+    offset = position[others] - position[carriers][leader]
+    before = position[carriers]
     solver = _solver(replace(solver_constants(coarse), particles=count))
     solver.load([_state(given, carriers)])
     for frame in given.predicted_frames:
         solver.advance(coarse.substeps_per_frame)
         after = solver.position()[0].astype(np.float64)
         if fills_box(given.size) and others.size:
-            field = linear_field(
-                *mirrored(given, before, after - before, given.walls[frame])
+            points, velocities = with_wall_images(
+                given, before, after - before, given.walls[frame]
             )
-            now[others] = now[others] + field(now[others])
+            field = linear_field(points, velocities)
+            position[others] += field(position[others])
         else:
-            now[others] = after[leader] + offset
-        now[carriers] = after
+            position[others] = after[leader] + offset
+        position[carriers] = after
         before = after
-        now = given.inside(now)
-        yield now.astype("float32")
+        position = given.inside(position)
+        yield position.astype("float32")
 
 
 @functools.lru_cache(maxsize=1)
@@ -183,13 +194,26 @@ def _leaders(
     return leader
 
 
-PREDICTOR = ReferencePredictor(
-    name="coarse-solver",
-    title="Coarse solver",
-    definition="The solver itself on the grid of the next smaller size, with its time "
-    "step: it knows the"
-    " equations, the materials and what drives the flow.",
-    applies=lambda size: coarser(size) is not None,
-    predict=predict,
-    counts=False,
+def _describe(name: str, times: int, share: str) -> ReferencePredictor:
+    def predict_scenario(given: Given) -> Prediction:
+        return predict(given, times)
+
+    def has_grid(size: Size) -> bool:
+        return coarser(size, times) is not None
+
+    return ReferencePredictor(
+        name=name,
+        title=f"Coarse solver, {share} of the cells",
+        kind=Kind.CLASSICAL,
+        definition=f"The solver itself on a grid with {share} of the cells along each"
+        " axis, with its time step: it knows the equations, the materials and what"
+        " drives the flow.",
+        applies=has_grid,
+        predict=predict_scenario,
+    )
+
+
+PREDICTORS = (
+    _describe("coarse-solver", 2, "half"),
+    _describe("coarse-solver-4x", 4, "a quarter"),
 )

@@ -6,7 +6,7 @@ With u the field of that frame, known at the middle of each particle's last step
 
 a midpoint step. a is 1 where walls drive the flow; elsewhere ``ln a`` is the slope of a
 line through the logarithms of the RMS speed of the given frames, at most 0. What is
-nearly steady needs no model: this floor tells.
+nearly steady needs no model: this predictor shows it.
 """
 
 from __future__ import annotations
@@ -16,17 +16,20 @@ import numpy as np
 from .predictor import (
     Floats,
     Given,
+    Kind,
     Prediction,
     ReferencePredictor,
     fills_box,
     linear_field,
-    mirrored,
+    with_wall_images,
 )
 
 
 def decay(position: Floats) -> float:
-    """Return the factor on the speed from frame to frame, fitted to given frames
-    [1].
+    """Return the factor on the speed from frame to frame, fitted to given frames [1].
+
+    Args:
+        position: the given frames [length], shape [frame, particle, 2].
     """
     speed = np.sqrt(np.mean(np.diff(position, axis=0) ** 2, axis=(1, 2)))
     if len(speed) < 2 or not speed.all():
@@ -39,7 +42,7 @@ def predict(given: Given) -> Prediction:
     """Yield positions that the last given field carries."""
     middle = (given.position[-1] + given.position[-2]) / 2.0
     wall = given.walls[given.size.task.input_frames - 1]
-    field = linear_field(*mirrored(given, middle, given.step, wall))
+    field = linear_field(*with_wall_images(given, middle, given.step, wall))
     factor = 1.0
     if given.driven:
         rate = 1.0
@@ -56,9 +59,9 @@ def predict(given: Given) -> Prediction:
 PREDICTOR = ReferencePredictor(
     name="frozen-field",
     title="Frozen field",
-    definition="The velocity field of the last given frame, held (in a box that "
-    "nothing drives: decaying as"
-    " the given frames do), carries the particles.",
+    kind=Kind.NAIVE,
+    definition="The velocity field of the last given frame carries the particles; in a"
+    " box that nothing drives it decays as the given frames do.",
     applies=fills_box,
     predict=predict,
 )

@@ -1,14 +1,19 @@
-"""A floor: what predicts without learning, and all that it may know of a test scenario.
+"""Reference predictors: what predicts without training, and what it may know.
 
-Some carry the particles of a full box by a velocity field that is known at scattered
-points. Between the points the field is linear on their Delaunay triangles. Beyond a
-wall stand mirror images of the points near it, so that the field meets the wall's
-condition half-way: where walls hold the fluid, the image of u is ``2 u_wall - u``;
-where they let it slide, its normal component is reversed.
+A *naive* predictor learns nothing and knows no equation; it may look things up in
+train. A *classical* one integrates the equations. Both get what a model gets of a test
+scenario: its first frames, its materials, its viscosity and the motion of its walls.
+
+Some predictors carry the particles of a full box by a velocity field that is known at
+scattered points. Between the points the field is linear on their Delaunay triangles.
+Beyond a wall stand mirror images of the points near it, so that the field meets the
+condition of the wall half-way: where walls hold the fluid, the image of u is
+``2 u_wall - u``; where they let it slide, its normal component is reversed.
 """
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
+from lagbench.data.box import Box
 from lagbench.data.grid import Placement
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
@@ -30,15 +36,25 @@ Prediction = Iterator[NDArray[np.float32]]
 Field = Callable[[Floats], Floats]
 """From points [length], shape [point, 2], to velocities there [length/frame]."""
 
-DEPTH = 4.0
+MIRRORED_LAYER = 4.0
 """Depth of the layer that is mirrored at the walls, in spacings of the points."""
+
+EFFECTIVE_VISCOSITY = "effective_viscosity"
+"""Parameter of a size whose scenarios have no viscosity of their own [length^2/s]."""
+
+
+class Kind(enum.StrEnum):
+    """How a prediction comes about."""
+
+    NAIVE = "naive"  # learns nothing, knows no equation; may look things up in train
+    CLASSICAL = "classical"  # integrates the equations
+    LEARNED = "learned"  # its parameters are fitted to train
+    HYBRID = "hybrid"  # a solver with a learned part
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Given:
-    """What is given of a test scenario: its first frames, its materials and what drives
-    it.
-    """
+    """What is given of a test scenario: first frames, materials, what drives it."""
 
     size: Size  # the split and size
     root: Path  # folder of all data sets: train may be looked at
@@ -51,6 +67,11 @@ class Given:
     # what the scenario's file states: viscosity, friction and the like
     parameters: Mapping[str, object]
 
+    @cached_property
+    def box(self) -> Box:
+        """The box that holds the particles."""
+        return Box.from_bounds(self.size.bounds)
+
     @property
     def last(self) -> Floats:
         """Positions of the last given frame [length], shape [particle, 2]."""
@@ -59,7 +80,24 @@ class Given:
     @property
     def step(self) -> Floats:
         """Last given velocity [length/frame], shape [particle, 2]."""
-        return np.asarray(self.position[-1] - self.position[-2])
+        return self.box.displacement(self.position[-2], self.position[-1])
+
+    @property
+    def fall(self) -> Floats:
+        """Acceleration of a free particle [length/frame^2], shape [2]."""
+        gravity = float(self.size.value("gravity"))
+        return np.array([0.0, -gravity]) * self.size.frame_interval**2
+
+    @property
+    def viscosity(self) -> float:
+        """Kinematic viscosity that the scenario or its data set states [length^2/s].
+
+        Where neither states one the fluid is inviscid: 0.
+        """
+        stated = self.parameters.get("viscosity")
+        if stated is None and EFFECTIVE_VISCOSITY in self.size.parameters:
+            stated = self.size.value(EFFECTIVE_VISCOSITY)
+        return float(str(stated or 0.0))
 
     @property
     def predicted_frames(self) -> range:
@@ -74,27 +112,35 @@ class Given:
 
     def inside(self, position: Floats) -> Floats:
         """Return positions, those beyond a wall put on it, shape [particle, 2]."""
-        low, high = np.transpose(self.size.bounds)
-        return np.clip(position, low, high)
+        return self.box.inside(position)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferencePredictor:
-    """One way to predict that costs no learning."""
+    """One way to predict without training."""
 
     name: str  # name of its rows
     title: str  # the same for readers
+    kind: Kind  # naive or classical
     definition: str  # what it predicts, one sentence
     predict: Callable[[Given], Prediction]
     applies: Callable[[Size], bool] = lambda _: True  # whether a split and size has it
-    # whether it may be the best floor, which skill is measured against
-    counts: bool = True
     reads_train: bool = False  # whether it looks at the scenarios of train
+
+    @property
+    def counts(self) -> bool:
+        """Whether skill may be measured against it: against naive ones only."""
+        return self.kind is Kind.NAIVE
 
 
 def fills_box(size: Size) -> bool:
     """Tell whether the material fills the box: no surface, one material."""
     return Placement(size.task.score_grid.placement) is Placement.CELL_CENTRES
+
+
+def falls(size: Size) -> bool:
+    """Tell whether the material has a free surface and falls."""
+    return not fills_box(size) and "gravity" in size.parameters
 
 
 def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
@@ -114,8 +160,9 @@ def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
 
 
 def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:
-    """Return the velocity of each wall towards the first frames [length/frame], shape
-    [frame, 4, 2].
+    """Return the velocity of each wall towards the first frames [length/frame].
+
+    Shape [frame, 4, 2].
     """
     if "wall_velocity" not in file.variables:
         return np.zeros((frames, len(WALLS), 2))
@@ -124,8 +171,9 @@ def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:
 
 
 def linear_field(points: Floats, values: Floats) -> Field:
-    """Return the field that is linear between points, and beyond them that of the
-    nearest one.
+    """Return the field that is linear between points.
+
+    Beyond the points the field has the value at the nearest one.
     """
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import KDTree
@@ -133,35 +181,38 @@ def linear_field(points: Floats, values: Floats) -> Field:
     linear = LinearNDInterpolator(points, values)
 
     def field(at: Floats) -> Floats:
-        found = np.asarray(linear(at), np.float64)
-        beyond = np.isnan(found[:, 0])
+        velocity = np.asarray(linear(at), np.float64)
+        beyond = np.isnan(velocity[:, 0])
         if beyond.any():
-            found[beyond] = values[KDTree(points).query(at[beyond])[1]]
-        return found
+            velocity[beyond] = values[KDTree(points).query(at[beyond])[1]]
+        return velocity
 
     return field
 
 
-def mirrored(
+def with_wall_images(
     given: Given, points: Floats, values: Floats, walls: Floats
 ) -> tuple[Floats, Floats]:
-    """Return points and velocities there, each [point, 2], with those that the walls
-    reflect.
+    """Return points and velocities together with their images behind the walls.
 
-    ``walls`` are their velocities, left, right, bottom, top [length/frame], shape [4,
-    2].
+    Args:
+        given: what is given of the scenario: its box, and whether walls move.
+        points: points in the box [length], shape [point, 2].
+        values: velocities there [length/frame], shape [point, 2].
+        walls: velocities of the walls, left, right, bottom, top [length/frame], shape
+            [4, 2].
     """
-    (left, right), (bottom, top) = given.size.bounds
-    depth = DEPTH * np.sqrt((right - left) * (top - bottom) / len(points))
+    box = given.box
+    depth = MIRRORED_LAYER * np.sqrt(box.volume / len(points))
     places = [points]
     speeds = [values]
-    for motion, axis, where in zip(
-        walls, (0, 0, 1, 1), (left, right, bottom, top), strict=True
-    ):
-        near = np.abs(points[:, axis] - where) < depth
+    for number, motion in enumerate(walls):
+        axis, side = divmod(number, 2)
+        wall_place = box.bounds[axis][side]
+        near = np.abs(points[:, axis] - wall_place) < depth
         image = points[near].copy()
         speed = values[near].copy()
-        image[:, axis] = 2.0 * where - image[:, axis]
+        image[:, axis] = 2.0 * wall_place - image[:, axis]
         if given.driven:
             speed = 2.0 * motion - speed
         else:

@@ -1,4 +1,4 @@
-"""The table of floors: what every list of them, every row and every name comes from."""
+"""The table of reference predictors: every list, row and name comes from it."""
 
 from __future__ import annotations
 
@@ -7,30 +7,50 @@ from types import MappingProxyType
 
 from lagbench.data.registry import Size
 
-from . import analog, coarse_solver, extrapolation, frozen_field
-from .predictor import ReferencePredictor
+from . import (
+    analog,
+    ballistic_analog,
+    climatology,
+    coarse_solver,
+    extrapolation,
+    frozen_field,
+    projection,
+)
+from .predictor import Kind, ReferencePredictor
+
+_PREDICTORS = (
+    extrapolation.PERSISTENCE,
+    extrapolation.CONSTANT_VELOCITY,
+    frozen_field.PREDICTOR,
+    extrapolation.BALLISTIC,
+    climatology.PREDICTOR,
+    analog.PREDICTOR,
+    ballistic_analog.PREDICTOR,
+    *projection.PREDICTORS,
+    *coarse_solver.PREDICTORS,
+)
 
 REFERENCES: Mapping[str, ReferencePredictor] = MappingProxyType(
-    {
-        floor.name: floor
-        for floor in (
-            extrapolation.PERSISTENCE,
-            extrapolation.CONSTANT_VELOCITY,
-            frozen_field.PREDICTOR,
-            extrapolation.FREE_FLIGHT,
-            analog.PREDICTOR,
-            coarse_solver.PREDICTOR,
-        )
-    }
+    {predictor.name: predictor for predictor in _PREDICTORS}
 )
-"""All floors by name, in the order in which they are shown."""
+"""All reference predictors by name, in the order in which they are shown."""
 
-COUNTING = frozenset(name for name, floor in REFERENCES.items() if floor.counts)
-"""Names of those that skill may be measured against."""
+NAIVE = frozenset(
+    name for name, predictor in REFERENCES.items() if predictor.kind is Kind.NAIVE
+)
+"""Names of the naive predictors: skill is measured against the best of them."""
+
+COUNTING = NAIVE
+
+CLASSICAL = frozenset(REFERENCES) - NAIVE
+"""Names of the classical solvers, which ``against_classical`` is measured against."""
 
 
 def references_of(size: Size) -> tuple[ReferencePredictor, ...]:
-    """Return the floors of a split and size; a split of the user's own has those of its
-    kind of box.
+    """Return the reference predictors of a split and size.
+
+    A split of the user's own has those of its kind of box.
     """
-    return tuple(floor for floor in REFERENCES.values() if floor.applies(size))
+    return tuple(
+        predictor for predictor in REFERENCES.values() if predictor.applies(size)
+    )

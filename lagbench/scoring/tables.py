@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator
 
-from lagbench.draw.tables import Table
+from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS

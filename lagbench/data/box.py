@@ -1,0 +1,201 @@
+"""The box that holds the particles: its dimension, its walls, its periodic axes.
+
+Every question about space goes through a :class:`Box`: how far apart two points are,
+whether a point lies inside, which walls there are. A box has two or three dimensions.
+Along each axis it either ends at two walls or repeats itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+"""Names of the axes, in the order of the components of a position."""
+
+WALL_NAMES = ("left", "right", "bottom", "top", "front", "back")
+"""Names of the walls: the lower and the upper one of each axis, axis by axis."""
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box with walls or periodic ends along each axis.
+
+    >>> box = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)], periodic=[True, False])
+    >>> box.displacement([0.9, 0.2], [0.1, 0.7]).round(3)
+    array([0.2, 0.5])
+    """
+
+    low: tuple[float, ...]  # lower end of each axis [length]
+    high: tuple[float, ...]  # upper end of each axis [length]
+    periodic: tuple[bool, ...]  # whether an axis repeats itself
+
+    def __post_init__(self) -> None:
+        """Refuse boxes without extent and those that are neither flat nor solid.
+
+        Raises:
+            UsageError: the dimension is not 2 or 3, the parts differ in length, or an
+                axis has no extent.
+        """
+        if not len(self.low) == len(self.high) == len(self.periodic):
+            raise UsageError(
+                "the parts of a box differ in dimension",
+                where="low, high, periodic",
+                expected="as many values in each",
+                got=f"{len(self.low)}, {len(self.high)} and {len(self.periodic)}",
+            )
+        if self.dimension not in (2, 3):
+            raise UsageError(
+                "a box has two or three dimensions", where="low", got=self.dimension
+            )
+        for axis, low, high in zip(AXES, self.low, self.high, strict=False):
+            if not low < high:
+                raise UsageError(
+                    "an axis of a box has no extent",
+                    where=axis,
+                    expected="low < high",
+                    got=f"{low} and {high}",
+                )
+
+    @classmethod
+    def from_bounds(
+        cls,
+        bounds: Sequence[Sequence[float]],
+        periodic: Sequence[bool] | None = None,
+    ) -> Self:
+        """Return a box from its ends along each axis, walled where nothing is said.
+
+        Args:
+            bounds: lower and upper end of each axis [length], shape [axis, 2].
+            periodic: whether each axis repeats itself, shape [axis].
+
+        Raises:
+            UsageError: as in :meth:`__post_init__`.
+        """
+        if periodic is None:
+            periodic = [False] * len(bounds)
+        return cls(
+            low=tuple(float(low) for low, _ in bounds),
+            high=tuple(float(high) for _, high in bounds),
+            periodic=tuple(bool(value) for value in periodic),
+        )
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return len(self.low)
+
+    @property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Lower and upper end of each axis [length], shape [axis, 2]."""
+        return tuple(zip(self.low, self.high, strict=True))
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """Extent along each axis [length], shape [axis]."""
+        return np.asarray(np.subtract(self.high, self.low), np.float64)
+
+    @property
+    def volume(self) -> float:
+        """Volume, or the area in two dimensions [length^dimension]."""
+        return float(np.prod(self.lengths))
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether any axis repeats itself."""
+        return any(self.periodic)
+
+    @property
+    def walls(self) -> tuple[str, ...]:
+        """Names of the walls: two for each axis that is not periodic."""
+        names: list[str] = []
+        for axis, is_periodic in enumerate(self.periodic):
+            if not is_periodic:
+                names.extend(WALL_NAMES[2 * axis : 2 * axis + 2])
+        return tuple(names)
+
+    def displacement(self, start: ArrayLike, end: ArrayLike) -> Floats:
+        """Return the shortest way from one point to another (minimum image).
+
+        Along an axis with walls this is ``end - start``. Along a periodic axis of
+        length L it lies in [-L/2, L/2].
+
+        Args:
+            start: points [length], shape [..., axis].
+            end: points [length], shape [..., axis].
+        """
+        way = np.asarray(np.subtract(end, start))
+        if not self.is_periodic:
+            return way
+        period = np.where(self.periodic, self.lengths, np.inf)
+        return np.asarray(way - period_multiple(way, period))
+
+    def wrap(self, position: ArrayLike) -> Floats:
+        """Return positions moved by whole periods into [low, high) of periodic axes.
+
+        Components along axes with walls stay as they are, even beyond a wall.
+
+        Args:
+            position: points [length], shape [..., axis].
+        """
+        points = np.asarray(position)
+        if not self.is_periodic:
+            return points
+        wrapped = np.array(points, copy=True)
+        for axis, is_periodic in enumerate(self.periodic):
+            if is_periodic:
+                low = self.low[axis]
+                high = self.high[axis]
+                column = low + np.mod(points[..., axis] - low, high - low)
+                # The sum can round up to the upper end, which is the lower one.
+                wrapped[..., axis] = np.where(column < high, column, low)
+        return wrapped
+
+    def inside(self, position: ArrayLike) -> Floats:
+        """Return positions inside: those beyond a wall are put on it, others wrapped.
+
+        Args:
+            position: points [length], shape [..., axis].
+        """
+        walled = ~np.asarray(self.periodic)
+        low = np.where(walled, self.low, -np.inf)
+        high = np.where(walled, self.high, np.inf)
+        return self.wrap(np.clip(position, low, high))
+
+    def contains(
+        self, position: ArrayLike, *, tolerance: float = 0.0
+    ) -> NDArray[np.bool_]:
+        """Tell which points lie between the walls.
+
+        Args:
+            position: points [length], shape [..., axis].
+            tolerance: distance beyond a wall that still counts as inside [length].
+
+        Returns:
+            Booleans, shape [...]. A point that is no number does not lie inside.
+        """
+        points = np.asarray(position)
+        above = points >= np.asarray(self.low) - tolerance
+        below = points <= np.asarray(self.high) + tolerance
+        finite = np.isfinite(points)
+        along_axis = np.where(self.periodic, finite, above & below)
+        return np.asarray(along_axis.all(axis=-1))
+
+
+def period_multiple(way: Floats, period: Floats) -> Floats:
+    """Return the whole number of periods next to each component, as a length.
+
+    An infinite period stands for an axis with walls: its multiple is 0.
+    """
+    finite = np.isfinite(period)
+    length = np.where(finite, period, 1.0)
+    return np.where(finite, length * np.rint(way / length), 0.0)

@@ -1,0 +1,221 @@
+"""Figures of matplotlib without a display: one style, PNG files with equal bytes.
+
+Speed and vorticity take maps of matplotlib that stay apart under every common colour
+vision deficiency. All colours, with the blends that smooth edges, fit the 256 colours
+of one palette: PNG and GIF files use it, stay small, and show each colour as drawn.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.atomic import write_atomically
+from lagbench.errors import UsageError, require
+
+from .colours import INK, MATERIAL_COLOURS, MOVING, MUTED, PAPER, WALL, parse_rgb
+
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from PIL.Image import Image
+
+ENDINGS = (".png", ".pdf", ".svg")  # endings of files that pictures can be
+
+DPI = 128  # a power of two: every whole number of pixels is exact in inches
+COARSEST = 32
+FINEST = 1200  # pixels per inch that a picture may have
+
+PALETTE_SIZE = 256
+
+# flat colours, each with the number of blends with paper that smooth its edges
+BLENDS = (
+    (INK, 8),
+    (MUTED, 6),
+    (MOVING, 4),
+    (WALL, 3),
+    *((colour, 4) for colour in MATERIAL_COLOURS),
+)
+
+_STYLE = {
+    # ships with matplotlib, so that text has the same pixels everywhere
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "text.color": INK,
+    "axes.labelcolor": MUTED,
+    "axes.edgecolor": MUTED,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 10.0,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "figure.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+}
+
+
+def build_speed_map() -> ListedColormap:
+    """Return the colour map of speeds: dark when slow, and never as light as paper."""
+    return _cut_map("plasma", low=0.0, high=0.9, levels=80)
+
+
+def build_vorticity_map() -> ListedColormap:
+    """Return the diverging colour map of vorticities.
+
+    Blue is clockwise, red counter-clockwise, white no vorticity.
+    """
+    # the middle of an odd number of levels is no vorticity
+    return _cut_map("RdBu_r", low=0.04, high=0.96, levels=81)
+
+
+def _cut_map(name: str, *, low: float, high: float, levels: int) -> ListedColormap:
+    """Return a stretch of a map of matplotlib in so many colours."""
+    matplotlib = require("matplotlib", extra="plots")
+    colors = require("matplotlib.colors", extra="plots")
+    shares = np.linspace(low, high, levels)
+    cut: ListedColormap = colors.ListedColormap(matplotlib.colormaps[name](shares))
+    return cut
+
+
+@functools.cache
+def build_palette() -> NDArray[np.uint8]:
+    """Return the 256 colours of every file, paper first, shape [256, 3]."""
+    paper = parse_rgb(PAPER).astype(float)
+    speeds = np.asarray(build_speed_map().colors)[:, :3] * 255.0
+    vorticities = np.asarray(build_vorticity_map().colors)[:, :3] * 255.0
+
+    tables = [paper[None], speeds, vorticities]
+    # edges of dots by speed are smoothed too; fewer levels do there
+    tables.append(_blend(speeds[::3], paper, share=0.62))
+    tables.append(_blend(speeds[::5], paper, share=0.3))
+    for colour, blend_count in BLENDS:
+        pure = parse_rgb(colour)[None].astype(float)
+        for share in np.arange(1, blend_count + 1) / blend_count:
+            tables.append(_blend(pure, paper, share=share))
+
+    palette = np.concatenate(tables).round().astype(np.uint8)
+    filling = np.repeat(palette[:1], PALETTE_SIZE - len(palette), axis=0)
+    return np.concatenate([palette, filling])
+
+
+def _blend(
+    colours: NDArray[np.float64], paper: NDArray[np.float64], *, share: float
+) -> NDArray[np.float64]:
+    return share * colours + (1.0 - share) * paper
+
+
+def reduce_colours(image: Image) -> Image:
+    """Return an RGB image with the nearest colour of the palette in each pixel."""
+    images = require("PIL.Image", extra="plots")
+    palette = images.new("P", (1, 1))
+    palette.putpalette(build_palette().tobytes())
+    return image.quantize(palette=palette, dither=images.Dither.NONE)
+
+
+@contextmanager
+def figure(width: float, height: float, *, dpi: int = DPI) -> Iterator[Figure]:
+    """Yield an empty figure in lagbench's style; save it inside the context.
+
+    The user's matplotlibrc has no influence. Width and height are in inches.
+
+    Raises:
+        UsageError: the pixels per inch are out of range, or matplotlib is missing.
+    """
+    is_number = isinstance(dpi, int | float | np.number)
+    if not (is_number and COARSEST <= dpi <= FINEST):
+        raise UsageError(
+            "no such number of pixels per inch",
+            where="--dpi",
+            expected=f"{COARSEST} to {FINEST}",
+            got=dpi,
+        )
+    matplotlib = require("matplotlib", extra="plots")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        drawn = Figure(figsize=(width, height), dpi=dpi)
+        FigureCanvasAgg(drawn)
+        yield drawn
+
+
+def draw_header(drawn: Figure, title: str, subtitle: str, *, left: float) -> None:
+    """Write a title and a quieter second line at the top left [inch]."""
+    width, height = drawn.get_size_inches()
+    x = left / width
+    y = 1 - 0.16 / height
+    drawn.text(x, y, title, fontsize=13, fontweight="bold", va="top")
+    below = 1 - 0.43 / height
+    drawn.text(x, below, subtitle, fontsize=9.5, color=MUTED, va="top")
+
+
+def pixels_of(drawn: Figure) -> NDArray[np.uint8]:
+    """Return the figure as RGB bytes, shape [row, column, 3]."""
+    canvas = cast("FigureCanvasAgg", drawn.canvas)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    rgba = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    return rgba[..., :3].copy()
+
+
+def png_bytes(drawn: Figure) -> bytes:
+    """Return the figure as a PNG file in 256 colours, without date or software."""
+    from PIL import Image
+
+    image = reduce_colours(Image.fromarray(pixels_of(drawn)))
+    with io.BytesIO() as buffer:
+        image.save(buffer, format="PNG", optimize=True)
+        return buffer.getvalue()
+
+
+def save(drawn: Figure, output: str | Path) -> Path:
+    """Write the figure to a file, with equal bytes every time; return its path.
+
+    The file appears whole or not at all.
+
+    Raises:
+        UsageError: the name ends in none of :data:`ENDINGS`.
+        WorkFailedError: the file cannot be written.
+    """
+    path = Path(output)
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise UsageError(
+            "pictures are PNG, PDF or SVG files",
+            where="output",
+            expected=f"a name ending in {', '.join(ENDINGS)}",
+            got=path,
+        )
+    if ending == ".png":
+        data = png_bytes(drawn)
+    else:
+        data = _vector_bytes(drawn, ending)
+    write_atomically(path, data, option="--output")
+    return path
+
+
+def _vector_bytes(drawn: Figure, ending: str) -> bytes:
+    """Return the figure as a PDF or SVG file without date or software."""
+    import matplotlib as mpl
+
+    if ending == ".svg":
+        fields = ["Date"]
+    else:
+        fields = ["CreationDate", "Producer", "Creator"]
+    no_metadata = dict.fromkeys(fields)
+    # identifiers in SVG files follow from the salt
+    with mpl.rc_context({"svg.hashsalt": "lagbench"}), io.BytesIO() as buffer:
+        drawn.savefig(buffer, format=ending[1:], metadata=no_metadata)
+        return buffer.getvalue()

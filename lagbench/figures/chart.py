@@ -1,0 +1,492 @@
+"""Charts as SVG: axes with few quiet lines, and marks coloured by the style sheet.
+
+Classes of marks: ``s0`` to ``s5`` are series, ``d1`` to ``d3`` dashes, ``truth`` is the
+truth, ``floor0`` and so on are reference predictors. Each chart has a title and a
+description for readers who do not see it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .html import Markup, clipped, format_multiples, format_power, join, path_data, tag
+from .labels import ANCHORS, Label, LabelBox, place_labels
+
+Floats = NDArray[np.float64]
+Point = tuple[float, float]
+
+WIDE = 60.0
+"""From this ratio of greatest to least value an axis of errors is logarithmic."""
+
+DEEPEST = 1e-6
+"""A logarithmic axis reaches no lower than this share of its top."""
+
+HUGE = 1e300  # values beyond are no numbers of a chart
+MOST_LABELS = 8  # of a logarithmic axis; of more ticks the powers of ten stay
+PLAIN_POWERS = range(-3, 4)  # powers of ten that are written out
+ROUND_FACTORS = (1.0, 2.0, 2.5, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class Tick:
+    """A mark of an axis."""
+
+    value: float  # where it stands
+    label: str  # its text
+
+
+@dataclass(frozen=True)
+class AxisScale:
+    """Where values stand along one axis."""
+
+    low: float  # value at its start
+    high: float  # value at its end
+    log: bool  # whether it is logarithmic
+    exponent: int  # the labels are in units of this power of ten
+    ticks: tuple[Tick, ...]  # its marks
+
+    def share(self, values: ArrayLike) -> Floats:
+        """Return where values lie between low (0) and high (1).
+
+        NaN stands for values that have no place.
+        """
+        x = np.asarray(values, np.float64)
+        if not self.log:
+            return (x - self.low) / (self.high - self.low)
+        is_positive = x > 0.0
+        logs = np.where(is_positive, np.log10(np.where(is_positive, x, 1.0)), np.nan)
+        low = math.log10(self.low)
+        high = math.log10(self.high)
+        return np.asarray((logs - low) / (high - low), np.float64)
+
+    @property
+    def factor(self) -> str:
+        """The factor of all labels, empty for 1."""
+        if self.exponent:
+            return f"×{format_power(self.exponent)}"
+        return ""
+
+
+def linear(
+    low: float, high: float, *, count: int = 5, tight: bool = False
+) -> AxisScale:
+    """Return a linear axis that covers a range with about so many steps.
+
+    A tight axis ends at the range, others at the next ticks.
+    """
+    if not high > low:
+        middle = abs(low) or 1.0
+        high = low + 0.5 * middle
+        low = low - 0.5 * middle
+    step = _round_up((high - low) / count)
+    first = math.floor(low / step + 1e-9)
+    last = math.ceil(high / step - 1e-9)
+    values = [k * step for k in range(first, last + 1)]
+    if tight:
+        slack = 1e-9 * step
+        values = [v for v in values if low - slack <= v <= high + slack]
+    else:
+        low = values[0]
+        high = values[-1]
+
+    order = math.floor(math.log10(max(abs(low), abs(high))))
+    exponent = 0
+    if order < -2 or order > 4:
+        exponent = order
+    unit = 10.0**exponent
+    labels = format_multiples([value / unit for value in values], step / unit)
+    return AxisScale(low, high, False, exponent, tuple(map(Tick, values, labels)))
+
+
+def _round_up(rough: float) -> float:
+    """Return the next number that is 1, 2, 2.5 or 5 times a power of ten."""
+    unit = 10.0 ** math.floor(math.log10(rough))
+    for factor in ROUND_FACTORS:
+        if factor * unit >= rough * (1 - 1e-9):
+            break
+    return factor * unit
+
+
+def logarithmic(low: float, high: float) -> AxisScale:
+    """Return a logarithmic axis over whole decades.
+
+    A single decade has ticks between, many decades skip some.
+    """
+    first = math.floor(math.log10(low) + 1e-9)
+    last = math.ceil(math.log10(high) - 1e-9)
+    last = max(last, first + 1)
+    every = 1 + (last - first) // 7
+    ticks = [Tick(10.0**k, format_power(k)) for k in range(first, last + 1, every)]
+    if last - first == 1:
+        for factor in (2, 5):
+            label = f"{factor}×{format_power(first)}"
+            ticks.append(Tick(factor * 10.0**first, label))
+    return AxisScale(10.0**first, 10.0**last, True, 0, tuple(ticks))
+
+
+def close_logarithmic(low: float, high: float) -> AxisScale:
+    """Return a logarithmic axis that ends at the next 1, 2 or 5 times a power of ten.
+
+    Where there are many ticks, only the powers of ten are labelled.
+    """
+    first_decade = math.floor(math.log10(low)) - 1
+    last_decade = math.ceil(math.log10(high)) + 1
+    marks = []
+    for k in range(first_decade, last_decade):
+        marks += [(factor * 10.0**k, factor, k) for factor in (1, 2, 5)]
+    first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.8 * low)
+    last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
+    marks = marks[first : last + 1]
+
+    ticks = []
+    for value, factor, k in marks:
+        if factor != 1 and len(marks) > MOST_LABELS:
+            continue
+        if k in PLAIN_POWERS:
+            label = f"{value:g}"
+        elif factor == 1:
+            label = format_power(k)
+        else:
+            label = f"{factor}×{format_power(k)}"
+        ticks.append(Tick(value, label))
+    return AxisScale(marks[0][0], marks[-1][0], True, 0, tuple(ticks))
+
+
+def spanning(
+    series: Sequence[ArrayLike], *, zero: bool = True, log: bool | None = None
+) -> AxisScale:
+    """Return an axis for series of values; values that are not finite are left out.
+
+    Args:
+        series: values, of any shape.
+        zero: whether a linear axis holds 0.
+        log: whether the axis is logarithmic; None decides by the range of the values.
+    """
+    parts = [np.asarray(values, np.float64).ravel() for values in series]
+    values = np.concatenate([*parts, np.zeros(0)])
+    values = values[np.isfinite(values) & (np.abs(values) < HUGE)]
+    if not values.size:
+        return linear(0.0, 1.0)
+    low = float(values.min())
+    high = float(values.max())
+    positive = values[:0]
+    if high > 0.0:
+        positive = values[values > DEEPEST * high]
+
+    has_logs = positive.size > 0 and high > 1.0 / HUGE
+    if log is None:
+        log = False
+        if has_logs and low >= 0.0:
+            log = float(np.percentile(positive, 5)) * WIDE < high
+    if log and has_logs:
+        return logarithmic(float(positive.min()), high)
+    if zero:
+        low = min(low, 0.0)
+        high = max(high, 0.0)
+    return linear(low, high)
+
+
+# lengths of a chart [pixel]
+WIDTH = 460
+HEIGHT = 270
+LEFT = 44
+RIGHT = 10
+TOP = 30
+BOTTOM = 40
+MARGIN = 3  # marks may reach so far over the rim of the plot
+DOT_RADIUS = 5
+REACH_RADIUS = 14  # of the disc around a dot that the pointer meets
+LABEL_ROOM = 22  # letters of a dot's label
+
+FAR = 3.0
+"""Marks are cut off at so many heights or widths of the plot."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Spot:
+    """A dot that has a name, and that the keyboard reaches."""
+
+    x: float
+    y: float
+    name: str  # drawn beside it where there is room
+    description: str  # the dot in words, for readers who do not see it
+    kind: str  # classes of the mark
+    href: str | None = None  # where it leads
+
+
+class Plot:
+    """One chart, built mark by mark."""
+
+    def __init__(
+        self,
+        x: AxisScale,
+        y: AxisScale,
+        *,
+        x_label: str,
+        y_label: str,
+        height: int = HEIGHT,
+    ) -> None:
+        self._x = x
+        self._y = y
+        self._x_label = x_label
+        self._y_label = y_label
+        self._height = height
+        self._plot_width = WIDTH - LEFT - RIGHT
+        self._plot_height = height - TOP - BOTTOM
+        self._marks: list[Markup] = []
+        self._notes: list[LabelBox] = []  # text that labels of dots must not cover
+        self._is_interactive = False
+
+    def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
+        """Draw a line through points; NaN leaves a gap."""
+        points = zip(self._columns(x), self._rows(y), strict=True)
+        self._add_path(path_data(points), f"line {kind}", title)
+
+    def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
+        """Fill between two lines where both are numbers."""
+        columns = self._columns(x)
+        below = self._rows(low)
+        above = self._rows(high)
+        for run in _runs(np.isfinite(below) & np.isfinite(above)):
+            forth = zip(columns[run], above[run], strict=True)
+            back = zip(columns[run][::-1], below[run][::-1], strict=True)
+            self._add_path(path_data([*forth, *back]) + "Z", f"band {kind}")
+
+    def steps(
+        self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = ""
+    ) -> None:
+        """Draw the outline of a histogram; there is one edge more than heights."""
+        x = np.repeat(np.asarray(edges, np.float64), 2)[1:-1]
+        y = np.repeat(np.asarray(heights, np.float64), 2)
+        self.line(x, y, f"steps {kind}", title)
+
+    def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
+        """Draw a cloud of points."""
+        points = zip(self._columns(x), self._rows(y), strict=True)
+        self._add_path(_dot_data(points), f"dots {kind}")
+
+    def level(self, value: float, label: str) -> None:
+        """Draw a horizontal line with a label at its right end."""
+        row = float(self._rows(np.array([value]))[0])
+        self._add_path(path_data([(0, row), (self._plot_width, row)]), "level")
+        self._marks.append(draw_text(label, self._plot_width, row - 5, "note end"))
+
+    def upright(self, value: float, label: str) -> None:
+        """Draw a vertical line with a label at its top."""
+        column = float(self._columns(np.array([value]))[0])
+        self._add_path(path_data([(column, 0), (column, self._plot_height)]), "level")
+        is_right = column > self._plot_width / 2
+        if is_right:
+            note = Label(label, column - 5, 11, 1.0)
+        else:
+            note = Label(label, column + 5, 11, 0.0)
+        self._marks.append(_draw_label(note, "note"))
+        self._notes.append(note.box)
+
+    def spots(self, spots: Sequence[Spot]) -> None:
+        """Draw dots that the keyboard reaches, with labels where there is room.
+
+        Spots that come first have the choice.
+        """
+        self._is_interactive = True
+        columns = self._columns([spot.x for spot in spots]).tolist()
+        rows = self._rows([spot.y for spot in spots]).tolist()
+        labels = place_labels(
+            [clipped(spot.name, LABEL_ROOM) for spot in spots],
+            list(zip(columns, rows, strict=True)),
+            plot=LabelBox(0, 0, self._plot_width, self._plot_height),
+            taken=self._notes,
+        )
+        for spot, x, y, label in zip(spots, columns, rows, labels, strict=True):
+            self._marks.append(_draw_spot(spot, x, y, label))
+
+    def svg(self, title: str, description: str) -> Markup:
+        """Return the chart."""
+        shift = f"translate({MARGIN} {MARGIN})"
+        area = tag(
+            "svg",
+            tag("g", *self._marks, transform=shift),
+            x=LEFT - MARGIN,
+            y=TOP - MARGIN,
+            width=self._plot_width + 2 * MARGIN,
+            height=self._plot_height + 2 * MARGIN,
+        )
+        role = "img"
+        if self._is_interactive:
+            role = "group"
+        parts = [*self._draw_axes(), area]
+        return _wrap_svg(self._height, title, description, parts, role=role)
+
+    def _add_path(self, data: str, kind: str, title: str = "") -> None:
+        children = []
+        if title:
+            children.append(tag("title", title))
+        self._marks.append(tag("path", *children, d=data, class_=kind))
+
+    def _columns(self, x: ArrayLike) -> Floats:
+        return np.clip(self._x.share(x), -FAR, FAR) * self._plot_width
+
+    def _rows(self, y: ArrayLike) -> Floats:
+        return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._plot_height
+
+    def _draw_axes(self) -> list[Markup]:
+        bottom = TOP + self._plot_height
+        right = WIDTH - RIGHT
+        drawn = []
+        for tick in self._y.ticks:
+            row = TOP + float(self._rows(tick.value))
+            drawn.append(_draw_line((LEFT, row), (right, row), "grid"))
+            drawn.append(draw_text(tick.label, LEFT - 7, row + 4, "tick end"))
+        for tick in self._x.ticks:
+            column = LEFT + float(self._columns(tick.value))
+            drawn.append(_draw_line((column, bottom), (column, bottom + 4), "mark"))
+            drawn.append(draw_text(tick.label, column, bottom + 17, "tick middle"))
+        drawn.append(_draw_line((LEFT, bottom), (right, bottom), "axis"))
+
+        x_label = _with_factor(self._x_label, self._x)
+        drawn.append(draw_text(x_label, right, self._height - 5, "label end"))
+        y_label = _with_factor(self._y_label, self._y)
+        drawn.append(draw_text(y_label, 2, 14, "label"))
+        return drawn
+
+
+def _draw_spot(spot: Spot, x: float, y: float, label: Label | None) -> Markup:
+    """Return a dot with its label; the element takes the keyboard's focus."""
+    place = {"cx": f"{x:.1f}", "cy": f"{y:.1f}"}
+    parts = [
+        tag("title", spot.description),
+        tag("circle", **place, r=REACH_RADIUS, class_="reach"),
+        tag("circle", **place, r=DOT_RADIUS),
+    ]
+    if label is not None:
+        parts.append(_draw_label(label, "name"))
+    kind = f"dot {spot.kind}".strip()
+    if spot.href is None:
+        element = "g"
+        attributes: dict[str, object] = {"tabindex": 0, "role": "img"}
+    else:
+        element = "a"
+        attributes = {"href": spot.href}
+    return tag(element, *parts, class_=kind, **attributes, aria_label=spot.description)
+
+
+# lengths of a chart of bars [pixel]
+ROW_HEIGHT = 40
+BAR_HEIGHT = 11
+BARS_LEFT = 8
+BARS_RIGHT = 14
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bar:
+    """One bar of a chart."""
+
+    label: str  # what it stands for
+    value: float  # its length; NaN leaves it out
+    value_text: str  # the value as text
+    dots: Sequence[float]  # values of the scenarios, drawn on the bar
+    kind: str  # classes of the mark
+    bold: bool = False  # whether it is the best
+
+
+def bar_chart(
+    bars: Sequence[Bar], scale: AxisScale, *, label: str, title: str, description: str
+) -> Markup:
+    """Return horizontal bars with their names above them."""
+    across = WIDTH - BARS_LEFT - BARS_RIGHT
+    bottom = ROW_HEIGHT * len(bars) + 6
+
+    def column_of(value: float) -> float:
+        share = float(np.nan_to_num(scale.share(value), nan=0.0))
+        return BARS_LEFT + across * min(max(share, 0.0), 1.0)
+
+    drawn: list[Markup] = []
+    for tick in scale.ticks:
+        column = column_of(tick.value)
+        drawn.append(_draw_line((column, 4), (column, bottom), "grid"))
+        drawn.append(draw_text(tick.label, column, bottom + 16, "tick middle"))
+
+    start = float(BARS_LEFT)
+    if not scale.log:
+        start = column_of(0.0)
+    for number, bar in enumerate(bars):
+        top = number * ROW_HEIGHT + 19
+        drawn.append(_draw_bar_name(bar, top))
+        if np.isfinite(bar.value):
+            low, high = sorted((start, column_of(bar.value)))
+            box = {"x": f"{low:.1f}", "width": f"{max(high - low, 1.0):.1f}"}
+            kind = f"bar {bar.kind}"
+            drawn.append(tag("rect", **box, y=top, height=BAR_HEIGHT, class_=kind))
+        middle = top + BAR_HEIGHT / 2
+        points = [(column_of(dot), middle) for dot in bar.dots if np.isfinite(dot)]
+        if points:
+            drawn.append(tag("path", d=_dot_data(points), class_="dots on"))
+    drawn.append(_draw_line((start, 4), (start, bottom), "axis"))
+    axis_label = _with_factor(label, scale)
+    drawn.append(draw_text(axis_label, WIDTH - BARS_RIGHT, bottom + 34, "label end"))
+    return _wrap_svg(bottom + 40, title, description, drawn, role="img")
+
+
+def _draw_bar_name(bar: Bar, top: float) -> Markup:
+    kind = None
+    if bar.bold:
+        kind = "strong"
+    name = tag("tspan", clipped(bar.label), class_=kind)
+    value = tag("tspan", f"  {bar.value_text}", class_="value")
+    return tag("text", name, value, x=14, y=top - 5, class_="name")
+
+
+def draw_text(text: str, x: float, y: float, kind: str) -> Markup:
+    """Return a text at a place, on its base line."""
+    return tag("text", text, x=f"{x:.1f}", y=f"{y:.1f}", class_=kind)
+
+
+def _draw_label(label: Label, kind: str) -> Markup:
+    classes = f"{kind} {ANCHORS[label.left_share]}".strip()
+    return draw_text(label.text, label.x, label.y, classes)
+
+
+def _draw_line(start: Point, end: Point, kind: str) -> Markup:
+    return tag("path", d=path_data([start, end]), class_=kind)
+
+
+def _dot_data(points: Iterable[Point]) -> str:
+    """Return path data of single points; a line with round ends makes dots of them."""
+    return "".join(path_data([point]) for point in points)
+
+
+def _wrap_svg(
+    height: int, title: str, description: str, parts: Sequence[object], *, role: str
+) -> Markup:
+    return tag(
+        "svg",
+        tag("title", title),
+        tag("desc", description),
+        *parts,
+        viewBox=f"0 0 {WIDTH} {height}",
+        class_="chart",
+        role=role,
+        aria_label=title,
+    )
+
+
+def _with_factor(label: str, scale: AxisScale) -> Markup:
+    if not scale.factor:
+        return join([label])
+    return join([label, tag("tspan", f"  {scale.factor}", class_="factor")])
+
+
+def _runs(is_kept: NDArray[np.bool_]) -> list[slice]:
+    """Return the stretches of True.
+
+    >>> _runs(np.array([True, True, False, True]))
+    [slice(0, 2, None), slice(3, 4, None)]
+    """
+    padded = np.concatenate([[False], is_kept, [False]]).astype(np.int8)
+    changes = np.flatnonzero(np.diff(padded)).reshape(-1, 2)
+    return [slice(int(start), int(stop)) for start, stop in changes]

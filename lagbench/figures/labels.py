@@ -1,0 +1,118 @@
+"""Labels of dots in a chart: beside their dot, where they cover nothing.
+
+A label that finds no room is left out; its dot still says its name to the pointer, the
+keyboard and screen readers. Lengths are in pixels from the top left of the plot, and
+the width of a text is estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+DOT_REACH = 7.0  # half the side of the square that a dot takes
+ASCENT = 11.0
+DESCENT = 3.0
+CAPITAL_WIDTH = 9.0
+LETTER_WIDTH = 6.4
+
+# shift of a label from the middle of its dot, and the share of it that lies to the left
+SHIFTS = (
+    (9.0, 4.0, 0.0),
+    (-9.0, 4.0, 1.0),
+    (4.0, -9.0, 0.0),
+    (4.0, 17.0, 0.0),
+    (-4.0, -9.0, 1.0),
+    (-4.0, 17.0, 1.0),
+    (0.0, -9.0, 0.5),
+    (0.0, 17.0, 0.5),
+)
+
+ANCHORS = {0.0: "", 0.5: "middle", 1.0: "end"}
+"""Class of the style sheet by the share of a text that lies left of its place."""
+
+
+@dataclass(frozen=True)
+class LabelBox:
+    """A rectangle that something takes."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def overlaps(self, other: LabelBox) -> bool:
+        """Return whether two rectangles share an area."""
+        is_across = self.left < other.right and self.right > other.left
+        is_down = self.top < other.bottom and self.bottom > other.top
+        return is_across and is_down
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text at a place, on its base line."""
+
+    text: str
+    x: float
+    y: float
+    left_share: float  # share of the text that lies left of x: 0, 0.5 or 1
+
+    @property
+    def box(self) -> LabelBox:
+        """The rectangle that the text takes."""
+        width = 0.0
+        for letter in self.text:
+            if letter.isupper():
+                width += CAPITAL_WIDTH
+            else:
+                width += LETTER_WIDTH
+        left = self.x - width * self.left_share
+        return LabelBox(left, self.y - ASCENT, left + width, self.y + DESCENT)
+
+
+def place_labels(
+    names: Sequence[str],
+    dots: Sequence[tuple[float, float]],
+    *,
+    plot: LabelBox,
+    taken: Sequence[LabelBox] = (),
+) -> list[Label | None]:
+    """Return the label of each dot, None where there is no room.
+
+    Labels that come first have the choice.
+
+    Args:
+        names: text of each label.
+        dots: middle of each dot, across and down.
+        plot: the rectangle that labels must not leave.
+        taken: rectangles that hold other text.
+    """
+    occupied = list(taken)
+    for x, y in dots:
+        box = LabelBox(x - DOT_REACH, y - DOT_REACH, x + DOT_REACH, y + DOT_REACH)
+        occupied.append(box)
+
+    labels: list[Label | None] = []
+    for name, (x, y) in zip(names, dots, strict=True):
+        label = _find_room(name, x, y, plot=plot, occupied=occupied)
+        labels.append(label)
+        if label is not None:
+            occupied.append(label.box)
+    return labels
+
+
+def _find_room(
+    name: str, x: float, y: float, *, plot: LabelBox, occupied: Sequence[LabelBox]
+) -> Label | None:
+    for right, down, left_share in SHIFTS:
+        label = Label(name, x + right, y + down, left_share)
+        box = label.box
+        is_within = (
+            box.left >= plot.left
+            and box.right <= plot.right
+            and box.top >= plot.top
+            and box.bottom <= plot.bottom
+        )
+        if is_within and not any(box.overlaps(other) for other in occupied):
+            return label
+    return None

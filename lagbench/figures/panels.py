@@ -1,0 +1,304 @@
+"""Panels of a picture: one frame seen one way, inside the walls of its box.
+
+Needs matplotlib; :mod:`lagbench.figures.plot` composes them.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data import MATERIALS
+
+from .canvas import build_speed_map, build_vorticity_map
+from .colours import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL
+from .particles import DOT_DIAMETER
+from .recording import Recording, Scene
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+    from matplotlib.patches import Rectangle
+
+Floats = NDArray[np.float64]
+
+
+class Panel(enum.StrEnum):
+    """What a panel shows."""
+
+    SPEED = "speed"
+    MATERIAL = "material"
+    VORTICITY = "vorticity"
+    STREAMLINES = "streamlines"
+
+
+TITLES = {  # heading of each panel
+    Panel.SPEED: "Particles by speed",
+    Panel.MATERIAL: "Particles by material",
+    Panel.VORTICITY: "Vorticity",
+    Panel.STREAMLINES: "Streamlines",
+}
+UNITS = {  # label of each colour bar; time is physical, as in velocities of the files
+    Panel.SPEED: "speed  [length/s]",
+    Panel.VORTICITY: "vorticity  [1/s]",
+    Panel.STREAMLINES: "speed on the grid  [length/s]",
+}
+
+# particles drawn at the most; more would take memory and no eye would tell
+MOST_DOTS = 1 << 16
+POINTS_PER_INCH = 72.0
+
+# nodes with neighbours to differentiate over, below which no streamline is drawn
+FEW_NODES = 4
+
+# direction along the walls left, right, bottom, top
+_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])
+# places of the arrowheads on a moving wall, as shares of its length from its middle
+_ARROWHEADS = (-0.4, -0.2, 0.0, 0.2, 0.4)
+
+
+def limit_of(panel: Panel, scene: Scene) -> float:
+    """Return the top of the colour scale: the 99th percentile of what is shown."""
+    if panel is Panel.SPEED:
+        values = scene.speed
+    elif panel is Panel.VORTICITY:
+        values = np.abs(scene.vorticity[scene.fields.differentiable])
+    else:
+        values = _grid_speed(scene)[scene.fields.counted]
+    if values.size == 0:
+        return 1.0
+    return float(np.percentile(values, 99.0)) or 1.0
+
+
+def draw(
+    axes: Axes, panel: Panel, scene: Scene, *, limit: float, detail: float = 1.0
+) -> None:
+    """Draw one frame inside its box.
+
+    Args:
+        axes: where to draw.
+        panel: what to show.
+        scene: the frame.
+        limit: top of the colour scale.
+        detail: how dense and thick streamlines are, 0 to 1.
+    """
+    draw_walls(axes, scene.recording, scene.frame)
+    scale = colour_scale(panel, limit)
+    if panel is Panel.MATERIAL:
+        colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
+        _draw_dots(axes, scene, colours)
+    elif panel is Panel.SPEED:
+        _draw_dots(axes, scene, scale.to_rgba(scene.speed))
+    elif panel is Panel.VORTICITY:
+        _draw_field(axes, scene, scene.vorticity, scale)
+    else:
+        speed = np.where(scene.fields.counted, _grid_speed(scene), np.nan)
+        _draw_field(axes, scene, speed, scale)
+        _draw_streamlines(axes, scene, detail=detail)
+
+
+def box_of(recording: Recording) -> tuple[float, float, float, float]:
+    """Return left, right, bottom and top wall of the box [length]."""
+    (left, right), (bottom, top) = recording.size.bounds
+    return left, right, bottom, top
+
+
+def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats]]:
+    """Yield number and velocity of each wall that slides towards a frame.
+
+    Velocities are those along the wall [length/s], shape [2].
+    """
+    velocities = recording.wall_velocity[frame] * _ALONG
+    for wall, velocity in enumerate(velocities):
+        if velocity.any():
+            yield wall, velocity
+
+
+def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
+    """Draw the walls as bands around the box.
+
+    Arrowheads on a moving wall show which way it slides.
+    """
+    from matplotlib.patches import Rectangle
+
+    axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[])
+    axes.set(aspect="equal", frame_on=False)
+    axes.add_patch(Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0))
+
+    left, right, bottom, top = box_of(recording)
+    width = right - left
+    height = top - bottom
+    inside = Rectangle((left, bottom), width, height, color=PAPER, lw=0, zorder=0.5)
+    axes.add_patch(inside)
+
+    # x, y, width and height of the walls left, right, bottom, top
+    bands = [
+        (0, bottom, left, height),
+        (right, bottom, 1 - right, height),
+        (left, 0, width, bottom),
+        (left, top, width, 1 - top),
+    ]
+    for wall, velocity in moving_walls(recording, frame):
+        _draw_moving_wall(axes, bands[wall], velocity)
+
+
+def _draw_moving_wall(
+    axes: Axes, band: tuple[float, float, float, float], velocity: Floats
+) -> None:
+    """Draw a band with arrowheads that point along its velocity."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    x, y, width, height = band
+    axes.add_patch(Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6))
+
+    along = velocity / np.abs(velocity).max()
+    across = np.array([-along[1], along[0]])
+    centre = np.array([x + width / 2, y + height / 2])
+    length = np.abs(along) * max(width, height)
+    size = 0.3 * min(width, height)
+    for share in _ARROWHEADS:
+        middle = centre + share * length
+        tip = middle + size * along
+        tail = middle - 0.7 * size * along
+        corners = [tip, tail + size * across, tail - size * across]
+        axes.add_patch(Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7))
+
+
+def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
+    """Draw a dot for every particle, or for every k-th of too many.
+
+    Dots are cut off at the walls.
+    """
+    step = -(-len(scene.position) // MOST_DOTS)
+    x, y = scene.position[::step].T
+    drawn = axes.get_figure()
+    assert drawn is not None  # axes stand in a figure
+    side = axes.get_position().width * drawn.get_figwidth()  # type: ignore[union-attr]
+    diameter = DOT_DIAMETER * scene.recording.spacing * POINTS_PER_INCH * side
+    area = step * float(diameter**2)  # of the marker [point^2]
+    dots = axes.scatter(x, y, area, colours[::step], linewidths=0, zorder=2)
+    dots.set_clip_path(_box_patch(axes, scene.recording))
+
+
+def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
+    """Return the inside of the box, to cut drawings off at the walls."""
+    from matplotlib.patches import Rectangle
+
+    left, right, bottom, top = box_of(recording)
+    width = right - left
+    height = top - bottom
+    return Rectangle((left, bottom), width, height, transform=axes.transData)
+
+
+def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) -> None:
+    """Draw a square for the value at each node, cut off at the walls.
+
+    NaN stays paper.
+    """
+    grid = scene.fields.grid
+    low = grid.axis[0] - grid.spacing / 2
+    high = grid.axis[-1] + grid.spacing / 2
+    image = axes.imshow(
+        np.ma.masked_invalid(field.T),
+        origin="lower",
+        extent=(low, high, low, high),
+        interpolation="nearest",
+        cmap=scale.cmap,
+        norm=cast("Normalize", scale.norm),
+        zorder=1,
+    )
+    image.set_clip_path(_box_patch(axes, scene.recording))
+    axes.set(xlim=(0, 1), ylim=(0, 1))
+
+
+def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
+    """Draw white streamlines of the velocity at the nodes that count."""
+    fields = scene.fields
+    if fields.differentiable.sum() < FEW_NODES:
+        return
+    u = np.ma.masked_array(fields.velocity[..., 0], ~fields.counted)
+    v = np.ma.masked_array(fields.velocity[..., 1], ~fields.counted)
+    axes.streamplot(
+        fields.grid.axis,
+        fields.grid.axis,
+        u.T,
+        v.T,
+        density=0.7 + 0.7 * detail,
+        color=PAPER,
+        linewidth=0.35 + 0.45 * detail,
+        arrowsize=0.3 + 0.4 * detail,
+        maxlength=2.0,
+        zorder=2,
+    )
+
+
+def _grid_speed(scene: Scene) -> Floats:
+    """Return the speed at the nodes [length/s], shape [x node, y node]."""
+    per_frame: Floats = np.sqrt((scene.fields.velocity**2).sum(axis=-1))
+    return per_frame / scene.recording.size.frame_interval
+
+
+def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
+    """Return the colours of values up to a limit.
+
+    Speeds start at 0, vorticities at minus the limit.
+    """
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    if panel is Panel.VORTICITY:
+        return ScalarMappable(Normalize(-limit, limit), build_vorticity_map())
+    return ScalarMappable(Normalize(0.0, limit), build_speed_map())
+
+
+def colour_bar(
+    axes: Axes, panel: Panel, limit: float, *, label: str | None = None
+) -> None:
+    """Draw a horizontal colour bar with its unit.
+
+    Its ends are pointed where values may lie beyond them.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    if panel is Panel.VORTICITY:
+        pointed = "both"
+    else:
+        pointed = "max"
+    drawn = axes.get_figure()
+    assert drawn is not None  # axes stand in a figure
+    scale = colour_scale(panel, limit)
+    bar = drawn.colorbar(scale, cax=axes, orientation="horizontal", extend=pointed)
+    bar.outline.set_visible(False)
+    bar.set_label(label or UNITS[panel], labelpad=3)
+    bar.ax.tick_params(length=0, pad=3)
+    bar.locator = MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10])
+    bar.update_ticks()
+
+
+def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
+    """Draw a key of the materials that occur."""
+    from matplotlib.lines import Line2D
+
+    handles = []
+    for material in np.unique(materials):
+        colour = MATERIAL_COLOURS[material]
+        name = MATERIALS[material]
+        dot = Line2D([], [], ls="", marker="o", ms=6, color=colour, label=name)
+        handles.append(dot)
+    axes.set_axis_off()
+    axes.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(-0.02, 1.6),
+        ncols=len(handles),
+        frameon=False,
+        handletextpad=0.1,
+        columnspacing=1.2,
+        labelcolor=INK,
+        fontsize=9,
+    )

@@ -1,0 +1,435 @@
+"""Pictures of one frame, and contact sheets: many scenarios of a split on one page.
+
+Needs matplotlib: ``pip install 'lagbench[plots]'``. The same frame gives the same
+bytes. Splits whose scenarios draw a ``family`` or ``pair`` get a sheet of one row per
+kind over time; the others get a table of scenarios at one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lagbench.data import WALLS
+from lagbench.data.local import locate, remedy
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import DataError, UsageError, nearest
+from lagbench.store.copy import bring
+
+from .canvas import DPI, draw_header, figure, save
+from .colours import MUTED
+from .panels import (
+    TITLES,
+    Panel,
+    colour_bar,
+    draw,
+    limit_of,
+    material_key,
+    moving_walls,
+)
+from .recording import Recording, Scene, open_recording
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "KINDS",
+    "Panel",
+    "check_kind",
+    "contact_sheet",
+    "describe",
+    "plot_frame",
+    "scenario_files",
+]
+
+ALL = "all"
+KINDS = (ALL, *(str(panel) for panel in Panel))
+"""What :func:`plot_frame` can draw."""
+
+SEPARATOR = "  ·  "
+KIND_PARAMETERS = ("family", "pair")  # parameters that say of which kind a scenario is
+DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
+
+# lengths of a picture of one frame [inch]
+SIDE = 3.25
+GAP = 0.25
+MARGIN = 0.25
+TOP = 0.96
+BAR = 0.66
+
+# lengths of a sheet [inch]
+CELL = 1.3
+CELL_GAP = 0.08
+LABEL = 0.18
+RIM = 0.22
+HEAD = 0.7
+FOOT = 0.58
+NARROWEST = 5.0
+
+COLUMNS = 6  # of a table of scenarios at one frame
+# moments of a row over time, as shares of the last frame
+TIMES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0)
+# moments of flows that walls drive, as shares of the last frame of interest
+MOMENTS = (1 / 9, 1 / 2, 1.0)
+# most scenarios on a sheet of flows that walls drive, and of flows that only decay
+MOST_DRIVEN = 30
+MOST_DECAYING = 36
+# the fluid itself seldom moves faster than this share of the wall's speed
+WALL_SHARE = 0.6
+
+
+def check_kind(kind: str) -> None:
+    """Refuse a kind of picture that :func:`plot_frame` cannot draw.
+
+    Raises:
+        UsageError: the kind is none of :data:`KINDS`.
+    """
+    if kind not in KINDS:
+        raise UsageError(
+            f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS)
+        )
+
+
+def plot_frame(
+    source: str | Path | xr.Dataset,
+    frame: int,
+    output: str | Path,
+    *,
+    kind: str = ALL,
+    dpi: int = DPI,
+    registry: Registry | None = None,
+) -> Path:
+    """Draw one frame of a scenario; return the path of the file.
+
+    Args:
+        source: scenario file, or a data set of one scenario.
+        frame: absolute frame number; negative ones count from the end.
+        output: file to write, ending in .png, .pdf or .svg.
+        kind: one of :data:`KINDS`; ``all`` draws three panels side by side.
+        dpi: pixels per inch.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown kind, no such frame, a name with another ending, no
+            matplotlib.
+        DataError: the scenario file is missing or damaged.
+    """
+    check_kind(kind)
+    with open_recording(source, registry=registry) as recording:
+        scene = recording.scene(frame)
+    panels = _choose_panels(kind, recording)
+    width = 2 * MARGIN + len(panels) * SIDE + (len(panels) - 1) * GAP
+    height = TOP + SIDE + BAR
+    with figure(width, height, dpi=dpi) as drawn:
+        if len(panels) > 1:
+            subtitle = _describe_scene(scene)
+            moment = ""
+        else:
+            subtitle = describe(recording)
+            moment = f" at frame {scene.frame}, t = {scene.time:.2f} s"
+        draw_header(drawn, recording.title, subtitle, left=MARGIN)
+        for column, panel in enumerate(panels):
+            left = (MARGIN + column * (SIDE + GAP)) / width
+            axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
+            axes.set_title(TITLES[panel] + moment)
+            limit = limit_of(panel, scene)
+            draw(axes, panel, scene, limit=limit)
+
+            bar_bottom = (BAR - 0.2) / height
+            place = (left, bar_bottom, SIDE / width, 0.09 / height)
+            below = drawn.add_axes(place)
+            if panel is Panel.MATERIAL:
+                material_key(below, recording.material)
+            else:
+                colour_bar(below, panel, limit)
+        return save(drawn, output)
+
+
+def _choose_panels(kind: str, recording: Recording) -> list[Panel]:
+    if kind != ALL:
+        return [Panel(kind)]
+    if recording.is_mixed:
+        return [Panel.MATERIAL, Panel.SPEED, Panel.VORTICITY]
+    return [Panel.SPEED, Panel.VORTICITY, Panel.STREAMLINES]
+
+
+def describe(recording: Recording) -> str:
+    """Return split, size, scenario and what sets it apart.
+
+    That reads like "cavity full · scenario 3 · Re 120".
+    """
+    parts = [
+        f"{recording.size.split} {recording.size.name}",
+        f"scenario {recording.scenario}",
+        *_describe_parameters(recording, (*KIND_PARAMETERS, "frequency")),
+    ]
+    return SEPARATOR.join(parts)
+
+
+def _describe_scene(scene: Scene) -> str:
+    """Return what :func:`describe` says, the frame, and how walls move."""
+    parts = [
+        describe(scene.recording),
+        f"frame {scene.frame}",
+        f"t = {scene.time:.2f} s",
+    ]
+    for wall, velocity in moving_walls(scene.recording, scene.frame):
+        x_sign, y_sign = np.sign(velocity).astype(int).tolist()
+        direction = DIRECTIONS[x_sign, y_sign]
+        speed = np.abs(velocity).max()
+        parts.append(f"{WALLS[wall]} wall moves {direction} at {speed:.3g} length/s")
+    return SEPARATOR.join(parts)
+
+
+def _describe_parameters(recording: Recording, names: Sequence[str]) -> list[str]:
+    """Return the Reynolds number and further parameters, those that there are."""
+    parts = []
+    if recording.reynolds is not None:
+        parts.append(f"Re {recording.reynolds:.0f}")
+    for name in names:
+        if name in recording.parameters:
+            parts.append(f"{name} {recording.parameters[name]}")
+    return parts
+
+
+@dataclass(frozen=True)
+class SheetCell:
+    """A small panel of a contact sheet."""
+
+    scene: Scene
+    label: str
+    limit: float  # top of the colour scale
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactSheet:
+    """What a contact sheet shows."""
+
+    rows: Sequence[Sequence[SheetCell]]
+    panel: Panel  # what every cell shows
+    subtitle: str  # second line of the title
+    limit: float  # top of the colour bar
+    unit: str | None = None  # label of the colour bar where it is not the panel's own
+
+
+def contact_sheet(
+    split: str,
+    size: str,
+    output: str | Path,
+    *,
+    root: str | Path | None = None,
+    kind: Panel | str | None = None,
+    frame: int | None = None,
+    dpi: int = DPI,
+    registry: Registry | None = None,
+) -> Path:
+    """Draw many scenarios of a split on one page; return the path of the file.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        output: file to write, ending in .png, .pdf or .svg.
+        root: folder that holds all data sets; see ``resolve_root``.
+        kind: what each panel shows; the default suits the split.
+        frame: frame to show where the sheet is a table of scenarios; when None, the
+            first, the last frame of interest of what starts at rest, or three frames up
+            to that of what is driven.
+        dpi: pixels per inch.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: unknown split, size or kind, no matplotlib.
+        DataError: no scenario is there, or a file is damaged.
+    """
+    tier, folder, splits = locate(split, size, root=root, registry=registry)
+    bring(tier, folder, tier.scenarios)
+    files = scenario_files(tier, folder)
+    if not files:
+        where = f"{tier.split} {size} under {folder}"
+        raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
+    panel = None
+    if kind is not None:
+        panel = Panel(kind)
+
+    kinds = _first_of_each_kind(files, splits)
+    if kinds:
+        sheet = _arrange_over_time(kinds, panel, splits)
+    else:
+        sheet = _arrange_table(files, panel, frame=frame, splits=splits)
+    title = f"{splits.split(tier.split).title} · {tier.split} {size}"
+    return _draw_sheet(sheet, title, output, dpi=dpi)
+
+
+def scenario_files(size: Size, root: Path) -> list[Path]:
+    """Return the scenario files that exist: train, valid, test, extra, each by id."""
+    files = []
+    for ids in size.subsets.values():
+        for scenario in sorted(ids):
+            path = size.path(root, scenario)
+            if path.is_file():
+                files.append(path)
+    return files
+
+
+def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Path]:
+    """Return the first scenario of every family or pair, in the order of names."""
+    paths: dict[str, Path] = {}
+    for path in files:
+        with open_recording(path, registry=splits) as recording:
+            for name in KIND_PARAMETERS:
+                kind = str(recording.parameters.get(name, ""))
+                if kind:
+                    paths.setdefault(kind, path)
+                    break
+    return dict(sorted(paths.items(), key=lambda item: item[1].name))
+
+
+def _arrange_over_time(
+    kinds: Mapping[str, Path], panel: Panel | None, splits: Registry
+) -> ContactSheet:
+    """Return one row per kind: the same moments of each, one colour scale."""
+    rows = []
+    for path in kinds.values():
+        with open_recording(path, registry=splits) as recording:
+            last = recording.frames - 1
+            rows.append([recording.scene(round(share * last)) for share in TIMES])
+    if panel is None:
+        if any(row[0].recording.is_mixed for row in rows):
+            panel = Panel.MATERIAL
+        else:
+            panel = Panel.SPEED
+
+    limits = []
+    for row in rows:
+        limits += [limit_of(panel, scene) for scene in row]
+    limit = max(limits)
+    cells = []
+    for kind, row in zip(kinds, rows, strict=True):
+        labels = [f"{row[0].recording.scenario}  {kind}"]
+        labels += [f"frame {scene.frame}" for scene in row[1:]]
+        line = []
+        for scene, label in zip(row, labels, strict=True):
+            line.append(SheetCell(scene, label, limit))
+        cells.append(line)
+    return ContactSheet(
+        rows=cells,
+        panel=panel,
+        subtitle="the first scenario of each kind over time",
+        limit=limit,
+    )
+
+
+def _arrange_table(
+    files: Sequence[Path], panel: Panel | None, *, frame: int | None, splits: Registry
+) -> ContactSheet:
+    """Return a table of scenarios at one frame, or at three where walls drive them."""
+    with open_recording(files[0], registry=splits) as recording:
+        is_driven = bool(recording.wall_velocity.any())
+        if frame is None:
+            frames = _choose_frames(recording)
+        else:
+            frames = [frame]
+    if is_driven:
+        shown_files = files[:MOST_DRIVEN]
+        panel = panel or Panel.STREAMLINES
+    else:
+        shown_files = files[:MOST_DECAYING]
+        panel = panel or Panel.VORTICITY
+
+    scenes = []
+    for path in shown_files:
+        with open_recording(path, registry=splits) as recording:
+            scenes += [recording.scene(number) for number in frames]
+
+    # speeds of driven flows are compared with the speed of the wall
+    is_wall_scaled = is_driven and panel in (Panel.STREAMLINES, Panel.SPEED)
+    common_limit = float(np.median([limit_of(panel, scene) for scene in scenes]))
+    cells = []
+    for number, scene in enumerate(scenes):
+        is_first_of_scenario = number % len(frames) == 0
+        if is_first_of_scenario:
+            recording = scene.recording
+            marks = _describe_parameters(recording, ("frequency",))[:1]
+            label = "   ".join([str(recording.scenario), *marks])
+        else:
+            label = f"frame {scene.frame}"
+        limit = common_limit
+        if is_wall_scaled:
+            limit = WALL_SHARE * np.abs(scene.recording.wall_velocity).max()
+        cells.append(SheetCell(scene, label, limit))
+
+    columns = COLUMNS
+    if len(frames) > 1:
+        columns = 3 * len(frames)
+    rows = []
+    for first in range(0, len(cells), columns):
+        rows.append(cells[first : first + columns])
+    shown_frames = ", ".join(str(scene.frame) for scene in scenes[: len(frames)])
+    subtitle = f"{len(shown_files)} scenarios at frame {shown_frames}"
+    if is_wall_scaled:
+        return ContactSheet(
+            rows=rows,
+            panel=panel,
+            subtitle=subtitle,
+            limit=WALL_SHARE,
+            unit="speed / wall speed",
+        )
+    return ContactSheet(rows=rows, panel=panel, subtitle=subtitle, limit=common_limit)
+
+
+def _choose_frames(recording: Recording) -> list[int]:
+    """Return the frames of a table of scenarios like this one."""
+    latest = recording.size.task.frames_of_interest[-1]
+    latest = min(latest, recording.frames - 1)
+    if recording.wall_velocity.any():
+        return [round(share * latest) for share in MOMENTS]
+    starts_at_rest = not recording.scene(0).speed.any()
+    if starts_at_rest:
+        return [latest]
+    return [0]
+
+
+def _draw_sheet(
+    sheet: ContactSheet, title: str, output: str | Path, *, dpi: int
+) -> Path:
+    """Draw a contact sheet; return the path of its file."""
+    columns = max(len(row) for row in sheet.rows)
+    width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, NARROWEST)
+    row_height = CELL + LABEL + CELL_GAP
+    height = HEAD + len(sheet.rows) * row_height + FOOT
+    with figure(width, height, dpi=dpi) as drawn:
+        draw_header(drawn, title, sheet.subtitle, left=RIM)
+        for row, cells in enumerate(sheet.rows):
+            bottom = height - HEAD - (row + 1) * row_height + CELL_GAP
+            for column, cell in enumerate(cells):
+                left = RIM + column * (CELL + CELL_GAP)
+                place = (left / width, bottom / height, CELL / width, CELL / height)
+                _draw_cell(drawn.add_axes(place), sheet.panel, cell)
+        _draw_key(drawn, sheet, width=width, height=height)
+        return save(drawn, output)
+
+
+def _draw_cell(axes: Axes, panel: Panel, cell: SheetCell) -> None:
+    axes.set_title(cell.label, fontsize=7.5, color=MUTED, pad=2.5)
+    draw(axes, panel, cell.scene, limit=cell.limit, detail=0.0)
+
+
+def _draw_key(
+    drawn: Figure, sheet: ContactSheet, *, width: float, height: float
+) -> None:
+    """Draw the colour bar or the key of materials below the cells."""
+    place = (RIM / width, 0.42 / height, 2.6 / width, 0.09 / height)
+    below = drawn.add_axes(place)
+    if sheet.panel is Panel.MATERIAL:
+        materials = []
+        for row in sheet.rows:
+            materials += [cell.scene.recording.material for cell in row]
+        material_key(below, np.concatenate(materials))
+    else:
+        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)

@@ -1,0 +1,286 @@
+"""A scenario as pictures need it: frames, walls, names and grid fields.
+
+A recording is a scenario file, or an ``xarray.Dataset`` of one scenario as
+``xarray.open_dataset`` and ``lagbench.open_split(...).sel(scenario=3)`` give it.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data import grid as gridding
+from lagbench.data.local import rooted
+from lagbench.data.registry import Registry, Size, load
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import UsageError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# from the name of a variable and one or several frames to its values
+Read = Callable[[str, slice | int], NDArray[Any]]
+
+IDENTITY = ("split", "size", "scenario")  # what names a scenario
+
+# folders between the root of all data sets and a scenario file
+DEPTH = 4
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One frame of a scenario."""
+
+    recording: Recording  # scenario that the frame belongs to
+    frame: int  # absolute frame number
+    position: NDArray[np.float64]  # [length], shape [particle, 2]
+    # velocity of the solver [length/s], shape [particle, 2]
+    velocity: NDArray[np.float64]
+    # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
+    displacement: NDArray[np.float64]
+
+    @property
+    def time(self) -> float:
+        """Time since frame 0 [s]."""
+        return self.frame * self.recording.size.frame_interval
+
+    @property
+    def speed(self) -> NDArray[np.float64]:
+        """Speed of each particle [length/s], shape [particle]."""
+        speed: NDArray[np.float64] = np.sqrt((self.velocity**2).sum(axis=-1))
+        return speed
+
+    @cached_property
+    def fields(self) -> gridding.Fields:
+        """Fields on the size's score grid; vorticity and divergence in 1/frame."""
+        score_grid = self.recording.size.task.score_grid
+        placement = gridding.Placement(score_grid.placement)
+        grid = gridding.Grid(score_grid.cells, placement)
+        full = grid.full_weight(self.recording.particles, self.recording.area)
+        return gridding.fields(self.position, self.displacement, grid, full=full)
+
+    @property
+    def vorticity(self) -> NDArray[np.float64]:
+        """Vorticity at the nodes of the score grid [1/s], shape [x node, y node]."""
+        return self.fields.vorticity / self.recording.size.frame_interval
+
+
+class Recording:
+    """A scenario whose frames are read one at a time."""
+
+    def __init__(
+        self,
+        identity: Mapping[str, Any],
+        *,
+        parameters: Mapping[str, Any],
+        frames: int,
+        variables: set[str],
+        read: Read,
+        registry: Registry,
+    ) -> None:
+        """Read what holds for all frames.
+
+        Args:
+            identity: split, size and id of the scenario.
+            parameters: physical parameters by name.
+            frames: number of recorded frames.
+            variables: names of the recorded variables.
+            read: returns a variable at one or several frames.
+            registry: where the split is described.
+        """
+        self.size: Size = registry.size(str(identity["split"]), str(identity["size"]))
+        self.title = registry.split(self.size.split).title
+        self.scenario = int(identity["scenario"])
+        self.parameters = parameters
+        self.frames = frames
+        self._read = read
+        # rows of NaN fill up scenarios that have fewer particles than others
+        self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
+        material = read("material", slice(None))
+        self.material = material[self._is_present].astype(np.int8)
+        # [length/s], shape [frame, wall, 2]; zeros without walls
+        self.wall_velocity = np.zeros((frames, 4, 2))
+        if "wall_velocity" in variables:
+            self.wall_velocity[:] = read("wall_velocity", slice(frames))
+        self._particle_mass = float(read("particle_mass", slice(None)))
+
+    @property
+    def particles(self) -> int:
+        """Number of particles in every frame."""
+        return len(self.material)
+
+    @property
+    def area(self) -> float:
+        """Area that the material covers at first [length^2]."""
+        mass = self._particle_mass * self.particles
+        return mass / float(self.size.value("density"))
+
+    @property
+    def spacing(self) -> float:
+        """Mean distance of neighbouring particles at first [length]."""
+        return float(np.sqrt(self.area / self.particles))
+
+    @property
+    def reynolds(self) -> float | None:
+        """Reynolds number, None where there is none."""
+        value = self.parameters.get("reynolds_number")
+        if value is None:
+            return None
+        return float(value)
+
+    @property
+    def is_mixed(self) -> bool:
+        """Whether the scenario has several materials."""
+        return np.unique(self.material).size > 1
+
+    def frame_number(self, frame: int) -> int:
+        """Return an absolute frame number; negative ones count from the end.
+
+        Raises:
+            UsageError: the scenario has no such frame.
+        """
+        try:
+            number = operator.index(frame)
+        except TypeError:
+            what = "a frame is named by a whole number"
+            raise self._no_frame(what, got=repr(frame)) from None
+        if not -self.frames <= number < self.frames:
+            raise self._no_frame(f"no frame {number}", got=number)
+        return number % self.frames
+
+    def _no_frame(self, what: str, *, got: object) -> UsageError:
+        return UsageError(
+            what,
+            where=f"scenario {self.scenario}",
+            expected=f"0 to {self.frames - 1}",
+            got=got,
+        )
+
+    def scene(self, frame: int) -> Scene:
+        """Return one frame; negative numbers count from the end.
+
+        Raises:
+            UsageError: the scenario has no such frame.
+        """
+        number = self.frame_number(frame)
+        position = self._read_particles("position", number)
+        velocity = self._read_particles("velocity", number)
+        if number > 0:
+            displacement = position - self._read_particles("position", number - 1)
+        else:
+            displacement = velocity * self.size.frame_interval
+        return Scene(self, number, position, velocity, displacement)
+
+    def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:
+        return self._read(name, frame)[self._is_present].astype(np.float64)
+
+
+@contextmanager
+def open_recording(
+    source: str | Path | xr.Dataset, *, registry: Registry | None = None
+) -> Iterator[Recording]:
+    """Open a scenario file, or a data set of one scenario, for drawing.
+
+    Args:
+        source: scenario file, or data set of one scenario with all its frames.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: the data set has several scenarios, or lacks frames.
+        DataError: the scenario file is missing or damaged.
+    """
+    if not isinstance(source, str | Path):
+        yield _record_dataset(source, registry)
+        return
+    with read_scenario(Path(source)) as file:
+        key = file.header.key
+        yield Recording(
+            {"split": key.split, "size": key.size, "scenario": key.scenario},
+            parameters=file.header.parameters,
+            frames=file.header.frames,
+            variables={*file.variables},
+            read=file.read,
+            registry=_registry_around(source, registry),
+        )
+
+
+def _registry_around(file: str | Path, registry: Registry | None) -> Registry:
+    """Return a registry that also knows the local splits around a scenario file."""
+    parents = Path(file).absolute().parents
+    root = parents[min(DEPTH, len(parents) - 1)]
+    return rooted(root, registry)
+
+
+def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:
+    """Return the recording that a data set of one scenario holds."""
+    if "scenario" in data.dims:
+        raise UsageError(
+            "a picture shows one scenario",
+            got=f"a data set of {data.sizes['scenario']}",
+            fix="choose one: data.sel(scenario=3)",
+        )
+    attributes: dict[str, Any] = {str(name): v for name, v in data.attrs.items()}
+    identity = {}
+    for name in IDENTITY:
+        if name in data.coords:
+            identity[name] = data.coords[name].item()
+        else:
+            identity[name] = attributes[name]
+
+    def read(name: str, frames: slice | int) -> NDArray[Any]:
+        variable = data[name]
+        if "frame" in variable.dims:
+            variable = variable.isel(frame=frames)
+        return np.asarray(variable)
+
+    # as xarray and open_split note where the data are from
+    file = data.encoding.get("source")
+    if isinstance(file, str | Path):
+        registry = _registry_around(file, registry)
+    elif registry is None:
+        registry = load()
+    return Recording(
+        identity,
+        parameters=attributes,
+        frames=_count_frames(data),
+        variables={str(name) for name in data.variables},
+        read=read,
+        registry=registry,
+    )
+
+
+def _count_frames(data: xr.Dataset) -> int:
+    """Return how many frames a data set of one scenario has; padding does not count."""
+    if "frame" in data.dims:
+        numbers = data["frame"].values.tolist()
+    else:
+        numbers = []
+    if "frame_count" in data:
+        frame_count = int(data["frame_count"])
+    else:
+        frame_count = len(numbers)
+
+    expected = max(frame_count, len(numbers), 1)
+    if numbers != list(range(expected)):
+        if numbers:
+            first = ", ".join(map(str, numbers[:3]))
+            got = f"{len(numbers)}: {first}, ..."
+        else:
+            got = "no dimension frame"
+        raise UsageError(
+            "a picture needs all frames of a scenario: a frame is called by its number",
+            where="coordinate frame",
+            expected=f"0, 1, 2, ... to {expected - 1}",
+            got=got,
+            fix="choose a scenario only, data.sel(scenario=3), and say which "
+            "frame to draw",
+        )
+    return frame_count

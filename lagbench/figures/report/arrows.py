@@ -1,0 +1,152 @@
+"""Velocity arrows over time: truth, prediction and difference (Figs. 5.22 to 5.24)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.grid import Fields
+from lagbench.figures.html import (
+    SIDE,
+    Markup,
+    ReportFigure,
+    draw_line_panel,
+    draw_panel_grid,
+    draw_ramp,
+    join,
+    path_data,
+    tag,
+)
+
+from .subject import Gallery, Moment, ReportEntry, Subject, limit_of
+
+Floats = NDArray[np.float64]
+
+LEVELS = 6
+"""Colours of speed, classes ``q0`` to ``q5`` of the style sheet."""
+
+MOST_ARROWS = 18  # across a panel
+MOST_ENTRIES = 3  # entries that are drawn: arrows take room
+LONGEST = 1.7  # arrow of the scale's top, in distances between arrows
+MOST_TIMES_LIMIT = 1.5  # arrows of runaways are cut off at so many times the top
+SHORTEST = 1.0  # shorter arrows are dots [panel coordinate]
+HEAD = 0.32  # length of an arrow's head, as a share of the arrow
+HEAD_SPREAD = 0.55  # half its width, as a share of its length
+
+TINY = 1e-300  # keeps quotients finite
+
+
+def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigure]:
+    """Yield a figure of velocity arrows over time for each of the first entries."""
+    scenario = subject.scenarios[0]
+    moments = gallery.at(scenario, subject.times)
+    speeds = [_speed(moment.truth.fields.velocity) for moment in moments]
+    limit = limit_of(speeds)
+    caption = (
+        f"Scenario {scenario}; colour is speed on the score grid, on one scale for all "
+        "panels, and so is the length of arrows. Difference: predicted − true."
+    )
+    omitted = [entry.name for entry in subject.entries[MOST_ENTRIES:]]
+    if omitted:
+        caption += f" Not drawn for want of room: {', '.join(omitted)}."
+    ramp = draw_ramp("flow", limit, "speed [length/frame]")
+
+    for entry in subject.entries[:MOST_ENTRIES]:
+        rows: dict[str, list[Markup]] = {"truth": [], entry.name: [], "difference": []}
+        for moment in moments:
+            panels = _draw_panels(subject, gallery, moment, entry, limit=limit)
+            for row, panel in zip(rows.values(), panels, strict=True):
+                row.append(panel)
+        columns = [f"frame {moment.frame}" for moment in moments]
+        panel_grid = draw_panel_grid(columns, list(rows.items()), width=7.4)
+        yield ReportFigure(
+            name=f"arrows-{entry.number}",
+            title=f"Velocity over time: {entry.name}",
+            thesis="Figs. 5.22–5.24",
+            body=join([ramp, panel_grid]),
+            caption=caption,
+            wide=True,
+        )
+
+
+def _draw_panels(
+    subject: Subject,
+    gallery: Gallery,
+    moment: Moment,
+    entry: ReportEntry,
+    *,
+    limit: float,
+) -> list[Markup]:
+    """Return the panels of truth, prediction and difference at one frame."""
+    true = moment.truth.fields.velocity
+    predicted = moment.pairs[entry.number].predicted_fields.velocity
+    velocities = {
+        "truth": true,
+        "prediction": predicted,
+        "difference": predicted - true,
+    }
+    classes = gallery.labels[moment.scenario].classes
+    panels = []
+    for name, velocity in velocities.items():
+        arrows = _draw_arrows(subject, moment.truth.fields, velocity, limit=limit)
+        alt = f"{name}, frame {moment.frame}"
+        panels.append(draw_line_panel(arrows, classes, alt))
+    return panels
+
+
+def _draw_arrows(
+    subject: Subject, fields: Fields, velocity: Floats, *, limit: float
+) -> Markup:
+    """Return arrows at every k-th node that counts, coloured by speed.
+
+    A panel shows the inside of the box in coordinates from 0 to :data:`SIDE`, from the
+    top left.
+    """
+    grid = fields.grid
+    every = -(-grid.nodes // MOST_ARROWS)
+    nodes = np.argwhere(fields.counted)  # shape [node, 2]
+    nodes = nodes[((nodes - every // 2) % every == 0).all(axis=1)]
+
+    (left, right), (_, top) = subject.task.size.bounds
+    scale = SIDE / (right - left)
+    position = (nodes + grid.origin) * grid.spacing
+    x = (position[:, 0] - left) * scale
+    y = (top - position[:, 1]) * scale
+
+    u, v = velocity[nodes[:, 0], nodes[:, 1]].T
+    speed = np.hypot(u, v)
+    longest = scale * every * grid.spacing * LONGEST
+    length = longest * np.minimum(speed / limit, MOST_TIMES_LIMIT)
+    along_x = length * u / np.maximum(speed, TINY)
+    along_y = -length * v / np.maximum(speed, TINY)
+
+    levels = np.clip(speed / limit * LEVELS, 0, LEVELS - 1).astype(int)
+    data = [""] * LEVELS
+    arrows = zip(x, y, along_x, along_y, levels, strict=True)
+    for middle_x, middle_y, a, b, level in arrows:
+        data[level] += _arrow_data(middle_x, middle_y, a, b)
+    paths = []
+    for level, level_data in enumerate(data):
+        if level_data:
+            paths.append(tag("path", d=level_data, class_=f"q{level}"))
+    return join(paths)
+
+
+def _arrow_data(x: float, y: float, a: float, b: float) -> str:
+    """Return path data of an arrow (a, b) around its middle; a short one is a dot."""
+    if np.hypot(a, b) < SHORTEST:
+        return path_data([(x, y)])
+    tail = (x - a / 2, y - b / 2)
+    tip_x = x + a / 2
+    tip_y = y + b / 2
+    left = (tip_x - HEAD * (a + HEAD_SPREAD * b), tip_y - HEAD * (b - HEAD_SPREAD * a))
+    right = (tip_x - HEAD * (a - HEAD_SPREAD * b), tip_y - HEAD * (b + HEAD_SPREAD * a))
+    shaft = path_data([tail, (tip_x, tip_y)])
+    return shaft + path_data([left, (tip_x, tip_y), right])
+
+
+def _speed(velocity: Floats) -> Floats:
+    speed: Floats = np.sqrt((velocity**2).sum(axis=-1))
+    return speed

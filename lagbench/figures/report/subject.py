@@ -1,0 +1,379 @@
+"""The subject of a report: entries, task, and the frames that its pictures show."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data import WALLS
+from lagbench.data.local import resolve_root, rooted
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.frame import FramePair, Snapshot
+from lagbench.metrics.metric import Metric
+from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
+from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
+from lagbench.submission.predictions import Predictions, open_predictions
+
+Floats = NDArray[np.float64]
+
+COLOURS = 6  # series that differ in colour; further ones are dashed
+DASHES = 3
+
+THESIS_FRAMES = {"cavity": 54, "curl-noise": 40}
+"""Frame at which the thesis compares models: 54, and 35 after the last of 6 given
+frames.
+"""
+
+OTHER_FRAME = 60  # the same of splits that are not in the thesis
+
+TIMES = 6  # columns of the pictures over time
+
+TOP_PERCENTILE = 99.5  # full colour is this percentile of the truth's magnitudes
+
+SAME_FIELDS = ("split", "size", "dataset_version", "dataset_sha256")
+"""Fields of the header that all entries of a report share."""
+
+# direction along the walls left, right, bottom, top
+_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportEntry:
+    """One submission of the report."""
+
+    number: int  # its place in the order in which the files were given, from 0
+    name: str  # its method, distinct from the names of other entries
+    card: ScoreCard  # its scores
+    predictions: Path  # its file
+
+    @property
+    def kind(self) -> str:
+        """Classes of its marks."""
+        return series_kind(self.number)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportRow:
+    """One line of tables and charts: an entry or a reference predictor."""
+
+    name: str
+    kind: str  # classes of its marks
+    scores: Mapping[str, Score]  # its scores by metric
+    entry: ReportEntry | None = None  # None for a reference predictor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Subject:
+    """All that the figures are drawn from."""
+
+    task: ScoredTask  # the test subset
+    title: str  # title of the split
+    entries: tuple[ReportEntry, ...]  # in the order in which the files were given
+
+    @cached_property
+    def rows(self) -> tuple[ReportRow, ...]:
+        """Entries, then the reference predictors."""
+        rows = []
+        for entry in self.entries:
+            scores = entry.card.submission
+            row = ReportRow(
+                name=entry.name, kind=entry.kind, scores=scores, entry=entry
+            )
+            rows.append(row)
+        reference_scores = {
+            name: scores
+            for name, scores in self.entries[0].card.scores.items()
+            if name != SUBMISSION
+        }
+        for number, (name, scores) in enumerate(reference_scores.items()):
+            rows.append(ReportRow(name=name, kind=f"floor{number}", scores=scores))
+        return tuple(rows)
+
+    @property
+    def ranking(self) -> Metric:
+        """The metric that ranks."""
+        card = self.entries[0].card
+        return card.submission[card.ranking].metric
+
+    @property
+    def best_entry(self) -> ReportRow:
+        """The entry with the least loss in the ranking metric, the first of equals."""
+        metric = self.ranking
+        rows = self.rows[: len(self.entries)]
+        losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
+        return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+
+    @property
+    def is_full_box(self) -> bool:
+        """Whether the material fills the box: no surface, one material."""
+        return self.task.setting.full_box
+
+    @property
+    def scenarios(self) -> tuple[int, ...]:
+        """Ids of the test scenarios, ascending."""
+        return self.task.scenarios
+
+    @property
+    def frames(self) -> NDArray[np.int64]:
+        """Absolute numbers of the predicted frames, shape [frame]."""
+        return np.array(self.task.setting.predicted_frames)
+
+    @property
+    def key_frame(self) -> int:
+        """The frame of interest nearest to the one at which the thesis compares."""
+        target = THESIS_FRAMES.get(self.task.size.split, OTHER_FRAME)
+        return min(
+            self.frames_of_interest, key=lambda frame: (abs(frame - target), frame)
+        )
+
+    @property
+    def frames_of_interest(self) -> tuple[int, ...]:
+        """Frames of interest, the last predicted one if there are none."""
+        predicted = self.task.setting.predicted_frames
+        frames = set(self.task.setting.frames_of_interest).intersection(predicted)
+        return tuple(sorted(frames)) or (predicted[-1],)
+
+    @property
+    def histogram_frames(self) -> tuple[int, ...]:
+        """Frames of the distributions over time.
+
+        They are those of interest except the key frame, or evenly spaced.
+        """
+        frames = [frame for frame in self.frames_of_interest if frame != self.key_frame]
+        if len(frames) >= TIMES:
+            return tuple(frames[:TIMES])
+        return self.times
+
+    @property
+    def times(self) -> tuple[int, ...]:
+        """Frames of the pictures over time, with the first and last predicted one."""
+        predicted = self.task.setting.predicted_frames
+        if len(self.frames_of_interest) >= TIMES:
+            frames = _choose_evenly(self.frames_of_interest, TIMES - 1)
+        else:
+            frames = _choose_evenly(predicted, TIMES)
+        return tuple(sorted({*frames, predicted[-1]}))
+
+
+def series_kind(number: int) -> str:
+    """Return the classes of a series: six colours, then the same colours dashed."""
+    colour = f"s{number % COLOURS}"
+    dash = min(number // COLOURS, DASHES)
+    if dash == 0:
+        return colour
+    return f"{colour} d{dash}"
+
+
+def _choose_evenly(numbers: Sequence[int], count: int) -> Sequence[int]:
+    if len(numbers) <= count:
+        return numbers
+    step = (len(numbers) - 1) / (count - 1)
+    return [numbers[round(i * step)] for i in range(count)]
+
+
+def load_subject(
+    cards: Sequence[ScoreCard],
+    predictions: Sequence[Path],
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Subject:
+    """Return the subject of a report.
+
+    Raises:
+        UsageError: there is no entry, or entries do not belong together.
+        DataError: the test subset is missing or damaged.
+    """
+    if not cards or len(cards) != len(predictions):
+        raise UsageError(
+            "a report needs score reports and their predictions",
+            expected="one file per score report, at least one",
+            got=f"{len(cards)} score reports, {len(predictions)} files",
+        )
+    _check_same_data(cards, predictions)
+    header = cards[0].header
+    folder = resolve_root(root)
+    splits = rooted(folder, registry)
+    task = load_scored_task(splits.size(header.split, header.size), folder)
+
+    methods = [card.header.method for card in cards]
+    names = told_apart(methods, taken=cards[0].scores)
+    entries = []
+    for number, name in enumerate(names):
+        entry = ReportEntry(
+            number=number,
+            name=name,
+            card=cards[number],
+            predictions=Path(predictions[number]),
+        )
+        entries.append(entry)
+    title = splits.split(header.split).title
+    return Subject(task=task, title=title, entries=tuple(entries))
+
+
+def _check_same_data(cards: Sequence[ScoreCard], predictions: Sequence[Path]) -> None:
+    """Refuse score reports that are about different data."""
+    first = cards[0].header
+    for card, path in zip(cards, predictions, strict=True):
+        for name in SAME_FIELDS:
+            expected = getattr(first, name)
+            value = getattr(card.header, name)
+            if value != expected:
+                raise UsageError(
+                    f"one report, two values of {name}",
+                    where=str(path),
+                    expected=expected,
+                    got=value,
+                    fix="report submissions to one data set together, others on "
+                    "their own",
+                )
+
+
+@dataclass(frozen=True)
+class ScenarioLabel:
+    """What sets a scenario apart: moving walls, Reynolds number, family."""
+
+    moving: tuple[str, ...]  # names of the walls that slide
+    reynolds: float | None  # Reynolds number, None where there is none
+    mark: str  # family, pair or frequency, as in "falling circle", or empty
+
+    @property
+    def classes(self) -> str:
+        """Classes of a panel, which tell the walls that move."""
+        return " ".join(["panel", *(f"{wall}-moves" for wall in self.moving)])
+
+    @property
+    def details(self) -> list[str]:
+        """Mark and Reynolds number, those that there are."""
+        details = []
+        if self.mark:
+            details.append(self.mark)
+        if self.reynolds is not None:
+            details.append(f"Re {self.reynolds:.0f}")
+        return details
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Moment:
+    """One frame of one scenario: the truth and every entry's prediction."""
+
+    scenario: int  # id of the scenario
+    frame: int  # absolute frame number
+    pairs: tuple[FramePair, ...]  # truth and prediction of each entry, in their order
+
+    @property
+    def truth(self) -> Snapshot:
+        """The true particles."""
+        return self.pairs[0].truth
+
+    @cached_property
+    def true_vorticity(self) -> Floats:
+        """Vorticity of the truth [1/frame], shape [x node, y node].
+
+        NaN stands where it is not compared.
+        """
+        return self.truth.fields.vorticity
+
+    def predicted_vorticity(self, number: int) -> Floats:
+        """Return the vorticity of an entry where it is compared, NaN elsewhere."""
+        pair = self.pairs[number]
+        return np.where(pair.nodes, pair.predicted_fields.vorticity, np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Gallery:
+    """All frames that the pictures of a report show."""
+
+    moments: Mapping[tuple[int, int], Moment]  # by scenario id and frame
+    labels: Mapping[int, ScenarioLabel]  # by scenario id
+
+    def at(self, scenario: int, frames: Collection[int]) -> list[Moment]:
+        """Return the moments of a scenario at some frames."""
+        return [self.moments[scenario, frame] for frame in frames]
+
+
+def read_gallery(subject: Subject) -> Gallery:
+    """Read the frames that the pictures of a report show.
+
+    Raises:
+        DataError: the test subset is missing or damaged.
+        UnreadableFileError: predictions are.
+    """
+    moments: dict[tuple[int, int], Moment] = {}
+    labels: dict[int, ScenarioLabel] = {}
+    all_frames = {subject.key_frame, *subject.times, *subject.histogram_frames}
+    with ExitStack() as stack:
+        files = []
+        for entry in subject.entries:
+            files.append(stack.enter_context(open_predictions(entry.predictions)))
+        for number in subject.scenarios:
+            # in full boxes only the first scenario is shown over time
+            if subject.is_full_box and number != subject.scenarios[0]:
+                frames = [subject.key_frame]
+            else:
+                frames = sorted(all_frames)
+            with subject.task.opened(number) as truth:
+                labels[number] = _label_scenario(truth)
+                for frame in frames:
+                    pairs = _read_pairs(truth, files, number, frame)
+                    moment = Moment(scenario=number, frame=frame, pairs=pairs)
+                    moments[number, frame] = moment
+    return Gallery(moments, labels)
+
+
+def _read_pairs(
+    truth: OpenScenario, files: Sequence[Predictions], number: int, frame: int
+) -> tuple[FramePair, ...]:
+    """Return truth and prediction of each entry at a frame."""
+    scenario = truth.scenario
+    before, now = truth.file.read("position", slice(frame - 1, frame + 1))
+    true_snapshot = scenario.snapshot(now, before)
+    pairs = []
+    for file in files:
+        is_first_predicted = frame == scenario.setting.input_frames
+        if is_first_predicted:
+            before = scenario.given[-1]
+            now = file.frames(number, frame, 1)[0]
+        else:
+            before, now = file.frames(number, frame - 1, 2)
+        predicted_snapshot = scenario.snapshot(now, before)
+        pairs.append(FramePair(scenario, frame, true_snapshot, predicted_snapshot))
+    return tuple(pairs)
+
+
+def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
+    file = truth.file
+    parameters = file.header.parameters
+    moving = []
+    if "wall_velocity" in file.variables:
+        wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
+        largest = np.abs(wall_velocity).max(axis=0) * _ALONG  # shape [wall, 2]
+        moving = [wall for wall, v in zip(WALLS, largest, strict=True) if v.any()]
+
+    marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
+    if "frequency" in parameters:
+        marks.append(f"frequency {parameters['frequency']}")
+    reynolds = None
+    value = parameters.get("reynolds_number")
+    if isinstance(value, (int, float)):
+        reynolds = float(value)
+    return ScenarioLabel(moving=tuple(moving), reynolds=reynolds, mark=", ".join(marks))
+
+
+def limit_of(fields: Sequence[Floats]) -> float:
+    """Return the magnitude of full colour: almost all nodes stay below it."""
+    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
+    if values.size == 0:
+        return 1.0
+    top = float(np.percentile(values, TOP_PERCENTILE))
+    if np.isfinite(top) and top > 0.0:
+        return top
+    return 1.0

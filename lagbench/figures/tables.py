@@ -1,0 +1,65 @@
+"""Tables of text, and their Markdown: escaped and aligned."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+_SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text."""
+
+    title: str  # what it shows
+    columns: tuple[str, ...]  # names of the columns, perhaps in lines
+    rows: tuple[tuple[str, ...], ...]  # cells, row by row
+    keys: int = 1  # number of columns that say what a row is
+
+
+def escape(text: object) -> str:
+    r"""Return text that Markdown shows as it stands, on one line.
+
+    >>> print(escape("a_b | <c>"))
+    a\_b \| \<c\>
+    """
+    one_line = " ".join(str(text).split())
+    return _SPECIAL.sub(r"\\\1", one_line)
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return a table in Markdown, all text escaped.
+
+    Columns of numbers are set flush right. Cells that start and end with a backtick
+    are code and stay as they are.
+    """
+    rules = []
+    for column in range(len(head)):
+        is_numeric = all(isinstance(row[column], int | float) for row in rows)
+        if is_numeric and rows:
+            rules.append("---:")
+        else:
+            rules.append("---")
+
+    lines = [[escape(name) for name in head], rules]
+    for row in rows:
+        lines.append([_format_cell(value) for value in row])
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def _format_cell(value: object) -> str:
+    if isinstance(value, bool):
+        if value:
+            return "yes"
+        return "no"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, float):
+        return f"{value:.9g}"
+    text = str(value)
+    is_quoted = len(text) > 2 and text.startswith("`") and text.endswith("`")
+    if is_quoted and "`" not in text[1:-1]:
+        return text.replace("|", "\\|")
+    return escape(text)

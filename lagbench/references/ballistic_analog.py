@@ -1,0 +1,290 @@
+"""Ballistic flight until contact, then what came of the states of train most like it.
+
+Free bodies fall on parabolas until one touches a wall or another body. Some frames
+later the state of the flight is compared with states of train: every second frame of
+every scenario and of its mirror image (see :mod:`.train_library`). The particles share
+the nearest few among them: each particle follows its partner in one of these analogs.
+How far a particle was from its partner is kept at first and fades away.
+
+How many frames after contact, and how many analogs, is chosen on train: each scenario
+is predicted from the others, and the choice with the least mean distance of clouds is
+taken. That is looked up in ``chosen.json``; see :func:`choose`.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size
+from lagbench.data.scenario import read_scenario
+from lagbench.metrics.transport import sliced_wasserstein2
+
+from .assignment import assign_particles
+from .extrapolation import ballistic_positions
+from .predictor import (
+    Floats,
+    Given,
+    Kind,
+    Prediction,
+    ReferencePredictor,
+    falls,
+    given_in,
+)
+from .train_library import (
+    StateLibrary,
+    describe_state,
+    long_enough,
+    mirrors_of,
+    read_train_scenario,
+    state_library,
+)
+
+CONTACT_SHARE = 0.1
+"""Share of the particles that must lie on a wall for the flight to be over."""
+
+OFFSET_FADING = 0.95
+"""Factor per frame on the distance of a particle from its partner."""
+
+CHOSEN_PATH = Path(__file__).parent / "chosen.json"
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is chosen on train."""
+
+    lag: int = 5  # frames from contact to the comparison
+    analogs: int = 4  # analogs that the particles share
+
+
+CHOICES = tuple(
+    Choice(lag=lag, analogs=analogs)
+    for lag, analogs in itertools.product((0, 5, 10, 15), (1, 2, 3, 4, 6))
+)
+
+CHOSEN_SCENARIOS = 24
+"""Scenarios of train on which the choice is made, at most."""
+
+CHOSEN_STRIDE = 20
+"""Frames from one comparison with the truth to the next when the choice is made."""
+
+
+@functools.cache
+def _chosen() -> Mapping[str, Mapping[str, int]]:
+    choices: dict[str, dict[str, int]] = json.loads(CHOSEN_PATH.read_text("utf-8"))
+    return choices
+
+
+def choice_for(size: Size) -> Choice:
+    """Return what was chosen for a data set; the default for those of a user."""
+    key = f"{size.split}-{size.name}-v{size.major}"
+    return Choice(**_chosen().get(key, {}))
+
+
+def label_bodies(position: Floats, radius: float) -> NDArray[np.intp]:
+    """Return the number of the body of each particle.
+
+    A body is all that hangs together by steps shorter than the radius.
+
+    Args:
+        position: positions [length], shape [particle, 2].
+        radius: longest distance of neighbours [length].
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import KDTree
+
+    pairs = KDTree(position).query_pairs(radius, output_type="ndarray")
+    count = len(position)
+    links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], np.intp)
+
+
+def bodies_touch(position: Floats, body: NDArray[np.intp], radius: float) -> bool:
+    """Tell whether particles of two bodies lie within the radius of each other."""
+    from scipy.spatial import KDTree
+
+    for number in range(1, int(body.max()) + 1):
+        tree = KDTree(position[body == number])
+        nearest, _ = tree.query(position[body < number], distance_upper_bound=radius)
+        if np.isfinite(nearest).any():
+            return True
+    return False
+
+
+def frames_of_flight(given: Given) -> int:
+    """Return how many frames on the bodies still fly freely, at most the horizon."""
+    radius = given.size.task.radius
+    body = label_bodies(given.last, radius)
+    low = np.asarray(given.box.low) + 1e-9
+    high = np.asarray(given.box.high) - 1e-9
+    for frames_on in range(1, len(given.predicted_frames)):
+        position = ballistic_positions(given, frames_on)
+        on_wall = ((position <= low) | (position >= high)).any(axis=1)
+        if on_wall.mean() > CONTACT_SHARE or bodies_touch(position, body, radius):
+            return frames_on - 1
+    return len(given.predicted_frames)
+
+
+def predict_positions(
+    given: Given,
+    choice: Choice,
+    *,
+    library: StateLibrary | None,
+    without: int | None = None,
+) -> Iterator[Floats]:
+    """Yield positions of the predicted frames [length], each [particle, 2].
+
+    Args:
+        given: what is given of the scenario.
+        choice: how long after contact, and how many analogs.
+        library: states of train; without any the flight goes on.
+        without: a scenario of train that may not be looked at.
+    """
+    horizon = len(given.predicted_frames)
+    flown = min(horizon, frames_of_flight(given) + choice.lag)
+    for frames_on in range(1, flown + 1):
+        yield ballistic_positions(given, frames_on)
+    if flown == horizon:
+        return
+    analogs = _analogs_of(given, flown, choice, library=library, without=without)
+    for frames_on in range(1, horizon - flown + 1):
+        if not analogs:
+            yield ballistic_positions(given, flown + frames_on)
+            continue
+        position = np.empty_like(given.last)
+        for analog in analogs:
+            position[analog.members] = analog.positions(frames_on)
+        yield given.inside(position)
+
+
+@dataclass(frozen=True, eq=False)
+class FollowedAnalog:
+    """An analog and the particles that follow it."""
+
+    members: NDArray[np.intp]  # our particles, shape [member]
+    paths: Floats  # of their partners, from the compared frame on, [frame, member, 2]
+    offset: Floats  # from partner to particle at that frame [length], [member, 2]
+
+    def positions(self, frames_on: int) -> Floats:
+        """Return the members' positions so many frames on [length], [member, 2]."""
+        path = self.paths[min(frames_on, len(self.paths) - 1)]
+        return np.asarray(path + self.offset * OFFSET_FADING**frames_on)
+
+
+def _analogs_of(
+    given: Given,
+    flown: int,
+    choice: Choice,
+    *,
+    library: StateLibrary | None,
+    without: int | None,
+) -> list[FollowedAnalog]:
+    """Return the analogs of the state after so many frames of flight."""
+    if library is None:
+        return []
+    position = ballistic_positions(given, flown) if flown else given.last
+    previous = given.position[-2]
+    if flown == 1:
+        previous = given.last
+    elif flown > 1:
+        previous = ballistic_positions(given, flown - 1)
+    feature = describe_state(position, position - previous, given.material)
+    states = library.nearest(feature, count=choice.analogs, without=without)
+    followed = []
+    for number, state in enumerate(states):
+        members = np.arange(number, len(position), len(states))
+        scenario = int(library.scenarios[state])
+        frame = int(library.frames[state])
+        motion = read_train_scenario(given.size.path(given.root, scenario))
+        mirror = mirrors_of(given.size)[library.mirrors[state]]
+        start = mirror.positions(motion.position[frame])
+        partner = assign_particles(
+            position[members], start, given.material[members], motion.material
+        )
+        stop = frame + 1 + len(given.predicted_frames)
+        paths = mirror.positions(motion.position[frame:stop, partner])
+        offset = position[members] - paths[0]
+        followed.append(FollowedAnalog(members, paths, offset))
+    return followed
+
+
+def predict(given: Given) -> Prediction:
+    """Yield positions on parabolas, and after contact those of the analogs."""
+    library = state_library(given.size, given.root, np.unique(given.material).tolist())
+    for position in predict_positions(given, choice_for(given.size), library=library):
+        yield position.astype("float32")
+
+
+def cloud_error(given: Given, choice: Choice, scenario: int) -> float:
+    """Return how far a scenario of train is from its prediction out of the others.
+
+    The mean over some frames of the sliced Wasserstein-2 distance, weighted by the
+    share of each material [length].
+    """
+    library = state_library(given.size, given.root, np.unique(given.material).tolist())
+    truth = read_train_scenario(given.size.path(given.root, scenario))
+    errors = []
+    predicted = predict_positions(given, choice, library=library, without=scenario)
+    for frame, position in zip(given.predicted_frames, predicted, strict=True):
+        if frame % CHOSEN_STRIDE:
+            continue
+        error = 0.0
+        for kind in np.unique(given.material):
+            members = given.material == kind
+            distance = sliced_wasserstein2(
+                position[members], truth.position[frame][members]
+            )
+            error += float(np.mean(members)) * distance
+        errors.append(error)
+    return float(np.mean(errors))
+
+
+def choose(size: Size, root: Path) -> Choice:
+    """Return the choice that predicts the scenarios of train best from one another.
+
+    Raises:
+        DataError: no scenario of train is as long as the task.
+    """
+    scenarios = long_enough(size)[:CHOSEN_SCENARIOS]
+    starts = {}
+    for scenario in scenarios:
+        with read_scenario(size.path(root, scenario)) as file:
+            starts[scenario] = given_in(file, size, root)
+    means = {}
+    for choice in CHOICES:
+        errors = [
+            cloud_error(given, choice, scenario) for scenario, given in starts.items()
+        ]
+        means[choice] = float(np.mean(errors))
+    return min(CHOICES, key=lambda choice: means[choice])
+
+
+def record_choice(size: Size, root: Path, *, path: Path = CHOSEN_PATH) -> Choice:
+    """Choose for a data set, write the choice beside the others, and return it."""
+    choice = choose(size, root)
+    choices = json.loads(path.read_text("utf-8"))
+    key = f"{size.split}-{size.name}-v{size.major}"
+    choices[key] = {"lag": choice.lag, "analogs": choice.analogs}
+    path.write_text(json.dumps(choices, indent=1, sort_keys=True) + "\n", "utf-8")
+    return choice
+
+
+PREDICTOR = ReferencePredictor(
+    name="ballistic-analog",
+    title="Ballistic, then analog",
+    kind=Kind.NAIVE,
+    definition="Every particle falls freely until a tenth of them touch a wall or two"
+    " bodies meet; then it follows its partner in the states of train, or their mirror"
+    " images, that are most like that.",
+    applies=falls,
+    predict=predict,
+    reads_train=True,
+)

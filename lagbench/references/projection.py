@@ -1,0 +1,97 @@
+"""Projection solver: incompressible Navier-Stokes on a staggered grid, in full boxes.
+
+A textbook solver (:mod:`.staggered`) that is told what a model is told: the given
+frames, the motion of the walls and the viscosity. It starts from the velocities of the
+last two given frames, which hold half a frame before the last one, and brings them
+there. From then on its field carries the particles, two readings a frame (Heun).
+
+It learns nothing. It knows the equations, which are not quite those of the data: their
+fluid is weakly compressible. What a surrogate of a full box must be compared with:
+accuracy against cost (McGreivy and Hakim, Nature Machine Intelligence 6 (2024) 1256).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from .predictor import Given, Kind, Prediction, ReferencePredictor, fills_box
+from .staggered import StaggeredGrid
+
+RESOLUTIONS = {"projection": 1, "projection-2x": 2, "projection-3x": 3}
+"""Cells of each solver over those of the score grid, along each axis."""
+
+
+def cell_counts(given: Given, resolution: float) -> tuple[int, ...]:
+    """Return the cells along each axis of the box, shape [axis]."""
+    density = resolution * given.size.task.score_grid.cells
+    return tuple(max(4, round(density * length)) for length in given.box.lengths)
+
+
+def predict(given: Given, resolution: float) -> Prediction:
+    """Yield positions that the solver on a grid of some resolution finds.
+
+    Args:
+        given: what is given of the scenario.
+        resolution: cells over those of the score grid [1].
+    """
+    interval = given.size.frame_interval
+    viscosity = given.viscosity
+    walls = given.walls / interval
+    grid = StaggeredGrid(
+        given.box,
+        cells=cell_counts(given, resolution),
+        no_slip=given.driven,
+    )
+    first = given.predicted_frames[0]
+    middle = (given.position[-1] + given.position[-2]) / 2.0
+    field = grid.from_particles(
+        middle, given.step / interval, wall_velocity=walls[first - 1]
+    )
+    field = grid.advance(
+        field,
+        duration=0.5 * interval,
+        viscosity=viscosity,
+        wall_velocity=walls[first - 1],
+    )
+    position = given.last
+    for frame in given.predicted_frames:
+        later = grid.advance(
+            field,
+            duration=interval,
+            viscosity=viscosity,
+            wall_velocity=walls[frame],
+        )
+        position = grid.carry(
+            position,
+            before=field,
+            after=later,
+            duration=interval,
+            wall_velocity=walls[frame],
+        )
+        field = later
+        yield position.astype("float32")
+
+
+def predict_at(resolution: float) -> Callable[[Given], Prediction]:
+    """Return the predictor of one resolution."""
+
+    def predict_scenario(given: Given) -> Prediction:
+        return predict(given, resolution)
+
+    return predict_scenario
+
+
+def _describe(name: str, resolution: int) -> ReferencePredictor:
+    return ReferencePredictor(
+        name=name,
+        title=f"Projection solver, {resolution} x the score grid",
+        kind=Kind.CLASSICAL,
+        definition="Incompressible Navier-Stokes on a staggered grid with"
+        f" {resolution} times the cells of the score grid along each axis; it knows the"
+        " viscosity and the motion of the walls.",
+        applies=fills_box,
+        predict=predict_at(resolution),
+    )
+
+
+PREDICTORS = tuple(_describe(*item) for item in RESOLUTIONS.items())

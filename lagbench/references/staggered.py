@@ -1,0 +1,554 @@
+"""Incompressible Navier-Stokes on a staggered grid, in two and three dimensions.
+
+    du/dt + div(u u) = -grad p + nu lap u + f,    div u = 0
+
+The component of the velocity along an axis stands on the faces that the axis crosses,
+the pressure in the cells (Harlow and Welch, Phys. Fluids 8 (1965) 2182). Fluxes and the
+Laplacian are central differences of second order. Time steps are Heun's, each stage
+projected on fields without divergence (Chorin, Math. Comp. 22 (1968) 745). The
+projection solves Poisson's equation exactly: cosines along walled axes and Fourier
+modes along periodic ones are eigenvectors of its matrix.
+
+Walls hold the fluid (no slip; they may move along themselves) or let it slide (free
+slip). The solver takes the time step that is stable: at most half a cell and a fifth of
+the viscous time of a cell per step.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.box import Box
+
+Floats = NDArray[np.float64]
+
+Velocity = list[Floats]
+"""One array of face values per component [length/s]. The array of component a has one
+value per cell along each axis, and along a walled axis a one more: both walls included.
+"""
+
+COURANT = 0.5
+"""Cells that the fluid crosses in a time step, at most."""
+
+VISCOUS_SHARE = 0.2
+"""Time step over h^2 / nu, at most; the explicit scheme is stable up to 1 / (2 d)."""
+
+
+class StaggeredGrid:
+    """A staggered grid that fills a box, and the operators of the equations on it.
+
+    Args:
+        box: the box; all its walls are of one kind.
+        cells: cells along each axis, shape [axis].
+        no_slip: whether walls hold the fluid; else it slides along them.
+    """
+
+    def __init__(self, box: Box, *, cells: Sequence[int], no_slip: bool) -> None:
+        self.box = box
+        self.cells = tuple(cells)
+        self.no_slip = no_slip
+        self.spacing = box.lengths / np.asarray(self.cells)
+        self._modes = []
+        eigenvalues = np.zeros(self.cells)
+        for axis, count in enumerate(self.cells):
+            modes, rates = poisson_modes(count, periodic=box.periodic[axis])
+            shape = [1] * box.dimension
+            shape[axis] = count
+            eigenvalues += rates.reshape(shape) / self.spacing[axis] ** 2
+            self._modes.append(modes)
+        # The pressure is known up to a constant: its mean mode is left out.
+        eigenvalues.flat[0] = np.inf
+        self._inverse_eigenvalues = 1.0 / eigenvalues
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return self.box.dimension
+
+    def face_shape(self, component: int) -> tuple[int, ...]:
+        """Return the shape of the array of a velocity component."""
+        shape = list(self.cells)
+        if not self.box.periodic[component]:
+            shape[component] += 1
+        return tuple(shape)
+
+    def face_origin(self, component: int) -> Floats:
+        """Return where the first face of a component lies [length], shape [axis]."""
+        offset = np.full(self.dimension, 0.5)
+        offset[component] = 0.0
+        return np.asarray(np.asarray(self.box.low) + offset * self.spacing)
+
+    def rest(self) -> Velocity:
+        """Return the velocity of a fluid at rest [length/s]."""
+        return [np.zeros(self.face_shape(axis)) for axis in range(self.dimension)]
+
+    # --- the equations ---------------------------------------------------------------
+
+    def divergence(self, velocity: Velocity) -> Floats:
+        """Return div u in the cells [1/s], shape [*cells]."""
+        total = np.zeros(self.cells)
+        for axis, values in enumerate(velocity):
+            if self.box.periodic[axis]:
+                change = np.roll(values, -1, axis) - values
+            else:
+                change = np.diff(values, axis=axis)
+            total += change / self.spacing[axis]
+        return total
+
+    def project(self, velocity: Velocity) -> Velocity:
+        """Return the nearest velocity without divergence [length/s].
+
+        ``u - grad p`` with ``lap p = div u``; walls stay impermeable.
+        """
+        pressure = self._solve_poisson(self.divergence(velocity))
+        projected = []
+        for axis, values in enumerate(velocity):
+            h = self.spacing[axis]
+            if self.box.periodic[axis]:
+                gradient = (pressure - np.roll(pressure, 1, axis)) / h
+                projected.append(values - gradient)
+            else:
+                corrected = values.copy()
+                inner = _slice(self.dimension, axis, 1, -1)
+                corrected[inner] -= np.diff(pressure, axis=axis) / h
+                projected.append(corrected)
+        return projected
+
+    def _solve_poisson(self, source: Floats) -> Floats:
+        """Return the p of mean 0 with ``lap p = source``, shape [*cells]."""
+        coefficients = source
+        for axis, modes in enumerate(self._modes):
+            coefficients = _multiply_along(modes, coefficients, axis)
+        coefficients = -coefficients * self._inverse_eigenvalues
+        for axis, modes in enumerate(self._modes):
+            coefficients = _multiply_along(modes.T, coefficients, axis)
+        return coefficients
+
+    def acceleration(
+        self,
+        velocity: Velocity,
+        *,
+        viscosity: float,
+        wall_velocity: Floats,
+        force: Sequence[float] | None = None,
+    ) -> Velocity:
+        """Return ``-div(u u) + nu lap u + f`` at the faces [length/s^2].
+
+        Args:
+            velocity: face velocities [length/s].
+            viscosity: kinematic viscosity nu [length^2/s].
+            wall_velocity: velocity of each wall, two walls per axis, shape [2 axis,
+                axis] [length/s]; rows of periodic axes are not read.
+            force: acceleration f of the whole fluid [length/s^2], shape [axis].
+        """
+        padded = [
+            self._with_ghosts(values, component, wall_velocity)
+            for component, values in enumerate(velocity)
+        ]
+        result = []
+        for component, ghosted in enumerate(padded):
+            rate = viscosity * self._laplacian(ghosted)
+            for axis in range(self.dimension):
+                rate -= self._flux_divergence(padded, component, axis)
+            if force is not None:
+                rate += force[component]
+            if not self.box.periodic[component]:
+                rate[_slice(self.dimension, component, None, 1)] = 0.0
+                rate[_slice(self.dimension, component, -1, None)] = 0.0
+            result.append(rate)
+        return result
+
+    def _with_ghosts(
+        self, values: Floats, component: int, wall_velocity: Floats
+    ) -> Floats:
+        """Return a component with one more layer on each side of every axis.
+
+        Across a wall stands the mirror image: ``2 u_wall - u`` where it holds the
+        fluid, u where it slides, -u for the component that the wall stops.
+        """
+        padded = values
+        for axis in range(self.dimension):
+            first = _slice(self.dimension, axis, None, 1)
+            last = _slice(self.dimension, axis, -1, None)
+            if self.box.periodic[axis]:
+                layers = (padded[last], padded, padded[first])
+            elif axis == component:
+                below = -padded[_slice(self.dimension, axis, 1, 2)]
+                above = -padded[_slice(self.dimension, axis, -2, -1)]
+                layers = (below, padded, above)
+            elif self.no_slip:
+                low_wall = wall_velocity[2 * axis, component]
+                high_wall = wall_velocity[2 * axis + 1, component]
+                below = 2.0 * low_wall - padded[first]
+                above = 2.0 * high_wall - padded[last]
+                layers = (below, padded, above)
+            else:
+                layers = (padded[first], padded, padded[last])
+            padded = np.concatenate(layers, axis)
+        return padded
+
+    def _laplacian(self, padded: Floats) -> Floats:
+        """Return lap u of a component with ghosts, without them [1/(length s)]."""
+        core = (slice(1, -1),) * self.dimension
+        total = np.zeros(padded[core].shape)
+        for axis in range(self.dimension):
+            below = padded[_neighbour(self.dimension, axis, -1)]
+            above = padded[_neighbour(self.dimension, axis, +1)]
+            change = below - 2.0 * padded[core] + above
+            total += change / self.spacing[axis] ** 2
+        return total
+
+    def _flux_divergence(self, padded: Velocity, component: int, axis: int) -> Floats:
+        """Return ``d(u_component u_axis) / d axis`` at the faces of the component.
+
+        The two velocities meet half a cell below and half a cell above each face: in
+        cells where the axis is the component's own, else on edges.
+        """
+        dimension = self.dimension
+        carried = padded[component]
+        core = (slice(1, -1),) * dimension
+        below = carried[_neighbour(dimension, axis, -1)]
+        above = carried[_neighbour(dimension, axis, +1)]
+        here = carried[core]
+        carried_below = 0.5 * (below + here)
+        carried_above = 0.5 * (here + above)
+        if axis == component:
+            flux_below = carried_below**2
+            flux_above = carried_above**2
+        else:
+            carrier = self._at_edges(padded[axis], axis=axis, component=component)
+            count = here.shape[axis]
+            lower = _slice(dimension, axis, None, count)
+            upper = _slice(dimension, axis, 1, count + 1)
+            flux_below = carried_below * carrier[lower]
+            flux_above = carried_above * carrier[upper]
+        return np.asarray((flux_above - flux_below) / self.spacing[axis])
+
+    def _at_edges(self, padded: Floats, *, axis: int, component: int) -> Floats:
+        """Return u_axis half a cell before the faces of another component.
+
+        Row i along ``axis`` lies on the lower edge of the component's row i. Along the
+        component's axis the rows are the component's faces.
+        """
+        dimension = self.dimension
+        # Drop the ghosts of all other axes and the lower ghost of the own axis: a face
+        # of number i is the lower end of cell i.
+        keep = [slice(1, -1)] * dimension
+        keep[axis] = slice(1, None)
+        keep[component] = slice(None)
+        values = padded[tuple(keep)]
+        pairs = values.shape[component] - 1
+        left = values[_slice(dimension, component, None, pairs)]
+        right = values[_slice(dimension, component, 1, None)]
+        mean = 0.5 * (left + right)
+        if self.box.periodic[component]:
+            # Periodic faces have no upper end: the last pair repeats the first.
+            return mean[_slice(dimension, component, None, -1)]
+        return mean
+
+    # --- time ------------------------------------------------------------------------
+
+    def advance(
+        self,
+        velocity: Velocity,
+        *,
+        duration: float,
+        viscosity: float,
+        wall_velocity: Floats,
+        force: Sequence[float] | None = None,
+    ) -> Velocity:
+        """Return the velocity after some time, walls and force held [length/s].
+
+        Args:
+            velocity: face velocities at the start [length/s].
+            duration: time to advance [s].
+            viscosity: kinematic viscosity [length^2/s].
+            wall_velocity: as in :meth:`acceleration`.
+            force: as in :meth:`acceleration`.
+        """
+        steps = self.step_count(
+            velocity,
+            duration=duration,
+            viscosity=viscosity,
+            wall_velocity=wall_velocity,
+        )
+        dt = duration / steps
+        rate_of = functools.partial(
+            self.acceleration,
+            viscosity=viscosity,
+            wall_velocity=wall_velocity,
+            force=force,
+        )
+        for _ in range(steps):
+            rate = rate_of(velocity)
+            predictor = self.project(_add(velocity, rate, dt))
+            later_rate = rate_of(predictor)
+            moved = _add(velocity, rate, 0.5 * dt)
+            velocity = self.project(_add(moved, later_rate, 0.5 * dt))
+        return velocity
+
+    def step_count(
+        self,
+        velocity: Velocity,
+        *,
+        duration: float,
+        viscosity: float,
+        wall_velocity: Floats,
+    ) -> int:
+        """Return how many time steps a duration takes at the least [1]."""
+        speeds = [float(np.abs(values).max()) for values in velocity]
+        fastest = max([*speeds, float(np.abs(wall_velocity).max(initial=0.0))])
+        h = float(self.spacing.min())
+        courant_steps = duration * fastest / (COURANT * h)
+        viscous_steps = duration * viscosity / (VISCOUS_SHARE * h**2)
+        return max(1, int(np.ceil(max(courant_steps, viscous_steps))))
+
+    # --- particles -------------------------------------------------------------------
+
+    def from_particles(
+        self,
+        position: Floats,
+        velocity: Floats,
+        *,
+        wall_velocity: Floats,
+        corrections: int = 2,
+    ) -> Velocity:
+        """Return the field without divergence that comes near particles' velocities.
+
+        First a face takes the mean of the particles less than a cell away, weighted
+        linearly along each axis; faces without any take the mean of their neighbours.
+        That mean smooths the field. Each correction spreads what the field then lacks
+        at the particles in the same way and adds it.
+
+        Args:
+            position: particle positions [length], shape [particle, axis].
+            velocity: particle velocities [length/s], shape [particle, axis].
+            wall_velocity: as in :meth:`acceleration`.
+            corrections: how often the field is corrected.
+        """
+        field = self.project(self._spread(position, velocity))
+        for _ in range(corrections):
+            reached = self.at_particles(field, position, wall_velocity=wall_velocity)
+            lacking = self._spread(position, velocity - reached)
+            field = self.project(_add(field, lacking, 1.0))
+        return field
+
+    def _spread(self, position: Floats, velocity: Floats) -> Velocity:
+        """Return at each face the weighted mean of the particles around it."""
+        result = []
+        for component in range(self.dimension):
+            shape = self.face_shape(component)
+            face_count = int(np.prod(shape))
+            sums = np.zeros(face_count)
+            weight = np.zeros(face_count)
+            for index, share in zip(*self._corners(position, component), strict=True):
+                weight += np.bincount(index, share, face_count)
+                sums += np.bincount(index, share * velocity[:, component], face_count)
+            values = fill_gaps(sums.reshape(shape), weight.reshape(shape))
+            if not self.box.periodic[component]:
+                values[_slice(self.dimension, component, None, 1)] = 0.0
+                values[_slice(self.dimension, component, -1, None)] = 0.0
+            result.append(values)
+        return result
+
+    def _corners(
+        self, position: Floats, component: int
+    ) -> tuple[list[NDArray[np.intp]], list[Floats]]:
+        """Return the faces around particles, as flat indices, and their linear weights.
+
+        Weights of faces beyond a wall go to the nearest face.
+        """
+        shape = self.face_shape(component)
+        place = (position - self.face_origin(component)) / self.spacing
+        lower = np.floor(place).astype(np.intp)
+        fraction = place - lower
+        per_axis = []
+        for axis, count in enumerate(shape):
+            rows = (lower[:, axis], lower[:, axis] + 1)
+            if self.box.periodic[axis]:
+                rows = tuple(np.mod(row, count) for row in rows)
+            else:
+                rows = tuple(np.clip(row, 0, count - 1) for row in rows)
+            weights = (1.0 - fraction[:, axis], fraction[:, axis])
+            per_axis.append(tuple(zip(rows, weights, strict=True)))
+        indices = []
+        shares = []
+        for corner in itertools.product(*per_axis):
+            flat = np.zeros(len(position), np.intp)
+            share = np.ones(len(position))
+            for count, (row, weight) in zip(shape, corner, strict=True):
+                flat = flat * count + row
+                share = share * weight
+            indices.append(flat)
+            shares.append(share)
+        return indices, shares
+
+    def at_particles(
+        self, velocity: Velocity, position: Floats, *, wall_velocity: Floats
+    ) -> Floats:
+        """Return the velocity at points, linear along each axis between the faces.
+
+        Args:
+            velocity: face velocities [length/s].
+            position: points in the box [length], shape [point, axis].
+            wall_velocity: as in :meth:`acceleration`; at a wall that holds the fluid
+                the velocity is the wall's.
+
+        Returns:
+            Velocities [length/s], shape [point, axis].
+        """
+        result = np.empty(position.shape)
+        for component, values in enumerate(velocity):
+            padded = self._with_ghosts(values, component, wall_velocity)
+            # The lower ghost layer stands one cell before the first face.
+            place = (position - self.face_origin(component)) / self.spacing + 1.0
+            result[:, component] = interpolate(padded, place)
+        return result
+
+    def carry(
+        self,
+        position: Floats,
+        *,
+        before: Velocity,
+        after: Velocity,
+        duration: float,
+        wall_velocity: Floats,
+    ) -> Floats:
+        """Return where the fluid takes particles while its velocity changes (Heun).
+
+        Args:
+            position: positions at the start [length], shape [particle, axis].
+            before: face velocities at the start [length/s].
+            after: face velocities at the end [length/s].
+            duration: time between them [s].
+            wall_velocity: as in :meth:`acceleration`.
+        """
+        start = self.at_particles(before, position, wall_velocity=wall_velocity)
+        guess = self.box.inside(position + duration * start)
+        end = self.at_particles(after, guess, wall_velocity=wall_velocity)
+        return self.box.inside(position + 0.5 * duration * (start + end))
+
+
+def poisson_modes(count: int, *, periodic: bool) -> tuple[Floats, Floats]:
+    """Return the orthonormal eigenvectors of the second difference, and its -values.
+
+    Along a periodic axis these are the real Fourier modes, between walls the cosines of
+    the discrete cosine transform DCT-II.
+
+    Args:
+        count: cells n along the axis.
+        periodic: whether the axis repeats itself.
+
+    Returns:
+        Eigenvectors as rows, shape [mode, cell], the constant one first; and minus the
+        eigenvalues for a spacing of 1, ``2 - 2 cos(theta)``, shape [mode].
+    """
+    cell = np.arange(count)
+    mode = np.arange(count)
+    if periodic:
+        wave = (mode + 1) // 2
+        theta = 2.0 * np.pi * wave / count
+        phase = theta[:, None] * cell
+        is_sine = (mode % 2 == 0) & (mode > 0)
+        modes = np.where(is_sine[:, None], np.sin(phase), np.cos(phase))
+    else:
+        theta = np.pi * mode / count
+        modes = np.cos(theta[:, None] * (cell + 0.5))
+    modes /= np.sqrt(np.sum(modes**2, axis=1, keepdims=True))
+    return modes, 2.0 - 2.0 * np.cos(theta)
+
+
+def interpolate(values: Floats, place: Floats) -> Floats:
+    """Return values at points between nodes, linear along each axis.
+
+    Args:
+        values: values at nodes, at least two along each axis.
+        place: points in units of nodes, the first node at 0, shape [point, axis];
+            points beyond the nodes are extrapolated from the nearest two.
+
+    Returns:
+        Values, shape [point].
+    """
+    shape = values.shape
+    strides = np.cumprod((1, *shape[:0:-1]))[::-1]
+    flat = values.ravel()
+    base = np.zeros(len(place), np.intp)
+    fractions = []
+    for axis, count in enumerate(shape):
+        along = place[:, axis]
+        lower = np.clip(along.astype(np.intp), 0, count - 2)
+        base += lower * strides[axis]
+        fractions.append(along - lower)
+    return _blend(flat, base, strides, fractions)
+
+
+def _blend(
+    flat: Floats, base: NDArray[np.intp], strides: NDArray[np.intp], fractions: Velocity
+) -> Floats:
+    """Return the linear blend over the axes that are left, first axis outermost."""
+    if not fractions:
+        return np.take(flat, base)
+    lower = _blend(flat, base, strides[1:], fractions[1:])
+    upper = _blend(flat, base + strides[0], strides[1:], fractions[1:])
+    upper -= lower
+    upper *= fractions[0]
+    upper += lower
+    return upper
+
+
+def fill_gaps(sums: Floats, weight: Floats) -> Floats:
+    """Return ``sums / weight``; where the weight is 0, the mean of known neighbours.
+
+    Gaps close from their edges, layer by layer. Without any weight all values are 0.
+    """
+    known = weight > 1e-9
+    values = np.where(known, sums / np.where(known, weight, 1.0), 0.0)
+    if not known.any():
+        return values
+    while not known.all():
+        total = np.zeros(values.shape)
+        count = np.zeros(values.shape)
+        padded_values = np.pad(values * known, 1)
+        padded_known = np.pad(known.astype(np.float64), 1)
+        for axis in range(values.ndim):
+            for step in (-1, +1):
+                beside = _neighbour(values.ndim, axis, step)
+                total += padded_values[beside]
+                count += padded_known[beside]
+        closing = ~known & (count > 0)
+        values[closing] = total[closing] / count[closing]
+        known |= closing
+    return values
+
+
+def _add(velocity: Velocity, rate: Velocity, dt: float) -> Velocity:
+    """Return ``velocity + dt rate``."""
+    return [values + dt * change for values, change in zip(velocity, rate, strict=True)]
+
+
+def _multiply_along(matrix: Floats, values: Floats, axis: int) -> Floats:
+    """Return the product of a matrix and the columns of an array along an axis."""
+    if values.ndim == 2:
+        return matrix @ values if axis == 0 else values @ matrix.T
+    return np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+
+
+def _slice(
+    dimension: int, axis: int, start: int | None, stop: int | None
+) -> tuple[slice, ...]:
+    """Return the index that takes ``start:stop`` along one axis and all of the rest."""
+    index = [slice(None)] * dimension
+    index[axis] = slice(start, stop)
+    return tuple(index)
+
+
+def _neighbour(dimension: int, axis: int, step: int) -> tuple[slice, ...]:
+    """Return the index of the core of a padded array, moved by one along an axis."""
+    index = [slice(1, -1)] * dimension
+    index[axis] = slice(None, -2) if step < 0 else slice(2, None)
+    return tuple(index)

@@ -1,0 +1,333 @@
+"""The tables of docs/results.md, as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import combinations
+from typing import Any
+
+from lagbench.figures.tables import markdown
+from lagbench.metrics.metric import Direction, Metric
+from lagbench.metrics.table import CHOSEN
+from lagbench.references.table import COUNTING, REFERENCES
+from lagbench.scoring.tables import ARROWS
+
+from .thesis.cases import key_frame, scenario_of
+from .thesis.claims import Claim, ComparedModels, answer
+from .thesis.formatting import interval, number
+from .thesis.published import MEASURES, OPERATORS, TABLE_4_8, TABLE_5_4
+from .thesis.roster import label
+from .thesis.split_results import (
+    Method,
+    SplitResults,
+    format_budget,
+    format_hardware,
+)
+
+
+def summary_table(all_results: Sequence[SplitResults]) -> str:
+    """Return the best reference predictors and the best model of each data set."""
+    heads = (
+        "data set",
+        "ranking metric",
+        "best naive baseline",
+        "classical solver",
+        "best model",
+        "skill of the model",
+    )
+    rows = []
+    for results in all_results:
+        solver = _first(results, [name for name in REFERENCES if name not in COUNTING])
+        model = _first(results, results.models)
+        rows.append(
+            (
+                results.where,
+                results.ranking,
+                _name_and_score(results, results.best_naive),
+                _name_and_score(results, solver),
+                _name_and_score(results, model),
+                number(None if model is None else results.skill(model)),
+            )
+        )
+    return markdown(heads, rows)
+
+
+def _first(
+    results: SplitResults, names: Sequence[str] | Mapping[str, Method]
+) -> str | None:
+    """Return the best of some methods; None where none of them is ranked."""
+    ranked = results.order(tuple(names))
+    return ranked[0] if ranked else None
+
+
+def _name_and_score(results: SplitResults, name: str | None) -> str:
+    if name is None:
+        return "-"
+    score = results.methods[name].scores[results.ranking]
+    return f"{label(name)}: {number(score.mean)}"
+
+
+def claims_overview(
+    rows_by_claim: Mapping[Claim, Mapping[str, Sequence[ComparedModels]]],
+    places: Sequence[str],
+) -> str:
+    """Return the answer to every claim, a column per split and size."""
+    rows = []
+    for claim, rows_by_place in rows_by_claim.items():
+        answers = [answer(rows_by_place[place]) or "-" for place in places]
+        rows.append([claim.question, *answers])
+    return markdown(["", *places], rows)
+
+
+def training_table(all_results: Sequence[SplitResults]) -> str:
+    """Return the budget of each training and its gains, best model first."""
+    heads = (
+        "where",
+        "model",
+        "steps x windows",
+        "epochs",
+        "CPU hours per seed",
+        "skill",
+        "validated",
+        "validation at 1/4",
+        "1/2",
+        "1",
+        "last doubling",
+    )
+    rows = []
+    for results in all_results:
+        for name in results.order(results.models):
+            rows.append(_training_row(results, name))
+    return markdown(heads, rows)
+
+
+def _training_row(results: SplitResults, name: str) -> list[str]:
+    method = results.models[name]
+    record = method.trainings[0].record
+
+    validated_metric = "-"
+    values_by_step = []
+    for entry in record.get("validation", ()):
+        # beside the step an entry holds one number, the metric that was validated
+        for metric, value in entry.items():
+            if metric != "step":
+                values_by_step.append((entry["step"], value))
+                if validated_metric == "-":
+                    validated_metric = metric
+
+    least_values = []
+    for share in (0.25, 0.5, 1.0):
+        least = None
+        for step, value in values_by_step:
+            if step <= share * record["step"]:
+                least = value if least is None else min(least, value)
+        least_values.append(least)
+    _, half, whole = least_values
+    gain = "-"
+    if half and whole is not None:
+        gain = f"{100.0 * (1.0 - whole / half):.2g} %"
+
+    epochs = None
+    if "windows" in record:
+        windows_seen = record["step"] * record["recipe"]["training"]["batch"]
+        if windows_seen:
+            epochs = windows_seen / record["windows"]
+    return [
+        results.where,
+        label(name),
+        format_budget(record),
+        number(epochs),
+        number(method.hours_per_seed),
+        number(results.skill(name)),
+        validated_metric,
+        *map(number, least_values),
+        gain,
+    ]
+
+
+def horizon_table(results: SplitResults) -> str:
+    """Return the scores over the horizon: skill, ranking metric, the chosen metrics."""
+    metrics = _shown_metrics(results)
+    heads = ["model", "skill", "seeds"]
+    for metric in metrics:  # as in "position_rmse [length], lower"
+        goal = ARROWS[metric.direction]
+        if metric.direction is Direction.TARGET:
+            goal = f"{goal} {metric.perfect:g}"
+        heads.append(f"{metric.name} [{metric.unit}], {goal}")
+
+    rows = []
+    for name in results.order():
+        method = results.methods[name]
+        cells = [_score_cell(method, metric.name) for metric in metrics]
+        skill = number(results.skill(name))
+        rows.append([label(name), skill, _seeds_cell(method), *cells])
+    return markdown(heads, rows)
+
+
+def _shown_metrics(results: SplitResults) -> list[Metric]:
+    """Return the ranking metric and the chosen ones that were scored."""
+    scored: dict[str, Metric] = {}
+    for method in results.methods.values():
+        for name, score in method.scores.items():
+            scored[name] = score.metric
+
+    # vorticity says little where the material does not fill the box
+    hidden_families: tuple[str, ...] = ()
+    if results.size.split in TABLE_4_8:
+        hidden_families = ("vorticity", "distributions")
+
+    metrics = []
+    for name in dict.fromkeys((results.ranking, *CHOSEN)):
+        metric = scored.get(name)
+        if metric is None or metric.direction is Direction.NONE:
+            continue
+        if metric.family not in hidden_families:
+            metrics.append(metric)
+    return metrics
+
+
+def _seeds_cell(method: Method) -> str:
+    """Return the number of seeds, or the kind of a reference predictor."""
+    if method.name in COUNTING:
+        return "naive baseline"
+    if method.name in REFERENCES:
+        return "classical solver"
+    return str(len(method.trainings))
+
+
+def _score_cell(method: Method, metric: str) -> str:
+    """Return mean, interval, deviation over seeds and number of undefined values."""
+    if metric not in method.scores:
+        return "-"
+    score = method.scores[metric]
+    cell = interval(score.mean, score.interval)
+    if len(method.trainings) > 1:
+        cell += f" ± {number(method.spread(metric), 2)}"
+    undefined_count = sum(score.undefined)
+    if undefined_count:
+        cell += f", {undefined_count} undefined"
+    return cell
+
+
+def vorticity_table(results: SplitResults) -> str:
+    """Return Tables 5.4 and 5.5 and the correlations of Fig. 5.13.
+
+    A cell has our mean and T0 in brackets. On the cavity the thesis's number follows.
+    """
+    frame = key_frame(results.size)
+    first_scenario = scenario_of(results.size, 0)
+    has_thesis = results.size.split == "cavity"
+    heads = ["model"]
+    for measure in MEASURES:
+        heads.append(measure.upper())
+        if has_thesis:
+            heads.append(f"{measure.upper()}, thesis")
+
+    rows = []
+    for name in dict.fromkeys((*OPERATORS, *results.models)):
+        if name not in results.models:
+            continue
+        method = results.models[name]
+        row = [label(name)]
+        for measure in MEASURES:
+            metric = f"vorticity_{measure}"
+            mean_value = method.at(metric, frame)
+            first_value = method.at(metric, frame, first_scenario)
+            row.append(f"{number(mean_value)} ({number(first_value)})")
+            if has_thesis:
+                row.append(number(TABLE_5_4.get(name, {}).get(measure), 4))
+        rows.append(row)
+    return markdown(heads, rows)
+
+
+def order_agreement(results: SplitResults) -> str | None:
+    """Return Kendall's tau of our order by MSE and the thesis's.
+
+    None without a table of the thesis, or without two of its models.
+    """
+    if results.size.split != "cavity":
+        return None
+    frame = key_frame(results.size)
+    thesis_values = []
+    our_values = []
+    for name, row in TABLE_5_4.items():
+        if name in results.models:
+            thesis_values.append(row["mse"])
+            our_values.append(results.models[name].at("vorticity_mse", frame))
+    if len(thesis_values) < 2:
+        return None
+    return number(kendall_tau(thesis_values, our_values), 2)
+
+
+def kendall_tau(first: Sequence[float], second: Sequence[float]) -> float:
+    """Return Kendall's tau of two rankings without ties.
+
+    It is 1 for the same order, -1 for the reversed one, 0 for unrelated ones.
+    """
+    pairs = list(zip(first, second, strict=True))
+    pair_count = 0
+    reversed_count = 0
+    for (a, x), (b, y) in combinations(pairs, 2):
+        pair_count += 1
+        reversed_count += (a - b) * (x - y) < 0.0
+    return 1.0 - 2.0 * reversed_count / pair_count
+
+
+def cost_table(results: SplitResults) -> str:
+    """Return recipe, parameters, training hours and seconds per frame of each model."""
+    heads = (
+        "model",
+        "recipe",
+        "changed",
+        "parameters",
+        "seeds",
+        "CPU hours per seed",
+        "hardware",
+        "s/frame",
+        "solver s/frame",
+        "speed-up",
+    )
+    rows = []
+    for name, method in results.models.items():
+        recipes = [training.record.get("recipe", {}) for training in method.trainings]
+        recipe_names = [recipe.get("name", "-") for recipe in recipes]
+        changes = [_changes(recipe) for recipe in recipes]
+        parameters = "-"
+        if method.parameters is not None:
+            parameters = f"{method.parameters:,}"
+        seeds = []
+        for training in method.trainings:
+            seeds.append("-" if training.seed is None else str(training.seed))
+        rows.append(
+            [
+                label(name),
+                " / ".join(dict.fromkeys(recipe_names)),
+                " / ".join(dict.fromkeys(changes)),
+                parameters,
+                ", ".join(seeds),
+                number(method.hours_per_seed),
+                format_hardware(method.trainings[0].record),
+                *_frame_costs(method),
+            ]
+        )
+    return markdown(heads, rows)
+
+
+def _changes(recipe: Mapping[str, Any]) -> str:
+    """Return the changed options of a recipe; a dash without a recipe."""
+    from lagbench.baselines.job import changes_of  # loads torch
+
+    if not recipe:
+        return "-"
+    return recipe.get("changed") or "; ".join(changes_of(recipe)) or "none"
+
+
+def _frame_costs(method: Method) -> Iterator[str]:
+    """Yield seconds per frame of the model and of the solver, and the speed-up."""
+    cost = method.cost
+    if cost is None:
+        yield from (number(None), number(None), number(None))
+        return
+    yield number(cost.seconds_per_frame)
+    yield number(cost.solver_seconds_per_frame)
+    yield number(cost.speed_up)

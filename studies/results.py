@@ -1,0 +1,364 @@
+"""Write docs/results.md from committed files: claims, scores and costs.
+
+    python -m studies.results -o docs/results.md [--board leaderboard]
+        [--weights FOLDER] [--runs RUNS] [--studies FOLDER] [--check]
+
+The page shows our scores beside the numbers of the thesis. It needs the entries and
+score files of the leaderboard and the records of trainings; no data set is read.
+``--runs`` adds runs that are not committed yet. The same files give the same bytes.
+``--check`` writes nothing and fails where the page is stale.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from lagbench.atomic import write_atomically
+from lagbench.errors import LagbenchError
+
+from .result_tables import (
+    claims_overview,
+    cost_table,
+    horizon_table,
+    order_agreement,
+    summary_table,
+    training_table,
+    vorticity_table,
+)
+from .thesis.cases import key_frame
+from .thesis.claims import CLAIMS, claim_rows, comparison_table, leading_references
+from .thesis.items import table_markdown
+from .thesis.plan import TABLES, read_studies, study_name, study_rows
+from .thesis.published import TABLE_4_8
+from .thesis.roster import EXPECTED, ROSTER, SIZES, RosterModel, label
+from .thesis.split_results import (
+    BOARD,
+    COMMITTED_STUDIES,
+    WEIGHTS,
+    Sources,
+    SplitResults,
+    read_json,
+)
+from .thesis.tables import rollout_table, studies_beside_thesis
+from .thesis.var_protocol import FILE_NAME as PROTOCOL_FILE
+from .thesis.var_protocol import beside_thesis
+
+INTRODUCTION = """\
+# Results
+
+On this page you can look up how well the reference models predict each data set, which
+claims of the thesis hold on our data, and what the trainings cost. The first table has
+the best model of each data set. After it come the claims, the trainings, and one
+chapter per data set with all models beside the numbers of the thesis (D. Dharma, PhD
+thesis, University of Leeds, 2025)."""
+
+HOW_TO_READ = """\
+## How to read this page
+
+- **Reference predictors** learn nothing. A naive baseline predicts without equations; a
+  classical solver integrates the equations on a coarser grid
+  ([references](references.md)).
+- **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
+  as that baseline, and below 0 is worse.
+- **Cells** are means over test scenarios with 95 % bootstrap intervals over scenarios.
+  After ± stands the deviation over seeds, where there are several. The board resamples
+  seeds too, so its intervals are wider where there are few seeds.
+- **Tests** are two-sided. Where both models have one seed, the test is the exact
+  sign-flip test over scenarios. Else it is the two-way bootstrap over scenarios and
+  seeds. For one training that is used in two ways it takes the differences seed by
+  seed. The p-values are corrected for the number of rivals (Holm). With fewer than six
+  scenarios nothing is claimed.
+- **The thesis** trained on its own data, at the size called `full` here, for hours on
+  GPUs. It prints one scenario per table. Its absolute numbers stand beside ours for
+  orientation. At size `mini` (a quarter of the particles, half the grid) compare only
+  the orders of the models.
+- **Metrics** are defined in [scoring](scoring.md).
+
+`python -m studies.results -o docs/results.md` writes this page from the entries and
+score files in `leaderboard/` and from the records of the trainings. Do not edit it."""
+
+CLAIMS_NOTE = """\
+The answers use the ranking metric over the horizon. "Ahead" counts the better means.
+"Better" (yes) and "worse" (no) are significant at 5 %; everything else is open. Two
+models are compared over the seeds that both have, or over all seeds if they share none.
+A dash stands where an entry is missing."""
+
+TRAINING_NOTE = """\
+The validation columns have the least validation error up to a quarter, half and all of
+the steps, of the first seed. The last column is the gain of the last doubling of the
+steps. A model that gained more than 2 % has not converged. Hours are without
+validations, as in the entries; the first trainings of NeuralMPM did not time their
+validations apart."""
+
+COST_NOTE = """\
+Cost. The columns have the recipe, and the options that the training or the prediction
+changed (`none`: no option). Where the seeds differ, their values stand in the order of
+the seeds. Without a record of the training, the words of the entry are used. The
+speed-up is our solver's time for a frame, on one core, over that of the model on the
+same machine. Hours are without validations."""
+
+COMMANDS = """\
+## How to make these results again
+
+```
+lagbench generate --split cavity --size mini
+lagbench train --baseline supergat --split cavity --size mini --seed 0
+lagbench predict runs/cavity/mini/supergat-0/weights.pt -o predictions.nc
+lagbench score predictions.nc
+lagbench submit predictions.nc --from meta.yaml
+```
+
+`python -m studies.thesis --size mini --root DATA --runs runs` makes all models, tables
+and figures of a size. It can be interrupted and repeated. `lagbench submit` makes
+entries of its runs.
+
+Results without an entry are read from `docs/studies/<split>/<size>/`. There,
+`mlp_studies.json` is a copy of that in the folder of runs, and `var_protocol.json` is
+the output of `python -m studies.thesis.var_protocol --size mini --json`.
+
+Variants change an option or two:"""
+
+
+def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
+    """Return the page."""
+    all_results = []
+    for size in sizes:
+        for split in EXPECTED:
+            all_results.append(SplitResults(sources, split, size))
+    scored = [results for results in all_results if results.methods]
+    learned = [results for results in scored if results.models]
+
+    parts = [INTRODUCTION]
+    if learned:
+        parts.append(summary_table(learned))
+    parts.append(HOW_TO_READ)
+    parts += _claims(learned)
+    for results in scored:
+        parts += _chapter(results)
+
+    protocols = list(_protocols(sources, sizes))
+    if protocols:
+        parts += ["## VAR by the thesis's protocol (section 4.8.3)", *protocols]
+    studies = list(_studies(sources, sizes))
+    if studies:
+        parts += ["## MLPs from frame to frame", *studies]
+
+    variants = [_variant_line(model) for model in ROSTER.values() if model.variant_of]
+    missing = [line for results in all_results for line in _missing_lines(results)]
+    parts += [
+        COMMANDS,
+        "\n".join(variants),
+        "## Missing",
+        "\n".join(missing) or "Nothing.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _claims(learned: Sequence[SplitResults]) -> Iterator[str]:
+    """Yield an overview of all claims, then the comparisons behind each."""
+    yield "## Claims"
+    if not learned:
+        yield "No model has been scored yet. The commands are at the end of this page."
+        return
+
+    rows_by_claim = {}
+    for claim in CLAIMS:
+        rows_by_claim[claim] = {
+            results.where: claim_rows(claim, results) for results in learned
+        }
+    yield CLAIMS_NOTE
+    yield claims_overview(rows_by_claim, [results.where for results in learned])
+
+    for claim, rows_by_place in rows_by_claim.items():
+        yield f"### {claim.question}"
+        all_rows = [row for rows in rows_by_place.values() for row in rows]
+        if all_rows:
+            yield table_markdown(comparison_table(all_rows))
+        else:
+            yield (
+                f"There is nothing to compare yet: a split needs entries of "
+                f"{label(claim.first)} and of a rival."
+            )
+
+    leading = leading_references(learned)
+    if leading.rows:
+        yield (
+            "### In which metrics has a reference predictor a better mean than every "
+            "model?"
+        )
+        yield table_markdown(leading)
+
+    yield "### What does a CPU hour buy?"
+    yield TRAINING_NOTE
+    yield training_table(learned)
+
+
+def _chapter(results: SplitResults) -> Iterator[str]:
+    """Yield the scores on one split and size: horizon, thesis, costs."""
+    size = results.size
+    task = size.task
+    test_count = len(size.subsets["test"])
+    train_count = len(size.subsets["train"])
+    yield f"## {results.where}"
+    yield (
+        f"{size.particles} particles; {task.input_frames} given frames, "
+        f"{task.horizon} predicted ones; {test_count} test scenarios, {train_count} "
+        f"to train on; data set {size.version}. The best by `{results.ranking}` "
+        "comes first."
+    )
+    yield horizon_table(results)
+    if not results.models:
+        return
+
+    if size.split in TABLE_4_8:
+        yield "Table 4.8: errors of a rollout by scene. A cell is ours / the thesis's."
+        yield table_markdown(rollout_table(results, TABLE_4_8[size.split]))
+    else:
+        yield _vorticity_note(results)
+        yield vorticity_table(results)
+        tau = order_agreement(results)
+        if tau is not None:
+            yield (
+                f"Kendall's tau of the two orders by MSE: {tau} "
+                "(1: the same order, -1: reversed)."
+            )
+    yield COST_NOTE
+    yield cost_table(results)
+
+
+def _vorticity_note(results: SplitResults) -> str:
+    note = (
+        "Tables 5.4, 5.5 and Fig. 5.13: vorticity at frame "
+        f"{key_frame(results.size)}. A cell is the mean over test scenarios, with the "
+        "first test scenario (T0) in brackets"
+    )
+    if results.size.split == "cavity":
+        return f"{note}. The thesis has T0."
+    return f"{note}."
+
+
+def _protocols(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
+    """Yield the results of VAR by the thesis's protocol, committed ones first."""
+    for size in sizes:
+        for home in (sources.studies, sources.runs):
+            if home is None:
+                continue
+            path = home / "fluid" / size / PROTOCOL_FILE
+            if path.is_file():
+                yield beside_thesis(read_json(path)).text
+                break
+
+
+def _studies(sources: Sources, sizes: Sequence[str]) -> Iterator[str]:
+    """Yield the tables of MLPs that have a row with results."""
+    homes = [home for home in (sources.studies, sources.runs) if home is not None]
+    for size in sizes:
+        for name, (_, split) in TABLES.items():
+            measured = sources.size(split, size).measured
+            data_hash = measured.dataset_sha256 if measured else None
+            folders = [home / split / size for home in homes]
+            studies = read_studies(folders, data_hash)
+            row_names = {study_name(study) for study in study_rows(name)}
+            if row_names & studies.keys():
+                yield studies_beside_thesis(name, size, studies).text
+
+
+def _variant_line(model: RosterModel) -> str:
+    """Return how a variant of a reference model is made."""
+    settings = "".join(f" --set {setting}" for setting in model.settings)
+    if model.weights_of:
+        weights = f"weights of `{model.weights_of}`"
+        return f"- `{model.name}`: `lagbench predict{settings}` with {weights}"
+    recipe = f" --recipe {model.recipe}" if model.recipe else ""
+    return f"- `{model.name}`: `--baseline {model.baseline}{recipe}{settings}`"
+
+
+def _missing_lines(results: SplitResults) -> Iterator[str]:
+    """Yield the models without an entry, and the command that makes them."""
+    split = results.size.split
+    expected = EXPECTED[split]
+    unscored = []
+    missing = []
+    for name in expected:
+        if name in results.methods:
+            continue
+        if results.was_trained(name):
+            unscored.append(label(name))
+        else:
+            missing.append(label(name))
+
+    if unscored:
+        names = ", ".join(unscored)
+        yield (
+            f"- {results.where}: {names}: trained, but without a score "
+            "([baselines](baselines.md) says why)."
+        )
+    if missing:
+        names = ", ".join(missing)
+        if len(missing) == len(expected):
+            names = "all models"
+        command = f"python -m studies.thesis --size {results.size.name} --split {split}"
+        yield f"- {results.where}: {names}: `{command}`, then `lagbench submit`."
+    if results.stale:
+        count = len(results.stale)
+        yield f"- {results.where}: {count} score files of other data, left out."
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write or check the page; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.results",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--output", "-o", type=Path, default=Path("docs/results.md"))
+    parser.add_argument("--board", type=Path, default=BOARD)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS)
+    parser.add_argument(
+        "--runs", type=Path, help="folder of runs that are not committed yet"
+    )
+    parser.add_argument(
+        "--studies",
+        type=Path,
+        default=COMMITTED_STUDIES,
+        help="folder of committed results without an entry",
+    )
+    parser.add_argument("--root", type=Path, help="not needed: no data set is read")
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="write nothing; fail where the page is stale",
+    )
+    options = parser.parse_args(arguments)
+    try:
+        sources = Sources(
+            board=options.board,
+            weights=options.weights,
+            runs=options.runs,
+            studies=options.studies,
+        )
+        page = render(sources).encode()
+        if options.check:
+            return _check(options.output, page)
+        write_atomically(options.output, page)
+    except LagbenchError as error:
+        sys.stderr.write(f"error: {error}\n")
+        return error.exit_code
+    sys.stdout.write(f"{options.output}: written, {len(page)} bytes\n")
+    return 0
+
+
+def _check(path: Path, page: bytes) -> int:
+    """Return 0 if a file holds the page, else 1."""
+    if path.is_file() and path.read_bytes() == page:
+        sys.stdout.write(f"{path}: up to date\n")
+        return 0
+    sys.stdout.write(f"{path}: stale\n")
+    return 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

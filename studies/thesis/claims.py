@@ -1,0 +1,373 @@
+"""Claims of the thesis and of ours, and what the scores say about each.
+
+A comparison is two-sided, in the loss of a metric, over the seeds that both models have
+(over all where they share none). Where both have one seed, the test is the exact
+sign-flip test over test scenarios, else the two-way bootstrap over scenarios and seeds.
+For the same weights used in two ways it is that of the differences seed by seed. The
+p-values of one model against several are corrected together (Holm 1979). With one
+training per model, a difference is one between two trainings; another seed may turn it.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from lagbench.figures.tables import Table
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.metric import Direction
+from lagbench.metrics.significance import SIGNIFICANCE, Comparison, compare, holm
+from lagbench.metrics.table import CHOSEN
+
+from .cases import key_frame
+from .formatting import interval, number
+from .published import FRAME_MODELS, OPERATORS
+from .roster import ROSTER, label
+from .split_results import Method, SplitResults, rank
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A question about one model and its rivals, asked of every split."""
+
+    first: str  # the model in question; empty for the best naive baseline
+    rivals: tuple[str, ...] = ()  # models to compare it with; empty for all
+    question: str = ""
+    # metrics to compare over the horizon, beside the one that ranks
+    metrics: tuple[str, ...] = ()
+    # metrics to compare at the frame at which the thesis compares models
+    at_key_frame: tuple[str, ...] = ()
+
+
+_CLAIMS = {
+    "Does SuperGAT come first among the operators (Table 5.4: on the cavity "
+    "it does)?": Claim(
+        "supergat",
+        tuple(name for name in OPERATORS if name != "supergat"),
+        at_key_frame=("vorticity_mse",),
+    ),
+    "Does SuperGAT's link loss help, at the same start and seeds?": Claim(
+        "supergat", ("supergat-unlinked",), at_key_frame=("vorticity_pearson",)
+    ),
+    "Does the vorticity loss help (Fig. 5.5: it does), at the same budget "
+    "and seeds?": Claim(
+        "gns",
+        ("gns-novorticity",),
+        metrics=("position_rmse", "energy_error"),
+        at_key_frame=("vorticity_pearson",),
+    ),
+    "Is SuperGAT better with summed messages than without?": Claim(
+        "supergat", ("supergat-unsummed",)
+    ),
+    "Is MX attention better than SD (Eq. 5.27 has both)?": Claim(
+        "supergat", ("supergat-sd",)
+    ),
+    "Is acceleration a better target than velocity (section 5.9.3)?": Claim(
+        "gns", ("gns-velocity",), at_key_frame=("vorticity_pearson",)
+    ),
+    "Is L2 better than L1 as the norm of the loss (the thesis chooses L2)?": Claim(
+        "gns", ("gns-l1",)
+    ),
+    "Does a weight of the vorticity loss ten times as large help?": Claim(
+        "gns-tenfold", ("gns",), at_key_frame=("vorticity_pearson",)
+    ),
+    "Does a loss over three unrolled steps help (section 6.2), at the same "
+    "processor time?": Claim("gns-unrolled", ("gns",)),
+    "Graph or grid: is NeuralMPM better than every operator?": Claim(
+        "neuralmpm", OPERATORS
+    ),
+    "Does NeuralMPM learn better from its own rollouts than from more unrolled "
+    "frames?": Claim("neuralmpm-long", ("neuralmpm-unrolled",)),
+    "Does NeuralMPM gain by one velocity grid for all materials, at no more "
+    "steps?": Claim("neuralmpm", ("neuralmpm-unmixed",)),
+    "Does NeuralMPM gain by conserved momentum, shorter bundles and more of the "
+    "first frames?": Claim("neuralmpm-conserving", ("neuralmpm-long", "neuralmpm")),
+    "Does NeuralMPM gain by shape matching and density projection?": Claim(
+        "neuralmpm-projected", ("neuralmpm-conserving",)
+    ),
+    "Does NeuralMPM gain by averaging over the mirror images of the box, with the "
+    "same weights?": Claim("neuralmpm-averaged", ("neuralmpm",)),
+    "Does NeuralMPM gain by starting from the weights of another size?": Claim(
+        "neuralmpm-started", ("neuralmpm",)
+    ),
+    "Does NeuralMPM with shape matching gain by starting from the weights of "
+    "another size?": Claim("neuralmpm-projected-started", ("neuralmpm-projected",)),
+    "Does it gain by grids for shape and density as fine as those of the size "
+    "full?": Claim(
+        "neuralmpm-projected-finer",
+        ("neuralmpm-projected-started", "neuralmpm-projected"),
+    ),
+    "Does LSTM + MLP come first among the frame models (Table 4.8: it does)?": Claim(
+        "lstm-mlp", tuple(name for name in FRAME_MODELS if name != "lstm-mlp")
+    ),
+    "Is standing still better than VAR(1) (section 4.8.3: its forecast "
+    "diverges)?": Claim("persistence", ("var",), metrics=("mse_end",)),
+    "Is the best naive baseline better than a model that learned?": Claim(""),
+}
+
+CLAIMS = tuple(replace(claim, question=question) for question, claim in _CLAIMS.items())
+
+
+class Verdict(enum.StrEnum):
+    """What a comparison says of the first of two models, at 5 %."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    OPEN = "open"
+    FEW = "too few scenarios"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedModels:
+    """Two models compared by one metric."""
+
+    where: str  # split and size
+    metric: str
+    frame: int | None  # None for the horizon
+    first: str
+    second: str
+    means: tuple[float, float]
+    test: Comparison
+    win_count: int  # scenarios in which the first has the smaller loss
+    seed_counts: tuple[int, int]  # trainings behind each mean
+    p: float  # corrected for the number of rivals; NaN with too few scenarios
+
+    @property
+    def verdict(self) -> Verdict:
+        """What the test says of the first model."""
+        if math.isnan(self.p):
+            return Verdict.FEW
+        if self.p >= SIGNIFICANCE:
+            return Verdict.OPEN
+        if self.test.difference < 0.0:
+            return Verdict.BETTER
+        return Verdict.WORSE
+
+
+def compare_models(
+    results: SplitResults,
+    first: str,
+    rivals: Sequence[str],
+    metrics: Sequence[str],
+    *,
+    frame: int | None = None,
+) -> list[ComparedModels]:
+    """Compare a model with its rivals by each metric that both have.
+
+    The values are those over the horizon, or those of a frame.
+    """
+    all_rows: list[ComparedModels] = []
+    for metric in metrics:
+        rows = []
+        for rival in rivals:
+            if first in results.methods and rival in results.methods:
+                row = _compare_pair(results, first, rival, metric=metric, frame=frame)
+                if row is not None:
+                    rows.append(row)
+        corrected = holm([row.test.p for row in rows])
+        for row, p in zip(rows, corrected, strict=True):
+            all_rows.append(replace(row, p=p))
+    return all_rows
+
+
+def _compare_pair(
+    results: SplitResults,
+    first: str,
+    second: str,
+    *,
+    metric: str,
+    frame: int | None,
+) -> ComparedModels | None:
+    """Compare two models by a metric; None where one of them lacks it."""
+    first_method = results.methods[first]
+    second_method = results.methods[second]
+    first_seeds = {training.seed for training in first_method.trainings}
+    second_seeds = {training.seed for training in second_method.trainings}
+    common_seeds = first_seeds & second_seeds
+    if common_seeds:
+        first_method = first_method.of_seeds(common_seeds)
+        second_method = second_method.of_seeds(common_seeds)
+    if metric not in first_method.scores or metric not in second_method.scores:
+        return None
+
+    first_score = _value_at(first_method.scores[metric], frame)
+    second_score = _value_at(second_method.scores[metric], frame)
+    have_same_weights = (
+        bool(common_seeds) and first in ROSTER and ROSTER[first].weights_of == second
+    )
+    test = compare(
+        _seed_values(first_method, metric, frame),
+        _seed_values(second_method, metric, frame),
+        paired=have_same_weights,
+    )
+
+    win_count = 0
+    for first_value, second_value in zip(
+        first_score.values.tolist(), second_score.values.tolist(), strict=True
+    ):
+        first_loss = first_score.metric.loss(first_value)
+        second_loss = second_score.metric.loss(second_value)
+        win_count += first_loss < second_loss  # NaN is not smaller
+    return ComparedModels(
+        where=results.where,
+        metric=metric,
+        frame=frame,
+        first=first,
+        second=second,
+        means=(first_score.mean, second_score.mean),
+        test=test,
+        win_count=win_count,
+        seed_counts=(len(first_method.trainings), len(second_method.trainings)),
+        p=test.p,
+    )
+
+
+def _value_at(score: Score, frame: int | None) -> Score:
+    """Return a score with its values at a frame; None is the horizon."""
+    if frame is None:
+        return score
+    return replace(score, values=score.at(frame))
+
+
+def _seed_values(method: Method, metric: str, frame: int | None) -> list[Score]:
+    """Return the score of each seed, at a frame or over the horizon."""
+    return [_value_at(training.scores[metric], frame) for training in method.trainings]
+
+
+def claim_rows(claim: Claim, results: SplitResults) -> list[ComparedModels]:
+    """Return all comparisons of a claim, those by the ranking metric first."""
+    first = claim.first or results.best_naive
+    if first is None:
+        return []
+    rivals = claim.rivals
+    if not rivals:
+        ranked = results.order(results.models)
+        rivals = tuple(name for name in ranked if name != first)
+
+    metrics = tuple(dict.fromkeys((results.ranking, *claim.metrics)))
+    over_horizon = compare_models(results, first, rivals, metrics)
+    at_key_frame = compare_models(
+        results, first, rivals, claim.at_key_frame, frame=key_frame(results.size)
+    )
+    return over_horizon + at_key_frame
+
+
+def answer(rows: Sequence[ComparedModels]) -> str:
+    """Return the answer of the rows by the ranking metric; "" without rows.
+
+    One rival gives yes, no or open. Several give yes, or how many are worse or better.
+    """
+    judged = []
+    for row in rows:
+        if row.metric == rows[0].metric and row.frame is None:
+            judged.append(row)
+    if not judged:
+        return ""
+
+    verdicts = [row.verdict for row in judged]
+    if Verdict.FEW in verdicts:
+        return Verdict.FEW.value
+    better_count = verdicts.count(Verdict.BETTER)
+    worse_count = verdicts.count(Verdict.WORSE)
+    if better_count == len(judged):
+        return "yes"
+    if len(judged) == 1:
+        return "no" if worse_count else "open"
+    ahead_count = sum(row.test.difference < 0.0 for row in judged)
+    return (
+        f"ahead of {ahead_count} of {len(judged)}; "
+        f"better than {better_count}, worse than {worse_count}"
+    )
+
+
+def comparison_table(rows: Sequence[ComparedModels]) -> Table:
+    """Return comparisons as a table.
+
+    The lead is the second mean minus the first in loss: positive favours the first.
+    """
+    heads = (
+        "where",
+        "metric",
+        "first",
+        "second",
+        "means",
+        "seeds",
+        "lead (95 %)",
+        "won",
+        "p (Holm)",
+        "the first is",
+    )
+    cells = []
+    for row in rows:
+        metric = row.metric
+        if row.frame is not None:
+            metric = f"{row.metric}, frame {row.frame}"
+        low, high = row.test.interval
+        cells.append(
+            (
+                row.where,
+                metric,
+                label(row.first),
+                label(row.second),
+                f"{number(row.means[0])} / {number(row.means[1])}",
+                f"{row.seed_counts[0]} / {row.seed_counts[1]}",
+                interval(-row.test.difference, (-high, -low)),
+                f"{row.win_count} of {len(row.test.scenarios)}",
+                number(row.p, 2),
+                row.verdict.value,
+            )
+        )
+    return Table("", heads, tuple(cells))
+
+
+def leading_references(all_results: Sequence[SplitResults]) -> Table:
+    """Return the metrics in which a reference predictor has a better mean than all."""
+    rows = []
+    for results in all_results:
+        for metric in dict.fromkeys((results.ranking, *CHOSEN)):
+            row = _leading_reference(results, metric)
+            if row is not None:
+                rows.append(row)
+    heads = (
+        "where",
+        "metric",
+        "reference predictor",
+        "its mean",
+        "best model",
+        "its mean",
+    )
+    return Table("", heads, tuple(rows))
+
+
+def _leading_reference(results: SplitResults, metric: str) -> tuple[str, ...] | None:
+    """Return the row of a metric in which a reference predictor leads; None else."""
+    scores: Mapping[str, Score] = {
+        name: method.scores[metric]
+        for name, method in results.methods.items()
+        if metric in method.scores
+    }
+    directions = {score.metric.direction for score in scores.values()}
+    if Direction.NONE in directions:
+        return None
+
+    ranked = [name for name in rank(scores) if not math.isnan(scores[name].mean)]
+    ranked_models = [name for name in ranked if name in results.models]
+    if not ranked_models or ranked[0] not in results.references:
+        return None
+    reference = ranked[0]
+    model = ranked_models[0]
+    reference_mean = scores[reference].mean
+    model_mean = scores[model].mean
+    loss = scores[model].metric.loss
+    if loss(reference_mean) >= loss(model_mean):
+        return None
+    return (
+        results.where,
+        metric,
+        reference,
+        number(reference_mean),
+        label(model),
+        number(model_mean),
+    )
