@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lagbench.baselines.particle_grid import ParticleGrid
-from lagbench.baselines.projection import Density, Shape
+from lagbench.baselines.projection import DensityProjection, ShapeMatching
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
@@ -60,14 +60,14 @@ def figures(
                 for frame in frames
             }
         one = torch.zeros_like(material)
-        shape = Shape.of(clusters, first, material, len(NAMES))
-        density = Density.of(nodes, first, one, 1)
+        shape = ShapeMatching.build(clusters, first, material, len(NAMES))
+        density = DensityProjection.build(nodes, first, one, 1)
         for frame in frames:
             now = torch.from_numpy(
                 truth[frame] if read is None else read(scenario, frame)
             )
-            off = (shape.matched(now) - now).norm(dim=1)
-            dense, _ = density.relative(nodes.stencil(now, one))
+            off = (shape.match(now) - now).norm(dim=1)
+            dense, _ = density.relative_density(nodes.stencil(now, one))
             for kind in sorted(set(material.tolist())):
                 own = material == kind
                 rows[kind].append(

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lagbench.baselines.baseline import Batch, Facts
+from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
@@ -38,7 +38,7 @@ FRAMES = 8
 REPEATS = 3
 
 
-def facts() -> Facts:
+def facts() -> DatasetInfo:
     """Return the public figures of the data set whose recipes are used; no file of it
     is read.
     """
@@ -48,7 +48,7 @@ def facts() -> Facts:
     else:
         known = {}
     task = size.task
-    return Facts(
+    return DatasetInfo(
         split=SPLIT,
         size=SIZE,
         version=size.version,
@@ -66,7 +66,7 @@ def facts() -> Facts:
     )
 
 
-def given(about: Facts) -> Batch:
+def given(about: DatasetInfo) -> Batch:
     """Return the given frames of a box full of particles, one in each cell of a
     lattice, that swirl.
     """

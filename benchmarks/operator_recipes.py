@@ -21,7 +21,7 @@ import torch
 
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.machine import multiplies_bfloat16
 from lagbench.baselines.recipe import Recipe, recipe_for
 from lagbench.torch import WindowDataset, collate
@@ -105,7 +105,7 @@ def main() -> int:
         "|\n|---|---|---|---|---|---|"
     )
     for split in given.split:
-        facts = facts_of(split, given.size, root=given.root)
+        facts = read_dataset_info(split, given.size, root=given.root)
         for name in given.operator:
             recipe = recipe_for(find(name), split, given.size, variant=given.recipe)
             torch.manual_seed(0)

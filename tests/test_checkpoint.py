@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from simple_models import FACTS, Drift, install
+from simple_models import INFO, Drift, install
 
-from lagbench.baselines.baseline import Facts
-from lagbench.baselines.catalogue import find, names
+from lagbench.baselines.baseline import DatasetInfo
+from lagbench.baselines.catalogue import find, list_names
 from lagbench.baselines.checkpoint import (
     Checkpoint,
     check_data,
     load,
     restore,
-    rounded_weights,
+    round_weights,
     save,
 )
 from lagbench.data.registry import Registry
@@ -37,11 +37,11 @@ from lagbench.make.generate import GenerationResult
 
 def example(**changes: Any) -> Checkpoint:
     """Return a checkpoint of a Drift whose parameter needs all bits of a float32."""
-    model = Drift.build({"start": 1 / 3}, FACTS)
+    model = Drift.build({"start": 1 / 3}, INFO)
     fields = {
         "baseline": "drift",
         "options": {"start": 1 / 3},
-        "facts": FACTS,
+        "info": INFO,
         "weights": model.state_dict(),
         "training": {"step": 3, "recipe": {"training": {"seed": 4}}},
     }
@@ -57,10 +57,10 @@ def test_round_trip(tmp_path: Path) -> None:
     stored = example(optimizer=optimizer.state_dict())
     save(tmp_path / "a.pt", stored)
     found = load(tmp_path / "a.pt")
-    assert (found.baseline, found.options, found.facts) == (
+    assert (found.baseline, found.options, found.info) == (
         stored.baseline,
         stored.options,
-        FACTS,
+        INFO,
     )
     assert found.training == stored.training
     assert torch.equal(found.weights["a"], stored.weights["a"])
@@ -79,7 +79,7 @@ def test_rounding() -> None:
     )
     bits = model.weight.detach().numpy().view(np.uint32)
     expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
-    found = rounded_weights(model)
+    found = round_weights(model)
     assert found["weight"].dtype is torch.bfloat16
     assert np.array_equal(found["weight"].float().numpy().view(np.uint32), expected)
     assert torch.equal(found["running_mean"], model.running_mean)
@@ -248,14 +248,14 @@ def test_missing_cut_and_never_written(tmp_path: Path) -> None:
         ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
         ({"options": {"sart": 1}}, "sart"),
         (
-            {"baseline": "mlp", "options": {}, "facts": replace(FACTS, statistics={})},
+            {"baseline": "mlp", "options": {}, "info": replace(INFO, statistics={})},
             "position_mean",
         ),
         (
             {
                 "baseline": "gns",
                 "options": {},
-                "facts": replace(FACTS, score_placement="edges"),
+                "info": replace(INFO, score_placement="edges"),
             },
             "statistics|edges|acceleration",
         ),
@@ -289,7 +289,7 @@ def test_data_of_another_version(
         ("curl-noise", root / "nowhere", "lagbench generate"),
         ("my-river", root, "where: a.pt"),  # a local split of another root
     ):
-        found = example(facts=replace(FACTS, split=split))
+        found = example(info=replace(INFO, split=split))
         with pytest.raises(DataError, match=words):
             check_data(found, root=there, registry=unmeasured, where="a.pt")
 
@@ -316,7 +316,7 @@ def test_an_archive_that_unpacks_to_more_is_refused(tmp_path: Path) -> None:
 
 
 def test_overlapping_members_are_refused(tmp_path: Path) -> None:
-    """A directory that names the same bytes many times promises more than the file
+    """A directory that list_names the same bytes many times promises more than the file
     holds.
     """
     with zipfile.ZipFile(tmp_path / "a.pt", "w") as archive:
@@ -355,7 +355,7 @@ KINDS = [
     for name in ("position", "velocity", "acceleration")
     for of in ("mean", "std")
 ]
-WHOLE = replace(FACTS, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
+WHOLE = replace(INFO, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
 
 SIZES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "neuralmpm": (
@@ -378,10 +378,10 @@ def stored(baseline: str) -> Checkpoint:
     """Return the checkpoint of a small model."""
     options, _ = SIZES.get(baseline, GRAPHS)
     weights = find(baseline).model.build(options, WHOLE).state_dict()
-    return Checkpoint(baseline=baseline, options=options, facts=WHOLE, weights=weights)
+    return Checkpoint(baseline=baseline, options=options, info=WHOLE, weights=weights)
 
 
-@pytest.mark.parametrize("baseline", names())
+@pytest.mark.parametrize("baseline", list_names())
 def test_what_the_weights_fill_is_built(baseline: str) -> None:
     """Every baseline comes back with the numbers of its weights; no random number is
     drawn for the check.
@@ -397,20 +397,20 @@ def test_what_the_weights_fill_is_built(baseline: str) -> None:
         assert torch.equal(model.state_dict()[name], value), name
 
 
-@pytest.mark.parametrize("baseline", names())
+@pytest.mark.parametrize("baseline", list_names())
 def test_larger_models_are_refused(baseline: str) -> None:
     """Options for 10^10 numbers and more are refused as those of an unreadable file, at
     once.
     """
     found = stored(baseline)
-    facts = replace(WHOLE, particles=10**9) if baseline == "var-stable" else WHOLE
+    info = replace(WHOLE, particles=10**9) if baseline == "var-stable" else WHOLE
     options = {**found.options, **SIZES.get(baseline, GRAPHS)[1]}
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*weights of"):
-        restore(replace(found, options=options, facts=facts), where="theirs.pt")
+        restore(replace(found, options=options, info=info), where="theirs.pt")
 
 
 def test_small_numbers_and_shared_bytes_are_seen_through() -> None:
-    """Ten million layers of one number each are not built; names for the same bytes
+    """Ten million layers of one number each are not built; list_names for the same bytes
     make no large file.
     """
     with pytest.raises(UnreadableFileError, match=r"larger model(.|\n)*tensors"):
@@ -427,8 +427,8 @@ class Reading(Drift):
     have.
     """
 
-    def __init__(self, options: Any, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Any, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         self.half = float(torch.full((1,), 0.5))
 
 

@@ -106,7 +106,7 @@ def train(
             fix=fix,
         )
     split = chosen(name, split)
-    for module in ("torch", "torch_geometric", "pytorch_lightning"):
+    for module in ("torch", "torch_geometric", "lightning_fabric"):
         check_installed(module, extra=EXTRA)
     from lagbench.data.local import locate
 
