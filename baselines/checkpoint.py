@@ -5,7 +5,8 @@ A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format num
 for resuming, ``optimizer``. It is read with ``weights_only=True``, which refuses a file
 with any other object in it. So a stranger's file runs no code. The one threat that is
 left is memory: an archive of a few kilobytes may unpack to more than the machine has.
-So the size that its members state is limited.
+So the size that its members state is limited. Options may ask for a model beyond all
+memory; building it fails, and so does :func:`restore`.
 """
 
 from __future__ import annotations
@@ -267,11 +268,19 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
             got=detail["msg"],
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
         ) from None
-    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        ArithmeticError,
+        MemoryError,
+        RuntimeError,
+    ) as error:
+        reason = str(error).split("\n")[0][:200]
         raise UnreadableFileError(
             "no model can be built from it",
             where=where,
-            got=f"{type(error).__name__}: {error}",
+            got=f"{type(error).__name__}: {reason}",
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()

@@ -109,7 +109,7 @@ def test_the_loss_is_equation_4_16() -> None:
     loss = sum(
         model.weights[name] * float(term.detach()) for name, term in terms.items()
     )
-    state = FrameState(INFO).of(torch.from_numpy(window))
+    state = FrameState(INFO).standardise(torch.from_numpy(window))
     predicted = model.next_state(model.start(batch_of([window[:2]])))[0]
     assert loss == pytest.approx(
         float((predicted - state[2]).square().mean().detach()), rel=1e-5
@@ -153,10 +153,10 @@ def test_noise_is_as_large_as_asked_and_only_in_training() -> None:
     """
     model = MLP.build({**SMALL, "noise_std": 0.3}, INFO)
     state = torch.zeros(500, 1, 12, 4)
-    noise = model.disturbed(state, torch.Generator().manual_seed(1))
+    noise = model.add_noise(state, torch.Generator().manual_seed(1))
     assert float(noise.std()) == pytest.approx(0.3, rel=0.02)
-    assert torch.equal(noise, model.disturbed(state, torch.Generator().manual_seed(1)))
-    assert torch.equal(model.disturbed(state, None), state)
+    assert torch.equal(noise, model.add_noise(state, torch.Generator().manual_seed(1)))
+    assert torch.equal(model.add_noise(state, None), state)
 
 
 GATED: dict[str, Any] = {"latent": 8, "decoder": [6]}
@@ -165,7 +165,7 @@ BOTH = pytest.mark.parametrize("kind", [LSTM, LSTMWithMLP])
 
 def window_of() -> FrameWindow:
     """Return the states of the first scenario's first two frames."""
-    state = FrameState(INFO).of(torch.from_numpy(SCENARIOS[0][:2]))
+    state = FrameState(INFO).standardise(torch.from_numpy(SCENARIOS[0][:2]))
     return FrameWindow(state[None], torch.zeros(1, 12, dtype=torch.int64))
 
 

@@ -93,7 +93,7 @@ def run(
     ) -> PredictionResult:
         root = options.pop("root", generated.root)
         here = read_dataset_info("curl-noise", "tiny", root=root, registry=unmeasured)
-        info = options.pop("facts", here)
+        info = options.pop("info", here)
         model = Drift.build({"start": start, **options.pop("model", {})}, info)
         stored = Checkpoint(
             baseline=baseline,

@@ -64,7 +64,7 @@ def test_clusters_turn_as_scipy_says() -> None:
     first = body(0, low=0.4, high=0.6)[:40]
     now = turn(first, 0.7) + torch.from_numpy(rng.normal(0.0, 0.01, (40, 2)))
     found = shape(first, cells=6)
-    weight = np.zeros((found.nodes, 40))
+    weight = np.zeros((found.node_count, 40))
     for particle, (nodes, shares) in enumerate(
         zip(found.stencil.node.view(-1, 9), found.stencil.weight, strict=True)
     ):

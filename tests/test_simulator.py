@@ -169,7 +169,7 @@ def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
     given = batch(swirl(0, 7))
     model = network()
     following = model.start(given.part(slice(1, 7)))
-    moved = model.start(given.part(slice(6))).moved(
+    moved = model.start(given.part(slice(6))).move(
         following.position, following.velocity[:, -1]
     )
     for field in fields(ParticleState):
@@ -202,7 +202,7 @@ def test_walls_move_per_frame() -> None:
     seen = []
     for _ in range(3):
         seen.append(float(state.wall_velocity[0, 0, 0, 0]))
-        state = state.moved(state.position, state.velocity[:, -1])
+        state = state.move(state.position, state.velocity[:, -1])
     assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 

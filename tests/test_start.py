@@ -301,16 +301,16 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
     ("baseline", "start", "kind"),
     [
         ("drift", {}, UsageError),  # of another baseline
-        ("any", {"facts": {"split": "fluid"}}, UsageError),
-        ("any", {"facts": {"dataset_sha256": "0" * 64}}, DataError),
-        ("any", {"facts": {"size": "mini", "version": "0.9.0"}}, DataError),
-        ("any", {"facts": {"size": "mini", "frame_interval": 9.0}}, UsageError),
+        ("any", {"info": {"split": "fluid"}}, UsageError),
+        ("any", {"info": {"dataset_sha256": "0" * 64}}, DataError),
+        ("any", {"info": {"size": "mini", "version": "0.9.0"}}, DataError),
+        ("any", {"info": {"size": "mini", "frame_interval": 9.0}}, UsageError),
         (
             "drift",
-            {"baseline": "drift", "facts": {"size": "mini"}},
+            {"baseline": "drift", "info": {"size": "mini"}},
             UsageError,
         ),  # for one size only
-        ("any", {"facts": {"statistics": {}}}, UnreadableFileError),
+        ("any", {"info": {"statistics": {}}}, UnreadableFileError),
         *(
             (
                 "any",
