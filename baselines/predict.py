@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 
 from lagbench.atomic import write_atomically
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.submission.provenance import StartWeights, TrainingProvenance
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.work.progress import Meter, Progress
 
@@ -29,7 +31,7 @@ from .baseline import Baseline, Facts, rescaled
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
-from .job import MOST_RECORD, RunFolder, changes_of, parameter_count
+from .job import MOST_RECORD, RunFolder, parameter_count, settings_of
 from .machine import (
     bound_memory,
     chosen_device,
@@ -40,6 +42,8 @@ from .machine import (
 from .recipe import changed_options
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 from .start import warn_of_last_state
+
+START_DIGITS = 12  # digits of a SHA-256 that provenance names
 
 SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
@@ -139,7 +143,7 @@ def predict(
             stacklevel=2,
         )
     home = resolve_root(root)
-    known = rooted(home, registry)
+    known = load_rooted_registry(home, registry)
     facts = check_data(
         found, root=home, registry=known, size=size, where=str(checkpoint)
     )
@@ -357,54 +361,60 @@ def _model(
         ) from error
 
 
-# before a recipe's name and before the settings of a prediction, in the words for a
-# training
-RECIPE = ", recipe "
-PREDICTED_WITH = ", predicted with "
+def provenance_of(checkpoint: Checkpoint) -> TrainingProvenance:
+    """Return the training behind weights.
 
-
-def training_words(checkpoint: Checkpoint) -> str:
-    """Return what weights were trained on, by which recipe with which changes, and how
-    long.
+    Raises:
+        UnreadableFileError: what the weights record of their training cannot be told.
     """
     facts = checkpoint.facts
-    done = checkpoint.training
-    recipe = done.get("recipe", {})
-    subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
-    words = f"{facts.split} {facts.size} {subsets}{RECIPE}{recipe.get('name')}, step {done.get('step', 0)}"
-    return words + "".join(f", {change}" for change in changes_of(recipe))
-
-
-def told_by_us(training: str) -> bool:
-    """Tell whether what predictions say of their training was written by
-    `training_words`.
-    """
-    return RECIPE in training
-
-
-def fits(training: str, checkpoint: Checkpoint) -> bool:
-    """Tell whether what predictions say of their training is what weights say; words of
-    others always fit.
-    """
-    said, _, _ = training.partition(PREDICTED_WITH)
-    return not told_by_us(said) or said == training_words(checkpoint)
+    recipe = checkpoint.training.get("recipe", {})
+    subsets = recipe.get("training", {}).get("windows", ("train",))
+    start = recipe.get("start")
+    try:
+        start_weights = None
+        if start:
+            start_weights = StartWeights(
+                recipe=start["recipe"], weights=start["sha256"][:START_DIGITS]
+            )
+        return TrainingProvenance(
+            split=facts.split,
+            size=facts.size,
+            subsets=tuple(subsets),
+            recipe=str(recipe.get("name")),
+            step=checkpoint.training.get("step", 0),
+            overrides=settings_of(recipe),
+            start=start_weights,
+        )
+    except (ValidationError, TypeError, KeyError) as error:
+        raise UnreadableFileError(
+            "the weights record a training that cannot be told",
+            where=f"{facts.split} {facts.size}",
+            expected="a recipe, subsets and a step, as `lagbench train` records them",
+            got=type(error).__name__,
+            fix="train the model with `lagbench train`",
+        ) from error
 
 
 def _provenance(
     checkpoint: Checkpoint, here: Facts, settings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return seed, training in words and its budget, for the file's attributes.
+    """Return seed, training as data and in words, and its budget, for the file's attributes.
 
     Validations at another size than the one predicted are left out: they compare with
     none there.
     """
     facts = checkpoint.facts
     done = checkpoint.training
-    words = training_words(checkpoint) + (
-        f"{PREDICTED_WITH}{', '.join(settings)}" if settings else ""
+    provenance = provenance_of(checkpoint).model_copy(
+        update={"prediction_overrides": tuple(settings)}
     )
     seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
-    found: dict[str, Any] = {"training": words, "seed": int(seed)}
+    found: dict[str, Any] = {
+        "training": provenance.describe(),
+        "provenance": provenance.to_json(),
+        "seed": int(seed),
+    }
     if budget := checkpoint.budget:
         unknown = {"metric": None, "best": None, "best_step": None, "validations": ()}
         if here.size == facts.size:

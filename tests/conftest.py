@@ -31,7 +31,8 @@ from lagbench.data.layout import dataset_folder
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.make import cards
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
@@ -44,7 +45,7 @@ from lagbench.scoring.score_file_checks import (
 )
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
-from lagbench.submission.format import Anatomy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
 from lagbench.work.progress import Meter
@@ -65,10 +66,18 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
-OUTCOMES = scored.score_scenarios
-DRAW = cards._draw
+SCORE_SCENARIOS = scored.score_scenarios
+PAINT = painting.paint_pictures
 Names = tuple[str, ...]
-READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
+READERS = (
+    "build",
+    "folder_checks",
+    "identity",
+    "publish",
+    "ranking",
+    "rescoring",
+    "seeds",
+)
 
 SPLIT = "curl-noise"
 SIZE = "tiny"
@@ -121,7 +130,7 @@ def lasting_workers() -> Iterator[None]:
         try:
             yield pool
         finally:
-            if pool._waiting or any(worker.attempt for worker in pool._workers):
+            if pool._queue or any(worker.attempt for worker in pool._workers):
                 held.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
@@ -154,7 +163,7 @@ def quick(home: Path) -> Iterator[None]:
         """Leave the pictures of cards blank: to draw them takes longer than to generate
         tiny data.
         """
-        for name in cards.PICTURES:
+        for name in PICTURES:
             path = dataset_folder(root, size.split, size.name, size.major) / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"")
@@ -163,7 +172,7 @@ def quick(home: Path) -> Iterator[None]:
         patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
         for module in ("scoring.score", "board.submit"):
             patch.setattr(f"lagbench.{module}.validate", validated)
-        patch.setattr(cards, "_draw", draw)
+        patch.setattr(painting, "paint_pictures", draw)
         # Commands are built from their signatures once, not at every call, which may
         # take less.
         patch.setattr("typer.testing._get_command", functools.cache(get_command))
@@ -177,10 +186,10 @@ def references_once() -> Iterator[None]:
     """
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
-    def outcomes(
+    def score_once(
         task: ScoredTask,
         path: Path,
-        anatomy: Anatomy,
+        info: FileInfo,
         *,
         metrics: Names,
         references: Names,
@@ -188,38 +197,39 @@ def references_once() -> Iterator[None]:
         scheduler: str | None,
         meter: Meter,
     ) -> list[ScenarioScores]:
-        options = {"workers": workers, "scheduler": scheduler, "meter": meter}
-        if not references or scheduler is not None or (workers or 1) > 1:
-            return OUTCOMES(
-                task, path, anatomy, metrics=metrics, references=references, **options
-            )
-        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        key = (
-            metrics,
-            references,
-            repr((task.size, task.config)),
-            *map(file_sha256, files),
-        )
-        found = OUTCOMES(
+        score_rows = functools.partial(
+            SCORE_SCENARIOS,
             task,
             path,
-            anatomy,
+            info,
             metrics=metrics,
-            references=() if key in known else references,
-            **options,
+            workers=workers,
+            scheduler=scheduler,
+            meter=meter,
         )
-        if key not in known:
+        if not references or scheduler is not None or (workers or 1) > 1:
+            return score_rows(references=references)
+
+        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
+        hashes = [file_sha256(file) for file in files]
+        key = (metrics, references, repr((task.size, task.config)), *hashes)
+        if key in known:
+            outcomes = score_rows(references=())
+        else:
+            outcomes = score_rows(references=references)
             known[key] = {
-                one.scenario: {name: one.tallies[name] for name in references}
-                for one in found
+                outcome.scenario: {name: outcome.tallies[name] for name in references}
+                for outcome in outcomes
             }
-        return [
-            replace(one, tallies={**one.tallies, **known[key][one.scenario]})
-            for one in found
-        ]
+
+        completed = []
+        for outcome in outcomes:
+            tallies = {**outcome.tallies, **known[key][outcome.scenario]}
+            completed.append(replace(outcome, tallies=tallies))
+        return completed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagbench.scoring.score.score_scenarios", outcomes)
+        patch.setattr("lagbench.scoring.score.score_scenarios", score_once)
         yield
 
 
@@ -268,8 +278,8 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
     for module in READERS:
         monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
-    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", OUTCOMES)
-    monkeypatch.setattr(cards, "_draw", DRAW)
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", SCORE_SCENARIOS)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
 
 
 @pytest.fixture(scope="session")

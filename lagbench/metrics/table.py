@@ -11,8 +11,8 @@ from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
 from lagbench.data.grid import Placement
-from lagbench.data.registry import Size, installed
-from lagbench.errors import LagbenchError, UsageError, loaded, nearest
+from lagbench.data.registry import Size, list_entry_points
+from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
@@ -90,7 +90,7 @@ def available() -> dict[str, Metric]:
             metric, or follow from statistics that no metric measures.
     """
     metrics = dict(METRICS)
-    for point in sorted(installed(GROUP), key=lambda point: point.name):
+    for point in sorted(list_entry_points(GROUP), key=lambda point: point.name):
         if point.value.startswith(f"{__package__}."):
             continue  # METRICS holds ours, whatever version of lagbench is installed
         for metric in _load(point):
@@ -122,7 +122,7 @@ def _load(point: EntryPoint) -> Sequence[Metric]:
     where = f"entry point {point.name} = {point.value}"
     metrics: tuple[object, ...]
     try:
-        value = loaded(point)
+        value = load_entry_point(point)
         if isinstance(value, Iterable):
             metrics = tuple(value)
         else:
@@ -182,6 +182,6 @@ def select(
     needed: set[str] = set()
     for name in names:
         if name not in table:
-            raise UsageError(f"no metric {name!r}", fix=nearest(name, table))
+            raise UsageError(f"no metric {name!r}", fix=suggest_name(name, table))
         needed.update((name, *table[name].of))
     return tuple(metric for name, metric in table.items() if name in needed)

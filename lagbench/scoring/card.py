@@ -22,8 +22,8 @@ from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
-from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
 from .skill import Skill
@@ -86,7 +86,7 @@ class ScoreCard:
     # counts has a score
     skill: Skill | None
     flags: tuple[Flag, ...]  # hints for the reader of a score
-    warnings: tuple[Finding, ...]  # of the validation; they do not reject
+    warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 

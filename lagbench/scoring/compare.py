@@ -23,7 +23,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     check_regular,
-    nearest,
+    suggest_name,
 )
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -303,7 +303,7 @@ def _no_reference(contestant: Contestant, first: str | Path, second: str) -> Usa
         )
     hint = ""
     if contestant.references:
-        hint = f"{nearest(second, contestant.references)}; or "
+        hint = f"{suggest_name(second, contestant.references)}; or "
     return UsageError(
         "neither a reference nor a file",
         got=ascii(second),
@@ -342,7 +342,7 @@ def _choose_metrics(metrics: Collection[str], judging: Sequence[str]) -> set[str
             raise UsageError(
                 f"no metric {name!r} to compare by",
                 where="--metric",
-                fix=nearest(name, judging),
+                fix=suggest_name(name, judging),
             )
     return set(metrics or judging)
 

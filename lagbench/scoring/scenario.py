@@ -27,8 +27,8 @@ from lagbench.references.predictor import (
     given_in,
 )
 from lagbench.references.table import REFERENCES
-from lagbench.store.copy import bring
-from lagbench.submission.format import Anatomy
+from lagbench.store.copy import update_working_copy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.predictions import Predictions, open_predictions
 from lagbench.work.pool import Report
 
@@ -122,7 +122,7 @@ class ScenarioJob:
     task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
-    anatomy: Anatomy  # content of its headers
+    info: FileInfo  # content of its headers
     metrics: tuple[str, ...]  # names of the metrics
     references: tuple[str, ...] = ()  # names of the references to measure beside it
     has_preview: bool = False  # whether to take the preview
@@ -150,7 +150,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     try:
         with (
             job.task.opened(number) as truth,
-            open_predictions(job.predictions, checked=job.anatomy) as predictions,
+            open_predictions(job.predictions, info=job.info) as predictions,
         ):
             scenario = truth.scenario
             frames = _predicted_frames(predictions, number)
@@ -192,7 +192,7 @@ def _predicted_frames(
 def predict_reference(reference: ReferencePredictor, given: Given) -> Prediction:
     """Return the prediction of a reference; train is fetched if it is read."""
     if reference.reads_train:
-        bring(given.size, given.root, given.size.subsets["train"])
+        update_working_copy(given.size, given.root, given.size.subsets["train"])
     return reference.predict(given)
 
 

@@ -18,7 +18,7 @@ from lagbench.errors import LagbenchError
 from lagbench.metrics.coverage import Cloud, covered_nodes, fitting_cells
 from lagbench.metrics.metric import MINIMUM_NODES
 from lagbench.metrics.table import ranking_metric
-from lagbench.submission.findings import Finding, Severity
+from lagbench.submission.issues import Severity, ValidationIssue
 
 from .task import ScoredTask, load_scored_task
 
@@ -26,7 +26,7 @@ OF_NODES = "vorticity_nrmse"
 """The ranking metric that needs nodes."""
 
 
-def few_nodes_warning(task: ScoredTask, scenarios: Collection[int]) -> Finding:
+def few_nodes_warning(task: ScoredTask, scenarios: Collection[int]) -> ValidationIssue:
     """Return the warning for scenarios whose vorticity has no value in any frame.
 
     It names the nodes that they cover, and a grid of which all scenarios cover enough.
@@ -42,7 +42,7 @@ def few_nodes_warning(task: ScoredTask, scenarios: Collection[int]) -> Finding:
     nodes = str(least)
     if most > least:
         nodes = f"{least} to {most}"
-    return Finding(
+    return ValidationIssue(
         check="undefined",
         severity=Severity.WARNING,
         what="the vorticity has no value in any frame",

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import shipped
 from lagbench.references.table import COUNTING
-from lagbench.submission.findings import Finding, ValidationResult
-from lagbench.submission.format import Anatomy, Header
+from lagbench.submission.format import FileInfo, Header
+from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.machine import available_cores
@@ -90,7 +90,7 @@ def score(
     metrics = _select_metrics(extras)
     path = Path(predictions).absolute()
     data_root = resolve_root(root)
-    splits = rooted(data_root, registry)
+    splits = load_rooted_registry(data_root, registry)
     folder = scores_folder(Path(predictions))
     if output_dir is not None:
         folder = Path(output_dir)
@@ -112,7 +112,7 @@ def score(
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header = opened.header
-        anatomy = opened.anatomy
+        info = opened.info
         sha256 = result.sha256 or opened.content_sha256()
     if write:
         _check_overwriting(folder / JSON_NAME, header)
@@ -129,7 +129,7 @@ def score(
     outcomes = score_scenarios(
         task,
         path,
-        anatomy,
+        info,
         metrics=tuple(metric.name for metric in metrics),
         references=references,
         workers=workers,
@@ -205,7 +205,7 @@ def _check_overwriting(path: Path, header: Header) -> None:
 
 def _warn_of_few_nodes(
     task: ScoredTask, tallies: Mapping[int, Tally]
-) -> Iterator[Finding]:
+) -> Iterator[ValidationIssue]:
     """Warn of scenarios whose vorticity has too few nodes in every frame.
 
     Where it ranks, of any such scenario; else only if all scenarios are such.
@@ -246,7 +246,7 @@ def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
             raise UsageError(
                 f"no extra {extra!r} with metrics",
                 where="--extras",
-                fix=nearest(extra, known),
+                fix=suggest_name(extra, known),
             )
     return select(extras=extras)
 
@@ -254,7 +254,7 @@ def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
 def score_scenarios(
     task: ScoredTask,
     path: Path,
-    anatomy: Anatomy,
+    info: FileInfo,
     *,
     metrics: tuple[str, ...],
     references: tuple[str, ...],
@@ -267,7 +267,7 @@ def score_scenarios(
     Args:
         task: the test subset.
         path: a predictions.nc that has been validated.
-        anatomy: content of its headers.
+        info: content of its headers.
         metrics: names of the metrics.
         references: names of the references to measure beside it.
         workers: worker processes; None: one per core where the work is worth it.
@@ -281,7 +281,7 @@ def score_scenarios(
             task=task,
             scenario=scenario,
             predictions=path,
-            anatomy=anatomy,
+            info=info,
             metrics=metrics,
             references=references,
             has_preview=scenario == scenarios[0],

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import Size
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
-from lagbench.work.machine import in_child
+from lagbench.work.machine import run_in_child
 
 from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .published_scores import PublishedScores, unreadable_scores
@@ -93,11 +94,11 @@ def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
         fix="`lagbench submit` writes it beside the entry",
     )
     try:
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             check_structure(file, path, STRUCTURE)
         scores = read_statistics(path)
         _check_statistics(scores)
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             preview, precision = _read_preview(file[GROUP])
         _check_shapes(preview)
         if size is not None:
@@ -246,7 +247,9 @@ def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
         if stops == MOST_STOPS or wall <= 0.0:
             return reasons | dict.fromkeys(pending, UNREAD)
         names = [str(path) for path in pending]
-        answers, stopped = in_child(READ, names, seconds=CPU_SECONDS * parts, wall=wall)
+        answers, stopped = run_in_child(
+            READ, names, seconds=CPU_SECONDS * parts, wall=wall
+        )
 
         for path, reason in zip(pending, answers, strict=False):
             if reason is not None:
