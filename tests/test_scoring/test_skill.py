@@ -331,15 +331,18 @@ def test_scoring_takes_what_is_shipped(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With shipped scores nothing but the submission is measured, and the card says the
-    same.
+    """With shipped scores nothing but the submission is measured, and the card is equal.
+
+    Without them only the references that count are measured.
     """
+    names = measurable(bench.size, bench.root)
+    counting = {name: measured_references[name] for name in names}
     path = bench.submit(tmp_path / "predictions.nc", straight)
     measured = bench.evaluate(path)
-    monkeypatch.setattr(scoring, "shipped", lambda size: measured_references)
+    monkeypatch.setattr(scoring, "shipped", lambda size: counting)
     card = bench.evaluate(path)
     assert list(card.tallies) == [SUBMISSION]
-    assert set(measured.tallies) == {SUBMISSION, *measurable(bench.size, bench.root)}
+    assert set(measured.tallies) == {SUBMISSION, *names}
     assert card.as_json() == measured.as_json()
 
 
