@@ -131,6 +131,8 @@ class Task(_Strict):
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
+    # kinematic viscosity that models are told where scenarios state none [length^2/s]
+    effective_viscosity: float | None = Field(None, gt=0, allow_inf_nan=False)
 
 
 class Measured(_Strict):

@@ -88,14 +88,21 @@ class Subject:
                 name=entry.name, kind=entry.kind, scores=scores, entry=entry
             )
             rows.append(row)
-        reference_scores = {
-            name: scores
-            for name, scores in self.entries[0].card.scores.items()
-            if name != SUBMISSION
-        }
+        reference_scores = dict(self.entries[0].card.scores)
+        del reference_scores[SUBMISSION]
         for number, (name, scores) in enumerate(reference_scores.items()):
-            rows.append(ReportRow(name=name, kind=f"floor{number}", scores=scores))
+            kind = f"floor{number}"
+            rows.append(ReportRow(name=name, kind=kind, scores=scores))
         return tuple(rows)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the entries."""
+        return [entry.name for entry in self.entries]
+
+    def rows_with(self, metric: str) -> list[ReportRow]:
+        """Return the rows that have a score of a metric."""
+        return [row for row in self.rows if metric in row.scores]
 
     @property
     def ranking(self) -> Metric:
@@ -108,8 +115,12 @@ class Subject:
         """The entry with the least loss in the ranking metric, the first of equals."""
         metric = self.ranking
         rows = self.rows[: len(self.entries)]
-        losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
-        return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+        losses = []
+        for row in rows:
+            score = row.scores[metric.name]
+            losses.append(metric.loss(score.mean))
+        finite_losses = np.nan_to_num(losses, nan=np.inf)
+        return rows[int(np.argmin(finite_losses))]
 
     @property
     def is_full_box(self) -> bool:
@@ -130,9 +141,12 @@ class Subject:
     def key_frame(self) -> int:
         """The frame of interest nearest to the one at which the thesis compares."""
         target = THESIS_FRAMES.get(self.task.size.split, OTHER_FRAME)
-        return min(
-            self.frames_of_interest, key=lambda frame: (abs(frame - target), frame)
-        )
+
+        def distance(frame: int) -> int:
+            return abs(frame - target)
+
+        # the earlier of two that are as near
+        return min(self.frames_of_interest, key=distance)
 
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
@@ -147,7 +161,8 @@ class Subject:
 
         They are those of interest except the key frame, or evenly spaced.
         """
-        frames = [frame for frame in self.frames_of_interest if frame != self.key_frame]
+        frames = list(self.frames_of_interest)
+        frames.remove(self.key_frame)
         if len(frames) >= TIMES:
             return tuple(frames[:TIMES])
         return self.times
@@ -248,7 +263,10 @@ class ScenarioLabel:
     @property
     def classes(self) -> str:
         """Classes of a panel, which tell the walls that move."""
-        return " ".join(["panel", *(f"{wall}-moves" for wall in self.moving)])
+        classes = "panel"
+        for wall in self.moving:
+            classes += f" {wall}-moves"
+        return classes
 
     @property
     def details(self) -> list[str]:
@@ -268,6 +286,11 @@ class Moment:
     scenario: int  # id of the scenario
     frame: int  # absolute frame number
     pairs: tuple[FramePair, ...]  # truth and prediction of each entry, in their order
+
+    @property
+    def title(self) -> str:
+        """The frame as a heading."""
+        return f"frame {self.frame}"
 
     @property
     def truth(self) -> Snapshot:
@@ -356,9 +379,14 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
     if "wall_velocity" in file.variables:
         wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
         largest = np.abs(wall_velocity).max(axis=0) * _ALONG  # shape [wall, 2]
-        moving = [wall for wall, v in zip(WALLS, largest, strict=True) if v.any()]
+        for wall, velocity in zip(WALLS, largest, strict=True):
+            if velocity.any():
+                moving.append(wall)
 
-    marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
+    marks = []
+    for name in ("family", "pair"):
+        if name in parameters:
+            marks.append(str(parameters[name]))
     if "frequency" in parameters:
         marks.append(f"frequency {parameters['frequency']}")
     reynolds = None
@@ -370,7 +398,8 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
 
 def limit_of(fields: Sequence[Floats]) -> float:
     """Return the magnitude of full colour: almost all nodes stay below it."""
-    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
+    values = np.concatenate([field.ravel() for field in fields])
+    values = np.abs(values[np.isfinite(values)])
     if values.size == 0:
         return 1.0
     top = float(np.percentile(values, TOP_PERCENTILE))
