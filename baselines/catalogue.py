@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning, installed
-from lagbench.errors import LagbenchError, UsageError, loaded, nearest
+from lagbench.data.registry import PluginWarning, list_entry_points
+from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
 
 from .baseline import Baseline
 
@@ -52,7 +52,7 @@ def find(name: str) -> Entry:
     points = _points()
     if name not in points:
         raise UsageError(
-            f"no baseline {name!r}", where="--baseline", fix=nearest(name, points)
+            f"no baseline {name!r}", where="--baseline", fix=suggest_name(name, points)
         )
     try:
         return _entry(points[name])
@@ -85,7 +85,8 @@ def _points() -> dict[str, EntryPoint]:
     """Return the entry points by name; ours are not to be replaced."""
     found: dict[str, EntryPoint] = {}
     for point in sorted(
-        installed(GROUP), key=lambda point: not point.value.startswith(f"{GROUP}.")
+        list_entry_points(GROUP),
+        key=lambda point: not point.value.startswith(f"{GROUP}."),
     ):
         reason = "a name has small letters, digits and single hyphens"
         if NAME.fullmatch(point.name):
@@ -102,7 +103,7 @@ def _points() -> dict[str, EntryPoint]:
 
 
 def _entry(point: EntryPoint) -> Entry:
-    found = loaded(point)
+    found = load_entry_point(point)
     if not inspect.isclass(found):
         raise UsageError(
             f"{point.value} is no class", expected="a subclass of Baseline or Operator"

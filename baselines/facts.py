@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from lagbench.data.layout import dataset_folder
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.store.copy import bring
+from lagbench.store.copy import update_working_copy
 
 from .baseline import Facts
 
@@ -27,9 +27,9 @@ def facts_of(
     folder = dataset_folder(home, tier.split, tier.name, tier.major)
 
     def absent(what: str) -> DataError:
-        return DataError(what, where=str(folder), fix=remedy(tier, root=home))
+        return DataError(what, where=str(folder), fix=suggest_repair(tier, root=home))
 
-    bring(tier, home)
+    update_working_copy(tier, home)
     manifest = read_manifest(home, tier.split, tier.name, tier.major)
     if manifest is None:
         raise absent("the data set is not generated")
@@ -44,7 +44,7 @@ def facts_of(
         raise absent("the data set is empty")
     if not statistics:
         raise absent("the subset train is not complete, its statistics are unknown")
-    bring(tier, home, [manifest.files[0].scenario])
+    update_working_copy(tier, home, [manifest.files[0].scenario])
     with read_scenario(folder / manifest.files[0].path) as file:
         moving_walls = "wall_velocity" in file.variables
     return Facts(

@@ -28,7 +28,7 @@ from torch.optim import AdamW, Optimizer
 from torch.utils.data import DataLoader
 
 from lagbench.errors import UsageError, WorkFailedError
-from lagbench.tensors import Window
+from lagbench.tensors import TensorWindow
 
 from .baseline import Baseline, Batch
 from .checkpoint import load, rounded_weights, save
@@ -49,7 +49,7 @@ class TrainingModule(LightningModule):
         model: Baseline,
         options: TrainingOptions,
         *,
-        loader: Callable[[int, int], DataLoader[Window]],
+        loader: Callable[[int, int], DataLoader[TensorWindow]],
         steps: int,
         processes: int = 1,
         step: int = 0,
@@ -75,7 +75,7 @@ class TrainingModule(LightningModule):
             self.step, steps=self.steps, warmup=self.recipe.warmup_steps
         )
 
-    def train_dataloader(self) -> DataLoader[Window]:
+    def train_dataloader(self) -> DataLoader[TensorWindow]:
         """Return the batches of this process, from the next step on."""
         return self._loader(self.global_rank, self.trainer.world_size)
 

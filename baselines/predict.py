@@ -19,7 +19,7 @@ import torch
 from pydantic import ValidationError
 
 from lagbench.atomic import write_atomically
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.provenance import StartWeights, TrainingProvenance
@@ -143,7 +143,7 @@ def predict(
             stacklevel=2,
         )
     home = resolve_root(root)
-    known = rooted(home, registry)
+    known = load_rooted_registry(home, registry)
     facts = check_data(
         found, root=home, registry=known, size=size, where=str(checkpoint)
     )

@@ -30,7 +30,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
 from .baseline import Settings
 from .catalogue import Entry, names
@@ -296,7 +296,7 @@ def recipe_for(
     if part is None and (file.recipes or (variant and not own_file)):
         same_split = [other for other in file.recipes if other.split("/")[0] == split]
         if file.recipes:
-            fix = f"{nearest(name, same_split or file.recipes)}; or "
+            fix = f"{suggest_name(name, same_split or file.recipes)}; or "
         else:
             fix = "leave --recipe out; or "
         if variant and not own_file:
@@ -311,7 +311,7 @@ def recipe_for(
                 if other.startswith(f"{size}-")
             ]
             if variants:
-                fix = f"{nearest(variant, variants)}; or "
+                fix = f"{suggest_name(variant, variants)}; or "
             else:
                 fix = "" if size in parts else fix
             held = [
@@ -334,7 +334,9 @@ def recipe_for(
         if other not in names():
             where = f"{path}, {name}, baselines"
             raise UnreadableFileError(
-                f"unknown baseline {other!r}", where=where, fix=nearest(other, names())
+                f"unknown baseline {other!r}",
+                where=where,
+                fix=suggest_name(other, names()),
             )
     layers: Layer = {"model": file.model, "training": file.training}
     own = part.baselines.get(entry.name, _Part())
@@ -432,7 +434,7 @@ def _setting(text: str) -> Layer:
             where="--set",
             expected="model.KEY=VALUE or training.KEY=VALUE",
             got=text,
-            fix=nearest(group, ("model", "training")) if equals and path else None,
+            fix=suggest_name(group, ("model", "training")) if equals and path else None,
         )
     try:
         layer: Any = yaml.safe_load(value)
@@ -474,7 +476,7 @@ def _checked(
                 holder = inner
             elif step == "recipes" or holder is _File:
                 holder = _Shared
-        fix = nearest(str(first["loc"][-1]), list(holder.model_fields))
+        fix = suggest_name(str(first["loc"][-1]), list(holder.model_fields))
         raise kind(f"unknown key {key!r}", where=where, fix=fix)
     expected = first["msg"].removeprefix("Value error, ")
     if first["type"] == "tuple_type":

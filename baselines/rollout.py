@@ -29,9 +29,9 @@ from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, ranking_metric, select
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
-from lagbench.store.windows import window_of
+from lagbench.store.windows import copy_window
 from lagbench.submission.checks import MAX_DISTANCE
-from lagbench.tensors import Window, collate
+from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import tensors
 
 from .baseline import Baseline, Batch, Facts
@@ -169,7 +169,7 @@ def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) ->
     """Return the same frames of one or several whole scenarios, read without a
     cache.
     """
-    windows: list[Window] = []
+    windows: list[TensorWindow] = []
     for path in [paths] if isinstance(paths, Path) else paths:
         with read_scenario(path) as file:
             numbers = range(file.header.frames)[frames]
@@ -196,7 +196,9 @@ def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) ->
             scenario = file.header.key.scenario
             windows.append(
                 tensors(
-                    window_of(list(position), material, walls, scenario, numbers.start)
+                    copy_window(
+                        list(position), material, walls, scenario, numbers.start
+                    )
                 )
             )
     return collate(windows)

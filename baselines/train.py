@@ -26,7 +26,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
-from lagbench.tensors import Window, collate
+from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
@@ -321,7 +321,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         check_compiler(job.device)
         model.compile_layers()
 
-    def loader(rank: int, ranks: int) -> DataLoader[Window]:
+    def loader(rank: int, ranks: int) -> DataLoader[TensorWindow]:
         sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
         batches = StepBatches(sampler, options, first=ledger.step, last=steps)
         return DataLoader(

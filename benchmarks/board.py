@@ -112,7 +112,7 @@ def _measured(target: Path, entries: int) -> int:
 
 
 def make_entry(size: Size, target: Path, number: int) -> None:
-    """Write a made-up entry, its score files, and the floors beside it."""
+    """Write a made-up entry, its score files and the references beside it."""
     rng = np.random.Generator(np.random.PCG64(number))
     place = (size.split, size.name, f"model-{number}")
     seeds: list[int | None] = [None] if number % 5 else list(range(SEEDS))
@@ -231,7 +231,10 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     )
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
     scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
-    floors = {row: held[ranking] for row, held in scores.items() if row in COUNTING}
+    naive_scores = {}
+    for row, row_scores in scores.items():
+        if row in COUNTING:
+            naive_scores[row] = row_scores[ranking]
     return ScoreCard(
         header=header,
         predictions_sha256=f"{seed:064x}",
@@ -248,7 +251,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         ranking=ranking,
         tallies=tallies,
         scores=scores,
-        skill=skill([scores[SUBMISSION][ranking]], floors),
+        skill=skill([scores[SUBMISSION][ranking]], naive_scores),
         flags=(),
         warnings=(),
         preview=_preview(size, grid.nodes, rng),

@@ -50,7 +50,11 @@ own, children = (after - then for after, then in zip(used(), before))
 count = len(registry.size("cavity", "full").subsets["test"])
 peak = int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
 peak = max(peak, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
-print(json.dumps({"cpu": (own + children) / count, "children": children / count, "memory": 1024 * peak}))
+print(json.dumps({
+    "cpu": (own + children) / count,
+    "children": children / count,
+    "memory": 1024 * peak,
+}))
 """
 
 

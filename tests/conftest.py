@@ -31,7 +31,8 @@ from lagbench.data.layout import dataset_folder
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.make import cards
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
@@ -61,7 +62,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
 OUTCOMES = scored._outcomes
-DRAW = cards._draw
+PAINT = painting.paint_pictures
 Names = tuple[str, ...]
 READERS = (
     "build",
@@ -124,7 +125,7 @@ def lasting_workers() -> Iterator[None]:
         try:
             yield pool
         finally:
-            if pool._waiting or any(worker.attempt for worker in pool._workers):
+            if pool._queue or any(worker.attempt for worker in pool._workers):
                 held.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
@@ -157,7 +158,7 @@ def quick(home: Path) -> Iterator[None]:
         """Leave the pictures of cards blank: to draw them takes longer than to generate
         tiny data.
         """
-        for name in cards.PICTURES:
+        for name in PICTURES:
             path = dataset_folder(root, size.split, size.name, size.major) / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"")
@@ -166,7 +167,7 @@ def quick(home: Path) -> Iterator[None]:
         patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
         for module in ("scoring.score", "board.submit"):
             patch.setattr(f"lagbench.{module}.validate", validated)
-        patch.setattr(cards, "_draw", draw)
+        patch.setattr(painting, "paint_pictures", draw)
         # Commands are built from their signatures once, not at every call, which may
         # take less.
         patch.setattr("typer.testing._get_command", functools.cache(get_command))
@@ -257,7 +258,7 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in READERS:
         monkeypatch.setattr(f"lagbench.board.{module}.read_stored", read_stored)
     monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
-    monkeypatch.setattr(cards, "_draw", DRAW)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
 
 
 @pytest.fixture(scope="session")

@@ -15,7 +15,7 @@ from scenario_factory import frames_of, make_key, write_scenario
 
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.registry import Registry, default_path, load
-from lagbench.data.yamlfile import read_yaml, spell_yaml
+from lagbench.data.yamlfile import format_yaml, read_yaml
 from lagbench.submission import ValidationResult, validate, write
 
 TESTS = (3, 4, 5)
@@ -138,4 +138,4 @@ def _registry(hashes: dict[int, str]) -> str:
         "twin_floor": [],
     }
     file["measured"] = {"cavity": {"tiny": measured}}
-    return spell_yaml(file)
+    return format_yaml(file)

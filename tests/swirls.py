@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import registry
-from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.writer import ScenarioWriter
 
 OMEGA = 0.05
 """Angular velocity [1/frame]."""

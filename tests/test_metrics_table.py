@@ -374,7 +374,7 @@ ROOTLESS = (replace(OTHERS, statistic=None, of=("velocity_mse", "nothing_known")
 def with_entry_point(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
     """Pretend that another package registers an object."""
     point = EntryPoint(name="others", value=value, group=table_module.GROUP)
-    monkeypatch.setattr(table_module, "installed", lambda group: [point])
+    monkeypatch.setattr(table_module, "list_entry_points", lambda group: [point])
 
 
 def test_our_metrics_are_registered_as_those_of_others_are(

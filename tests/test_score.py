@@ -12,7 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from full_disk import largest_file
+from file_size_limit import largest_file
 from score_bench import ScoreBench, half_right, right, still, straight
 
 from lagbench.errors import ChecksFailedError, DataError, UsageError, WorkFailedError

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
-from full_disk import largest_file
+from file_size_limit import largest_file
 from score_bench import ScoreBench, straight
 
 from lagbench.errors import UnreadableFileError, WorkFailedError

@@ -12,7 +12,7 @@ from submission_data import Bench, small
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
 from lagbench.submission.findings import quoted
-from lagbench.work.machine import in_child
+from lagbench.work.machine import run_in_child
 
 ROOM = {"seconds": 5.0, "wall": 600.0}
 
@@ -64,7 +64,7 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
     """Two answers, then it ends; the last request is never reached."""
-    values, stopped = in_child(
+    values, stopped = run_in_child(
         "jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0
     )
     assert values == ["", ""]
@@ -79,12 +79,14 @@ def test_a_child_that_answers_waits_or_raises() -> None:
     code 5 with its last line.
     """
     asked = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
-    assert in_child("jobs.behave", asked, **ROOM) == (asked, None)
-    values, stopped = in_child("jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0)
+    assert run_in_child("jobs.behave", asked, **ROOM) == (asked, None)
+    values, stopped = run_in_child(
+        "jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0
+    )
     assert values in ([], [""])  # on a busy machine it may not even have begun
     assert stopped == "no end after 4 s"
     with pytest.raises(WorkFailedError) as caught:
-        in_child("jobs.behave", ["raise"], **ROOM)
+        run_in_child("jobs.behave", ["raise"], **ROOM)
     assert "ValueError: a bug" in str(caught.value.got)
 
 
@@ -96,7 +98,7 @@ def test_what_stops_the_child_is_a_finding(
     A terabyte that takes no room is not granted a day; waiting is granted far more than
     computing.
     """
-    monkeypatch.setattr(validation, "in_child", lambda *_, **__: ([], "a reason"))
+    monkeypatch.setattr(validation, "run_in_child", lambda *_, **__: ([], "a reason"))
     result = bench.validate(bench.valid, isolated=True)
     assert result.errors[0].got == "a reason"
     assert (result.errors[0].check, result.exit_code, result.passed) == (

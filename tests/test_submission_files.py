@@ -18,7 +18,7 @@ import torch
 import xarray as xr
 from bad_submissions import FAULTS
 from faulty import DIMS, positions, rows, store
-from full_disk import largest_file
+from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from full_disk import largest_file
+from file_size_limit import largest_file
 from scipy.special import comb
 from simple_models import FACTS, Drift, trainer
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lagbench.errors import ChecksFailedError, Mistakes, UsageError
+from lagbench.errors import ChecksFailedError, ErrorCollector, UsageError
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
 from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import Header
@@ -74,12 +74,12 @@ def draft_entry(
     rivals: dict[Path, Entry] = {}
     extended = None
 
-    mistakes = Mistakes()
-    with mistakes:
+    errors = ErrorCollector()
+    with errors:
         seeds = seeds_of(headers)
-    with mistakes:
+    with errors:
         urls = _urls_of(meta, len(files))
-    with mistakes:
+    with errors:
         place = _place_of(headers[0], meta)
         rivals = read_rivals(folder, place)
         if add:
@@ -88,11 +88,11 @@ def draft_entry(
             _require_free(folder, place)
         _require_distinct_name(_name_of(headers[0], meta, extended), rivals)
         read_verified(folder)  # publishing may have to write it
-    with mistakes:
+    with errors:
         about = _describe(headers, meta, extended)
-    with mistakes:
+    with errors:
         weight_paths = require_weights(weights, headers, rivals)
-    mistakes.tell()
+    errors.raise_errors()
 
     hashes = [file.sha256 for file in files]
     paths = [file.path for file in files]

@@ -17,8 +17,13 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from lagbench.data.checksums import file_sha256
-from lagbench.data.yamlfile import read_yaml, spell_yaml
-from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
+from lagbench.data.yamlfile import format_yaml, read_yaml
+from lagbench.errors import (
+    ChecksFailedError,
+    UnreadableFileError,
+    UsageError,
+    suggest_name,
+)
 from lagbench.submission.findings import quoted
 
 from .entry import Entry, Meta, Status
@@ -174,7 +179,7 @@ def entry_bytes(entry: Entry) -> bytes:
 
 def yaml_bytes(value: object) -> bytes:
     """Return plain values as the bytes of a YAML file."""
-    return spell_yaml(_to_plain(value), default_flow_style=None).encode()
+    return format_yaml(_to_plain(value), default_flow_style=None).encode()
 
 
 def _to_plain(value: object) -> object:
@@ -195,7 +200,7 @@ def _issue_from(kind: type[BaseModel], item: ErrorDetails) -> SchemaIssue:
 
     if item["type"] == "extra_forbidden":
         owner = _model_at(kind, location[:-1])
-        fix = nearest(str(location[-1])[:100], list(owner.model_fields))
+        fix = suggest_name(str(location[-1])[:100], list(owner.model_fields))
         return SchemaIssue(where=where, what="unknown key", got=got, fix=fix)
     if item["type"] == "missing":
         return SchemaIssue(where=where, what="this key is missing", got="no such key")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
 from lagbench.scoring.card import digits
 
@@ -35,7 +35,7 @@ def choose_data_sets(
     wanted = " ".join(name for name in (split, size) if name)
     fix: str | None = "submit something: lagbench submit"
     if known:
-        fix = nearest(wanted, [" ".join(data_set) for data_set in known])
+        fix = suggest_name(wanted, [" ".join(data_set) for data_set in known])
     raise UsageError("no entries there", where=f"leaderboard {wanted}", fix=fix)
 
 
@@ -57,7 +57,7 @@ def tables(
             raise UsageError(
                 f"no metric {name!r} here",
                 where="--metric",
-                fix=nearest(name, board.metrics),
+                fix=suggest_name(name, board.metrics),
             )
     for tab in board.tabs:
         names = _columns_of(tab, metrics, wide=wide)

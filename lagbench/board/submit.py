@@ -12,7 +12,7 @@ from pathlib import Path
 
 from lagbench.data.hdf5 import check_file
 from lagbench.data.registry import Registry, load
-from lagbench.errors import Mistakes, UsageError, WorkFailedError
+from lagbench.errors import ErrorCollector, UsageError, WorkFailedError
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.submission.checks import outside_share
@@ -143,8 +143,8 @@ def _require_fit_arguments(
     new_board: bool,
 ) -> None:
     """Refuse together all that is wrong before any file is read."""
-    mistakes = Mistakes()
-    with mistakes:
+    errors = ErrorCollector()
+    with errors:
         if add and replace:
             raise UsageError(
                 "an entry is added to or replaced",
@@ -153,7 +153,7 @@ def _require_fit_arguments(
             )
         if not add:
             _require_keys(meta)
-    with mistakes:
+    with errors:
         if new_board:
             folder.require_room()
         else:
@@ -161,9 +161,9 @@ def _require_fit_arguments(
                 "run it from the root of a clone, name it with --board, or begin one: "
                 "--new-board"
             )
-    with mistakes:
+    with errors:
         _require_files(paths)
-    mistakes.tell()
+    errors.raise_errors()
 
 
 def _require_keys(meta: Meta) -> None:

@@ -97,7 +97,7 @@ def download(
     quiet: QuietFlag = False,
 ) -> None:
     """Fetch a split from a store and check its content; simulate what no store has."""
-    from lagbench.data.registry import spell_ids
+    from lagbench.data.registry import format_ids
     from lagbench.exchange.downloading import download as run
 
     with progress_bar(quiet=quiet) as draw:
@@ -123,7 +123,7 @@ def download(
     if result.downloaded:
         words.append(
             f"  mirror  {result.mirror}: scenarios "
-            f"{spell_ids(sorted(result.downloaded))}"
+            f"{format_ids(sorted(result.downloaded))}"
         )
     if result.dataset_sha256:
         words.append(f"  hash    {result.dataset_sha256}")

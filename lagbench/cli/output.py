@@ -204,9 +204,9 @@ def progress_bar(
     leaves none. ``counted`` is what the work is counted in.
     """
     if quiet:
-        from lagbench.store.copy import quietly
+        from lagbench.store.copy import silence_fetching
 
-        with quietly():
+        with silence_fetching():
             yield None
         return
     if not watched():

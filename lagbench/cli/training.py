@@ -193,10 +193,10 @@ def _told_once() -> Iterator[None]:
 
 def _where(split: str, root: Path | None) -> str:
     """Return the option that tells the next command where the data are."""
-    from lagbench.data.local import home
+    from lagbench.data.local import locate_split
     from lagbench.data.registry import NO_GENERATOR
 
-    found = home(split, root=root)
+    found = locate_split(split, root=root)
     local = found.registry.split(found.name).generator == NO_GENERATOR
     if root or local:
         return f" --root {root or found.root}"

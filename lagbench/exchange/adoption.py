@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
-from lagbench.data.hdf5 import Structure, check_structure, opened, reading
+from lagbench.data.hdf5 import hdf5_errors, open_hdf5
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
@@ -256,11 +257,11 @@ def _h5_trajectories(
     """Yield a file's trajectories; a ``force.py`` beside it, which LagrangeBench would
     run, is left alone.
     """
-    with opened(path) as file:
+    with open_hdf5(path) as file:
         # A stranger's file shall read none of ours, and hold no more than it shows.
         check_structure(file, path, Structure(members=MOST_TRAJECTORIES, groups=None))
         for key in sorted(file):
-            with reading(path):
+            with hdf5_errors(path):
                 found = _h5_trajectory(
                     path, file[key], f"{path}, group {key!r}", kinds, stated
                 )
@@ -292,7 +293,7 @@ def _h5_trajectory(
     def read() -> Iterator[Frame]:
         before: NDArray[np.floating] | None = None
         for number in range(shape[0]):
-            with reading(path, f"{position.name}, frame {number}"):
+            with hdf5_errors(path, f"{position.name}, frame {number}"):
                 frame = position[number]
             if origin.any():
                 place = frame[kept] + origin

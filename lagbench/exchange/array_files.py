@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import MAX_ID
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .mistakes import check_meaning
@@ -245,7 +246,7 @@ def _netcdf(path: Path) -> dict[str, Any]:
     with path.open("rb") as stream:
         classic = stream.read(len(CLASSIC)) == CLASSIC
     if not classic:  # netCDF would follow links and read other files
-        with opened(path) as held:
+        with open_hdf5(path) as held:
             check_structure(held, path, NETCDF)
     file = netCDF4.Dataset(path, "r")
     file.set_auto_maskandscale(False)

@@ -16,23 +16,32 @@ from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
-    merged,
-    note_entries,
+    merge_entries,
     read_manifest,
     read_or_empty,
+    record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.make.cards import write_cards
 from lagbench.make.generate import generate
-from lagbench.make.inventory import State, compare, examine
+from lagbench.make.inventory import (
+    DataSetState,
+    compare_hashes,
+    inspect_scenario,
+)
 from lagbench.make.plan import Scenarios, Selection, check_disk, select
-from lagbench.store.archive import RELEASES, RELEASES_VARIABLE, fetch_archive, releases
-from lagbench.store.copy import address_of, parse_manifest, refuse_strangers
-from lagbench.store.fetch import CONNECTIONS, Wanted, fetch_scenarios, fetch_text
+from lagbench.store.archive import (
+    RELEASES,
+    RELEASES_VARIABLE,
+    fetch_archive,
+    list_releases,
+)
+from lagbench.store.copy import object_address, parse_manifest, refuse_foreign_hashes
+from lagbench.store.fetch import CONNECTIONS, FetchRequest, fetch_scenarios, fetch_text
 from lagbench.store.objects import NotInStoreError, StoreUnreachableError
-from lagbench.store.publication import publication
+from lagbench.store.publication import publish
 from lagbench.work.progress import Meter, Progress
 
 REMEDY = "try again; if it stays so, name another store: --from"
@@ -113,12 +122,16 @@ def download(
         )
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
     wanted = select(tier, subset=subset, scenarios=scenarios)
-    urls = (mirror,) if mirror else (*splits.split(tier.split).mirrors, *releases(tier))
+    urls = (
+        (mirror,)
+        if mirror
+        else (*splits.split(tier.split).mirrors, *list_releases(tier))
+    )
     with (
         dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-        publication(tier, folder) as store,
+        publish(tier, folder) as store,
     ):
-        held = [i for i in wanted if store and i in store.held]
+        held = [i for i in wanted if store and i in store.stored_entries]
         work = _Download(
             tier,
             folder,
@@ -131,12 +144,12 @@ def download(
         finally:
             manifest = work.record()
             if store:
-                store.follow(manifest, at_once=True)
+                store.put_files(manifest, at_once=True)
         if not work.missing:
-            verdict = compare(tier, manifest)
+            verdict = compare_hashes(tier, manifest)
             if work.downloaded and tier.simulated:
                 if store:
-                    store.bring(held)
+                    store.fetch(held)
                 cards = write_cards(folder, tier, splits.split(tier.split), manifest)
                 if store:
                     store.finish(manifest, cards)
@@ -149,7 +162,7 @@ def download(
             else:
                 place = ""
             announce(
-                f"{reason.what}{place}: simulating scenarios {spell_ids(work.missing)}"
+                f"{reason.what}{place}: simulating scenarios {format_ids(work.missing)}"
             )
         rest = generate(
             tier.split,
@@ -203,11 +216,14 @@ class _Download:
         self._old = read_or_empty(size, root)
         meter.begin("checking", total=len(wanted), scenarios=len(wanted))
         findings = [
-            examine(root, size, i, manifest=self._old, quick=True) for i in wanted
+            inspect_scenario(root, size, i, manifest=self._old, quick=True)
+            for i in wanted
         ]
         self._entries = [finding.entry for finding in findings if finding.entry]
-        self.kept = [f.scenario for f in findings if f.state is State.GOOD]
-        self.missing = [f.scenario for f in findings if f.state is not State.GOOD]
+        self.kept = [f.scenario for f in findings if f.state is DataSetState.GOOD]
+        self.missing = [
+            f.scenario for f in findings if f.state is not DataSetState.GOOD
+        ]
 
     def run(self, urls: Iterable[str]) -> Reason:
         """Fetch what is missing from stores in turn, unless one lies; return why
@@ -224,7 +240,7 @@ class _Download:
         unknown = [i for i in self.missing if i not in self._recorded]
         if unknown:
             what = "datasets.yaml has no hash to check downloads against"
-            return DataError(what, where=f"{place}, scenarios {spell_ids(unknown)}")
+            return DataError(what, where=f"{place}, scenarios {format_ids(unknown)}")
         for url in urls:
             if self.missing:
                 try:
@@ -242,29 +258,29 @@ class _Download:
         # one.
         claims: dict[int, FileEntry] | None = None
         last: NotInStoreError | None = None
-        place = address_of(self.size, url, MANIFEST_NAME)
+        place = object_address(self.size, url, MANIFEST_NAME)
         with suppress(NotInStoreError):
-            text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=REMEDY)
-            manifest = parse_manifest(self.size, text, where=place, remedy=REMEDY)
+            text = fetch_text(place, limit=MANIFEST_LIMIT, hint=REMEDY)
+            manifest = parse_manifest(self.size, text, where=place, hint=REMEDY)
             claims = {entry.scenario: entry for entry in manifest.files}
             other = [
                 i
                 for i in self.missing
                 if i in claims and not claims[i].has_hash(self._recorded[i])
             ]
-            refuse_strangers(manifest, other, where=place, remedy=REMEDY)
+            refuse_foreign_hashes(manifest, other, where=place, hint=REMEDY)
         wanted = {}
         for i in self.missing:
             key = self.size.key(i)
             claim = (claims or {}).get(i)
-            wanted[i] = Wanted(
-                url=address_of(self.size, url, f"{key.subset}/{i:04d}.nc"),
+            wanted[i] = FetchRequest(
+                url=object_address(self.size, url, f"{key.subset}/{i:04d}.nc"),
                 target=scenario_path(self.root, key),
                 limit=self.size.longest_file(i),
                 content_sha256=self._recorded[i],
                 length=claim.bytes if claim else None,
                 file_sha256=claim.file_sha256 if claim else None,
-                remedy=REMEDY,
+                hint=REMEDY,
             )
         total = sum(one.length or self.size.file_bytes(i) for i, one in wanted.items())
         self._meter.begin("downloading", total=total, scenarios=len(wanted))
@@ -275,7 +291,7 @@ class _Download:
                     + MANIFEST_LIMIT
                 )
                 archive = fetch_archive(
-                    self.size, url, wanted, self._count, limit=limit, remedy=REMEDY
+                    self.size, url, wanted, self._count, limit=limit, hint=REMEDY
                 )
                 with suppress(NotInStoreError), closing(archive) as arrived:
                     for claim in arrived:
@@ -315,11 +331,11 @@ class _Download:
 
     def record(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
-        note_entries(self.size.folder(self.root), self._entries)
+        record_entry_hashes(self.size.folder(self.root), self._entries)
         kept = tuple(
             entry for entry in self._old.files if entry.scenario not in self.missing
         )
-        manifest = merged(
+        manifest = merge_entries(
             self.size, self._old.model_copy(update={"files": kept}), self._entries
         )
         if self.size.measured and "train" in manifest.subset_sha256:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import HASHED_SUBSETS
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import ScenarioFile, read_scenario
@@ -336,7 +336,7 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
             "the data set is not complete: the statistics of train are "
             "recorded nowhere",
             where=f"{size.split} {size.name} in {root}",
-            fix=remedy(size, root=root),
+            fix=suggest_repair(size, root=root),
         )
     return dict(manifest.statistics), manifest.dataset_sha256
 

@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 from lagbench.atomic import temporary_name
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
-from lagbench.data.layout import ScenarioKey, expanded, scenario_path
+from lagbench.data.layout import ScenarioKey, expand_path, scenario_path
 from lagbench.data.local import DESCRIPTION
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
+    build_manifest,
     describe_file,
-    merge,
     write_manifest,
 )
-from lagbench.data.registry import MAX_ID, NO_GENERATOR, load, spell_ids
+from lagbench.data.registry import MAX_ID, NO_GENERATOR, format_ids, load
 from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
-from lagbench.data.yamlfile import spell_yaml
+from lagbench.data.yamlfile import format_yaml
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.metrics.coverage import Cloud, fitting_cells
-from lagbench.work.machine import environment_of
+from lagbench.work.machine import describe_machine
 from lagbench.work.progress import Meter, Progress
 
 from .trajectory import (
@@ -75,7 +75,7 @@ class LocalSplit:
 
 def output_name(output: str | Path) -> str:
     """Return the name of the split that a folder to make stands for: its last part."""
-    return Path(os.path.abspath(expanded(output, "--output"))).name
+    return Path(os.path.abspath(expand_path(output, "--output"))).name
 
 
 def make_local_split(
@@ -94,7 +94,7 @@ def make_local_split(
     of its description; ``counts`` are the trajectories of each subset, where they are
     known before.
     """
-    folder = Path(os.path.abspath(expanded(output, "--output")))
+    folder = Path(os.path.abspath(expand_path(output, "--output")))
     if about.name in load().splits:
         what = f"{about.name!r} is one of the splits of lagbench"
         raise UsageError(what, where="--output", fix="use another name")
@@ -329,14 +329,14 @@ class _Building:
             for name in HASHED_SUBSETS
         }
         keys = [self._key(i, "train") for i in ids["train"]]
-        manifest = merge(
+        manifest = build_manifest(
             None,
             self.entries,
             split=about.name,
             size=SIZE,
             version=VERSION,
             subsets=ids,
-            environment=environment_of(DEVICE),
+            environment=describe_machine(DEVICE),
             recorded=content,
             statistics=file_statistics([scenario_path(self.root, key) for key in keys]),
         )
@@ -356,7 +356,7 @@ class _Building:
             "splits": splits,
             "measured": {about.name: {SIZE: measured}},
         }
-        text = HEAD.format(command) + spell_yaml(described)
+        text = HEAD.format(command) + format_yaml(described)
         (self.root / about.name / DESCRIPTION).write_text(text, encoding="utf-8")
         return manifest
 
@@ -415,11 +415,11 @@ class _Building:
             ),
         }
         frames = {
-            n: spell_ids([e.scenario for e in self.entries if e.frames == n])
+            n: format_ids([e.scenario for e in self.entries if e.frames == n])
             for n in lengths
         }
         size = {
-            "subsets": {name: spell_ids(scenarios) for name, scenarios in ids.items()},
+            "subsets": {name: format_ids(scenarios) for name, scenarios in ids.items()},
             "frames": lengths[0] if len(lengths) == 1 else frames,
             "bounds": [[float(low), float(high)] for low, high in bounds],
             "parameters": {},
@@ -462,7 +462,7 @@ class _Building:
                 "a frame of interest is not predicted",
                 where="--frames-of-interest",
                 expected=f"frames {about.input_frames} to {last}",
-                got=spell_ids(interest) if interest[0] >= 0 else interest,
+                got=format_ids(interest) if interest[0] >= 0 else interest,
             )
         if about.full_box:
             placement = Placement.CELL_CENTRES

@@ -34,7 +34,7 @@ from pydantic import (
 from lagbench.atomic import write_atomically
 from lagbench.data import MATERIALS
 from lagbench.data.registry import Size
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
@@ -84,7 +84,7 @@ def parse_format(name: str) -> Format:
     known = [form.value for form in Format]
     if name not in known:
         raise UsageError(
-            f"no format {name!r}", where="--format", fix=nearest(name, known)
+            f"no format {name!r}", where="--format", fix=suggest_name(name, known)
         )
     return Format(name)
 
@@ -154,7 +154,7 @@ def materials_of(
 
 def _code(name: str) -> int:
     if name not in MATERIALS:
-        fix = nearest(name, (*MATERIALS, DROP))
+        fix = suggest_name(name, (*MATERIALS, DROP))
         raise UsageError(f"no material {name!r}", where="--kinds", fix=fix)
     return MATERIALS.index(name)
 

@@ -20,9 +20,9 @@ from typing_extensions import (
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
-from lagbench.data.local import is_name
+from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import DataError, UnreadableFileError, UsageError, suggest_name
 from lagbench.submission.findings import quoted
 
 from .mistakes import misplaced_axes
@@ -164,7 +164,7 @@ def _checked(given: object, *, where: str) -> Wishes:
             got=quoted(value)
             if isinstance(value, str | int | float)
             else f"a {type(value).__name__}",
-            fix=nearest(key, Wishes.__annotations__)
+            fix=suggest_name(key, Wishes.__annotations__)
             if strange
             else "docs/exchange.md has the keys",
         ) from None
@@ -205,7 +205,7 @@ class Description:
 
     def __post_init__(self) -> None:
         """Check what the user gave."""
-        if not is_name(self.name):
+        if not is_split_name(self.name):
             proposal = (
                 re.sub(r"[^a-z0-9_-]+", "-", self.name.lower()).strip("-_0123456789")
                 or "own"

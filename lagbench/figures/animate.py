@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 from lagbench.work.progress import watched
 
 from .canvas import DPI, figure, pixels_of
@@ -137,7 +137,7 @@ def check_ending(path: Path) -> None:
 
 def _check_kind(kind: Panel | str | None) -> None:
     if kind is not None and kind not in KINDS:
-        fix = nearest(str(kind), map(str, KINDS))
+        fix = suggest_name(str(kind), map(str, KINDS))
         raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
 
 

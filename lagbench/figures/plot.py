@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data import WALLS
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError, nearest
-from lagbench.store.copy import bring
+from lagbench.errors import DataError, UsageError, suggest_name
+from lagbench.store.copy import update_working_copy
 
 from .canvas import DPI, draw_header, figure, save
 from .colours import MUTED
@@ -93,7 +93,9 @@ def check_kind(kind: str) -> None:
     """
     if kind not in KINDS:
         raise UsageError(
-            f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS)
+            f"no kind of picture {kind!r}",
+            where="--kind",
+            fix=suggest_name(kind, KINDS),
         )
 
 
@@ -249,11 +251,13 @@ def contact_sheet(
         DataError: no scenario is there, or a file is damaged.
     """
     tier, folder, splits = locate(split, size, root=root, registry=registry)
-    bring(tier, folder, tier.scenarios)
+    update_working_copy(tier, folder, tier.scenarios)
     files = scenario_files(tier, folder)
     if not files:
         where = f"{tier.split} {size} under {folder}"
-        raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
+        raise DataError(
+            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
+        )
     panel = None
     if kind is not None:
         panel = Panel(kind)

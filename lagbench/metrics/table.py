@@ -12,8 +12,8 @@ from importlib.metadata import EntryPoint
 from types import MappingProxyType
 
 from lagbench.data.grid import Placement
-from lagbench.data.registry import Size, installed
-from lagbench.errors import LagbenchError, UsageError, loaded, nearest
+from lagbench.data.registry import Size, list_entry_points
+from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
@@ -96,7 +96,7 @@ def ranking_metric(size: Size) -> str:
 def available() -> dict[str, Metric]:
     """Return all metrics by name, those of other installed packages last."""
     known = dict(METRICS)
-    for point in sorted(installed(GROUP), key=lambda point: point.name):
+    for point in sorted(list_entry_points(GROUP), key=lambda point: point.name):
         if point.value.startswith(f"{__package__}."):
             continue  # ours stand in METRICS, whatever version of lagbench is installed
         for metric in _load(point):
@@ -123,7 +123,7 @@ def available() -> dict[str, Metric]:
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
     try:
-        given = loaded(point)
+        given = load_entry_point(point)
         if isinstance(given, Iterable):
             found = tuple(given)
         else:
@@ -163,6 +163,6 @@ def select(
     wanted: set[str] = set()
     for name in names:
         if name not in table:
-            raise UsageError(f"no metric {name!r}", fix=nearest(name, table))
+            raise UsageError(f"no metric {name!r}", fix=suggest_name(name, table))
         wanted |= {name, *table[name].of}
     return tuple(metric for name, metric in table.items() if name in wanted)

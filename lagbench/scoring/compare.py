@@ -23,7 +23,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     check_regular,
-    nearest,
+    suggest_name,
 )
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -225,7 +225,7 @@ def compare(
                 "scores.json",
             )
         if one.floors:
-            floors = f"{nearest(str(second), one.floors)}; or "
+            floors = f"{suggest_name(str(second), one.floors)}; or "
         else:
             floors = ""
         fix = f"{floors}name scores, predictions or a folder of them"
@@ -261,7 +261,7 @@ def compare(
             raise UsageError(
                 f"no metric {name!r} to compare by",
                 where="--metric",
-                fix=nearest(name, judged),
+                fix=suggest_name(name, judged),
             )
     wanted = {one.ranking, *(metrics or judged)}
     order = sorted(wanted, key=lambda name: (name != one.ranking, judged.index(name)))

@@ -27,7 +27,7 @@ from lagbench.references.predictor import (
     given_in,
 )
 from lagbench.references.table import REFERENCES
-from lagbench.store.copy import bring
+from lagbench.store.copy import update_working_copy
 from lagbench.submission.format import Anatomy
 from lagbench.submission.predictions import open_predictions
 from lagbench.work.pool import Report
@@ -158,7 +158,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
 def predicted_by(floor: ReferencePredictor, given: Given) -> Prediction:
     """Return what a floor predicts; what it reads of train is brought first."""
     if floor.reads_train:
-        bring(given.size, given.root, given.size.subsets["train"])
+        update_working_copy(given.size, given.root, given.size.subsets["train"])
     return floor.predict(given)
 
 

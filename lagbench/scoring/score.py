@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
@@ -91,7 +91,7 @@ def score(
     metrics = _chosen(extras)
     path = Path(predictions).absolute()
     holder = resolve_root(root)
-    described = rooted(holder, registry)
+    described = load_rooted_registry(holder, registry)
     if output_dir is None:
         folder = scores_folder(Path(predictions))
     else:
@@ -232,7 +232,7 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
             raise UsageError(
                 f"no extra {extra!r} with metrics",
                 where="--extras",
-                fix=nearest(extra, known),
+                fix=suggest_name(extra, known),
             )
     return select(extras=extras)
 

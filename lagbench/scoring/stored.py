@@ -21,13 +21,14 @@ from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.grid import Grid, Placement
-from lagbench.data.hdf5 import Structure, check_structure, opened
+from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import Size
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import UnreadableFileError, check_regular
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
-from lagbench.work.machine import in_child
+from lagbench.work.machine import run_in_child
 
 from .card import (
     FRAMES,
@@ -95,7 +96,7 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
         fix="`lagbench submit` writes it beside the entry",
     )
     try:
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             check_structure(file, path, STRUCTURE)
         scores = read_statistics(path)
         tallies = list(scores.tallies.values())
@@ -103,7 +104,7 @@ def read_stored(path: Path, size: Size | None = None) -> Stored:
             raise ValueError("no scenarios, or too many statistics")
         if not all(np.isfinite(tally.total).all() for tally in tallies):
             raise ValueError("infinite statistics")
-        with opened(path) as file:
+        with open_hdf5(path) as file:
             group = file[GROUP]
             vorticity, precision = _unpacked(group["vorticity"])
             histogram, _ = _unpacked(group["histogram"])
@@ -234,7 +235,7 @@ def unreadable_in_child(paths: Sequence[Path]) -> dict[Path, str]:
         if stops == MOST_STOPS or time.monotonic() >= end:
             return found | dict.fromkeys(left, UNREAD)
         room = end - time.monotonic()
-        said, stopped = in_child(
+        said, stopped = run_in_child(
             READ, [str(path) for path in left], seconds=CPU_SECONDS * parts, wall=room
         )
         found |= {

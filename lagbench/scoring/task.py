@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
 from lagbench.data.grid import Grid, Placement
-from lagbench.data.local import remedy
+from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError
 from lagbench.metrics.frame import Scenario, Setting, Snapshot, snapshots
-from lagbench.store.copy import bring
+from lagbench.store.copy import update_working_copy
 from lagbench.submission.truth import Truth
 
 BLOCK_BYTES = 1 << 20
@@ -95,7 +95,7 @@ class ScoredTask:
 
 def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredTask:
     """Check that a subset is there and gather what the metrics need to know."""
-    bring(size, root, size.subsets[subset])
+    update_working_copy(size, root, size.subsets[subset])
     truth = Truth(size, root, subset)
     truth.require()
     truth.check()
@@ -173,7 +173,7 @@ def _attribute_std(
             f"in {root}",
             expected="position_std and velocity_std, two numbers each",
             got=", ".join(known) or "nothing",
-            fix=remedy(size, root=root),
+            fix=suggest_repair(size, root=root),
         ) from None
     return x, y, u, v
 

@@ -16,18 +16,16 @@ from typing import Any
 
 import h5py
 
-from lagbench.data.hdf5 import (
+from lagbench.data.hdf5 import MAX_LINKS, hdf5_errors, list_members
+from lagbench.data.structure import (
     MAX_ATTRIBUTE,
-    MAX_LINKS,
-    Array,
-    Odd,
-    attribute_of,
-    describe,
-    members_of,
-    reading,
-    storage_problem,
+    ArrayInfo,
+    UnusableAttribute,
+    describe_array,
+    find_storage_issue,
+    read_single_value,
 )
-from lagbench.errors import UnreadableFileError, UsageError, nearest
+from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
 from .budget import Budget, budget_in
 from .findings import Findings, quoted
@@ -145,7 +143,7 @@ class Anatomy:
     link_count: int
     # attribute of the format to its value, None where it is missing
     attributes: Mapping[str, object]
-    arrays: Mapping[str, Array]  # variables of the format that a hard link leads to
+    arrays: Mapping[str, ArrayInfo]  # variables of the format that a hard link leads to
     # scale_factor and add_offset of ``position``, where it has them
     packing: Mapping[str, object]
     integers: Mapping[str, tuple[int, ...]]  # coordinates whose values could be read
@@ -213,24 +211,24 @@ def require_fit(name: str, value: object) -> None:
 def dissect(file: h5py.File, path: Path) -> Anatomy:
     """Return what a file holds; of values only coordinates are read."""
     length = path.stat().st_size
-    with reading(path):
-        links, count = members_of(file["/"])
+    with hdf5_errors(path):
+        links, count = list_members(file["/"])
         names = ("lagbench_format", *REQUIRED, *OPTIONAL)
-        attributes = {name: attribute_of(file["/"], name) for name in names}
+        attributes = {name: read_single_value(file["/"], name) for name in names}
     arrays = {}
     integers = {}
     packing = {}
     for name in ("position", *INTEGERS):
         if links.get(name) == "variable":
-            with reading(path, name):
+            with hdf5_errors(path, name):
                 dataset = file[name]
-                array = describe(dataset)
+                array = describe_array(dataset)
                 if array.shape:
                     arrays[name] = array
                 else:
                     arrays[name] = replace(array, shape=None)
                 if name == "position":
-                    found = {key: attribute_of(dataset, key) for key in PACKING}
+                    found = {key: read_single_value(dataset, key) for key in PACKING}
                     packing = {
                         key: value for key, value in found.items() if value is not None
                     }
@@ -240,7 +238,7 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
                     and array.shape[0] <= MAX_COORDINATE
                     and array.chunk_bytes <= MAX_COORDINATE_CHUNK
                     and array.kind.lstrip("u").startswith("int")
-                    and not storage_problem(array, length=length)
+                    and not find_storage_issue(array, length=length)
                 ):
                     integers[name] = tuple(int(i) for i in dataset[...])
     return Anatomy(
@@ -338,13 +336,13 @@ def check_format(anatomy: Anatomy, out: Findings) -> bool:
             if kind:
                 fix = _START
             else:
-                fix = nearest(quoted(name), known)
+                fix = suggest_name(quoted(name), known)
             got = kind or ", ".join(known) or "nothing"
             what = f"no variable {name!r}"
             expected = f"a variable {name!r}"
             out.error("format", what, where="/", expected=expected, got=got, fix=fix)
     for name, array in anatomy.arrays.items():
-        problem = storage_problem(array, length=anatomy.length)
+        problem = find_storage_issue(array, length=anatomy.length)
         if problem is None and (name == "position" or name in anatomy.integers):
             continue
         what, expected, got = problem or (
@@ -373,7 +371,7 @@ def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
     for name, value in anatomy.attributes.items():
         if name == "lagbench_format":
             expected = str(FORMAT)
-            right = not isinstance(value, (str, Odd)) and value == FORMAT
+            right = not isinstance(value, (str, UnusableAttribute)) and value == FORMAT
         elif name in REQUIRED:
             expected = kind_of(name)
             right = fits(name, value)
@@ -382,7 +380,7 @@ def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
             right = value is None or fits(name, value)
         if right:
             continue
-        if isinstance(value, Odd):
+        if isinstance(value, UnusableAttribute):
             got = value.reason
         else:
             got = quoted(value)
@@ -475,7 +473,7 @@ def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
         )
     if anatomy.packing:
         said = {
-            n: v.reason if isinstance(v, Odd) else quoted(v)
+            n: v.reason if isinstance(v, UnusableAttribute) else quoted(v)
             for n, v in anatomy.packing.items()
         }
         out.error(

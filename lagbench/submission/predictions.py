@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import ContentHasher
-from lagbench.data.hdf5 import cache_of, opened, reading
-from lagbench.data.registry import spell_ids
+from lagbench.data.hdf5 import hdf5_errors, open_hdf5
+from lagbench.data.registry import format_ids
+from lagbench.data.structure import estimate_chunk_cache
 from lagbench.errors import UsageError
 
 from .findings import Findings
@@ -93,9 +94,9 @@ class Predictions:
         ):
             what = "the file has no such frames"
             got = f"scenario {scenario}, {count} frames from {start}"
-            expected = f"scenarios {spell_ids(self.header.scenarios)}, frames {spell_ids(numbers)}"
+            expected = f"scenarios {format_ids(self.header.scenarios)}, frames {format_ids(numbers)}"
             raise UsageError(what, where=str(self.path), expected=expected, got=got)
-        with reading(self.path, "position"):
+        with hdf5_errors(self.path, "position"):
             values: NDArray[Any] = self._position[
                 self._row[scenario], first : first + count
             ]
@@ -163,7 +164,7 @@ def open_predictions(
     """
     path = Path(path)
     with ExitStack() as stack:
-        file = stack.enter_context(opened(path, fix=WRITE))
+        file = stack.enter_context(open_hdf5(path, fix=WRITE))
         if checked is None or checked.length != path.stat().st_size:
             checked = dissect(file, path)
             out = Findings()
@@ -179,9 +180,9 @@ def attach(
     """Return the predictions of an open file whose layout has been checked; they take
     over the stack.
     """
-    with reading(path, "position"):
+    with hdf5_errors(path, "position"):
         # just the chunk cache that reading in order needs
-        size, kept = cache_of(anatomy.arrays["position"])
+        size, kept = estimate_chunk_cache(anatomy.arrays["position"])
         plist = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
         plist.set_chunk_cache(10 * kept + 521, size, 1.0)
         position = h5py.Dataset(h5py.h5d.open(file.id, b"position", plist))

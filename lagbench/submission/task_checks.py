@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from lagbench.data.layout import major_of, spelled
-from lagbench.data.local import remedy
+from lagbench.data.layout import major_of, quote_root
+from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import UnreadableFileError, UsageError
 
 from .findings import Findings, quoted
@@ -78,7 +78,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             where="attribute 'dataset_sha256'",
             expected=f"a recorded hash of {size.split} {size.name}",
             got="neither datasets.yaml nor a complete manifest has one",
-            fix=remedy(size, root=root),
+            fix=suggest_repair(size, root=root),
         )
     elif got != expected:
         out.error(
@@ -89,7 +89,7 @@ def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> No
             got=quoted(got),
             fix=f"{remake}; whether it is what lies here, says lagbench verify "
             f"--split {size.split}"
-            f" --size {size.name} --root {spelled(root)}",
+            f" --size {size.name} --root {quote_root(root)}",
         )
 
 
@@ -187,7 +187,7 @@ def spell_numbers(numbers: Sequence[int]) -> str:
     >>> spell_numbers([6, 7, 8, 10])
     '6-8,10'
     """
-    text = spell_ids(numbers)
+    text = format_ids(numbers)
     if len(text) <= MAX_SPELLED:
         return text
     return f"{text[: MAX_SPELLED - 3]}... ({len(numbers)} numbers)"

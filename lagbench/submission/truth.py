@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.layout import spelled
-from lagbench.data.local import remedy
-from lagbench.data.manifest import note, noted_hashes, read_or_empty
-from lagbench.data.registry import Size, spell_ids
+from lagbench.data.layout import quote_root
+from lagbench.data.local import suggest_repair
+from lagbench.data.manifest import load_recorded_hashes, read_or_empty, record_hashes
+from lagbench.data.registry import Size, format_ids
 from lagbench.data.scenario import ScenarioFile, check_scenario, read_scenario
 from lagbench.errors import DataError
 
@@ -44,18 +44,18 @@ class Truth:
                 f"{len(missing)} of {len(ids)} {self.subset} scenarios are not "
                 f"generated",
                 where=str(self.path(ids[0]).parent),
-                expected=f"scenarios {spell_ids(ids)}",
-                got=f"missing: {spell_ids(missing)}",
+                expected=f"scenarios {format_ids(ids)}",
+                got=f"missing: {format_ids(missing)}",
                 fix=self._remedy(),
             )
 
     def check(self) -> None:
         """Hash the values of every scenario, or find that this machine has done so."""
-        known = noted_hashes(self.folder)
+        known = load_recorded_hashes(self.folder)
         new = {}
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
         fix = (
-            f"{self._remedy()}; {verify} --root {spelled(self.root)} says what is wrong"
+            f"{self._remedy()}; {verify} --root {quote_root(self.root)} says what is wrong"
         )
         if self.size.measured:
             recorded = None
@@ -96,10 +96,10 @@ class Truth:
                 raise DataError(
                     what, where=str(path), expected=expected, got=content, fix=fix
                 )
-        note(self.folder, new)
+        record_hashes(self.folder, new)
 
     def _remedy(self) -> str:
-        return remedy(self.size, f"--subset {self.subset}", root=self.root)
+        return suggest_repair(self.size, f"--subset {self.subset}", root=self.root)
 
     def path(self, scenario: int) -> Path:
         """Return where a scenario lies."""

@@ -16,11 +16,11 @@ from typing import Any
 
 import h5py
 
-from lagbench.data.hdf5 import check_file, opened
-from lagbench.data.local import RootedRegistry, resolve_root, rooted
+from lagbench.data.hdf5 import check_file, open_hdf5
+from lagbench.data.local import RootedRegistry, load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UnreadableFileError, UsageError, nearest
-from lagbench.work.machine import in_child
+from lagbench.errors import DataError, UnreadableFileError, UsageError, suggest_name
+from lagbench.work.machine import run_in_child
 
 from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
 from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
@@ -105,7 +105,7 @@ def validate(
     """
     folder = resolve_root(root)
     file = Path(path).absolute()
-    known = rooted(folder, registry)
+    known = load_rooted_registry(folder, registry)
     if isolated:
         look = _isolated
     else:
@@ -116,9 +116,9 @@ def validate(
     size = known.size(result.split, result.size)
     # Only the file says which test subset it needs; the child that reads it fetches
     # nothing.
-    from lagbench.store.copy import bring
+    from lagbench.store.copy import update_working_copy
 
-    if bring(size, folder, size.subsets["test"]):
+    if update_working_copy(size, folder, size.subsets["test"]):
         result = look(file, folder, known, require_truth=require_truth)
     if "discontinuous_start" in result.skipped:
         return result
@@ -167,7 +167,7 @@ def _isolated(
         extra = seconds_for(path)
         seconds = CPU_SECONDS + extra
         wall = WALL_SECONDS + extra
-        values, stopped = in_child(
+        values, stopped = run_in_child(
             f"{__name__}.{examine.__name__}", [request], seconds=seconds, wall=wall
         )
         if not values:
@@ -207,12 +207,12 @@ class _Sizes(RootedRegistry):
         if split in self.sent:
             raise UsageError(
                 f"split {split!r} has no size {name!r}",
-                fix=nearest(name, self.sent[split]),
+                fix=suggest_name(name, self.sent[split]),
             )
         if split not in self.local_names():
             raise UsageError(
                 f"no split {split!r}",
-                fix=nearest(split, [*self.sent, *self.local_names()]),
+                fix=suggest_name(split, [*self.sent, *self.local_names()]),
             )
         return super().size(split, name)
 
@@ -237,7 +237,7 @@ def _examine(
     names: dict[str, str] = {}
     content = None
     try:
-        with opened(path, fix=WRITE) as file:
+        with open_hdf5(path, fix=WRITE) as file:
             anatomy = dissect(file, path)
             refuse_other_kinds(anatomy, path)
             texts = {

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.data.local import locate, remedy
-from lagbench.data.registry import Registry, Size, spell_ids
-from lagbench.errors import DataError, UsageError, WorkFailedError, nearest
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.registry import Registry, Size, format_ids
+from lagbench.errors import DataError, UsageError, WorkFailedError, suggest_name
 
 from .findings import quoted
 from .format import ATTRIBUTES, DIMS, FORMAT, NEVER, OPTIONAL, SPACE, require_fit
@@ -71,7 +71,7 @@ class PredictionsWriter:
                     "the hash of the data set is not known",
                     where=f"{self.size.split} {self.size.name}",
                     expected="a hash in datasets.yaml, or a complete data set here",
-                    fix=f"{remedy(self.size, root=folder)}, or give dataset_sha256",
+                    fix=f"{suggest_repair(self.size, root=folder)}, or give dataset_sha256",
                 )
         self._hash = dataset_sha256
         if not isinstance(self._hash, str) or not HASH.fullmatch(self._hash):
@@ -114,7 +114,7 @@ class PredictionsWriter:
             else:
                 value = value
             if name not in OPTIONAL:
-                raise UsageError(f"no label {name!r}", fix=nearest(name, OPTIONAL))
+                raise UsageError(f"no label {name!r}", fix=suggest_name(name, OPTIONAL))
             require_fit(name, value)
             self._labels[name] = value
 
@@ -189,7 +189,7 @@ class PredictionsWriter:
                 what = "is written twice"
             else:
                 what = "is no test scenario"
-            expected = f"whole numbers: {spell_ids(self._rows)}"
+            expected = f"whole numbers: {format_ids(self._rows)}"
             raise UsageError(f"scenario {scenario!r} {what}", expected=expected)
         if velocity is None:
             arrays = [position]
@@ -208,7 +208,7 @@ class PredictionsWriter:
         where = f"diverged_at of scenario {scenario}"
         if diverged_at is not None and diverged_at not in frames:
             what = "no such frame is predicted"
-            expected = spell_ids(frames)
+            expected = format_ids(frames)
             raise UsageError(
                 what, where=where, expected=expected, got=repr(diverged_at)
             )
@@ -248,9 +248,9 @@ class PredictionsWriter:
         with self._stack:
             if missing := sorted(set(self._rows) - self._written):
                 what = f"{len(missing)} test scenarios are missing"
-                got = f"missing: {spell_ids(missing)}"
+                got = f"missing: {format_ids(missing)}"
                 raise UsageError(
-                    what, where=str(self.path), expected=spell_ids(self._rows), got=got
+                    what, where=str(self.path), expected=format_ids(self._rows), got=got
                 )
             with self._writing():
                 if (self._diverged != NEVER).any():
@@ -349,10 +349,10 @@ class PredictionsWriter:
 
 def _bring(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
     from lagbench.store.copy import (
-        bring,
+        update_working_copy,
     )  # http and more, which a child that only reads can do without
 
-    bring(size, root, scenarios)
+    update_working_copy(size, root, scenarios)
 
 
 def write(
@@ -421,7 +421,7 @@ def write(
             raise UsageError(
                 "no such test scenario",
                 where=name,
-                expected=spell_ids(ids),
+                expected=format_ids(ids),
                 got=got,
                 fix=fix,
             )
@@ -444,7 +444,7 @@ def _by_id(
     if array.ndim != len(DIMS) or len(array) != len(ids):
         raise UsageError(
             "the array does not hold one entry per test scenario",
-            expected=f"{len(ids)} scenarios ({spell_ids(ids)}) first, 4 dimensions",
+            expected=f"{len(ids)} scenarios ({format_ids(ids)}) first, 4 dimensions",
             got=f"shape {array.shape}",
             fix="or give a mapping of scenario id to array",
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from full_disk import largest_file
+from file_size_limit import largest_file
 from made_up import BoardBench, copied, nearer, noisy, still
 from simple_models import FACTS, Drift
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
@@ -216,7 +216,7 @@ def load_subject(
     _check_same_data(cards, predictions)
     header = cards[0].header
     folder = resolve_root(root)
-    splits = rooted(folder, registry)
+    splits = load_rooted_registry(folder, registry)
     task = load_scored_task(splits.size(header.split, header.size), folder)
 
     methods = [card.header.method for card in cards]
