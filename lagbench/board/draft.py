@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError
-from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationResult
 
 from .entry import About, Entry, Prediction
 from .entry_file import Model, examine, format_issues
