@@ -66,7 +66,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
-OUTCOMES = scored._outcomes
+OUTCOMES = scored.score_scenarios
 PAINT = painting.paint_pictures
 Names = tuple[str, ...]
 READERS = (
@@ -190,6 +190,7 @@ def references_once() -> Iterator[None]:
         task: ScoredTask,
         path: Path,
         anatomy: FileInfo,
+        *,
         metrics: Names,
         references: Names,
         workers: int | None,
@@ -276,7 +277,7 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
     for module in READERS:
         monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
-    monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", OUTCOMES)
     monkeypatch.setattr(painting, "paint_pictures", PAINT)
 
 
