@@ -315,11 +315,11 @@ def cost_table(results: SplitResults) -> str:
 
 def _changes(recipe: Mapping[str, Any]) -> str:
     """Return the changed options of a recipe; a dash without a recipe."""
-    from lagbench.baselines.job import changes_of  # loads torch
+    from lagbench.baselines.recipe_changes import describe_changes  # loads torch
 
     if not recipe:
         return "-"
-    return recipe.get("changed") or "; ".join(changes_of(recipe)) or "none"
+    return recipe.get("changed") or "; ".join(describe_changes(recipe)) or "none"
 
 
 def _frame_costs(method: Method) -> Iterator[str]:

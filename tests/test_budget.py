@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lagbench.board.entry import EntryBudget
-from lagbench.submission.budget import MOST_VALIDATIONS, Budget, budget_in, track_of
+from lagbench.submission.budget import MOST_VALIDATIONS, Budget, parse_budget, track_of
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_texts_that_are_no_budget(text: str) -> None:
     """A track is not stated, hours are not negative, names printable; validations as
     many as entries hold.
     """
-    assert budget_in(text) is None
-    assert budget_in(json.dumps({"validations": VALIDATIONS[1:]})) is not None
+    assert parse_budget(text) is None
+    assert parse_budget(json.dumps({"validations": VALIDATIONS[1:]})) is not None
 
 
 def test_the_mean_over_seeds() -> None:
@@ -106,7 +106,7 @@ def test_the_mean_over_seeds() -> None:
         "device": "a",
     }
     two = {**one, "windows": 201, "cpu_hours": 0.26, "device": "b"}
-    found = EntryBudget.of("mini", [Budget(**one), Budget(**two)])
+    found = EntryBudget.mean_over_seeds("mini", [Budget(**one), Budget(**two)])
     means: dict[str, Any] = {
         "windows": 150,
         "epochs": 0.5,
@@ -114,6 +114,6 @@ def test_the_mean_over_seeds() -> None:
         "gpu_hours": 0.0,
     }
     assert found == EntryBudget(track="equal compute", **means)
-    mixed = EntryBudget.of("mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})])
+    mixed = EntryBudget.mean_over_seeds("mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})])
     assert mixed.track is None
-    assert EntryBudget.of("mini", [Budget(**one), None]) is None
+    assert EntryBudget.mean_over_seeds("mini", [Budget(**one), None]) is None

@@ -16,7 +16,7 @@ import torch
 from simple_models import Drift, trainer
 
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.rollout import Validation
@@ -51,7 +51,7 @@ def validated_on_test(
     frames = {}
     for scenario in task.scenarios:
         with task.opened(scenario) as opened:
-            frames[scenario] = len(opened.scenario.active)
+            frames[scenario] = len(opened.scenario.moving_frames)
     torch.set_num_threads(1)
     return Validation(task=task, frames=frames)(restore(load(weights)))
 
@@ -126,7 +126,7 @@ def test_how_often() -> None:
         (6300, 1, 720, 1),
         (10, 1, 720, 1),
     ):
-        count = options.validations(steps, trained=trained, rolled=rolled)
+        count = options.count_validations(steps, trained=trained, rolled=rolled)
         at = [
             s
             for s in range(1, steps + 1)
@@ -189,9 +189,12 @@ def test_fewer_frames_for_tests(
     task = load_scored_task(
         unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid"
     )
-    short = replace(task, setting=replace(task.setting, horizon=4))
+    short = replace(task, config=replace(task.config, horizon=4))
     model = Drift.build(
-        {}, facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+        {},
+        read_dataset_info(
+            "curl-noise", "tiny", root=generated.root, registry=unmeasured
+        ),
     )
     model.load_state_dict(dict(load(result.checkpoint).weights))
     whole = dict.fromkeys(task.scenarios, 20)

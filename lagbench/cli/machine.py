@@ -19,7 +19,7 @@ from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, check_installed
 from lagbench.make.plan import free_bytes
 from lagbench.work.machine import available_cores
-from lagbench.work.pool import Pool, Report, Task
+from lagbench.work.pool import Pool, Report, WorkItem
 
 NEEDED = (
     *(
@@ -180,7 +180,7 @@ def bench_apart(split: str, size: str) -> SolverBench:
     check_installed("taichi", extra="generate")
     with Pool(1) as pool:
         pool.submit(
-            Task(
+            WorkItem(
                 name=f"bench of {split} {size}",
                 function=_bench,
                 arguments=(split, size),

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from lagbench.atomic import write_atomically
 from lagbench.data.manifest import FileEntry, Manifest
-from lagbench.data.registry import Parameter, Size, Split, spell_ids
+from lagbench.data.registry import Parameter, Size, Split, format_ids
 from lagbench.figures.tables import escape, markdown
 
 from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
@@ -218,7 +218,7 @@ def _subset_table(size: Size, manifest: Manifest) -> str:
         if name in manifest.subset_sha256:
             subset_hash = f"`{manifest.subset_sha256[name]}`"
         present = f"{entry_count} of {len(ids)}"
-        row = (name, spell_ids(ids), present, frame_count, byte_count, subset_hash)
+        row = (name, format_ids(ids), present, frame_count, byte_count, subset_hash)
         rows.append(row)
     head = ("subset", "ids", "scenarios", "frames", "bytes", "hash")
     return markdown(head, rows)

@@ -20,21 +20,21 @@ from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expanded
+from lagbench.data.layout import MANIFEST_NAME, expand_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
-    merged,
-    note_entries,
+    merge_entries,
     read_or_empty,
+    record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.registry import Registry, Size, Split, format_ids
 from lagbench.data.statistics import file_moments, statistics
-from lagbench.errors import UsageError, check_installed, nearest
+from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import (
     SimulatedScenario,
@@ -45,11 +45,16 @@ from lagbench.generators.simulate import (
 )
 from lagbench.generators.solver import Device
 from lagbench.store.copy import gather as gather_files
-from lagbench.store.copy import gatherable
-from lagbench.store.publication import Publication, check_address, look_at, publication
+from lagbench.store.copy import list_gatherable
+from lagbench.store.publication import (
+    Publication,
+    check_address,
+    inspect_store,
+    publish,
+)
 from lagbench.work.cluster import Cluster, await_file
-from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Event, Pool, Report, Task, worker_count
+from lagbench.work.machine import describe_machine, promises_bits
+from lagbench.work.pool import Event, Pool, Report, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
@@ -164,7 +169,7 @@ def generate(
         scheduler=scheduler,
         meter=Meter(progress),
     )
-    sources = [expanded(source, "--gather") for source in gather]
+    sources = [expand_path(source, "--gather") for source in gather]
 
     if dry_run:
         scan = _plan_only(setup, wanted_ids, sources, force=force)
@@ -175,7 +180,7 @@ def generate(
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-            publication(tier, folder) as store,
+            publish(tier, folder) as store,
         ):
             keeper = _ManifestKeeper(setup, store)
             scan = _simulate_missing(setup, keeper, wanted_ids, sources, force=force)
@@ -215,7 +220,7 @@ def _find_device(name: str) -> Device:
     names = list(map(str, Device))
     if name not in names:
         raise UsageError(
-            f"no device {name!r}", where="--device", fix=nearest(name, names)
+            f"no device {name!r}", where="--device", fix=suggest_name(name, names)
         )
     return Device(name)
 
@@ -291,7 +296,7 @@ class _ManifestKeeper:
         if manifest.files or (self._setup.folder / MANIFEST_NAME).exists():
             write_manifest(self._setup.root, manifest)
             if self.store:
-                self.store.follow(manifest)
+                self.store.put_files(manifest)
 
     def add(
         self,
@@ -299,12 +304,12 @@ class _ManifestKeeper:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         """Put entries in, and the machine that wrote their files."""
-        self.keep(merged(self._setup.size, self.manifest, entries, environment))
+        self.keep(merge_entries(self._setup.size, self.manifest, entries, environment))
 
     def fetch(self, scenarios: Iterable[int]) -> None:
         """Have files of scenarios here that only the store holds."""
         if self.store:
-            self.store.bring(scenarios)
+            self.store.fetch(scenarios)
 
 
 def _plan_only(
@@ -313,8 +318,8 @@ def _plan_only(
     """Scan a folder as if the sources were gathered; change nothing."""
     gathered: set[int] = set()
     for source in sources:
-        gathered.update(gatherable(setup.size, setup.root, source))
-    store = look_at(setup.size, setup.root)
+        gathered.update(list_gatherable(setup.size, setup.root, source))
+    store = inspect_store(setup.size, setup.root)
     return _scan_folder(setup, store, wanted_ids, force=force, gathered=gathered)
 
 
@@ -333,7 +338,7 @@ def _simulate_missing(
         keeper.keep(gather_files(setup.size, setup.root, source, old))
 
     scan = _scan_folder(setup, keeper.store, wanted_ids, force=force)
-    note_entries(setup.folder, scan.hashed)
+    record_entry_hashes(setup.folder, scan.hashed)
     check_disk(setup.root, scan.to_do.bytes)
     keeper.keep(scan.manifest)
     try:
@@ -362,7 +367,7 @@ def _scan_folder(
     old = read_or_empty(size, setup.root)
     stored: Mapping[int, FileEntry] = {}
     if store:
-        stored = store.held
+        stored = store.stored_entries
     suspects = _suspects(setup, old, stored, wanted_ids)
     setup.meter.begin("checking", total=len(suspects), scenarios=len(suspects))
     inspections = {}
@@ -397,7 +402,7 @@ def _scan_folder(
         else:
             missing_ids.append(scenario)
     return _Scan(
-        manifest=merged(size, base, [*hashed, *stored.values()]),
+        manifest=merge_entries(size, base, [*hashed, *stored.values()]),
         hashed=tuple(hashed),
         kept=tuple(kept_ids),
         to_do=estimate(size, missing_ids, on_cores=setup.is_on_cores),
@@ -469,7 +474,7 @@ def _simulate(
                 setup.meter.count(event.value)
             elif event.kind == "lost":
                 setup.meter.count(-event.value)
-            elif event.task.function is measure_predictability:
+            elif event.item.function is measure_predictability:
                 _add_limits(keeper, event.value)
             else:
                 _add_simulated(setup, keeper, event)
@@ -492,7 +497,7 @@ def _open_team(setup: _Setup, task_count: int) -> Pool | Cluster:
     return Pool(min(setup.workers, task_count), environment)
 
 
-def _simulation_tasks(setup: _Setup, to_do: Estimate) -> list[Task]:
+def _simulation_tasks(setup: _Setup, to_do: Estimate) -> list[WorkItem]:
     """Return a task per batch; scenarios of similar length share a batch."""
     costs = dict(zip(to_do.scenarios, to_do.substeps, strict=True))
     longest_first = sorted(costs, key=lambda scenario: (-costs[scenario], scenario))
@@ -504,12 +509,12 @@ def _simulation_tasks(setup: _Setup, to_do: Estimate) -> list[Task]:
     for start in range(0, len(longest_first), width):
         ids = tuple(longest_first[start : start + width])
         cost = sum(costs[scenario] for scenario in ids)
-        name = f"scenario {spell_ids(ids)}"
+        name = f"scenario {format_ids(ids)}"
         tasks.append(_task(setup, name, function=simulate, ids=ids, cost=cost))
     return tasks
 
 
-def _perturbation_task(setup: _Setup, scenario: int) -> Task:
+def _perturbation_task(setup: _Setup, scenario: int) -> WorkItem:
     return _task(
         setup,
         f"perturbed run of scenario {scenario}",
@@ -526,17 +531,17 @@ def _task(
     function: Callable[..., Any],
     ids: tuple[int, ...],
     cost: float,
-) -> Task:
+) -> WorkItem:
     size = setup.size
     job = SimulationJob(size=size, scenarios=ids, root=setup.root, device=setup.device)
     full_name = f"{size.split} {size.name}, {name}"
-    return Task(name=full_name, function=function, arguments=(job,), cost=cost)
+    return WorkItem(name=full_name, function=function, arguments=(job,), cost=cost)
 
 
 def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None:
     """Put scenarios that a worker has simulated into the manifest."""
     simulated: Sequence[SimulatedScenario] = event.value
-    machine = event.machine or environment_of(setup.device)
+    machine = event.machine or describe_machine(setup.device)
     environment = {**machine, "device": setup.device.value}
     is_promised = promises_bits(environment)
     for result in simulated:
@@ -546,7 +551,7 @@ def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None
     entries = []
     for result in simulated:
         entries.append(describe_file(setup.root, setup.size.key(result.scenario)))
-    note_entries(setup.folder, entries)
+    record_entry_hashes(setup.folder, entries)
     keeper.add(entries, environment)
     setup.meter.count(scenarios=len(entries))
 
@@ -592,6 +597,6 @@ def _describe(setup: _Setup, store: Publication | None, manifest: Manifest) -> N
 
     if store.is_settled(manifest, card_texts(size, setup.split, manifest)):
         return
-    store.bring(size.scenarios)
+    store.fetch(size.scenarios)
     cards = write_cards(setup.root, size, setup.split, manifest)
     store.finish(manifest, cards)

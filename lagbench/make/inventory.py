@@ -14,11 +14,16 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256, plain
+from lagbench.data.checksums import file_sha256, to_plain
 from lagbench.data.layout import scenario_path, url_of
 from lagbench.data.local import DESCRIPTION
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, noted_hashes
-from lagbench.data.registry import Size, spell_ids
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    load_recorded_hashes,
+)
+from lagbench.data.registry import Size, format_ids
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
 from lagbench.generators.batch import draw_initial_state
@@ -214,7 +219,7 @@ def _inspect_file(
     noted_content: str | None = None
     digest: str | None = None
     if quick:
-        noted = noted_hashes(size.folder(root))(path)
+        noted = load_recorded_hashes(size.folder(root))(path)
         if noted:
             noted_content, digest = noted
         else:
@@ -358,7 +363,7 @@ def _check_header(
     state = draw_initial_state(size, scenario)
     expected = {}
     for name, value in file_parameters(size, state).items():
-        expected[name] = plain(value)
+        expected[name] = to_plain(value)
     # What only the simulation tells is covered by the content hash.
     stated = {}
     for name, value in header.parameters.items():
@@ -417,9 +422,9 @@ def compare_hashes(
 
     if broken:
         what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
-        raise _hash_error(size, what, f"scenarios {spell_ids(broken)}")
+        raise _hash_error(size, what, f"scenarios {format_ids(broken)}")
     if differing:
-        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
+        return f"scenarios {format_ids(differing)} have {other_bits(size)}"
     if unequal:
         what = (
             "subsets or the data set have another hash though every scenario has its "

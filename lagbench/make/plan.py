@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Any
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import CACHE_VARIABLE, cache_folder
 from lagbench.data.limits import NEEDED, Limit
-from lagbench.data.registry import Size, parse_ids, spell_ids
-from lagbench.errors import UsageError, WorkFailedError, nearest
+from lagbench.data.registry import Size, format_ids, parse_ids
+from lagbench.errors import UsageError, WorkFailedError, suggest_name
 from lagbench.generators.batch import substep_count
 from lagbench.generators.constants import solver_constants
 from lagbench.generators.split import ClosedBoxParameters
@@ -74,13 +74,13 @@ def select(
     ids = _scenario_ids(scenarios)
     unknown = [scenario for scenario in ids if scenario not in selectable]
     if unknown or not ids:
-        choices = [f"{name} {spell_ids(size.subsets[name])}" for name in names]
-        missing = spell_ids(unknown) or "at all"
+        choices = [f"{name} {format_ids(size.subsets[name])}" for name in names]
+        missing = format_ids(unknown) or "at all"
         raise UsageError(
             f"no scenario {missing} in {', '.join(names)}",
             where=f"--scenarios, {size.split} {size.name}",
             expected="; ".join(choices),
-            got=spell_ids(ids),
+            got=format_ids(ids),
         )
     return tuple(sorted(set(ids)))
 
@@ -94,7 +94,7 @@ def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
             raise UsageError(
                 f"{size.split} {size.name} has no subset {name!r}",
                 where="--subset",
-                fix=nearest(name, size.subsets),
+                fix=suggest_name(name, size.subsets),
             )
     return names
 

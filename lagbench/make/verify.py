@@ -20,15 +20,15 @@ from lagbench.data.checksums import (
     file_sha256,
     subset_hash,
 )
-from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import Manifest, note, read_manifest
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import Manifest, read_manifest, record_hashes
+from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device
-from lagbench.store.copy import bring, unstored
-from lagbench.work.pool import Pool, Task, worker_count
+from lagbench.store.copy import list_unstored, update_working_copy
+from lagbench.work.pool import Pool, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 
 from .inventory import (
@@ -104,7 +104,7 @@ class VerificationResult:
             gaps = []
             for report in self.subsets:
                 if report.missing:
-                    gaps.append(f"{report.name} {spell_ids(report.missing)}")
+                    gaps.append(f"{report.name} {format_ids(report.missing)}")
             raise DataError(
                 "the data set is incomplete",
                 where=where,
@@ -159,7 +159,7 @@ def verify(
     if regenerate:
         check_installed("taichi", extra="generate")
 
-    bring(tier, folder, ids, thoroughly=True)
+    update_working_copy(tier, folder, ids, thoroughly=True)
     manifest, warnings = _read_manifest(tier, folder)
     inspections = _inspect_files(tier, folder, ids, manifest=manifest, meter=meter)
     # content hashes of the files that are there and right
@@ -183,7 +183,7 @@ def verify(
 
     problems = [*_file_problems(inspections), *_regeneration_problems(regenerated)]
     # A killed writer leaves files here that the store never got.
-    for scenario in unstored(tier, folder, [*hashes]):
+    for scenario in list_unstored(tier, folder, [*hashes]):
         problem = f"scenario {scenario} is in the working copy alone, not in the store"
         problems.append(problem)
     problems += _hash_problems(tier, reports, verdict)
@@ -205,7 +205,7 @@ def verify(
         warnings=tuple(warnings),
         must_be_complete=complete,
         verdict=verdict,
-        fix=remedy(tier, root=folder),
+        fix=suggest_repair(tier, root=folder),
     )
 
 
@@ -216,7 +216,7 @@ def _read_manifest(size: Size, root: Path) -> tuple[Manifest | None, list[str]]:
     except DataError as error:
         return None, [str(error)]
     if manifest is None:
-        return None, [f"there is no manifest: {remedy(size, root=root)}"]
+        return None, [f"there is no manifest: {suggest_repair(size, root=root)}"]
 
     warnings = []
     if manifest.identity == "tolerance":
@@ -252,7 +252,7 @@ def _inspect_files(
         if inspection.content_sha256:
             contents[path] = inspection.content_sha256
         meter.count(1, scenarios=1)
-    note(size.folder(root), contents, file_digests)
+    record_hashes(size.folder(root), contents, file_digests)
     return inspections
 
 
@@ -293,7 +293,9 @@ def _regenerate(
                 size=size, scenarios=(scenario,), root=Path(folder), device=Device.CPU
             )
             name = f"{size.split} {size.name}, scenario {scenario}"
-            pool.submit(Task(name=name, function=simulate, arguments=(job,), cost=cost))
+            pool.submit(
+                WorkItem(name=name, function=simulate, arguments=(job,), cost=cost)
+            )
         for event in pool.events():
             if event.kind == "done":
                 for simulated in event.value:
@@ -410,10 +412,10 @@ def _gaps(
     """Return what is tolerated, missing, or there without a scenario."""
     gaps = []
     if tolerated:
-        gaps.append(f"scenarios {spell_ids(tolerated)} have {other_bits(size)}")
+        gaps.append(f"scenarios {format_ids(tolerated)} have {other_bits(size)}")
     for report in reports:
         if report.missing:
-            gaps.append(f"{report.name} lacks {spell_ids(report.missing)}")
+            gaps.append(f"{report.name} lacks {format_ids(report.missing)}")
     for report in reports:
         if report.extra:
             names = ", ".join(report.extra)
@@ -437,7 +439,7 @@ def _manifest_differences(
         if entry and content and content != entry.content_sha256:
             different_ids.append(scenario)
     if different_ids:
-        listing = spell_ids(different_ids)
+        listing = format_ids(different_ids)
         differences.append(f"the manifest has other hashes of {listing}")
 
     names = _different_statistics(size, manifest)

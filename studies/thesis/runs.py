@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
-from lagbench.baselines.job import OVER
+from lagbench.baselines.training_log import OVER
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.pool import Report, crashed
+from lagbench.work.pool import Report, crash_error
 from lagbench.work.run import run_all
 
 from .plan import (
@@ -85,7 +85,7 @@ def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
         complain(error, job_name)
         return error.exit_code
     except Exception as error:  # the other runs go on
-        failure = crashed(error)
+        failure = crash_error(error)
         complain(failure, job_name)
         return failure.exit_code
     return 0
@@ -216,7 +216,7 @@ def check_training(
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
-    from lagbench.baselines.job import first_difference  # loads torch
+    from lagbench.baselines.recipe_changes import first_difference  # loads torch
 
     recipe = _recipe(plan, split, model=model, seed=seed).as_json()
     if record.get("recipe") != recipe:

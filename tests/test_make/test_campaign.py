@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
-from forging import forge
+from rewritten_files import forge
 
 from lagbench.data import checksums
 from lagbench.data.manifest import Manifest, read_manifest, write_manifest

@@ -13,7 +13,7 @@ import pytest
 from cluster_bench import everything
 from conftest import SIZE, SPLIT
 
-from lagbench.data.manifest import merge, read_manifest, write_manifest
+from lagbench.data.manifest import build_manifest, read_manifest, write_manifest
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError
 from lagbench.make.generate import GenerationResult, generate
@@ -40,7 +40,7 @@ def part(
         "subsets": size.subsets,
     }
     write_manifest(
-        root, merge(None, entries, **names, environment=whole.environments[0])
+        root, build_manifest(None, entries, **names, environment=whole.environments[0])
     )
     return root
 

@@ -25,7 +25,7 @@ from cluster_bench import (
     writers,
 )
 from conftest import SIZE, SPLIT
-from spread_jobs import report_for_ever
+from parallel_jobs import report_for_ever
 
 from lagbench.data.lock import Holder, read_holder
 from lagbench.data.manifest import read_manifest
@@ -34,8 +34,8 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.make import generate as campaign
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.work import cluster
-from lagbench.work.cluster import Client, Mark, marked
-from lagbench.work.pool import Task
+from lagbench.work.cluster import Client, FolderMark, mark_folder
+from lagbench.work.pool import WorkItem
 from lagbench.work.progress import Progress
 
 distributed = pytest.importorskip(
@@ -65,7 +65,7 @@ def test_a_worker_killed_and_one_slowed(
     """
     monkeypatch.setattr(
         campaign,
-        "environment_of",
+        "describe_machine",
         lambda device: {"machine": "aarch64", "device": device},
     )
     folder = tmp_path / SPLIT / SIZE / "v2"
@@ -133,11 +133,11 @@ def test_a_folder_that_workers_do_not_share(
     """
 
     @contextmanager
-    def elsewhere(folder: Path) -> Iterator[Mark]:
-        with marked(folder) as mark:
-            yield Mark(mark.path, "the word of another folder", 0.0)
+    def elsewhere(folder: Path) -> Iterator[FolderMark]:
+        with mark_folder(folder) as mark:
+            yield FolderMark(mark.path, "the word of another folder", 0.0)
 
-    monkeypatch.setattr(cluster, "marked", elsewhere)
+    monkeypatch.setattr(cluster, "mark_folder", elsewhere)
     with pytest.raises(
         WorkFailedError, match="does not see the folder of the data set"
     ) as caught:
@@ -158,8 +158,8 @@ def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
     word, is waited for.
     """
     with pytest.raises(WorkFailedError, match="no such folder"):
-        Mark(tmp_path / "none" / "mark", "word", 0.0).check("w")
-    late = Mark(tmp_path / "mark", "word", 20.0)
+        FolderMark(tmp_path / "none" / "mark", "word", 0.0).check("w")
+    late = FolderMark(tmp_path / "mark", "word", 20.0)
     late.path.touch()
     Timer(0.2, lambda: late.path.write_text("word")).start()
     late.check("w")
@@ -195,7 +195,9 @@ def test_what_nobody_waits_for_ends(workers: Any, tmp_path: Path) -> None:
     """
     marker = tmp_path / "ended"
     with cluster.Cluster(workers.scheduler_address) as here:
-        here.submit(Task(name="endless", function=report_for_ever, arguments=(marker,)))
+        here.submit(
+            WorkItem(name="endless", function=report_for_ever, arguments=(marker,))
+        )
         next(here.events())
     end = time.monotonic() + 30.0
     while not marker.exists() and time.monotonic() < end:

@@ -135,7 +135,7 @@ def test_a_worker_on_a_full_disk_names_the_file(
     tmp_path: Path, unmeasured: Registry
 ) -> None:
     """/dev/full answers every write with ENOSPC; the error carries the path and the
-    remedy.
+    suggest_repair.
     """
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")

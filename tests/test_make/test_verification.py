@@ -15,9 +15,9 @@ import netCDF4
 import numpy as np
 import pytest
 from conftest import SIZE, SPLIT
-from forging import forge, mend_manifest
 from hypothesis import given
 from hypothesis import strategies as st
+from rewritten_files import forge, mend_manifest
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
