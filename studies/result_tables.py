@@ -257,7 +257,7 @@ def _seeds_cell(method: Method) -> str:
     """Return the number of seeds, or the kind of a reference predictor."""
     if method.name in NAIVE:
         return "naive baseline"
-    if method.name in REFERENCES:
+    if method.name in CLASSICAL:
         return "classical solver"
     return str(len(method.trainings))
 
