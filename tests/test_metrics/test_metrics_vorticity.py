@@ -61,7 +61,10 @@ def test_a_scaled_flow_has_closed_errors() -> None:
         0.2 * np.mean(omega),
     ]
     assert found == pytest.approx(expected)
-    for still in (rotating_disc(0.0), flying(1e-3, 0.0)):  # at rest, or all by one vector
+    for still in (
+        rotating_disc(0.0),
+        flying(1e-3, 0.0),
+    ):  # at rest, or all by one vector
         found = measured(still, "vorticity_residual_slope", "vorticity_pearson")
         assert found == pytest.approx([-1.0, math.nan], nan_ok=True)
     x = lattice(30)
@@ -304,7 +307,10 @@ def test_nrmse_is_the_ratio_of_sums_over_frames() -> None:
     ]
     for scale in (0.0, 1.0, 1.5, -1.0):
         cases.append(
-            (*np.array(measured(rotating_disc(scale), *names))[:, None], abs(scale - 1.0))
+            (
+                *np.array(measured(rotating_disc(scale), *names))[:, None],
+                abs(scale - 1.0),
+            )
         )
     for mse, square, error in cases:
         assert metric.over_frames(metric.series(mse, square)) == pytest.approx(
