@@ -312,7 +312,8 @@ class BoardBench:
         self.rehash(method)
         entry = read_entry(self.entry(method))
         stored = [
-            read_score_file(self.folder / path).scores.tallies for path in entry.score_paths
+            read_score_file(self.folder / path).scores.tallies
+            for path in entry.score_paths
         ]
         plain = {
             name: summary.model_dump()

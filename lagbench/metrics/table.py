@@ -12,7 +12,12 @@ from types import MappingProxyType
 
 from lagbench.data.grid import Placement
 from lagbench.data.registry import Size, list_entry_points
-from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    load_entry_point,
+    suggest_name,
+)
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric

@@ -135,7 +135,7 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         place = "/".join(map(str, first["loc"]))
-        raise ValueError(f"{ascii(place)}: {first['msg']}") from error
+        raise ValueError(f"{place!a}: {first['msg']}") from error
 
     metrics = available()
     rows = {}

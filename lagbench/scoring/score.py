@@ -16,7 +16,7 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import shipped
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -151,7 +151,7 @@ def score(
     counting = {
         row: row_scores[ranking]
         for row, row_scores in scores.items()
-        if row in COUNTING and ranking in row_scores
+        if row in NAIVE and ranking in row_scores
     }
     card = ScoreCard(
         header=header,

@@ -172,7 +172,8 @@ def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) 
     """Maps of truth and prediction share one packing: the tab's truth is the finest."""
     names = ("flipping", "noisy")
     coarse, fine = (
-        read_score_file(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in names
+        read_score_file(bench.folder / f"scores/cavity/tiny/{name}.nc")
+        for name in names
     )
     assert coarse.precision > 5.0 * fine.precision
     truth = board.tabs[0].truth.vorticity

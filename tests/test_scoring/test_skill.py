@@ -25,7 +25,7 @@ from lagbench.references.shipped import (
     write_shipped,
     write_solver_seconds,
 )
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 from lagbench.scoring import references as references_of_scoring
 from lagbench.scoring import score as scoring
 from lagbench.scoring.card import SUBMISSION, ScoreCard
@@ -77,7 +77,7 @@ def test_skill_is_one_minus_the_ratio_of_means() -> None:
         "coarse-solver": scored([0.1]),
         "unknown": scored([0.1]),
     }
-    counting = {name: references[name] for name in COUNTING.intersection(references)}
+    counting = {name: references[name] for name in NAIVE.intersection(references)}
     assert best_reference(counting) == "analog"
 
     partial = {"analog": scored([4.0, math.nan])}

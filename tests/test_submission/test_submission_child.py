@@ -12,6 +12,7 @@ from submission_data import Bench, small
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
 from lagbench.submission.issues import quote
+from lagbench.work.machine import run_in_child
 
 ROOM = {"seconds": 5.0, "wall": 600.0}
 
