@@ -72,15 +72,14 @@ def _check_output(output: object, operator: Operator, *, nodes: int) -> None:
 
     The operator may be a user's own, so it may return anything.
     """
-    is_pair = isinstance(output, tuple) and len(output) == 2
-    if is_pair and isinstance(output[1], Mapping):  # type: ignore[index]
-        aggregate, losses = output  # type: ignore[misc]
-        values = [aggregate, *losses.values()]
-        prefix = ""
-    else:
-        values = [output]
-        prefix = "alone: "
-    shapes = []
+    values = [output]
+    prefix = "alone: "
+    if isinstance(output, tuple) and len(output) == 2:
+        aggregate, losses = output
+        if isinstance(losses, Mapping):
+            values = [aggregate, *losses.values()]
+            prefix = ""
+    shapes: list[object] = []
     for value in values:
         if isinstance(value, Tensor):
             shapes.append(tuple(value.shape))
