@@ -22,7 +22,7 @@ lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 
 types: $(VENV)/.dev
-	$(BIN)/mypy lagbench studies
+	$(BIN)/mypy lagbench studies validation
 
 bench: $(VENV)/.dev
 	$(BIN)/pytest benchmarks

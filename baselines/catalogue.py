@@ -15,8 +15,13 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-from lagbench.data.registry import PluginWarning, installed
-from lagbench.errors import LagbenchError, UsageError, loaded, nearest
+from lagbench.data.registry import PluginWarning, list_entry_points
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    load_entry_point,
+    suggest_name,
+)
 
 from .baseline import Baseline
 from .operators.operator import Operator
@@ -54,7 +59,7 @@ def find(name: str) -> CatalogueEntry:
     points = _find_points()
     if name not in points:
         raise UsageError(
-            f"no baseline {name!r}", where="--baseline", fix=nearest(name, points)
+            f"no baseline {name!r}", where="--baseline", fix=suggest_name(name, points)
         )
     try:
         return _load_entry(points[name])
@@ -81,7 +86,7 @@ def load_all() -> dict[str, CatalogueEntry]:
 def _find_points() -> dict[str, EntryPoint]:
     """Return the entry points by name; those of this package cannot be replaced."""
     points: dict[str, EntryPoint] = {}
-    for point in sorted(installed(GROUP), key=_is_foreign):
+    for point in sorted(list_entry_points(GROUP), key=_is_foreign):
         if not NAME.fullmatch(point.name):
             reason = "a name has small letters, digits and single hyphens"
             _warn_of_point(point, reason)
@@ -103,7 +108,7 @@ def _warn_of_point(point: EntryPoint, reason: str) -> None:
 
 
 def _load_entry(point: EntryPoint) -> CatalogueEntry:
-    loaded_class = loaded(point)
+    loaded_class = load_entry_point(point)
     if not inspect.isclass(loaded_class):
         raise UsageError(
             f"{point.value} is no class", expected="a subclass of Baseline or Operator"

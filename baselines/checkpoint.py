@@ -35,7 +35,7 @@ from lagbench.errors import (
     WorkFailedError,
     check_regular,
 )
-from lagbench.submission.budget import Budget, budget_in
+from lagbench.submission.budget import Budget, parse_budget
 
 from .baseline import Baseline, DatasetInfo
 from .catalogue import find
@@ -68,7 +68,7 @@ class Checkpoint:
     @property
     def budget(self) -> Budget | None:
         """Budget of the training; None where it is unknown."""
-        return budget_in(json.dumps(self.training.get("budget")))
+        return parse_budget(json.dumps(self.training.get("budget")))
 
 
 class _LogPart(BaseModel):

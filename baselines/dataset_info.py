@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from lagbench.data.layout import dataset_folder
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
-from lagbench.store.copy import bring
+from lagbench.store.copy import update_working_copy
 
 from .baseline import DatasetInfo
 
@@ -29,9 +29,9 @@ def read_dataset_info(
     """
     tier, root_folder, _ = locate(split, size, root=root, registry=registry)
     folder = dataset_folder(root_folder, tier.split, tier.name, tier.major)
-    hint = remedy(tier, root=root_folder)
+    hint = suggest_repair(tier, root=root_folder)
 
-    bring(tier, root_folder)
+    update_working_copy(tier, root_folder)
     manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
     if manifest is None:
         raise DataError("the data set is not generated", where=str(folder), fix=hint)
@@ -49,7 +49,7 @@ def read_dataset_info(
         )
 
     first_file = manifest.files[0]
-    bring(tier, root_folder, [first_file.scenario])
+    update_working_copy(tier, root_folder, [first_file.scenario])
     with read_scenario(folder / first_file.path) as file:
         moving_walls = "wall_velocity" in file.variables
 

@@ -180,10 +180,11 @@ def _expand_runs(xp: Any, start: Any, count: Any, *, particles: int) -> tuple[An
     """
     numbers = xp.arange(len(count), device=start.device)
     # The one repeat: each one makes the caller wait for a GPU.
-    repeat: Any = torch.repeat_interleave
+    run: Any
     if xp is np:
-        repeat = np.repeat
-    run = repeat(numbers, count)
+        run = np.repeat(numbers, count)
+    else:
+        run = torch.repeat_interleave(numbers, count)
     i = run
     if particles:
         i = run % particles

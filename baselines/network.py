@@ -72,7 +72,7 @@ def _check_output(output: object, operator: Operator, *, nodes: int) -> None:
 
     The operator may be a user's own, so it may return anything.
     """
-    values = [output]
+    values: list[object] = [output]
     prefix = "alone: "
     if isinstance(output, tuple) and len(output) == 2:
         aggregate, losses = output

@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import ValidationError
 
 from lagbench.atomic import write_atomically
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.submission.provenance import StartWeights, TrainingProvenance
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -38,10 +40,12 @@ from .machine import (
     use_threads,
 )
 from .recipe import change_options
-from .recipe_changes import describe_changes
+from .recipe_changes import list_settings
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 from .run_folder import LARGEST_LOG, RunFolder
 from .start import warn_of_last_state
+
+START_DIGITS = 12  # digits of a SHA-256 that provenance names
 
 TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
@@ -135,7 +139,7 @@ def predict(
     warn_of_last_state(trained, checkpoint_path)
     _warn_of_unfinished(trained, checkpoint_path)
     root_folder = resolve_root(root)
-    known_splits = rooted(root_folder, registry)
+    known_splits = load_rooted_registry(root_folder, registry)
     info = check_data(
         trained,
         root=root_folder,
@@ -414,50 +418,57 @@ def _restore_model(
         ) from error
 
 
-# before a recipe's name and before the settings of a prediction, in the words for a
-# training
-RECIPE = ", recipe "
-PREDICTED_WITH = ", predicted with "
+def provenance_of(checkpoint: Checkpoint) -> TrainingProvenance:
+    """Return the training behind weights.
 
-
-def training_words(checkpoint: Checkpoint) -> str:
-    """Return data, recipe with its changes, and steps of a training, in words."""
-    info = checkpoint.info
-    done = checkpoint.training
-    recipe = done.get("recipe", {})
-    subsets = "+".join(recipe.get("training", {}).get("windows", ("train",)))
-    step = done.get("step", 0)
-    words = f"{info.split} {info.size} {subsets}{RECIPE}{recipe.get('name')}"
-    return ", ".join([f"{words}, step {step}", *describe_changes(recipe)])
-
-
-def told_by_us(training: str) -> bool:
-    """Return whether the words for a training are those of `training_words`."""
-    return RECIPE in training
-
-
-def fits(training: str, checkpoint: Checkpoint) -> bool:
-    """Return whether predictions state the training of these weights.
-
-    Words that :func:`training_words` did not write always fit.
+    Raises:
+        UnreadableFileError: the record of the training in the weights is damaged.
     """
-    said, _, _ = training.partition(PREDICTED_WITH)
-    return not told_by_us(said) or said == training_words(checkpoint)
+    info = checkpoint.info
+    recipe = checkpoint.training.get("recipe", {})
+    start = recipe.get("start")
+    start_weights = None
+    try:
+        if start:
+            start_weights = StartWeights(
+                recipe=start["recipe"], weights=start["sha256"][:START_DIGITS]
+            )
+        return TrainingProvenance(
+            split=info.split,
+            size=info.size,
+            subsets=tuple(recipe.get("training", {}).get("windows", ("train",))),
+            recipe=str(recipe.get("name")),
+            step=checkpoint.training.get("step", 0),
+            overrides=list_settings(recipe),
+            start=start_weights,
+        )
+    except (ValidationError, TypeError, KeyError) as error:
+        raise UnreadableFileError(
+            "the weights record a damaged training",
+            where=f"{info.split} {info.size}",
+            expected="a recipe, subsets and a step, as `lagbench train` records them",
+            got=type(error).__name__,
+            fix="train the model with `lagbench train`",
+        ) from error
 
 
 def _training_attributes(
     checkpoint: Checkpoint, target: DatasetInfo, settings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the file's attributes of the training: words, seed and budget.
+    """Return the file's attributes of the training: provenance, seed and budget.
 
     The validations of another size are left out: they compare with nothing here.
     """
-    words = training_words(checkpoint)
-    if settings:
-        words += f"{PREDICTED_WITH}{', '.join(settings)}"
+    provenance = provenance_of(checkpoint).model_copy(
+        update={"prediction_overrides": tuple(settings)}
+    )
     recipe = checkpoint.training.get("recipe", {})
     seed = recipe.get("training", {}).get("seed", 0)
-    attributes: dict[str, Any] = {"training": words, "seed": int(seed)}
+    attributes: dict[str, Any] = {
+        "training": provenance.describe(),
+        "provenance": provenance.to_json(),
+        "seed": int(seed),
+    }
 
     budget = checkpoint.budget
     if budget is not None:

@@ -28,7 +28,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from lagbench.data.yamlfile import read_yaml
-from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, nearest
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
 from .baseline import Settings
 from .catalogue import CatalogueEntry, list_names
@@ -377,7 +377,7 @@ def _recipe_hint(name: str, split: str, file: _RecipeFile) -> str:
     if not file.recipes:
         return "leave --recipe out; or "
     same_split = [other for other in file.recipes if other.split("/")[0] == split]
-    return f"{nearest(name, same_split or file.recipes)}; or "
+    return f"{suggest_name(name, same_split or file.recipes)}; or "
 
 
 def _variant_hint(size: str, variant: str, split: str, file: _RecipeFile) -> str:
@@ -399,7 +399,7 @@ def _variant_hint(size: str, variant: str, split: str, file: _RecipeFile) -> str
     if has_size and sizes:
         hint = f"--size {' or '.join(sizes)} has it; or "
     elif variants:
-        hint = f"{nearest(variant, variants)}; or "
+        hint = f"{suggest_name(variant, variants)}; or "
     elif has_size:
         hint = ""
     else:
@@ -415,7 +415,7 @@ def _check_baselines(part: _SharedRecipe, *, where: str) -> None:
     for name in part.baselines:
         if name not in names:
             raise UnreadableFileError(
-                f"unknown baseline {name!r}", where=where, fix=nearest(name, names)
+                f"unknown baseline {name!r}", where=where, fix=suggest_name(name, names)
             )
 
 
@@ -498,7 +498,7 @@ def _parse_setting(text: str) -> Layer:
     if not equals or not path or group not in groups:
         hint = None
         if equals and path:
-            hint = nearest(group, groups)
+            hint = suggest_name(group, groups)
         raise UsageError(
             "cannot understand the setting",
             where="--set",
@@ -539,7 +539,7 @@ def _check_options(
         raise error_class(
             f"unknown key {key!r}",
             where=where,
-            fix=nearest(str(detail["loc"][-1]), known_keys),
+            fix=suggest_name(str(detail["loc"][-1]), known_keys),
         )
 
     expected = detail["msg"].removeprefix("Value error, ")

@@ -25,14 +25,14 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.metrics.aggregate import Tally, as_stored, score, tally
+from lagbench.metrics.aggregate import Tally, round_statistics, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, ranking_metric, select
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
-from lagbench.store.windows import window_of
+from lagbench.store.windows import copy_window
 from lagbench.submission.checks import MAX_DISTANCE
-from lagbench.tensors import Window, collate
+from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import tensors
 
 from .baseline import Baseline, Batch, DatasetInfo
@@ -191,7 +191,7 @@ def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) ->
     return collate([_read_window(path, frames) for path in paths])
 
 
-def _read_window(path: Path, frames: slice) -> Window:
+def _read_window(path: Path, frames: slice) -> TensorWindow:
     """Return frames of a scenario as a window."""
     with read_scenario(path) as file:
         numbers = range(file.header.frames)[frames]
@@ -212,7 +212,7 @@ def _read_window(path: Path, frames: slice) -> Window:
             # The forcing of all later frames too: a rollout from these knows it.
             walls = file.read("wall_velocity", slice(numbers.start, None))
         scenario = file.header.key.scenario
-    window = window_of(list(position), material, walls, scenario, numbers.start)
+    window = copy_window(list(position), material, walls, scenario, numbers.start)
     return tensors(window)
 
 
@@ -275,18 +275,18 @@ class Validation:
     ) -> Iterable[Rollout]:
         """Return rollouts of scenarios side by side."""
         paths = [self.task.truth.path(scenario) for scenario in scenarios]
-        input_frames = slice(0, self.task.setting.input_frames)
+        input_frames = slice(0, self.task.config.input_frames)
         given = scenario_batch(paths, input_frames).to(device)
         horizon = max(self.frames[scenario] for scenario in scenarios)
         return roll_out(model, given, horizon)
 
     def _compare(self, rollout: Rollout) -> Tally:
         """Return the tally of a rollout against the truth, rounded as in a file."""
-        frames = self.task.setting.predicted_frames
+        frames = self.task.config.predicted_frames
         with self.task.opened(rollout.scenario) as truth:
             # A generator, so that one pair of frames is in memory at a time.
             pairs = _pair_frames(rollout, truth, frames)
-            return as_stored(tally(pairs, select([self.metric]), frames))
+            return round_statistics(tally(pairs, select([self.metric]), frames))
 
 
 def _pair_frames(
@@ -310,9 +310,9 @@ def load_validation(
     size = registry.size(info.split, info.size)
     task = load_scored_task(size, root, subset="valid")
     horizon = min(options.validation_frames or info.horizon, info.horizon)
-    task = replace(task, setting=replace(task.setting, horizon=horizon))
+    task = replace(task, config=replace(task.config, horizon=horizon))
     frames = {}
     for scenario in task.scenarios[: options.validation_scenarios]:
         with task.opened(scenario) as truth:
-            frames[scenario] = len(truth.scenario.active)
+            frames[scenario] = len(truth.scenario.moving_frames)
     return Validation(task=task, frames=frames, is_compiled=options.compile)

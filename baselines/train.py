@@ -23,7 +23,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
-from lagbench.tensors import Window, collate
+from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
@@ -369,7 +369,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
             windows=len(data),
         )
 
-        def load_batches(rank: int, ranks: int) -> DataLoader[Window]:
+        def load_batches(rank: int, ranks: int) -> DataLoader[TensorWindow]:
             sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
             batches = StepBatches(sampler, options, first=log.step, last=steps)
             return _make_loader(data, batches, workers=job.workers)
@@ -382,7 +382,7 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
 
 def _make_loader(
     data: WindowDataset, batches: StepBatches, *, workers: int
-) -> DataLoader[Window]:
+) -> DataLoader[TensorWindow]:
     """Return a loader of batches, with processes that read ahead if asked."""
     if not workers:
         return DataLoader(data, batch_sampler=batches, collate_fn=collate)

@@ -22,7 +22,7 @@ from lightning_fabric import Fabric
 from torch.utils.data import DataLoader
 from torch.utils.tensorboard import SummaryWriter
 
-from lagbench.tensors import Batch, Window
+from lagbench.tensors import Batch, TensorWindow
 
 from .checkpoint import load, round_weights, save
 from .job import TrainingJob
@@ -33,7 +33,7 @@ from .rollout import Validation
 from .training_log import STOPPED_EARLY, TrainingLog
 
 # returns the batches of a process, by its rank among so many processes
-Loader = Callable[[int, int], DataLoader[Window]]
+Loader = Callable[[int, int], DataLoader[TensorWindow]]
 
 
 def launch_fabric(job: TrainingJob) -> Fabric:

@@ -25,25 +25,25 @@ import numpy as np
 from lagbench.board.build import build
 from lagbench.board.check import check_board
 from lagbench.board.entry import (
-    Cost,
     DataSet,
     Entry,
     EntryBudget,
-    Flag,
+    EntryCost,
+    EntryFlag,
     Prediction,
     ScoreBlock,
     ScoredFile,
     Status,
 )
-from lagbench.board.entry_file import spell
+from lagbench.board.entry_file import entry_bytes
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.ranking import combine, summarise, write_references
 from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
-from lagbench.metrics.aggregate import as_stored
+from lagbench.metrics import METRICS, Direction, Tally, TaskConfig, aggregate
+from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.table import COUNTING, REFERENCES
@@ -53,10 +53,10 @@ from lagbench.scoring.card import (
     SUBMISSION,
     Preview,
     ScoreCard,
-    skill,
 )
 from lagbench.scoring.score_file import write_statistics
-from lagbench.scoring.stored import read_stored, reported_frames
+from lagbench.scoring.score_file_checks import read_score_file, reported_frames
+from lagbench.scoring.skill import compute_skill
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -112,7 +112,7 @@ def _measured(target: Path, entries: int) -> int:
 
 
 def make_entry(size: Size, target: Path, number: int) -> None:
-    """Write a made-up entry, its score files, and the floors beside it."""
+    """Write a made-up entry, its score files and the references beside it."""
     rng = np.random.Generator(np.random.PCG64(number))
     place = (size.split, size.name, f"model-{number}")
     seeds: list[int | None] = [None] if number % 5 else list(range(SEEDS))
@@ -122,7 +122,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
     ]
     paths = [target / path for path in score_paths(place, seeds)]
     if number % 7 == 0:
-        flags = (Flag(name="physics", reasons=("made up",)),)
+        flags = (EntryFlag(name="physics", reasons=("made up",)),)
     else:
         flags = ()
     for card, path in zip(cards, paths, strict=True):
@@ -156,7 +156,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
         parameters=int(10.0 ** rng.uniform(4, 8)),
         hardware="none",
         command=f"python benchmarks/board.py  # number {number}",
-        cost=Cost(
+        cost=EntryCost(
             seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
             device="a machine",
             solver_seconds_per_frame=0.05 if number % 3 else None,
@@ -183,11 +183,13 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
             files=files,
-            metrics=summarise(combine([read_stored(path).scores for path in paths])),
+            metrics=summarise(
+                combine([read_score_file(path).scores.tallies for path in paths])
+            ),
         ),
     )
     (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)
-    (target / entry.yaml_path).write_bytes(spell(entry))
+    (target / entry.yaml_path).write_bytes(entry_bytes(entry))
 
 
 def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
@@ -229,11 +231,14 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     )
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
     scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
-    floors = {row: held[ranking] for row, held in scores.items() if row in COUNTING}
+    naive_scores = {}
+    for row, row_scores in scores.items():
+        if row in COUNTING:
+            naive_scores[row] = row_scores[ranking]
     return ScoreCard(
         header=header,
         predictions_sha256=f"{seed:064x}",
-        setting=Setting(
+        config=TaskConfig(
             grid=grid,
             input_frames=task.input_frames,
             horizon=task.horizon,
@@ -246,7 +251,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         ranking=ranking,
         tallies=tallies,
         scores=scores,
-        skill=skill([scores[SUBMISSION][ranking]], floors),
+        skill=compute_skill([scores[SUBMISSION][ranking]], naive_scores),
         flags=(),
         warnings=(),
         preview=_preview(size, grid.nodes, rng),
@@ -268,7 +273,7 @@ def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) ->
     falling = np.array([metric.direction is Direction.HIGHER for metric in metrics])
     total[falling] = 1.0 / (1.0 + quality * share)
     ones = np.ones(total.shape, np.int64)
-    return as_stored(
+    return round_statistics(
         Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones)
     )
 

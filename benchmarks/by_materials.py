@@ -1,11 +1,10 @@
-"""Which materials meet where methods of the board err: the error by the materials of a
-test scenario.
+"""Print the error of methods of the board by the materials of a test scenario.
 
-    python benchmarks/by_materials.py --size full --root DATA neuralmpm-projected neuralmpm-conserving
+    python benchmarks/by_materials.py --size full --root DATA neuralmpm-projected
 
-prints, for the entries named (mean over their seeds) and the floors of a split, the
-metric that ranks in the mean over the test scenarios of each set of materials, and over
-all. Data are read for the materials alone.
+prints the metric that ranks, for the named entries (mean over their seeds) and for the
+reference predictors of a split: the mean over the test scenarios of each set of
+materials, and over all. Data are read for the materials alone.
 """
 
 from __future__ import annotations
@@ -15,16 +14,17 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
 from lagbench.data.local import resolve_root
-from lagbench.data.registry import load
+from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
+from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.figures.tables import markdown
-from lagbench.errors import LagbenchError, nearest
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped
-from lagbench.scoring.stored import published
+from lagbench.scoring.score_file_checks import read_published_scores
 
 BOARD = Path(__file__).parent.parent / "leaderboard"
 
@@ -37,55 +37,61 @@ def main() -> int:
     parser.add_argument("methods", nargs="+", help="entries of the board")
     parser.add_argument("--split", default="multimaterial")
     parser.add_argument("--size", default="mini")
-    parser.add_argument("--root", type=Path, help="where data sets are")
-    asked = parser.parse_args()
-    size = load().size(asked.split, asked.size)
-    root = resolve_root(asked.root)
+    parser.add_argument("--root", type=Path, help="folder of all data sets")
+    options = parser.parse_args()
+    size = load().size(options.split, options.size)
     metric = ranking_metric(size)
-    scenarios = sorted(size.subsets["test"])
-    kinds = []
-    for scenario in scenarios:
-        with read_scenario(size.path(root, scenario)) as file:
-            kinds.append(
-                " + ".join(MATERIALS[kind] for kind in np.unique(file.read("material")))
-            )
-    rows = {
-        name: floor.scores[metric].values
-        for name, floor in (shipped(size) or {}).items()
-    }
-    folder = BOARD / "scores" / asked.split / asked.size
-    for method in asked.methods:
-        files = [
-            path
-            for path in sorted(folder.glob("*.nc"))
-            if method == path.stem.rpartition("_")[0]
-        ]
-        if (folder / f"{method}.nc").is_file():
-            files = [folder / f"{method}.nc"]
-        else:
-            files = files
-        if not files:
-            known = sorted(
-                {path.stem.partition("_")[0] for path in folder.glob("*.nc")}
-            )
-            parser.error(
-                f"no entry {method!r} of {asked.split} {asked.size}: "
-                f"{nearest(method, known)}"
-            )
-        seeds = [published(path).scores["submission"][metric].values for path in files]
-        rows[method] = np.mean(seeds, axis=0)
-    sets = sorted(set(kinds))
+    values_by_method = {}
+    references = shipped(size) or {}
+    for name, reference in references.items():
+        values_by_method[name] = reference.scores[metric].values
+    for method in options.methods:
+        values_by_method[method] = read_values(size, method, metric)
+
+    kinds = np.array(read_kinds(size, resolve_root(options.root)))
+    names, counts = np.unique(kinds, return_counts=True)
+    heads = [metric]
+    heads += [f"{name} ({count})" for name, count in zip(names, counts, strict=True)]
+    heads.append(f"all ({len(kinds)})")
     lines = []
-    for name, values in rows.items():
-        means = [
-            float(np.mean(np.asarray(values)[np.array(kinds) == one])) for one in sets
-        ]
-        lines.append(
-            [name, *(f"{mean:.4f}" for mean in [*means, float(np.mean(values))])]
-        )
-    head = [f"{one} ({kinds.count(one)})" for one in sets]
-    print(markdown([metric, *head, f"all ({len(kinds)})"], lines))
+    for method, values in values_by_method.items():
+        means = [np.mean(values[kinds == name]) for name in names]
+        means.append(np.mean(values))
+        lines.append([method, *(f"{mean:.4f}" for mean in means)])
+    print(markdown(heads, lines))
     return 0
+
+
+def read_kinds(size: Size, root: Path) -> list[str]:
+    """Return the materials of each test scenario, as in "liquid + snow"."""
+    kinds = []
+    for scenario in sorted(size.subsets["test"]):
+        with read_scenario(size.path(root, scenario)) as file:
+            materials = np.unique(file.read("material"))
+        kinds.append(" + ".join(MATERIALS[material] for material in materials))
+    return kinds
+
+
+def read_values(size: Size, method: str, metric: str) -> NDArray[np.float64]:
+    """Return a metric of an entry, the mean over its seeds, shape [scenario]."""
+    folder = BOARD / "scores" / size.split / size.name
+    files = sorted(folder.glob("*.nc"))
+    seed_files = [path for path in files if path.stem.rpartition("_")[0] == method]
+    single_file = folder / f"{method}.nc"
+    if single_file.is_file():
+        seed_files = [single_file]
+    if not seed_files:
+        names = sorted({path.stem.partition("_")[0] for path in files})
+        raise UsageError(
+            f"no entry {method!r} of {size.split} {size.name}",
+            where="METHOD",
+            fix=suggest_name(method, names),
+        )
+    seeds = []
+    for path in seed_files:
+        scores = read_published_scores(path).scores["submission"]
+        seeds.append(scores[metric].values)
+    return np.asarray(np.mean(seeds, axis=0))
 
 
 if __name__ == "__main__":

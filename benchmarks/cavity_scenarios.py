@@ -17,9 +17,17 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import read_scenario
+from lagbench.data.scenario import read_scenario
 
 NAMES = ("wall", "motion", "reynolds_number", "start_frame")
+
+HEAD = """\
+| id | walls | motion | Re | start frame | RMS speed [length/s] | reversals | \
+mean kinetic energy |
+|---:|---|---|---:|---:|---:|---:|---:|"""
+
+ScenarioRow = tuple[str, str, float, int, float, int, float]
+"""The values of a scenario in the order of the columns, after its id."""
 
 
 def main() -> int:
@@ -30,44 +38,51 @@ def main() -> int:
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--size", default="full")
     parser.add_argument("--subset", default="train")
-    given = parser.parse_args()
-    size = load().size("cavity", given.size)
-    ids = size.subsets[given.subset]
-    rows = [_row(size, given.root, scenario) for scenario in ids]
-    print(
-        "| id | walls | motion | Re | start frame | RMS speed [length/s] | reversals "
-        "| mean kinetic energy |"
-    )
-    print("|---:|---|---|---:|---:|---:|---:|---:|")
-    for scenario, (wall, motion, reynolds, start, speed, reversals, energy) in zip(
-        ids, rows, strict=True
-    ):
+    options = parser.parse_args()
+    size = load().size("cavity", options.size)
+    print(HEAD)
+    rows = []
+    for scenario in size.subsets[options.subset]:
+        row = _read_row(size, options.root, scenario)
+        rows.append(row)
+        wall, motion, reynolds, start, speed, reversals, energy = row
         print(
             f"| {scenario} | {wall} | {motion} | {reynolds:.1f} | {start} | "
-            f"{speed:.4f} | {reversals} "
-            f"| {energy:.3e} |"
+            f"{speed:.4f} | {reversals} | {energy:.3e} |"
         )
-    alike = len(rows) - min(
-        len({row[:-1] for row in rows}), len({row[-1] for row in rows})
-    )
-    print(f"\n{len(rows)} scenarios, {alike} alike")
-    if alike:
-        return 1
-    return 0
+
+    distinct_parameters = len({row[:-1] for row in rows})
+    distinct_energies = len({row[-1] for row in rows})
+    alike_count = len(rows) - min(distinct_parameters, distinct_energies)
+    print(f"\n{len(rows)} scenarios, {alike_count} alike")
+    return 1 if alike_count else 0
 
 
-def _row(size: Size, root: Path, scenario: int) -> tuple:
+def _read_row(size: Size, root: Path, scenario: int) -> ScenarioRow:
+    frame_count = size.frame_count(scenario)
+    energy = []
     with read_scenario(size.path(root, scenario)) as file:
-        drawn = tuple(file.header.parameters[name] for name in NAMES)
-        energy = [
-            0.5
-            * float((file.read("velocity", f).astype(np.float64) ** 2).sum(-1).mean())
-            for f in range(size.frame_count(scenario))
-        ]
-        walls = file.read("wall_velocity").astype(np.float64).reshape(len(energy), -1)
-    moving = walls[:, walls.any(axis=0)]
-    reversals = int(np.count_nonzero(np.diff(np.sign(moving), axis=0)))
-    return *drawn, float(np.sqrt(np.mean(moving**2))), reversals, float(np.mean(energy))
+        parameters = file.header.parameters
+        for frame in range(frame_count):
+            velocity = file.read("velocity", frame).astype(np.float64)
+            speed_squared = np.sum(velocity**2, axis=-1)
+            energy.append(0.5 * float(speed_squared.mean()))
+        wall_velocity = file.read("wall_velocity").astype(np.float64)
+
+    # velocity components of the walls that move, shape [frame, component]
+    components = wall_velocity.reshape(frame_count, -1)
+    moving = components[:, components.any(axis=0)]
+    sign_changes = np.diff(np.sign(moving), axis=0)
+    wall, motion, reynolds, start = (parameters[name] for name in NAMES)
+    return (
+        wall,
+        motion,
+        reynolds,
+        start,
+        float(np.sqrt(np.mean(moving**2))),
+        int(np.count_nonzero(sign_changes)),
+        float(np.mean(energy)),
+    )
 
 
 if __name__ == "__main__":

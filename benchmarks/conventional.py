@@ -1,10 +1,10 @@
 # ruff: noqa: ANN001, ANN201 (Taichi infers the types of its functions)
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""The closed box as one would write it in Taichi by habit: the yardstick of the solver.
+"""The closed box in conventional Taichi code: the yardstick of our solver.
 
-Same equations as ``lagbench.generators.closed_box`` (design 4.3), but the conventional
-way, after Taichi's own mpm128 example: one kernel launch per substep, every phase a
-parallel loop, float32 sums by atomics, Taichi's default fast math. Its sums depend on
+The equations are those of ``lagbench.generators.closed_box``. The code is written after
+Taichi's own mpm128 example: one kernel launch per substep, every phase a parallel loop,
+float32 sums by atomics, Taichi's default fast math. Its sums depend on
 the order of threads, so no two runs agree to the bit.
 
     python benchmarks/conventional.py --grid 40 --threads 1 --substeps 2000

@@ -1,6 +1,7 @@
 """Generate data sets and print what each took: wall time, CPU time, memory, bytes.
 
-    python benchmarks/data_sets.py --root FOLDER [--split NAME ...] [--size NAME ...] [--workers N]
+    python benchmarks/data_sets.py --root FOLDER [--split NAME ...]
+        [--size NAME ...] [--workers N]
 
 Prints one Markdown row per data set; what is there already is generated again, so the
 figures are those of a whole generation, cards and hash checks included.

@@ -13,14 +13,24 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from lagbench.data.grid import Grid, fields
 from lagbench.data.registry import Size, load
-from lagbench.data.writer import read_scenario
+from lagbench.data.scenario import read_scenario
+
+
+class ViscosityFit(NamedTuple):
+    """The viscosity of one scenario, fitted to its loss of energy."""
+
+    frequency: int
+    viscosity: float  # [length^2/s]
+    energy_share: float  # of the initial energy that is left at the end
 
 
 def main() -> int:
@@ -31,46 +41,55 @@ def main() -> int:
     parser.add_argument("--root", type=Path, required=True)
     parser.add_argument("--size", nargs="+", default=["mini", "full"])
     parser.add_argument("--subset", default="test")
-    given = parser.parse_args()
-    for name in given.size:
+    options = parser.parse_args()
+    for name in options.size:
         size = load().size("curl-noise", name)
-        found = defaultdict(list)
-        for scenario in size.subsets[given.subset]:
-            frequency, *fit = _fit(size, given.root, scenario)
-            found[frequency].append(fit)
-        for frequency, fits in sorted(found.items()):
-            viscosity, left = np.mean(fits, axis=0)
-            print(
-                f"{name}, frequency {frequency}: nu = {viscosity:.2e} length^2/s, "
-                f"{left:.0%} of E left"
-            )
-        every = np.array([fit for fits in found.values() for fit in fits])
-        print(
-            f"{name}: median nu = {np.median(every[:, 0]):.2e} length^2/s, "
-            f"{np.median(every[:, 1]):.0%} left"
-        )
+        fits = []
+        for scenario in size.subsets[options.subset]:
+            fits.append(_fit(size, options.root, scenario))
+        _print_fits(name, fits)
     return 0
 
 
-def _fit(size: Size, root: Path, scenario: int) -> tuple[int, float, float]:
-    """Return frequency, viscosity [length^2/s] and the share of energy left."""
+def _print_fits(name: str, fits: Sequence[ViscosityFit]) -> None:
+    by_frequency = defaultdict(list)
+    for fit in fits:
+        by_frequency[fit.frequency].append(fit)
+    for frequency, group in sorted(by_frequency.items()):
+        viscosity = np.mean([fit.viscosity for fit in group])
+        energy_share = np.mean([fit.energy_share for fit in group])
+        print(
+            f"{name}, frequency {frequency}: nu = {viscosity:.2e} length^2/s, "
+            f"{energy_share:.0%} of E left"
+        )
+    viscosity = np.median([fit.viscosity for fit in fits])
+    energy_share = np.median([fit.energy_share for fit in fits])
+    print(f"{name}: median nu = {viscosity:.2e} length^2/s, {energy_share:.0%} left")
+
+
+def _fit(size: Size, root: Path, scenario: int) -> ViscosityFit:
+    """Fit dE/dt = - nu * enstrophy to the energy E of a scenario."""
     grid = Grid(size.task.score_grid.cells, size.task.score_grid.placement)
     (low, high), _ = size.bounds
-    full = grid.full_weight(size.particles, (high - low) ** 2)
+    full_weight = grid.full_weight(size.particles, (high - low) ** 2)
+    frame_count = size.task.input_frames + size.task.horizon
     energy = []
     enstrophy = []
     with read_scenario(size.path(root, scenario)) as file:
-        for frame in range(size.task.input_frames + size.task.horizon):
+        for frame in range(frame_count):
             position = file.read("position", frame).astype(np.float64)
             velocity = file.read("velocity", frame).astype(np.float64)
-            energy.append(0.5 * np.mean(np.sum(velocity**2, axis=-1)))
-            enstrophy.append(
-                np.nanmean(fields(position, velocity, grid, full=full).vorticity ** 2)
-            )
+            speed_squared = np.sum(velocity**2, axis=-1)
+            energy.append(0.5 * np.mean(speed_squared))
+            node_fields = fields(position, velocity, grid, full=full_weight)
+            enstrophy.append(np.nanmean(node_fields.vorticity**2))
         frequency = int(file.header.parameters["frequency"])
-    spent = cumulative_trapezoid(enstrophy, dx=size.frame_interval, initial=0.0)
-    lost = energy[0] - np.array(energy)
-    return frequency, float(spent @ lost / (spent @ spent)), energy[-1] / energy[0]
+
+    # integral of the enstrophy up to each frame, and the energy lost up to it
+    dissipation = cumulative_trapezoid(enstrophy, dx=size.frame_interval, initial=0.0)
+    energy_loss = energy[0] - np.array(energy)
+    viscosity = dissipation @ energy_loss / (dissipation @ dissipation)
+    return ViscosityFit(frequency, float(viscosity), energy[-1] / energy[0])
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@ Markdown.
 
     python benchmarks/floors.py [--data cavity/full ...] [--each]
 
-From the scores that the package ships (``python -m lagbench.scoring.record`` measures
-them): for each data set and floor the ranking metric with its 95 % interval over test
+From the scores that the package ships (``python -m
+lagbench.scoring.measure_references`` measures them): for each data set and floor the ranking metric with its 95 % interval over test
 scenarios, the correlation of vorticity at frame 54 (tiny: the last), and the CPU time
 of a frame; the best floor is marked. Then, for the full boxes, the share of test
 scenarios in which the frozen field correlates below 0.8 at that frame, and its median
@@ -24,7 +24,7 @@ from lagbench.data.registry import Size, load
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import ReferenceScores, shipped
 from lagbench.references.table import COUNTING
-from lagbench.scoring.card import best_floor
+from lagbench.scoring.skill import best_reference
 
 FALLEN = 0.8
 SHARE = 0.75
@@ -33,7 +33,7 @@ ACCEPTED = ("full", "mini")
 
 
 def main() -> int:
-    """Print both tables; tell whether every task asks enough."""
+    """Print the tables; return whether every task is hard enough."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -43,66 +43,75 @@ def main() -> int:
         action="store_true",
         help="correlation of the frozen field by scenario",
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     registry = load()
-    names = given.data or [
-        f"{name}/{tier}" for name, s in registry.splits.items() for tier in s.sizes
-    ]
-    sizes = [registry.size(*name.split("/")) for name in names]
-    held = [(size, floors) for size in sizes if (floors := shipped(size))]
+    names = options.data
+    if not names:
+        names = []
+        for split, description in registry.splits.items():
+            names += [f"{split}/{size_name}" for size_name in description.sizes]
+    measured = []
+    for name in names:
+        split, size_name = name.split("/")
+        size = registry.size(split, size_name)
+        references = shipped(size)
+        if references:
+            measured.append((size, references))
     print(
-        "| data set | floor | ranking metric | 95 % interval | correlation | seconds "
-        "per frame |"
+        "| data set | predictor | ranking metric | 95 % interval | correlation | "
+        "seconds per frame |"
     )
     print("|---|---|---:|---:|---:|---:|")
-    for size, floors in held:
-        _print_floors(size, floors)
+    for size, references in measured:
+        _print_references(size, references)
     print(
         "\n| data set | frozen field below 0.8 | median correlation | median error "
         "|\n|---|---:|---:|---:|"
     )
-    enough = [_asks_enough(size, floors, each=given.each) for size, floors in held]
+    are_hard_enough = [
+        _is_hard_enough(size, references, each=options.each)
+        for size, references in measured
+    ]
     print(
         "\n| data set | active frames, median | least | greatest | of "
         "|\n|---|---:|---:|---:|---:|"
     )
-    for size, floors in held:
-        _print_active(size, floors)
-    if all(enough):
-        return 0
-    return 1
+    for size, references in measured:
+        _print_active(size, references)
+    return 0 if all(are_hard_enough) else 1
 
 
-def _print_floors(size: Size, floors: Mapping[str, ReferenceScores]) -> None:
+def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> None:
     ranking = ranking_metric(size)
-    best = best_floor(
-        {name: floors[name].scores[ranking] for name in COUNTING.intersection(floors)}
+    best = best_reference(
+        {
+            name: references[name].scores[ranking]
+            for name in COUNTING.intersection(references)
+        }
     )
-    for name, floor in floors.items():
-        score = floor.scores[ranking]
+    for name, reference in references.items():
+        score = reference.scores[ranking]
         low, high = score.interval
-        known = floor.correlation[np.isfinite(floor.correlation)]
-        if known.size:
-            correlation = f"{np.mean(known):.3f}"
-        else:
-            correlation = "undefined"
+        defined = reference.correlation[np.isfinite(reference.correlation)]
+        correlation = "undefined"
+        if defined.size:
+            correlation = f"{np.mean(defined):.3f}"
+        mark = " (best)" if name == best else ""
         print(
-            f"| {size.split} {size.name} | {name}{' (best)' if name == best else ''} "
+            f"| {size.split} {size.name} | {name}{mark} "
             f"| {score.mean:.4g} |"
             f" {low:.3g} to {high:.3g} | {correlation} | "
-            f"{floor.seconds_per_frame:.2g} |"
+            f"{reference.seconds_per_frame:.2g} |"
         )
 
 
-def _asks_enough(
-    size: Size, floors: Mapping[str, ReferenceScores], *, each: bool
+def _is_hard_enough(
+    size: Size, references: Mapping[str, ReferenceScores], *, each: bool
 ) -> bool:
-    """Print how often the frozen field fails; a correlation that is undefined has
-    failed.
-    """
-    if "frozen-field" not in floors:
+    """Print how often the frozen field fails; an undefined correlation has failed."""
+    if "frozen-field" not in references:
         return True
-    frozen = floors["frozen-field"]
+    frozen = references["frozen-field"]
     correlation = frozen.correlation
     error = float(np.median(frozen.scores["vorticity_nrmse"].values))
     below = float(np.mean(~(correlation >= FALLEN)))
@@ -117,10 +126,10 @@ def _asks_enough(
     return size.name not in ACCEPTED or (below >= SHARE and strong)
 
 
-def _print_active(size: Size, floors: Mapping[str, ReferenceScores]) -> None:
+def _print_active(size: Size, references: Mapping[str, ReferenceScores]) -> None:
     """Print for how many of the predicted frames the truth of a free surface moves."""
-    if "free-flight" in floors:
-        active = floors["free-flight"].scores["active_frames"].values
+    if "ballistic" in references:
+        active = references["ballistic"].scores["active_frames"].values
         where = f"{size.split} {size.name} | {np.median(active):g}"
         print(
             f"| {where} | {np.min(active):g} | {np.max(active):g} | "

@@ -34,54 +34,56 @@ RADIUS = 1.72
 """Connectivity radius in cells of the lattice."""
 
 
-def plain(self: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
+def plain_update(
+    self: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor
+) -> Tensor:
     """Return the edge update by the product of the whole concatenation."""
     sender, receiver = edge_index
-    whole = torch.cat([edge, node[receiver], node[sender]], dim=1)
-    update: Tensor = self.rest(self.first(whole))
+    features = torch.cat([edge, node[receiver], node[sender]], dim=1)
+    update: Tensor = self.rest(self.first(features))
     return update
 
 
-def conventional(given: argparse.Namespace) -> None:
-    """Put the conventional parts that were asked for in place of ours."""
-    if given.edge_layer == "plain":
-        EdgeMLP.forward = plain
-    if given.products == "torch":
+def use_conventional(options: argparse.Namespace) -> None:
+    """Put the chosen conventional parts in place of ours."""
+    if options.edge_layer == "plain":
+        EdgeMLP.forward = plain_update
+    if options.products == "torch":
         layers._fast = lambda x, weight: False
-    if given.hidden == "kept":
+    if options.hidden == "kept":
         layers.LARGEST_KEPT = math.inf
 
 
-def particles(count: int, windows: int) -> Tensor:
-    """Return a graph with about 8 neighbours: a box full of particles, one in each cell
-    of a lattice.
+def make_graph(count: int, windows: int) -> Tensor:
+    """Return a graph with about 8 neighbours per particle, shape [2, edge].
+
+    Each window is a box with one particle in each cell of a lattice.
     """
     side = math.ceil(math.sqrt(count))
     lattice = torch.cartesian_prod(torch.arange(side), torch.arange(side))[:count]
     source = torch.Generator().manual_seed(0)
-    position = lattice.repeat(windows, 1) + torch.rand(
-        count * windows, 2, generator=source
-    )
+    offset = torch.rand(count * windows, 2, generator=source)
+    position = lattice.repeat(windows, 1) + offset
     sample = torch.arange(windows).repeat_interleave(count)
     edge_index: Tensor = radius_graph(position, RADIUS, sample)
     return edge_index
 
 
-def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, int]]:
+def make_step(options: argparse.Namespace) -> tuple[Callable[[], None], dict[str, int]]:
     """Return a training step, and edges and parameters that it works on."""
-    (point,) = entry_points(group="lagbench.baselines", name=given.operator)
+    (point,) = entry_points(group="lagbench.baselines", name=options.operator)
     torch.manual_seed(0)
     model = EncodeProcessDecode(
         point.load(),
         node_features=NODE_FEATURES,
         edge_features=EDGE_FEATURES,
-        latent=given.latent,
-        layers=given.layers,
+        latent=options.latent,
+        layers=options.layers,
     )
-    if given.compiled:
+    if options.compiled:
         model.compile_layers()
-    edge_index = particles(given.particles, given.windows)
-    rows = given.particles * given.windows
+    edge_index = make_graph(options.particles, options.windows)
+    rows = options.particles * options.windows
     edges = edge_index.shape[1]
     node = torch.randn(rows, NODE_FEATURES)
     edge = torch.randn(edges, EDGE_FEATURES)
@@ -89,20 +91,18 @@ def one_step(given: argparse.Namespace) -> tuple[Callable[[], None], dict[str, i
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     source = torch.Generator().manual_seed(0)
 
+    uses_bfloat16 = options.precision == "bfloat16"
+
     def step() -> None:
-        with torch.autocast(
-            "cpu", torch.bfloat16, enabled=given.precision == "bfloat16"
-        ):
+        with torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16):
             output, losses = model(node, edge_index, edge, source)
         loss = nn.functional.mse_loss(output, target) + sum(losses.values())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
-    return step, {
-        "edges": edges,
-        "parameters": sum(p.numel() for p in model.parameters()),
-    }
+    parameter_count = sum(parameter.numel() for parameter in model.parameters())
+    return step, {"edges": edges, "parameters": parameter_count}
 
 
 def main() -> int:
@@ -125,18 +125,19 @@ def main() -> int:
     parser.add_argument(
         "--hidden", choices=("recomputed", "kept"), default="recomputed"
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    conventional(given)
-    step, found = one_step(given)
+    use_conventional(options)
+    step, counts = make_step(options)
     step()
     seconds = []
-    for _ in range(given.steps):
+    for _ in range(options.steps):
         start = time.process_time()
         step()
         seconds.append(time.process_time() - start)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"processor_seconds": min(seconds), "peak_bytes": peak} | found))
+    result = {"processor_seconds": min(seconds), "peak_bytes": peak, **counts}
+    print(json.dumps(result))
     return 0
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,54 +37,55 @@ FRAMES = 8
 REPEATS = 3
 
 
-def facts() -> DatasetInfo:
-    """Return the public figures of the data set whose recipes are used; no file of it
-    is read.
+def make_dataset_info(q: int) -> DatasetInfo:
+    """Return the info of a data set with q^2 times the particles.
+
+    They are those of the data set whose recipes are used; no file of it is read.
     """
     size = load().size(SPLIT, SIZE)
+    statistics_by_name = {}
     if size.measured:
-        known = size.measured.statistics
-    else:
-        known = {}
+        for name, (x, y) in size.measured.statistics.items():
+            statistics_by_name[name] = (float(x), float(y))
     task = size.task
     return DatasetInfo(
         split=SPLIT,
         size=SIZE,
         version=size.version,
         dataset_sha256="",
-        particles=PARTICLES,
+        particles=PARTICLES * q**2,
         bounds=size.bounds,
-        radius=task.radius,
+        radius=task.radius / q,
         input_frames=task.input_frames,
         horizon=FRAMES,
         score_cells=task.score_grid.cells,
         score_placement=task.score_grid.placement,
         frame_interval=size.frame_interval,
         moving_walls=False,
-        statistics={name: (float(x), float(y)) for name, (x, y) in known.items()},
+        statistics=statistics_by_name,
     )
 
 
-def given(about: DatasetInfo) -> Batch:
-    """Return the given frames of a box full of particles, one in each cell of a
-    lattice, that swirl.
+def make_given_frames(info: DatasetInfo) -> Batch:
+    """Return the given frames of a box full of particles that swirl.
+
+    There is one particle in each cell of a lattice.
     """
-    side = int(np.ceil(np.sqrt(about.particles)))
-    cells = np.stack(
-        np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), axis=-1
-    ).reshape(-1, 2)
+    count = info.particles
+    side = int(np.ceil(np.sqrt(count)))
+    axis = np.arange(side)
+    cells = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     rng = np.random.default_rng(0)
-    unit = (cells[: about.particles] + rng.random((about.particles, 2))) / side
-    a, b = np.pi * unit.T
-    speed = about.statistics["velocity_std"][0]
-    swirl = (
-        2.0 * speed * np.stack([np.sin(a) * np.cos(b), -np.cos(a) * np.sin(b)], axis=-1)
-    )
-    low, high = np.transpose(about.bounds)
-    frames = [
-        low + (high - low) * unit + step * swirl for step in range(about.input_frames)
-    ]
-    count = about.particles
+    # positions in a box of side 1, shape [particle, 2]
+    unit_position = (cells[:count] + rng.random((count, 2))) / side
+    phase_x, phase_y = np.pi * unit_position.T
+    speed = info.statistics["velocity_std"][0]
+    velocity_x = np.sin(phase_x) * np.cos(phase_y)
+    velocity_y = -np.cos(phase_x) * np.sin(phase_y)
+    velocity = 2.0 * speed * np.stack([velocity_x, velocity_y], axis=-1)
+    low, high = np.transpose(info.bounds)
+    first = low + (high - low) * unit_position
+    frames = [first + step * velocity for step in range(info.input_frames)]
     return Batch(
         position=torch.tensor(np.stack(frames, axis=1), dtype=torch.float32),
         sample=torch.zeros(count, dtype=torch.int64),
@@ -96,24 +96,24 @@ def given(about: DatasetInfo) -> Batch:
     )
 
 
-def milliseconds(name: str, q: int) -> float:
+def measure_milliseconds(name: str, q: int) -> float:
     """Return the median processor time of a frame of a model."""
-    about = facts()
-    about = replace(about, particles=about.particles * q**2, radius=about.radius / q)
+    info = make_dataset_info(q)
     entry = find(name)
     options = dict(recipe_for(entry, SPLIT, SIZE).model)
     if "cells" in options:
         options["cells"] *= q
     torch.manual_seed(0)
-    model = entry.model.build(options, about)
-    start = given(about)
-    roll_out(model, start, FRAMES)
-    taken = []
+    model = entry.model.build(options, info)
+    given = make_given_frames(info)
+    roll_out(model, given, FRAMES)
+    milliseconds = []
     for _ in range(REPEATS):
-        before = time.process_time()
-        roll_out(model, start, FRAMES)
-        taken.append(1e3 * (time.process_time() - before) / FRAMES)
-    return statistics.median(taken)
+        start = time.process_time()
+        roll_out(model, given, FRAMES)
+        seconds = time.process_time() - start
+        milliseconds.append(1e3 * seconds / FRAMES)
+    return statistics.median(milliseconds)
 
 
 def main() -> int:
@@ -123,27 +123,33 @@ def main() -> int:
     )
     parser.add_argument("--rows", default="1-4", help="values of q, as in 1-4")
     parser.add_argument("--output", type=Path, help="folder of the table")
-    asked = parser.parse_args()
-    first, _, last = asked.rows.partition("-")
+    options = parser.parse_args()
+    first, _, last = options.rows.partition("-")
     rows = range(int(first), int(last or first) + 1)
     torch.set_num_threads(1)
-    found = {name: [milliseconds(name, q) for q in rows] for name in MODELS}
+
     counts = [PARTICLES * q**2 for q in rows]
-    lines = [
-        [str(q), f"{count:,}", *(f"{found[name][i]:.3g}" for name in MODELS)]
-        for i, (q, count) in enumerate(zip(rows, counts, strict=True))
-    ]
+    times = {}
+    for name in MODELS:
+        times[name] = [measure_milliseconds(name, q) for q in rows]
+    lines = []
+    for i, q in enumerate(rows):
+        cells = [f"{times[name][i]:.3g}" for name in MODELS]
+        lines.append([str(q), f"{counts[i]:,}", *cells])
     if len(rows) > 1:
-        slopes = [
-            float(np.polyfit(np.log(counts), np.log(found[name]), 1)[0])
-            for name in MODELS
-        ]
-        lines.append(["", "exponent", *(f"{slope:.2f}" for slope in slopes)])
-    said = f"Processor time of a frame [ms] on one core; untrained models, recipes of {SPLIT} {SIZE}."
-    text = f"{said}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
+        exponents = []
+        for name in MODELS:
+            slope, _ = np.polyfit(np.log(counts), np.log(times[name]), 1)
+            exponents.append(f"{slope:.2f}")
+        lines.append(["", "exponent", *exponents])
+    caption = (
+        "Processor time of a frame [ms] on one core; untrained models, recipes of "
+        f"{SPLIT} {SIZE}."
+    )
+    text = f"{caption}\n\n{markdown(['q', 'particles', *MODELS], lines)}\n"
     print(text)
-    if asked.output:
-        (asked.output / "inference_cost.md").write_text(text, encoding="utf-8")
+    if options.output:
+        (options.output / "inference_cost.md").write_text(text, encoding="utf-8")
     return 0
 
 

@@ -28,44 +28,42 @@ ROOTS = {
     PACKAGE / "generators": "lagbench.generators",
     PACKAGE / "baselines": "lagbench.baselines",
 }
-MOST = {"generate": 40, "score": 42, "verify": 26}
-"""What a newcomer should at most have to open (issue: fewer rooms)."""
+"""Folders of modules; rglob does not follow the links inside the package."""
+
+MOST_FILES = {"generate": 40, "score": 42, "verify": 26}
+"""Files that a newcomer should at most have to open, by command."""
+
+OWN_LOCALS = 0x02  # flag of code objects of functions; class bodies lack it
 
 
-def sources() -> dict[str, Path]:
-    """Return the dotted name and file of every module; rglob does not follow the links
-    inside the package.
-    """
-    found = {}
+def module_paths() -> dict[str, Path]:
+    """Return the file of every module by its dotted name."""
+    paths = {}
     for folder, name in ROOTS.items():
         for path in folder.rglob("*.py"):
-            found[".".join((name, *path.relative_to(folder).with_suffix("").parts))] = (
-                path
-            )
-    return found
+            parts = path.relative_to(folder).with_suffix("").parts
+            paths[".".join((name, *parts))] = path
+    return paths
 
 
-def journey(words: list[str]) -> tuple[int, int]:
-    """Run a command; return the files whose functions ran, and the functions."""
+def trace_command(words: list[str]) -> tuple[int, int]:
+    """Run a command; return how many files and functions of the package ran."""
     from lagbench.__main__ import app
 
-    ours = {str(path.resolve()) for path in sources().values()}
-    known: dict[str, str] = {}
-    ran: set[tuple[str, int]] = set()
+    package_files = {str(path.resolve()) for path in module_paths().values()}
+    real_paths: dict[str, str] = {}
+    functions: set[tuple[str, int]] = set()
 
     def watch(frame: FrameType, event: str, _: object) -> None:
         code = frame.f_code
-        if (
-            event != "call"
-            or code.co_name in {"<module>", "<lambda>"}
-            or code.co_name.startswith("<")
-        ):
+        is_named = not code.co_name.startswith("<")  # as <module> and <lambda>
+        if event != "call" or not is_named:
             return
-        file = known.setdefault(code.co_filename, os.path.realpath(code.co_filename))
-        # Class bodies are code objects too; functions have local variables of their
-        # own.
-        if file in ours and code.co_flags & 0x02:
-            ran.add((file, code.co_firstlineno))
+        if code.co_filename not in real_paths:
+            real_paths[code.co_filename] = os.path.realpath(code.co_filename)
+        file = real_paths[code.co_filename]
+        if file in package_files and code.co_flags & OWN_LOCALS:
+            functions.add((file, code.co_firstlineno))
 
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         sys.setprofile(watch)
@@ -76,86 +74,92 @@ def journey(words: list[str]) -> tuple[int, int]:
                 raise
         finally:
             sys.setprofile(None)
-    return len({file for file, _ in ran}), len(ran)
+    return len({file for file, _ in functions}), len(functions)
 
 
-def imported(name: str, path: Path, known: dict[str, Path]) -> set[str]:
-    """Return the modules of ours that a module imports, for type checkers too."""
+def imported_modules(name: str, path: Path, paths: dict[str, Path]) -> set[str]:
+    """Return the package's modules that a module imports, for type checkers too."""
+    package = name.rpartition(".")[0]
     if path.name == "__init__.py":
-        package = name
-    else:
-        package = name.rpartition(".")[0]
-    package = package.removesuffix(".__init__")
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.ImportFrom):
-            if node.level:
-                above = package.split(".")[: len(package.split(".")) - node.level + 1]
-            else:
-                above = []
-            base = ".".join([*above, *([node.module] if node.module else [])])
-            for alias in node.names:
-                for candidate in (f"{base}.{alias.name}", base, f"{base}.__init__"):
-                    if candidate in known and candidate != name:
-                        found.add(candidate)
-                        break
-    return found
+        package = name.removesuffix(".__init__")
+
+    modules = set()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        base_parts = []
+        if node.level:
+            package_parts = package.split(".")
+            base_parts = package_parts[: len(package_parts) - node.level + 1]
+        if node.module:
+            base_parts.append(node.module)
+        base = ".".join(base_parts)
+        for alias in node.names:
+            for candidate in (f"{base}.{alias.name}", base, f"{base}.__init__"):
+                if candidate in paths and candidate != name:
+                    modules.add(candidate)
+                    break
+    return modules
 
 
-def longest_chain(known: dict[str, Path]) -> int:
+def longest_chain(paths: dict[str, Path]) -> int:
     """Return the number of modules in the longest chain of imports."""
-    graph = {name: imported(name, path, known) for name, path in known.items()}
-    depth: dict[str, int] = {}
+    graph = {}
+    for name, path in paths.items():
+        graph[name] = imported_modules(name, path, paths)
+    depths: dict[str, int] = {}
 
-    def measure(name: str) -> int:
-        if name not in depth:
-            depth[name] = 1  # a cycle, were there one, would end here
-            depth[name] = 1 + max((measure(other) for other in graph[name]), default=0)
-        return depth[name]
+    def depth(name: str) -> int:
+        if name not in depths:
+            depths[name] = 1  # a cycle, were there one, would end here
+            below = [depth(imported) for imported in graph[name]]
+            depths[name] = 1 + max(below, default=0)
+        return depths[name]
 
-    return max(measure(name) for name in graph)
+    return max(depth(name) for name in graph)
+
+
+def count_comments(text: str) -> int:
+    """Return the number of comments in the text of a module."""
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return sum(token.type == tokenize.COMMENT for token in tokens)
 
 
 def main() -> int:
-    """Print both tables."""
+    """Print the files behind each command, and the size of the package."""
+    too_long = []
     with tempfile.TemporaryDirectory() as folder:
-        root = str(Path(folder, "data"))
-        # a generation notes there how fast it was
+        # a generation notes its speed there
         os.environ["LAGBENCH_CACHE"] = folder
+        root = str(Path(folder, "data"))
         predictions = str(Path(folder, "p.nc"))
-        where = ["--split", "cavity", "--size", "tiny", "--root", root]
+        data_set = ["--split", "cavity", "--size", "tiny", "--root", root]
         commands = {
-            "generate": ["generate", *where],
-            "verify": ["verify", *where],
-            "template": ["template", *where, "-o", predictions],
+            "generate": ["generate", *data_set],
+            "verify": ["verify", *data_set],
+            "template": ["template", *data_set, "-o", predictions],
             "validate": ["validate", predictions, "--root", root],
             "score": ["score", predictions, "--root", root],
             "info": ["info", "cavity"],
         }
         print("| command | files | functions | at most |\n|---|---:|---:|---:|")
-        over = []
         for name, words in commands.items():
-            files, functions = journey(words)
-            print(f"| `{name}` | {files} | {functions} | {MOST.get(name, '')} |")
-            if files > MOST.get(name, files):
-                over.append(name)
-    known = sources()
-    text = [path.read_text(encoding="utf-8") for path in known.values()]
-    lines = sum(part.count("\n") for part in text)
-    comments = sum(
-        token.type == tokenize.COMMENT
-        for part in text
-        for token in tokenize.generate_tokens(io.StringIO(part).readline)
-    )
+            files, functions = trace_command(words)
+            print(f"| `{name}` | {files} | {functions} | {MOST_FILES.get(name, '')} |")
+            if files > MOST_FILES.get(name, files):
+                too_long.append(name)
+
+    paths = module_paths()
+    texts = [path.read_text(encoding="utf-8") for path in paths.values()]
+    line_count = sum(text.count("\n") for text in texts)
+    comment_count = sum(count_comments(text) for text in texts)
+    comments_per_100 = 100 * comment_count / line_count
     print(
-        f"\n{len(text)} files, {lines} lines, {100 * comments / lines:.1f} comments "
-        f"per 100 lines;",
-        end=" ",
+        f"\n{len(texts)} files, {line_count} lines, {comments_per_100:.1f} comments "
+        f"per 100 lines; longest chain of imports {longest_chain(paths)}"
     )
-    print(f"longest chain of imports {longest_chain(known)}")
-    if over:
-        return 1
-    return 0
+    return 1 if too_long else 0
 
 
 if __name__ == "__main__":

@@ -29,23 +29,29 @@ from lagbench.torch import WindowDataset, collate
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 OPERATORS = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
 WINDOWS = 120
-"""Windows whose terms are averaged; a few violent ones make most of the mean on the
-free surface.
+"""Windows whose terms are averaged.
+
+On the free surface a few violent ones make most of the mean.
 """
 
 STEPS = 12
 """Steps that are taken; the first two are not timed."""
 
 
-def half(recipe: Recipe) -> bool:
+def uses_bfloat16(recipe: Recipe) -> bool:
     """Return whether a recipe multiplies in bfloat16 here."""
-    wanted = recipe.training.precision
-    return wanted == "bf16" or (wanted == "auto" and multiplies_bfloat16("cpu"))
+    precision = recipe.training.precision
+    if precision == "auto":
+        return multiplies_bfloat16("cpu")
+    return precision == "bf16"
 
 
-def terms(recipe: Recipe, model: Baseline, data: WindowDataset) -> dict[str, float]:
-    """Return the weighted terms at the start that count, means over windows spread over
-    train.
+def mean_terms(
+    recipe: Recipe, model: Baseline, data: WindowDataset
+) -> dict[str, float]:
+    """Return the weighted terms of the loss at the start that are not 0.
+
+    They are means over windows spread over train.
     """
     generator = torch.Generator().manual_seed(0)
     totals: Counter[str] = Counter()
@@ -53,39 +59,36 @@ def terms(recipe: Recipe, model: Baseline, data: WindowDataset) -> dict[str, flo
     for index in places:
         with (
             torch.no_grad(),
-            torch.autocast("cpu", torch.bfloat16, enabled=half(recipe)),
+            torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16(recipe)),
         ):
-            found = model(collate([data[index]]), generator)
-        totals.update(
-            {
-                name: model.weights.get(name, 1.0) * float(value)
-                for name, value in found.items()
-            }
-        )
+            raw_terms = model(collate([data[index]]), generator)
+        for name, value in raw_terms.items():
+            totals[name] += model.weights.get(name, 1.0) * float(value)
     return {name: value / len(places) for name, value in totals.items() if value}
 
 
-def seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:
+def step_seconds(recipe: Recipe, model: Baseline, data: WindowDataset) -> float:
     """Return the processor seconds of a step."""
     batch = recipe.training.batch
     stride = len(data) // (STEPS * batch)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-4)
     generator = torch.Generator().manual_seed(0)
-    found = []
+    seconds = []
     for step in range(STEPS):
-        windows = collate(
-            [data[(step + STEPS * place) * stride] for place in range(batch)]
-        )
-        started = time.process_time()
-        with torch.autocast("cpu", torch.bfloat16, enabled=half(recipe)):
-            raw = model(windows, generator)
+        indices = [(step + STEPS * place) * stride for place in range(batch)]
+        windows = collate([data[index] for index in indices])
+        start = time.process_time()
+        with torch.autocast("cpu", torch.bfloat16, enabled=uses_bfloat16(recipe)):
+            raw_terms = model(windows, generator)
+        weighted_terms = []
+        for name, value in raw_terms.items():
+            weighted_terms.append(model.weights.get(name, 1.0) * value)
+        loss = torch.stack(weighted_terms).sum()
         optimizer.zero_grad()
-        torch.stack(
-            [model.weights.get(name, 1.0) * value for name, value in raw.items()]
-        ).sum().backward()
+        loss.backward()
         optimizer.step()
-        found.append(time.process_time() - started)
-    return statistics.median(found[2:])
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds[2:])
 
 
 def main() -> int:
@@ -98,33 +101,33 @@ def main() -> int:
     parser.add_argument("--recipe", help="variant of the recipe")
     parser.add_argument("--split", choices=SPLITS, nargs="*", default=SPLITS)
     parser.add_argument("--operator", nargs="*", default=OPERATORS)
-    given = parser.parse_args()
+    options = parser.parse_args()
     torch.set_num_threads(1)
     print(
         "| split | operator | terms at the start | s per step | steps | minutes "
         "|\n|---|---|---|---|---|---|"
     )
-    for split in given.split:
-        facts = read_dataset_info(split, given.size, root=given.root)
-        for name in given.operator:
-            recipe = recipe_for(find(name), split, given.size, variant=given.recipe)
+    for split in options.split:
+        info = read_dataset_info(split, options.size, root=options.root)
+        for name in options.operator:
+            recipe = recipe_for(find(name), split, options.size, variant=options.recipe)
             torch.manual_seed(0)
-            model = find(name).model.build(recipe.model, facts)
+            model = find(name).model.build(recipe.model, info)
             data = WindowDataset(
                 split,
-                size=given.size,
-                root=given.root,
+                size=options.size,
+                root=options.root,
                 history=model.history,
                 future=model.future,
             )
-            said = ", ".join(
-                f"{term} {value:.2g}"
-                for term, value in terms(recipe, model, data).items()
+            terms = mean_terms(recipe, model, data)
+            term_list = ", ".join(
+                f"{term} {value:.2g}" for term, value in terms.items()
             )
-            cost = seconds(recipe, model, data)
+            cost = step_seconds(recipe, model, data)
             count = recipe.training.steps or 0
             print(
-                f"| {split} | {name} | {said} | {cost:.3f} | {count} | "
+                f"| {split} | {name} | {term_list} | {cost:.3f} | {count} | "
                 f"{count * cost / 60:.1f} |",
                 flush=True,
             )

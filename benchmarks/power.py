@@ -54,152 +54,189 @@ ASSUMED = {
 
 
 def read_methods(split: str) -> dict[str, Floats]:
-    """Return the ranking metric's values of each method of the mini size, shape [seed,
-    scenario].
+    """Return the ranking metric of each method of the mini size.
+
+    The shape is [seed, scenario].
     """
     metric = ranking_metric(load().size(split, "mini"))
-    held = defaultdict(list)
-    for path in sorted((ROOT / "leaderboard" / "scores" / split / "mini").glob("*.nc")):
-        held[re.sub(r"_\d+$", "", path.stem)].append(
-            read_statistics(path).scores()[metric].values
-        )
-    return {name: np.array(seeds) for name, seeds in held.items()}
+    folder = ROOT / "leaderboard" / "scores" / split / "mini"
+    seeds_by_method = defaultdict(list)
+    for path in sorted(folder.glob("*.nc")):
+        method = re.sub(r"_\d+$", "", path.stem)
+        score = read_statistics(path).scores()[metric]
+        seeds_by_method[method].append(score.values)
+    return {method: np.array(seeds) for method, seeds in seeds_by_method.items()}
 
 
-def measured_scatter(methods: dict[str, Floats]) -> Scatter:
-    """Return the scatter of methods; NaN where no method has two seeds, or none a
-    rival.
+def measure_scatter(methods: dict[str, Floats]) -> Scatter:
+    """Return the scatter of methods.
+
+    It is NaN where no method has two seeds, or none of those has a near rival.
     """
-    seeds = []
-    rests = []
     relative = {name: values / values.mean() for name, values in methods.items()}
+    seed_variances = []
+    rest_variances = []
     for values in relative.values():
-        if len(values) > 1:
-            off = values - values.mean(axis=0)
-            count = values.shape[1]
-            within = off - off.mean(axis=1, keepdims=True)
-            rest = float(np.sum(within**2)) / ((len(values) - 1) * (count - 1))
-            rests.append(rest)
-            seeds.append(
-                max(0.0, float(np.var(off.mean(axis=1), ddof=1)) - rest / count)
-            )
-    near = [
-        (a, b)
-        for a, b in itertools.permutations(methods, 2)
-        if len(methods[a]) > 1 and 0.5 < methods[a].mean() / methods[b].mean() < 2.0
-    ]
-    pairs = {frozenset(pair) for pair in near}
-    if rests:
-        noise = float(np.mean(rests))
-    else:
-        noise = np.nan
-    gaps = []
-    for a, b in sorted(map(sorted, pairs)):
-        apart = float(
-            np.var(relative[a].mean(axis=0) - relative[b].mean(axis=0), ddof=1)
-        )
-        of_seeds = noise * (1 / len(methods[a]) + 1 / len(methods[b]))
-        gaps.append(max(0.0, apart - of_seeds) / 2)
+        seed_count, scenario_count = values.shape
+        if seed_count < 2:
+            continue
+        deviation = values - values.mean(axis=0)
+        seed_deviation = deviation.mean(axis=1, keepdims=True)
+        rest = deviation - seed_deviation
+        freedom = (seed_count - 1) * (scenario_count - 1)
+        rest_variance = float(np.sum(rest**2)) / freedom
+        rest_variances.append(rest_variance)
+        variance = float(np.var(seed_deviation, ddof=1))
+        seed_variances.append(max(0.0, variance - rest_variance / scenario_count))
 
-    def root(variances: list[float]) -> float:
-        if variances:
-            return float(np.sqrt(np.mean(variances)))
+    noise = float(np.mean(rest_variances)) if rest_variances else np.nan
+    method_variances = []
+    for first, second in _near_pairs(methods):
+        difference = relative[first].mean(axis=0) - relative[second].mean(axis=0)
+        variance = float(np.var(difference, ddof=1))
+        seed_share = 1 / len(methods[first]) + 1 / len(methods[second])
+        method_variances.append(max(0.0, variance - noise * seed_share) / 2)
+    return Scatter(
+        seed=_root_mean(seed_variances),
+        rest=_root_mean(rest_variances),
+        method=_root_mean(method_variances),
+    )
+
+
+def _near_pairs(methods: dict[str, Floats]) -> list[tuple[str, str]]:
+    """Return pairs whose means differ by less than a factor 2, one with two seeds."""
+    pairs = set()
+    for first, second in itertools.permutations(methods, 2):
+        ratio = methods[first].mean() / methods[second].mean()
+        if len(methods[first]) > 1 and 0.5 < ratio < 2.0:
+            pairs.add((min(first, second), max(first, second)))
+    return sorted(pairs)
+
+
+def _root_mean(variances: list[float]) -> float:
+    if not variances:
         return np.nan
-
-    return Scatter(root(seeds), root(rests), root(gaps))
+    return float(np.sqrt(np.mean(variances)))
 
 
 def share_told_apart(
     scatter: Scatter,
     scenarios: int,
     difference: float,
+    *,
     seeds: int,
-    others: int | None = None,
+    other_seeds: int | None = None,
 ) -> float:
-    """Return the share of draws of two methods so far apart that the test tells apart.
+    """Return the share of draws in which the test tells two methods apart.
 
-    The second has as many seeds as the first, or others.
+    Their means differ by a relative difference. The second has as many seeds as the
+    first, or ``other_seeds``.
     """
     rng = np.random.Generator(np.random.PCG64(0))
-    told = 0
+    method_scatter = scatter.method if difference else 0.0
+    level_and_seeds = [(1.0, seeds), (1.0 - difference, other_seeds or seeds)]
+    significant_count = 0
     for _ in range(DRAWS):
         sides = []
-        for level, count in ((1.0, seeds), (1.0 - difference, others or seeds)):
-            own = rng.normal(0.0, scatter.method if difference else 0.0, scenarios)
-            seed = rng.normal(0.0, scatter.seed, (count, 1))
-            sides.append(
-                level
-                * (1.0 + own + seed + rng.normal(0.0, scatter.rest, (count, scenarios)))
-            )
-        told += differ(*sides) < SIGNIFICANCE
-    return told / DRAWS
+        for level, count in level_and_seeds:
+            by_scenario = rng.normal(0.0, method_scatter, scenarios)
+            by_seed = rng.normal(0.0, scatter.seed, (count, 1))
+            rest = rng.normal(0.0, scatter.rest, (count, scenarios))
+            sides.append(level * (1.0 + by_scenario + by_seed + rest))
+        significant_count += differ(*sides) < SIGNIFICANCE
+    return significant_count / DRAWS
 
 
-def pairs_of_seeds() -> tuple[int, int]:
-    """Return how many pairs of seeds of one method there are, and how many differ as
-    weights.
-    """
-    p = [
-        differ(a, b)
-        for split in TEST
-        for values in read_methods(split).values()
-        for a, b in itertools.combinations(values, 2)
-    ]
-    return len(p), sum(value < SIGNIFICANCE for value in p)
+def count_pairs_of_seeds() -> tuple[int, int]:
+    """Return the pairs of seeds of one method, and how many of them differ."""
+    pair_count = 0
+    differing_count = 0
+    for split in TEST:
+        for values in read_methods(split).values():
+            for first, second in itertools.combinations(values, 2):
+                pair_count += 1
+                differing_count += differ(first, second) < SIGNIFICANCE
+    return pair_count, differing_count
 
 
-def tables() -> str:
-    """Return the page."""
-    cases = [(f"assumed: {name}", 16, scatter) for name, scatter in ASSUMED.items()]
-    for split, scenarios in TEST.items():
-        scatter = measured_scatter(read_methods(split))
-        if np.isfinite(astuple(scatter)).all():
-            cases.append((split, scenarios, scatter))
-    rows = []
-    wrong = []
-    for name, scenarios, scatter in cases:
-        spread = " | ".join(f"{100 * value:.1f} %" for value in astuple(scatter))
-        power = " | ".join(
-            f"{share_told_apart(scatter, scenarios, d, SEEDS):.2f}" for d in DIFFERENCES
-        )
-        rows.append(f"| {name} | {scenarios} | {spread} | {power} |")
-        sides = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
-        false = [
-            100 * share_told_apart(scatter, scenarios, 0.0, *seeds) for seeds in sides
-        ]
-        wrong.append(f"| {name} | {' | '.join(f'{share:.1f} %' for share in false)} |")
-    pairs, differing = pairs_of_seeds()
-    return f"""# Power: what the test can tell apart
+PAGE = """\
+# Power: what the test can tell apart
 
-Written by `python benchmarks/power.py --write`: by three assumptions about how much methods and seeds
-scatter, and from the score files of the mini sizes below leaderboard/scores, a row for each data set that
-has two near methods, one of them of several seeds (two methods of two seeds each are a rough measure).
+`python benchmarks/power.py --write` writes this page. The first rows assume how much
+methods and seeds scatter. A row of a data set is measured from the score files of its
+mini size in leaderboard/scores. A data set has a row if two of its methods are near
+each other and one of them has several seeds. Two methods of two seeds each are a rough
+measure.
 
-The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario + seed + rest).
-Two methods share the scenarios; what is left are the three standard deviations below, relative to a
-method's mean. The last three columns say how often `lagbench.metrics.differ` tells two methods apart
-at 5 %, with {SEEDS} seeds each, if one is better by 5, 10 and 20 % ({DRAWS} draws).
+The value of seed s in scenario i is read as mean x (1 + scenario + method-in-scenario +
+seed + rest). Two methods share the scenarios; the three other standard deviations are
+given below, relative to a method's mean. The last three columns say how often
+`lagbench.metrics.differ` tells two methods apart at 5 %, with {seeds} seeds each, if
+one is better by 5, 10 and 20 % ({draws} draws).
 
 | case | test scenarios | seed | rest | method in scenario | 5 % | 10 % | 20 % |
 |---|---|---|---|---|---|---|---|
-{chr(10).join(rows)}
+{rows}
 
-A difference that is small beside the scatter of seeds is not found with more scenarios: only with
-more seeds. A board that ranks by hundredths ranks by chance.
+More scenarios do not find a difference that is small beside the scatter of seeds; only
+more seeds do. A board that ranks by hundredths ranks by chance.
 
 ## Equal methods that are told apart
 
-Both sides are seeds of one method: at most 5 % may differ (give or take 1.4, the error of so many draws).
-With one seed a side the test is the sign-flip test over scenarios. It is right about those weights, and
-wrong about the method as often as the first column says: why such a row says "these weights". So does a
-row of one seed beside one of several, whose scatter alone is known.
+Both sides are seeds of one method, so at most 5 % may differ (give or take 1.4, the
+error of so many draws). With one seed a side the test is the sign-flip test over
+scenarios. It is right about those weights. About the method it is wrong as often as the
+first column says, so such a row of the board says "these weights". So does a row of one
+seed beside one of several: the scatter of the single seed is unknown.
 
-| case | 1 seed a side | 1 and {SEEDS} | 2 | 3 | 5 |
+| case | 1 seed a side | 1 and {seeds} | 2 | 3 | 5 |
 |---|---|---|---|---|---|
-{chr(10).join(wrong)}
+{false_rows}
 
-The score files have {pairs} pairs of single seeds of one method; {differing} of them differ as weights.
+The score files have {pair_count} pairs of single seeds of one method; {differing_count}
+of them differ as weights.
 """
+
+SIDES = ((1, 1), (1, SEEDS), (2, 2), (3, 3), (5, 5))
+"""Seeds of two equal methods."""
+
+
+def render_page() -> str:
+    """Return the page."""
+    cases = []
+    for name, scatter in ASSUMED.items():
+        cases.append((f"assumed: {name}", 16, scatter))
+    for split, scenarios in TEST.items():
+        scatter = measure_scatter(read_methods(split))
+        if np.isfinite(astuple(scatter)).all():
+            cases.append((split, scenarios, scatter))
+
+    rows = []
+    false_rows = []
+    for name, scenarios, scatter in cases:
+        cells = [name, str(scenarios)]
+        cells += [f"{100 * value:.1f} %" for value in astuple(scatter)]
+        for difference in DIFFERENCES:
+            share = share_told_apart(scatter, scenarios, difference, seeds=SEEDS)
+            cells.append(f"{share:.2f}")
+        rows.append(f"| {' | '.join(cells)} |")
+
+        false_cells = [name]
+        for seeds, other_seeds in SIDES:
+            share = share_told_apart(
+                scatter, scenarios, 0.0, seeds=seeds, other_seeds=other_seeds
+            )
+            false_cells.append(f"{100 * share:.1f} %")
+        false_rows.append(f"| {' | '.join(false_cells)} |")
+    pair_count, differing_count = count_pairs_of_seeds()
+    return PAGE.format(
+        seeds=SEEDS,
+        draws=DRAWS,
+        rows="\n".join(rows),
+        false_rows="\n".join(false_rows),
+        pair_count=pair_count,
+        differing_count=differing_count,
+    )
 
 
 def main() -> int:
@@ -209,7 +246,7 @@ def main() -> int:
     )
     parser.add_argument("--write", action="store_true", help="write docs/power.md")
     write = parser.parse_args().write
-    page = tables()
+    page = render_page()
     print(page)
     if write:
         (ROOT / "docs" / "power.md").write_text(page, encoding="utf-8")

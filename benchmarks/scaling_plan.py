@@ -25,12 +25,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from table_3_1 import THESIS, Row
+from table_3_1 import THESIS, ThesisRow
 
 from lagbench.data.registry import Registry, load
 from lagbench.data.scenario import check_scenario
 from lagbench.data.statistics import file_moments
-from lagbench.generators.batch import Batch, SimulationJob, draw
+from lagbench.generators.batch import (
+    ScenarioBatch,
+    SimulationJob,
+    draw_initial_state,
+)
 from lagbench.generators.simulate import scenario_writer
 from lagbench.make.generate import generate
 
@@ -72,7 +76,7 @@ class Whole:
     worker: int  # peak memory of the largest worker [bytes]
 
 
-def registry_of(row: Row, frames: int) -> Registry:
+def registry_of(row: ThesisRow, frames: int) -> Registry:
     """Return our splits with a size ``q`` of fluid that has the numbers of a row."""
     known = load()
     fluid = known.split("fluid")
@@ -112,12 +116,12 @@ def timed(function: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def measure_parts(row: Row, frames: int, root: Path) -> Parts:
+def measure_parts(row: ThesisRow, frames: int, root: Path) -> Parts:
     """Time the parts of a generation in this process."""
     size = registry_of(row, frames).size("fluid", "q")
     job = SimulationJob(size=size, scenarios=(0,), root=root)
-    drawing = min(timed(lambda: draw(size, 0)) for _ in range(3))
-    batch = Batch(job, lambda _: None)
+    drawing = min(timed(lambda: draw_initial_state(size, 0)) for _ in range(3))
+    batch = ScenarioBatch(job, lambda _: None)
     batch.solver.advance(1)
     solving = (
         min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3))
@@ -141,7 +145,7 @@ def measure_parts(row: Row, frames: int, root: Path) -> Parts:
     )
 
 
-def measure_whole(row: Row, frames: int, root: Path) -> Whole:
+def measure_whole(row: ThesisRow, frames: int, root: Path) -> Whole:
     """Generate one scenario and one with a twin, one after the other, by one worker."""
     start = time.process_time()
     generate(
@@ -161,7 +165,7 @@ def measure_whole(row: Row, frames: int, root: Path) -> Whole:
     )
 
 
-def apart(row: Row, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
+def apart(row: ThesisRow, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
     """Measure in a process of its own, whose peak memory is nobody else's."""
     command = [sys.executable, __file__, "--one", f"{row.q},{frames},{what}"]
     return json.loads(
@@ -182,7 +186,7 @@ def one(text: str) -> int:
     return 0
 
 
-def parts_table(found: Sequence[tuple[Row, Parts]]) -> list[str]:
+def parts_table(found: Sequence[tuple[ThesisRow, Parts]]) -> list[str]:
     """Return the costs per particle."""
     lines = [
         "| q | particles | draw [ns] | substep [ns] | write a frame [ns] | hash it "
@@ -199,7 +203,7 @@ def parts_table(found: Sequence[tuple[Row, Parts]]) -> list[str]:
     return lines
 
 
-def whole_table(found: Sequence[tuple[Row, Parts, Sequence[Whole]]]) -> list[str]:
+def whole_table(found: Sequence[tuple[ThesisRow, Parts, Sequence[Whole]]]) -> list[str]:
     """Return what whole generations took, beside the sum of the parts."""
     lines = [
         "| q | frames | core seconds | sum of the parts | one frame [MB] | parent, "
@@ -218,13 +222,13 @@ def whole_table(found: Sequence[tuple[Row, Parts, Sequence[Whole]]]) -> list[str
     return lines
 
 
-def expected(row: Row, p: Parts, frames: int) -> float:
+def expected(row: ThesisRow, p: Parts, frames: int) -> float:
     """Return what two scenarios and a twin should take by the parts [s]."""
     simulated = 3 * (frames - 1) * row.substeps * p.substep
     return row.particles * (3 * p.draw + simulated + 2 * frames * p.write)
 
 
-def plan_table(row: Row, p: Parts, memory: int) -> list[str]:
+def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     """Return bytes, core hours and memory of the planned data set."""
     n = row.particles
     frames = PLANNED
@@ -256,7 +260,7 @@ def plan_table(row: Row, p: Parts, memory: int) -> list[str]:
 
 
 def extrapolated(
-    found: Sequence[tuple[Row, Parts, Sequence[Whole]]], particles: int
+    found: Sequence[tuple[ThesisRow, Parts, Sequence[Whole]]], particles: int
 ) -> int:
     """Return a worker's peak memory at a number of particles, by the line through two
     rows [bytes].

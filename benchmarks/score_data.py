@@ -1,7 +1,6 @@
-"""A data set of the size of cavity full, and a submission to it, made without
-simulating.
+"""A made-up data set of the size of cavity full, and a submission to it.
 
-Particles are carried by swirls that differ between scenarios, so that fields and errors
+Particles are carried by rotating_disc that differ between scenarios, so that fields and errors
 are of realistic shape; nothing is learned from the values.
 """
 
@@ -15,44 +14,56 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from lagbench.data.layout import ScenarioKey, scenario_path
 from lagbench.data.registry import Registry, default_path, load
-from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.writer import ScenarioWriter
 from lagbench.data.yamlfile import read_yaml
 from lagbench.submission import PredictionsWriter
 
 __all__ = ["ScoreData", "make_score_data", "write_scenario"]
 
 SPEED = 0.0022
-"""Per-frame speed of the swirls, as in the cavity [length/frame]."""
+"""Per-frame speed of the rotating_disc, as in the cavity [length/frame]."""
 
 BOX = (0.0625, 0.875)
 """Lower corner and side of the box [length]."""
 
 
+LAST_GIVEN = 5  # number of the last given frame
+
+
 @dataclass(frozen=True)
 class ScoreData:
-    """Where the data set and the submission are."""
+    """The files of the data set and of the submission."""
 
     root: Path  # folder of all data sets
     registry: Registry  # registry that describes this one
     predictions: Path  # a predictions.nc
 
 
-def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
+def make_score_data(
+    folder: Path,
+    *,
+    horizon: int = 90,
+    scenario_count: int | None = None,
+    has_shipped_references: bool = True,
+) -> ScoreData:
     """Write the test scenarios of 8192 particles and predictions with growing errors.
-
-    The registry claims the hash of the real data set, so that scoring finds the shipped
-    floors, as a user's does, and measures the submission alone.
 
     Args:
         folder: an empty folder.
         horizon: frames to predict.
+        scenario_count: test scenarios; all by default.
+        has_shipped_references: claim the hash of the real data set, so that scoring
+            finds the shipped scores of the reference predictors, as for a user, and
+            measures the submission alone. They exist for a horizon of 90 only.
     """
     size = load().size("cavity", "full")
+    scenarios = size.subsets["test"][:scenario_count]
     frames = size.task.input_frames + horizon
     root = folder / "root"
     hashes = {}
-    for scenario in size.subsets["test"]:
+    for scenario in scenarios:
         key = ScenarioKey(
             split="cavity",
             size="full",
@@ -60,47 +71,54 @@ def make_score_data(folder: Path, *, horizon: int = 90) -> ScoreData:
             scenario=scenario,
             subset="test",
         )
-        flow = (
-            (position, position) for position in _flow(scenario, frames, size.particles)
-        )
+        positions = _flow(scenario, frames, size.particles)
+        flow = ((position, position) for position in positions)
         mass = 1e-4 * BOX[1] ** 2 / size.particles
         hashes[scenario] = write_scenario(
             root, key, flow, particles=size.particles, frames=frames, particle_mass=mass
         )
-    registry = load(_write_registry(folder / "datasets.yaml", horizon, frames, hashes))
+    registry_path = folder / "datasets.yaml"
+    _write_registry(
+        registry_path,
+        horizon=horizon,
+        frames=frames,
+        hashes=hashes,
+        has_shipped_references=has_shipped_references,
+    )
+    registry = load(registry_path)
     path = folder / "predictions.nc"
     writer = PredictionsWriter(
-        path, split="cavity", size="full", method="swirls", registry=registry
+        path, split="cavity", size="full", method="rotating_disc", registry=registry
     )
     with writer:
-        for scenario in size.subsets["test"]:
-            guess = list(_flow(scenario, frames, size.particles, error=0.02))[
-                size.task.input_frames :
-            ]
-            writer.add(scenario, np.stack(guess))
+        for scenario in scenarios:
+            guess = list(_flow(scenario, frames, size.particles, error=0.02))
+            predicted = guess[size.task.input_frames :]
+            writer.add(scenario, np.stack(predicted))
     return ScoreData(root, registry, path)
 
 
 def _flow(
     scenario: int, frames: int, particles: int, *, error: float = 0.0
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield positions frame by frame; an error makes the swirls faster by that
-    share.
-    """
+    """Yield positions frame by frame; an error makes the rotating_disc that much faster."""
     rng = np.random.Generator(np.random.PCG64(scenario))
     low, side = BOX
-    x = low + side * rng.random((particles, 2))
-    waves = 1 + scenario % 3
+    high = low + side
+    position = low + side * rng.random((particles, 2))
+    wave_count = 1 + scenario % 3
     for frame in range(frames):
-        yield x.astype(np.float32)
-        s = waves * np.pi * (x - low) / side
-        u = np.stack(
-            [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])],
-            axis=1,
-        )
-        x = np.clip(
-            x + SPEED * (1.0 + (error if frame >= 5 else 0.0)) * u, low, low + side
-        )
+        yield position.astype(np.float32)
+        phase = wave_count * np.pi * (position - low) / side
+        phase_x = phase[:, 0]
+        phase_y = phase[:, 1]
+        velocity_x = np.sin(phase_x) * np.cos(phase_y)
+        velocity_y = -np.cos(phase_x) * np.sin(phase_y)
+        velocity = np.stack([velocity_x, velocity_y], axis=1)
+        speed = SPEED
+        if frame >= LAST_GIVEN:
+            speed *= 1.0 + error
+        position = np.clip(position + speed * velocity, low, high)
 
 
 def write_scenario(
@@ -113,9 +131,7 @@ def write_scenario(
     particle_mass: float = 1e-8,
     wall_velocity: NDArray[np.float64] | None = None,
 ) -> str:
-    """Write a made-up scenario of positions and velocities, frame by frame; return its
-    content hash.
-    """
+    """Write a scenario of positions and velocities; return its content hash."""
     writer = ScenarioWriter(
         scenario_path(root, key),
         key,
@@ -137,25 +153,32 @@ def write_scenario(
 
 
 def _write_registry(
-    path: Path, horizon: int, frames: int, hashes: dict[int, str]
-) -> Path:
-    held = read_yaml(default_path())
-    size = held["splits"]["cavity"]["sizes"]["full"]
+    path: Path,
+    *,
+    horizon: int,
+    frames: int,
+    hashes: dict[int, str],
+    has_shipped_references: bool,
+) -> None:
+    """Write datasets.yaml with this horizon and the hashes of these scenarios."""
+    content = read_yaml(default_path())
+    size = content["splits"]["cavity"]["sizes"]["full"]
     size["task"]["horizon"] = horizon
     size["frames"] = frames
-    held["measured"] = {
-        "cavity": {
-            "full": {
-                "dataset_sha256": held["measured"]["cavity"]["full"]["dataset_sha256"],
-                "subset_sha256": {},
-                "scenario_sha256": {i: digest[:16] for i, digest in hashes.items()},
-                "statistics": {
-                    "position_std": [0.25, 0.25],
-                    "velocity_std": [0.0015, 0.0015],
-                },
-                "twin_floor": [1e-6] * horizon,
-            }
-        }
+    size["subsets"]["test"] = f"{min(hashes)}-{max(hashes)}"
+    dataset_sha256 = "0" * 64
+    if has_shipped_references:
+        dataset_sha256 = content["measured"]["cavity"]["full"]["dataset_sha256"]
+    scenario_hashes = {i: digest[:16] for i, digest in hashes.items()}
+    measured = {
+        "dataset_sha256": dataset_sha256,
+        "subset_sha256": {},
+        "scenario_sha256": scenario_hashes,
+        "statistics": {
+            "position_std": [0.25, 0.25],
+            "velocity_std": [0.0015, 0.0015],
+        },
+        "twin_floor": [1e-6] * horizon,
     }
-    path.write_text(yaml.safe_dump(held))
-    return path
+    content["measured"] = {"cavity": {"full": measured}}
+    path.write_text(yaml.safe_dump(content))

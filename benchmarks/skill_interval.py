@@ -2,7 +2,7 @@
 
     python benchmarks/skill_interval.py [--draws 400]
 
-Scores of a method and of a floor are drawn lognormal, with a correlation over
+Scores of a method and of a naive baseline are drawn lognormal, correlated over
 scenarios; each seed of the method has a factor of its own. Beside the shipped interval,
 on the logarithm of the ratio, stands that of the ratio itself. Prints the share of
 draws in which either 95 % interval holds the true skill, and the least and greatest end
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import skill
+from lagbench.scoring.skill import compute_skill
 
 CASES = (
     (1.9, 0.6, 0.6, 0.3),
@@ -26,8 +26,8 @@ CASES = (
     (0.4, 0.8, 0.6, 0.0),
     (1.0, 0.3, 0.3, 0.8),
 )
-"""Ratio of the means, deviations of the logarithms of method and floor over scenarios,
-their correlation.
+"""Ratio of the means, then of the logarithms over scenarios: both deviations (method,
+naive baseline) and their correlation.
 """
 
 SEED = 0.15
@@ -69,35 +69,36 @@ def main() -> int:
     for seeds in (1, 2, 3):
         for count in (6, 16, 20):
             for ratio, spread, base_spread, correlation in CASES:
-                held = np.zeros(2)
+                hit_counts = np.zeros(2)
                 least = np.full(2, np.inf)
                 greatest = np.full(2, -np.inf)
+                covariance = [[1, correlation], [correlation, 1]]
+                deviations = np.array([spread, base_spread])
+                true_skill = 1.0 - ratio
                 for _ in range(draws):
-                    z = rng.multivariate_normal(
-                        [0, 0], [[1, correlation], [correlation, 1]], count
-                    )
-                    deviations = np.array([spread, base_spread])
-                    ours, base = np.exp(deviations * z - deviations**2 / 2).T
+                    normal = rng.multivariate_normal([0, 0], covariance, count)
+                    log_factors = deviations * normal - deviations**2 / 2
+                    method_factor, baseline = np.exp(log_factors).T
+                    seed_factor = np.ones(1)
                     if seeds > 1:
-                        factor = np.exp(rng.normal(0.0, SEED, seeds) - SEED**2 / 2)
-                    else:
-                        factor = np.ones(1)
-                    own = ratio * factor[:, None] * ours
-                    found = skill(
-                        [score_of(row) for row in own], {"persistence": score_of(base)}
+                        log_seeds = rng.normal(0.0, SEED, seeds) - SEED**2 / 2
+                        seed_factor = np.exp(log_seeds)
+                    # shape [seed, scenario]
+                    method = ratio * seed_factor[:, None] * method_factor
+                    estimate = compute_skill(
+                        [score_of(row) for row in method],
+                        {"persistence": score_of(baseline)},
                     )
-                    if found is None:
-                        raise ValueError("persistence does not count as a floor")
-                    low, high = bootstrap_interval(
-                        (own - (1.0 - found.value) * base) / np.mean(base)
-                    )
-                    ends = np.array(
-                        [found.interval, (found.value - high, found.value - low)]
-                    )
-                    held += (ends[:, 0] <= 1.0 - ratio) & (1.0 - ratio <= ends[:, 1])
-                    least = np.minimum(least, ends[:, 0])
-                    greatest = np.maximum(greatest, ends[:, 1])
-                shares = zip(held / draws, least, greatest, strict=True)
+                    if estimate is None:
+                        raise ValueError("persistence does not count for skill")
+                    excess = method - (1.0 - estimate.value) * baseline
+                    low, high = bootstrap_interval(excess / np.mean(baseline))
+                    of_ratio = (estimate.value - high, estimate.value - low)
+                    lower, upper = np.array([estimate.interval, of_ratio]).T
+                    hit_counts += (lower <= true_skill) & (true_skill <= upper)
+                    least = np.minimum(least, lower)
+                    greatest = np.maximum(greatest, upper)
+                shares = zip(hit_counts / draws, least, greatest, strict=True)
                 cells = [
                     f"{share:.1%} | {low:.2f} | {high:.2f}"
                     for share, low, high in shares

@@ -33,7 +33,7 @@ FIXED = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class ThesisRow:
     """One row of Table 3.1 as the thesis prints it (times on its GPU, in
     milliseconds).
     """
@@ -47,7 +47,7 @@ class Row:
 
 
 THESIS = tuple(
-    Row(
+    ThesisRow(
         q=q,
         particles=n,
         grid=grid,
@@ -73,7 +73,7 @@ THESIS = tuple(
 class Measurement:
     """Our times for one row, in milliseconds."""
 
-    row: Row
+    row: ThesisRow
     substep_ms: float
     frame_ms: float
 
@@ -87,7 +87,7 @@ class Exponents:
     substep_particles: float  # of t/substep against particles
 
 
-def block(row: Row) -> tuple[FreeSurfaceParameters, InitialState]:
+def block(row: ThesisRow) -> tuple[FreeSurfaceParameters, InitialState]:
     """Return a square block of liquid above the floor, at rest."""
     parameters = FreeSurfaceParameters(
         particles=row.particles,
@@ -118,7 +118,7 @@ def block(row: Row) -> tuple[FreeSurfaceParameters, InitialState]:
     return parameters, state
 
 
-def start(row: Row, device: solver.Device) -> solver.Solver:
+def start(row: ThesisRow, device: solver.Device) -> solver.Solver:
     """Build the solver of a row, load the block and compile."""
     parameters, state = block(row)
     running = solver.build(
@@ -147,7 +147,7 @@ def best_ms(
     return 1e3 * min(times)
 
 
-def measure(row: Row, *, device: solver.Device, repeats: int) -> Measurement:
+def measure(row: ThesisRow, *, device: solver.Device, repeats: int) -> Measurement:
     """Time one row: substeps in runs of a fixed number, and frames of its own
     substeps.
     """
@@ -164,7 +164,7 @@ def measure(row: Row, *, device: solver.Device, repeats: int) -> Measurement:
 
 
 def exponents(
-    sizes: Sequence[Row], substep_ms: Sequence[float], frame_ms: Sequence[float]
+    sizes: Sequence[ThesisRow], substep_ms: Sequence[float], frame_ms: Sequence[float]
 ) -> Exponents:
     """Fit straight lines to the logarithms (Eq. 3.1)."""
     squares = [row.q**2 for row in sizes]
@@ -182,7 +182,7 @@ def _slope(x: Sequence[float], y: Sequence[float]) -> float:
     return float("nan")
 
 
-def of_thesis(rows: Sequence[Row] = THESIS) -> Exponents:
+def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
     """Return the exponents of the thesis's own times."""
     return exponents(
         rows, [row.substep_ms for row in rows], [row.frame_ms for row in rows]

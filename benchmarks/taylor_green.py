@@ -27,36 +27,42 @@ SIDES = (20, 32, 45, 64, 91, 128, 181, 256)
 WAVE = 2.0 * math.pi
 
 
-def velocity(x: Floats) -> Floats:
+KINDS = {"random": math.nan, "jitter 0.25": 0.25, "lattice": 0.0}
+"""Jitter of each kind of positions, in spacings; NaN for random ones."""
+
+FINE_SIDE = 2000  # particles along a side where only the error of the grid is left
+
+
+def velocity(position: Floats) -> Floats:
     """Return the flow at positions, shape [particle, 2]."""
-    s = WAVE * x
-    return np.stack(
-        [np.sin(s[:, 0]) * np.cos(s[:, 1]), -np.cos(s[:, 0]) * np.sin(s[:, 1])], axis=1
-    )
+    phase_x = WAVE * position[:, 0]
+    phase_y = WAVE * position[:, 1]
+    velocity_x = np.sin(phase_x) * np.cos(phase_y)
+    velocity_y = -np.cos(phase_x) * np.sin(phase_y)
+    return np.stack([velocity_x, velocity_y], axis=1)
 
 
-def particles(side: int, jitter: float, rng: np.random.Generator) -> Floats:
-    """Return a lattice moved by ``jitter`` spacings at the most, or random points for
-    NaN.
-    """
+def sample_positions(side: int, jitter: float) -> Floats:
+    """Return a lattice moved by at most ``jitter`` spacings; random points for NaN."""
+    rng = np.random.Generator(np.random.PCG64(0))
     if math.isnan(jitter):
         return rng.random((side * side, 2))
     axis = (np.arange(side) + 0.5) / side
-    lattice = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
-    return lattice + (rng.random(lattice.shape) - 0.5) * jitter / side
+    lattice = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    lattice = lattice.reshape(-1, 2)
+    offset = (rng.random(lattice.shape) - 0.5) * jitter / side
+    return lattice + offset
 
 
-def error(x: Floats, grid: Grid) -> float:
-    """Return the RMS error of the vorticity over that of the exact one [1]."""
-    found = fields(x, velocity(x), grid, full=grid.full_weight(len(x), 1.0))
-    nodes = found.differentiable
-    a, b = np.meshgrid(WAVE * grid.axis, WAVE * grid.axis, indexing="ij")
-    exact = 2.0 * WAVE * np.sin(a) * np.sin(b)
-    return float(
-        np.sqrt(
-            np.mean((found.vorticity - exact)[nodes] ** 2) / np.mean(exact[nodes] ** 2)
-        )
-    )
+def relative_error(position: Floats, grid: Grid) -> float:
+    """Return the RMS error of the vorticity over the RMS of the exact one [1]."""
+    full_weight = grid.full_weight(len(position), 1.0)
+    node_fields = fields(position, velocity(position), grid, full=full_weight)
+    phase_x, phase_y = np.meshgrid(WAVE * grid.axis, WAVE * grid.axis, indexing="ij")
+    exact = 2.0 * WAVE * np.sin(phase_x) * np.sin(phase_y)
+    nodes = node_fields.differentiable
+    residual = (node_fields.vorticity - exact)[nodes]
+    return float(np.sqrt(np.mean(residual**2) / np.mean(exact[nodes] ** 2)))
 
 
 def main() -> int:
@@ -65,28 +71,23 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--cells", type=int, default=40)
-    grid = Grid(parser.parse_args().cells)
-    kinds = {"random": math.nan, "jitter 0.25": 0.25, "lattice": 0.0}
+    options = parser.parse_args()
+    grid = Grid(options.cells)
     print(
         f"relative RMS error of the vorticity, {grid.cells}x{grid.cells} nodes at "
-        f"cell centres"
+        "cell centres"
     )
-    print(
-        f"{'particles':>10s}{'per cell':>10s}"
-        + "".join(f"{kind:>14s}" for kind in kinds)
-    )
+    heads = "".join(f"{kind:>14s}" for kind in KINDS)
+    print(f"{'particles':>10s}{'per cell':>10s}{heads}")
     for side in SIDES:
-        rng = np.random.Generator(np.random.PCG64(0))
-        cells = "".join(
-            f"{error(particles(side, jitter, rng), grid):14.4f}"
-            for jitter in kinds.values()
-        )
-        print(f"{side * side:10d}{side * side / grid.cells**2:10.2f}{cells}")
-    rng = np.random.Generator(np.random.PCG64(0))
-    print(
-        f"grid alone (4 million particles on a lattice): "
-        f"{error(particles(2000, 0.0, rng), grid):.4f}"
-    )
+        particle_count = side * side
+        line = f"{particle_count:10d}{particle_count / grid.cells**2:10.2f}"
+        for jitter in KINDS.values():
+            error = relative_error(sample_positions(side, jitter), grid)
+            line += f"{error:14.4f}"
+        print(line)
+    error = relative_error(sample_positions(FINE_SIDE, 0.0), grid)
+    print(f"grid alone (4 million particles on a lattice): {error:.4f}")
     return 0
 
 

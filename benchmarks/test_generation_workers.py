@@ -12,7 +12,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from timing import best_seconds
 
 import lagbench
-from lagbench.data.writer import rehash
+from lagbench.data.scenario import rehash
 
 TARGET = 1.8
 SCENARIOS = "0-23"

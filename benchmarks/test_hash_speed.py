@@ -47,7 +47,7 @@ def test_content_hash(benchmark: BenchmarkFixture, frames: Frames) -> None:
 
 
 def test_bare_sha256(benchmark: BenchmarkFixture, frames: Frames) -> None:
-    """The floor: SHA-256 of the bytes without looking at a value."""
+    """Lower bound: SHA-256 of the bytes without looking at a value."""
     bare = best_seconds(
         benchmark,
         lambda: hashlib.sha256(frames.data).digest(),

@@ -35,30 +35,31 @@ def position() -> Tensor:
     """Particles of the cavity [length], shape [particle, 2]."""
     rng = np.random.Generator(np.random.PCG64(0))
     side = int(np.ceil(np.sqrt(PARTICLES)))
-    lattice = np.stack(np.meshgrid(*[np.arange(side) + 0.5] * 2), axis=-1).reshape(
-        -1, 2
-    )[:PARTICLES]
-    x = 0.0625 + 0.875 * (lattice + rng.normal(0.0, 0.3, (PARTICLES, 2))) / side
-    return torch.from_numpy(x.astype(np.float32))
+    axis = np.arange(side) + 0.5
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    jitter = rng.normal(0.0, 0.3, (PARTICLES, 2))
+    # in spacings, then in the box
+    coordinates = lattice[:PARTICLES] + jitter
+    position = 0.0625 + 0.875 * coordinates / side
+    return torch.from_numpy(position.astype(np.float32))
 
 
 def brute_force(position: Tensor) -> Tensor:
     """Compute all distances in float64 in PyTorch."""
-    near = torch.cdist(
-        position.double(),
-        position.double(),
-        compute_mode="donot_use_mm_for_euclid_dist",
-    )
-    return (near <= RADIUS).fill_diagonal_(False).nonzero().T
+    exact = position.double()
+    distance = torch.cdist(exact, exact, compute_mode="donot_use_mm_for_euclid_dist")
+    is_near = distance <= RADIUS
+    is_near.fill_diagonal_(False)
+    return is_near.nonzero().T
 
 
 def tree(position: Tensor) -> Tensor:
     """Query SciPy's tree for pairs and write each in both directions, unsorted."""
-    found = cKDTree(
-        position.numpy().astype(np.float64), compact_nodes=False, balanced_tree=False
-    )
-    pairs = found.query_pairs(RADIUS, output_type="ndarray")
-    return torch.from_numpy(np.concatenate([pairs, pairs[:, ::-1]]).T)
+    exact = position.numpy().astype(np.float64)
+    search_tree = cKDTree(exact, compact_nodes=False, balanced_tree=False)
+    pairs = search_tree.query_pairs(RADIUS, output_type="ndarray")
+    edges = np.concatenate([pairs, pairs[:, ::-1]])
+    return torch.from_numpy(edges.T)
 
 
 def scikit_learn(position: Tensor) -> Tensor:
@@ -109,10 +110,10 @@ def test_on_device(benchmark: BenchmarkFixture, position: Tensor) -> None:
     moved = position.to(device)
 
     def search() -> Tensor:
-        found: Tensor = radius_graph(moved, RADIUS)
+        edges: Tensor = radius_graph(moved, RADIUS)
         if device.startswith("cuda"):
             torch.cuda.synchronize()
-        return found
+        return edges
 
     seconds = best_seconds(benchmark, search, rounds=50, warmup_rounds=5)
     print(f"\nours on {device}: {seconds * 1e3:.2f} ms")

@@ -29,7 +29,9 @@ def found() -> list[table_3_1.Measurement]:
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"q{row.q}")
 def test_row(
-    benchmark: BenchmarkFixture, row: table_3_1.Row, found: list[table_3_1.Measurement]
+    benchmark: BenchmarkFixture,
+    row: table_3_1.ThesisRow,
+    found: list[table_3_1.Measurement],
 ) -> None:
     """Time frames of the row's own substeps, and substeps in runs of 20."""
     rounds: list[table_3_1.Measurement] = []

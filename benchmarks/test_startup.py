@@ -1,40 +1,45 @@
-"""Processor time of starting lagbench, beside what an import of xarray alone takes.
+"""Processor time of starting lagbench, beside that of importing xarray.
 
 pytest benchmarks/test_startup.py -s
+
+The limits are ratios within one run, so they hold on slow and on busy machines.
 """
 
 import os
 import subprocess
 import sys
 
-SPENT = {
+REPEATS = 5
+YARDSTICK = "import xarray"
+ARGUMENTS = {
     "lagbench --help": ["-m", "lagbench", "--help"],
     "import lagbench": ["-c", "import lagbench"],
-    "import xarray": ["-c", "import xarray"],
+    YARDSTICK: ["-c", YARDSTICK],
 }
-LIMITS = {"lagbench --help": 0.3, "import lagbench": 0.5}
+LIMITS = {"lagbench --help": 0.5, "import lagbench": 0.15}
+"""Greatest processor time over that of the yardstick."""
 
 
-def _seconds(arguments: list[str]) -> float:
-    """Return the processor time of a fresh interpreter, best of five [s]."""
-    times = []
-    for _ in range(5):
-        process = subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.DEVNULL
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        assert process.returncode == 0
-        times.append(usage.ru_utime + usage.ru_stime)
-    return min(times)
+def _processor_seconds(arguments: list[str]) -> float:
+    """Return the processor time of a fresh interpreter [s]."""
+    process = subprocess.Popen([sys.executable, *arguments], stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0
+    return usage.ru_utime + usage.ru_stime
 
 
 def test_startup() -> None:
-    """Help and import stay within the targets of design section 13."""
-    seconds = {name: _seconds(arguments) for name, arguments in SPENT.items()}
-    for name, spent in seconds.items():
-        print(
-            f"{name}: {spent:.3f} s, {spent / seconds['import xarray']:.2f} x "
-            f"import xarray"
-        )
-    assert all(seconds[name] <= limit for name, limit in LIMITS.items())
+    """Help and import take a small share of the time that importing xarray takes."""
+    best: dict[str, float] = {}
+    # in turns, so that a busy moment of the machine meets all of them
+    for _ in range(REPEATS):
+        for name, arguments in ARGUMENTS.items():
+            seconds = _processor_seconds(arguments)
+            best[name] = min(seconds, best.get(name, seconds))
+
+    for name, seconds in best.items():
+        ratio = seconds / best[YARDSTICK]
+        print(f"{name}: {seconds:.3f} s, {ratio:.2f} x {YARDSTICK}")
+    for name, limit in LIMITS.items():
+        assert best[name] <= limit * best[YARDSTICK]

@@ -63,7 +63,8 @@ from pathlib import Path
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.data.registry import load
 root, windows = Path(sys.argv[1]), int(sys.argv[2])
-data = WindowDataset("cavity", root=root, history=6, registry=load(root / "datasets.yaml"))
+registry = load(root / "datasets.yaml")
+data = WindowDataset("cavity", root=root, history=6, registry=registry)
 for drawn, index in enumerate(WindowSampler(data, seed=0)):
     data[index]
     if drawn == windows:

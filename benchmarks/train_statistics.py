@@ -3,9 +3,9 @@
     python benchmarks/train_statistics.py [--size full]
 
 Per-frame velocity x(f) - x(f-1) and acceleration (second difference), mean and standard
-deviation over all train scenarios, from datasets.yaml. Table 5.3 is read as the cavity,
-Table 5.1 as curl noise (design section 12); the thesis gives none for the free-surface
-splits.
+deviation over all train scenarios, from datasets.yaml. Table 5.3 of the thesis is
+its cavity. We read Table 5.1, of the "vorticity conservation model", as curl noise. The
+thesis has no such table for the free-surface splits.
 """
 
 from __future__ import annotations
@@ -22,22 +22,27 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--size", default="full")
-    name = parser.parse_args().size
+    size_name = parser.parse_args().size
     registry = load()
-    print(f"| split, `{name}` | statistic of `train` | x | y | thesis x | thesis y |")
+    print(
+        f"| split, `{size_name}` | statistic of `train` | x | y | thesis x | thesis y |"
+    )
     print("|---|---|---:|---:|---:|---:|")
     for split in registry.splits:
-        measured = registry.size(split, name).measured
-        for statistic, values in measured.statistics.items() if measured else ():
-            if name == "full":
+        measured = registry.size(split, size_name).measured
+        if measured is None:
+            continue
+        for statistic, values in measured.statistics.items():
+            thesis = None
+            if size_name == "full":
                 thesis = STATISTICS.get(split, {}).get(statistic)
+            cells = [f"{value:.4g}" for value in values]
+            if thesis is None:
+                cells += ["", ""]
             else:
-                thesis = None
-            cells = [*values, *(thesis or ("", ""))]
-            words = (
-                f"{cell:.4g}" if isinstance(cell, float) else cell for cell in cells
-            )
-            print(f"| {split} | {statistic.replace('_', ' ')} | {' | '.join(words)} |")
+                cells += [f"{value:.4g}" for value in thesis]
+            name = statistic.replace("_", " ")
+            print(f"| {split} | {name} | {' | '.join(cells)} |")
     return 0
 
 

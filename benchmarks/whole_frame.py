@@ -17,7 +17,7 @@ import time
 import numpy as np
 
 from lagbench.generators import solver
-from lagbench.generators.acceptance.experiment import (
+from validation.experiment import (
     Case,
     initial_state,
     plan,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from lagbench.errors import UsageError, require
@@ -18,8 +18,8 @@ from lagbench.work.machine import available_cores
 
 from .solver import Device
 
-# Taichi greets on stdout as it is imported, which would spoil `--json`, and asks the
-# network.
+# As it is imported, Taichi greets on stdout, which would spoil `--json`, and asks the
+# network for a newer version.
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")
 ti = require("taichi", extra="generate")
@@ -35,7 +35,7 @@ HARMLESS = frozenset(
         "TI_VISIBLE_DEVICE",
     }
 )
-"""Variables of Taichi's that a user may set: they choose memory, places and cards,
+"""Variables of Taichi that a user may set: they choose memory, places and cards,
 never arithmetic.
 """
 
@@ -58,49 +58,65 @@ def start(device: Device, *, scenarios: int = 1, threads: int | None = None) -> 
         )
     on_gpu = device is Device.CUDA
     if not _started:
-        size = max(2, available_cores(), threads or 0)
-        greeting = io.StringIO()
-        # Others would change device, precision or optimisation behind our back.
-        names = [
-            name
-            for name in os.environ
-            if name.startswith("TI_") and name not in HARMLESS
-        ]
-        hidden = {name: os.environ.pop(name) for name in names}
-        try:
-            with contextlib.redirect_stdout(greeting):
-                ti.init(
-                    arch=ti.cuda if on_gpu else ti.cpu,
-                    default_fp=ti.f32,
-                    default_ip=ti.i32,
-                    fast_math=False,
-                    cpu_max_num_threads=size,
-                    offline_cache=True,
-                    enable_fallback=False,
-                    log_level=ti.ERROR,
-                )
-        except RuntimeError as error:
-            raise UsageError(
-                "Taichi cannot use this device",
-                where="cuda" if on_gpu else "cpu",
-                got=error,
-                fix="use --device cpu: there is no NVIDIA GPU, or no driver of one"
-                if on_gpu
-                else None,
-            ) from error
-        finally:
-            os.environ.update(hidden)
-        _started.append((on_gpu, size))
-    running_on_gpu, pool = _started[0]
-    if running_on_gpu != on_gpu or (threads or 1) > pool:
+        pool_size = max(2, available_cores(), threads or 0)
+        _initialise(on_gpu, pool_size)
+        _started.append((on_gpu, pool_size))
+
+    running_on_gpu, pool_size = _started[0]
+    if running_on_gpu != on_gpu or (threads or 1) > pool_size:
+        running_device = "CUDA" if running_on_gpu else "CPU"
         raise UsageError(
             "Taichi runs already with another device or fewer threads",
             where=f"device {device.value}, threads {threads}",
-            expected=f"{'CUDA' if running_on_gpu else 'CPU'} with at most "
-            f"{pool} threads",
+            expected=f"{running_device} with at most {pool_size} threads",
             fix="use another process",
         )
-    return threads or min(pool, available_cores())
+    return threads or min(pool_size, available_cores())
+
+
+def _initialise(on_gpu: bool, pool_size: int) -> None:
+    """Start Taichi in silence and with strict arithmetic."""
+    architecture = ti.cuda if on_gpu else ti.cpu
+    greeting = io.StringIO()
+    with _hidden_variables(), contextlib.redirect_stdout(greeting):
+        try:
+            ti.init(
+                arch=architecture,
+                default_fp=ti.f32,
+                default_ip=ti.i32,
+                fast_math=False,
+                cpu_max_num_threads=pool_size,
+                offline_cache=True,
+                enable_fallback=False,
+                log_level=ti.ERROR,
+            )
+        except RuntimeError as error:
+            raise _device_error(on_gpu, error) from error
+
+
+@contextlib.contextmanager
+def _hidden_variables() -> Iterator[None]:
+    """Hide variables that would change device, precision or optimisation unseen."""
+    names = []
+    for name in os.environ:
+        if name.startswith("TI_") and name not in HARMLESS:
+            names.append(name)
+    hidden = {name: os.environ.pop(name) for name in names}
+    try:
+        yield
+    finally:
+        os.environ.update(hidden)
+
+
+def _device_error(on_gpu: bool, error: RuntimeError) -> UsageError:
+    if on_gpu:
+        return UsageError(
+            "Taichi cannot use this device",
+            where="cuda",
+            got=error,
+            fix="use --device cpu: there is no NVIDIA GPU, or no driver of one",
+        )
+    return UsageError("Taichi cannot use this device", where="cpu", got=error)
 
 
 def place(*groups: tuple[tuple[int, ...], Sequence[Any]]) -> Any:  # noqa: ANN401 (Taichi is untyped)

@@ -1,8 +1,8 @@
-"""Scenarios of one size that a solver advances together, from frame to frame.
+"""Draw scenarios of one size, and advance them together from frame to frame.
 
-Every scenario starts recording after frames of its own, so a batch advances from one
-frame to the next, whichever scenario it belongs to. On ``Device.CPU`` a batch is one
-scenario.
+Every scenario records from a frame of its own on. A batch therefore advances to the
+next frame that is due, whichever scenario it belongs to. On ``Device.CPU`` a batch is
+one scenario.
 """
 
 from __future__ import annotations
@@ -29,6 +29,10 @@ from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 # particle-substeps between two reports: about a tenth of a second on a core
 STRIDE = 4_000_000
 
+# particles of the initial states that a process keeps, 65 bytes each: a perturbed run
+# starts from the state of a scenario that was simulated some tasks before
+KEPT_PARTICLES = 1 << 17
+
 Report = Callable[[int], None]
 """Called with the substeps done since the last call, summed over scenarios."""
 
@@ -43,82 +47,135 @@ class SimulationJob:
     device: Device = Device.CPU  # where the solver runs
 
 
-def draw(size: Size, scenario: int) -> InitialState:
-    """Return a scenario before its first substep; what cannot be drawn is a
-    WorkFailedError.
+def start_frame(size: Size, scenario: int) -> int:
+    """Return how many frames a scenario is simulated before frame 0 is recorded.
+
+    The split says it from the head of the scenario's random stream, without a draw of
+    the whole scenario. A split without a function ``start_frame`` records at once.
+    """
+    state_start_frame = getattr(split_module(size), "start_frame", None)
+    if state_start_frame is None:
+        return 0
+
+    rng = generator(size.split, size.name, size.major, scenario)
+    with blamed_on_parameters(size, f"drawing the first frame of scenario {scenario}"):
+        return int(state_start_frame(size, scenario, rng))
+
+
+def substep_count(size: Size, scenario: int) -> int:
+    """Return how many substeps a scenario takes, those before frame 0 included."""
+    last_frame = start_frame(size, scenario) + size.frame_count(scenario) - 1
+    return last_frame * size.substeps_per_frame
+
+
+def draw_initial_state(size: Size, scenario: int) -> InitialState:
+    """Draw a scenario before its first substep.
+
+    Raises:
+        WorkFailedError: a value cannot be drawn.
+        UsageError: the split returns something else than an initial state, or one that
+            starts at another frame than the split said.
     """
     rng = generator(size.split, size.name, size.major, scenario)
     module = split_module(size)
+    place = f"{size.split} {size.name}, scenario {scenario}"
     try:
         with blamed_on_parameters(size, f"drawing scenario {scenario}"):
             state: object = module.initial_state(size, scenario, rng)
     except WorkFailedError as error:
-        raise _placed(
-            error, f"{size.split} {size.name}, scenario {scenario}"
-        ) from error
+        raise _relocate(error, place) from error
+
+    where = f"{size.generator}.initial_state"
     if not isinstance(state, InitialState):
-        where = f"{size.generator}.initial_state"
-        got = type(state).__name__
         raise UsageError(
             "a split drew no initial state",
             where=where,
             expected="an InitialState",
-            got=got,
+            got=type(state).__name__,
+        )
+    stated_start = start_frame(size, scenario)
+    if state.start_frame != stated_start:
+        raise UsageError(
+            "a split starts a scenario at another frame than it said",
+            where=f"{where}, scenario {scenario}",
+            expected=f"start_frame {stated_start}",
+            got=state.start_frame,
+            fix="let the split have a function start_frame(size, scenario, rng) that "
+            "returns the start_frame of its initial state",
         )
     return state
 
 
-def _placed(error: WorkFailedError, where: str) -> WorkFailedError:
-    """Return an error that says where it happened."""
+def _relocate(error: WorkFailedError, where: str) -> WorkFailedError:
+    """Return the same error with another place."""
     return WorkFailedError(
         error.what, where=where, expected=error.expected, got=error.got, fix=error.fix
     )
 
 
-def substeps_of(size: Size, scenario: int) -> int:
-    """Return how many substeps a scenario takes, those before frame 0 included."""
-    last = draw(size, scenario).start_frame + size.frame_count(scenario) - 1
-    return last * size.substeps_per_frame
+class _RecentStates:
+    """The initial states that this process drew last, oldest first."""
+
+    def __init__(self) -> None:
+        self._entries: list[tuple[Size, int, InitialState]] = []
+
+    def draw(self, size: Size, scenario: int) -> InitialState:
+        """Return the state of a scenario, from memory where it is among the last."""
+        for known_size, known_scenario, state in self._entries:
+            if known_scenario == scenario and known_size == size:
+                return state
+
+        state = draw_initial_state(size, scenario)
+        self._entries.append((size, scenario, state))
+        while sum(entry[0].particles for entry in self._entries) > KEPT_PARTICLES:
+            del self._entries[0]
+        return state
 
 
-class Batch:
+_RECENT = _RecentStates()
+
+
+class ScenarioBatch:
     """Scenarios in a solver, and the frames at which they are due."""
 
     def __init__(
         self, job: SimulationJob, report: Report, frames: Sequence[int] | None = None
     ) -> None:
+        size = job.size
+        scenario_count = len(job.scenarios)
         self.job = job  # what to simulate
-        # the scenarios before their first substep
-        self.states = [draw(job.size, scenario) for scenario in job.scenarios]
-        # what each has gone through so far
+        # the scenarios before their first substep, in the order of the job
+        self.states = [_RECENT.draw(size, scenario) for scenario in job.scenarios]
+        # extremes that each scenario has gone through so far
         unseen = Health(
             finite=True, max_speed=0.0, jacobian_min=np.inf, jacobian_max=-np.inf
         )
-        self.extremes = [unseen] * len(self.states)
-        # in the order of the job
-        self.solver = _solver(solver_constants(job.size), job.device, len(self.states))
-        with self._naming():
+        self.extremes = [unseen] * scenario_count
+        self.solver = _solver(solver_constants(size), job.device, scenario_count)
+        with self._scenario_names():
             self.solver.load(self.states)
+
         self._report = report
-        self._frames = frames or [
-            job.size.frame_count(scenario) for scenario in job.scenarios
-        ]
-        self._stride = max(1, STRIDE // (job.size.particles * len(self.states)))
-        self._now = 0
-        self._displaced: list[tuple[int, NDArray[np.float32]]] = []
+        # recorded frames of each scenario
+        self._frames = frames or [size.frame_count(i) for i in job.scenarios]
+        # substeps between two reports
+        self._stride = max(1, STRIDE // (size.particles * scenario_count))
+        self._substep = 0  # substeps done so far
+        # (substep, offset) of every displacement
+        self._displacements: list[tuple[int, NDArray[np.float32]]] = []
 
     def recordings(self) -> Iterator[tuple[int, int]]:
         """Yield (index in the batch, frame) whenever the solver stands at that
         frame.
         """
         interval = self.job.size.substeps_per_frame
-        schedule = sorted(
-            ((state.start_frame + frame) * interval, index, frame)
-            for index, (state, count) in enumerate(
-                zip(self.states, self._frames, strict=True)
-            )
-            for frame in range(count)
-        )
+        schedule: list[tuple[int, int, int]] = []
+        for index, state in enumerate(self.states):
+            for frame in range(self._frames[index]):
+                substep = (state.start_frame + frame) * interval
+                schedule.append((substep, index, frame))
+        schedule.sort()
+
         for substep, due in groupby(schedule, key=lambda entry: entry[0]):
             self._advance_to(substep)
             self._position = self.solver.position()
@@ -135,33 +192,39 @@ class Batch:
     def displace(self, offset: NDArray[np.float32]) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, 2]."""
         self.solver.displace(offset)
-        self._displaced.append((self._now, offset.copy()))
+        self._displacements.append((self._substep, offset.copy()))
 
     def _advance_to(self, substep: int) -> None:
-        while self._now < substep:
-            count = min(self._stride, substep - self._now)
-            with self._naming():
+        while self._substep < substep:
+            count = min(self._stride, substep - self._substep)
+            with self._scenario_names():
                 try:
                     self.solver.advance(count)
                 except WorkFailedError:
                     self._replay(count)
                     raise
-            self._now += count
-            # Extremes are those of the scenarios that still record, and so is the work.
-            interval = self.job.size.substeps_per_frame
-            running = 0
-            for index, health in enumerate(self.solver.health()):
-                last = self.states[index].start_frame + self._frames[index] - 1
-                if self._now <= last * interval:
-                    running += 1
-                    widest = self.extremes[index]
-                    self.extremes[index] = Health(
-                        finite=health.finite,
-                        max_speed=max(widest.max_speed, health.max_speed),
-                        jacobian_min=min(widest.jacobian_min, health.jacobian_min),
-                        jacobian_max=max(widest.jacobian_max, health.jacobian_max),
-                    )
-            self._report(count * running)
+            self._substep += count
+            running_count = self._update_extremes()
+            self._report(count * running_count)
+
+    def _update_extremes(self) -> int:
+        """Widen the extremes of the scenarios that still record; return how many do."""
+        interval = self.job.size.substeps_per_frame
+        running_count = 0
+        for index, health in enumerate(self.solver.health()):
+            last_frame = self.states[index].start_frame + self._frames[index] - 1
+            if self._substep > last_frame * interval:
+                continue
+
+            running_count += 1
+            widest = self.extremes[index]
+            self.extremes[index] = Health(
+                finite=health.finite,
+                max_speed=max(widest.max_speed, health.max_speed),
+                jacobian_min=min(widest.jacobian_min, health.jacobian_min),
+                jacobian_max=max(widest.jacobian_max, health.jacobian_max),
+            )
+        return running_count
 
     def _replay(self, count: int) -> None:
         """Repeat everything up to here, then single substeps, to learn which one breaks
@@ -171,30 +234,34 @@ class Batch:
         """
         self.solver.load(self.states)
         done = 0
-        for start, offset in [*self._displaced, (self._now, None)]:
-            while done < start:
-                step = min(self._stride, start - done)
-                self.solver.advance(step)
-                done += step
-            if offset is not None:
-                self.solver.displace(offset)
+        for substep, offset in self._displacements:
+            self._replay_to(substep, done)
+            done = substep
+            self.solver.displace(offset)
+        self._replay_to(self._substep, done)
         for _ in range(count):
             self.solver.advance(1)
 
+    def _replay_to(self, substep: int, done: int) -> None:
+        while done < substep:
+            step = min(self._stride, substep - done)
+            self.solver.advance(step)
+            done += step
+
     @contextmanager
-    def _naming(self) -> Iterator[None]:
+    def _scenario_names(self) -> Iterator[None]:
         """Put a scenario's id into errors of the solver, which knows its index only."""
         ids = self.job.scenarios
         size = self.job.size
+
+        def name_scenario(match: re.Match[str]) -> str:
+            return f"scenario {ids[int(match[1])]}"
+
         try:
             yield
         except WorkFailedError as error:
-            place = re.sub(
-                r"scenario (\d+)",
-                lambda found: f"scenario {ids[int(found[1])]}",
-                error.where or "",
-            )
-            raise _placed(error, f"{size.split} {size.name}, {place}") from error
+            place = re.sub(r"scenario (\d+)", name_scenario, error.where or "")
+            raise _relocate(error, f"{size.split} {size.name}, {place}") from error
 
 
 @functools.lru_cache(maxsize=1)
@@ -204,5 +271,8 @@ def _solver(
     scenarios: int,
 ) -> Solver:
     """Build a solver, or take the last one again: building compiles."""
-    threads = 1 if device is Device.CPU else None
+    if device is Device.CPU:
+        threads = 1
+    else:
+        threads = None
     return build(parameters, device=device, scenarios=scenarios, threads=threads)

@@ -1,18 +1,18 @@
 """Lid-driven cavity: a full box, one wall or two opposite ones slide (thesis §5.8).
 
-Every moving wall follows a program of its own: knots with speeds drawn from [-U, U], to
-the other side at each (else half of the walls would slide as before when it matters,
-and the frozen flow would do for an answer), and between two of them, at frames t0 and
-t1 with speeds a and b,
+Every moving wall follows a program of its own: knots with speeds drawn from [-U, U], of
+the other sign at each knot. Without the change of sign half of the walls would slide as
+before when it matters, and the frozen flow would do for an answer. Between two knots,
+at frames t0 and t1 with speeds a and b, the speed is
 
     u(t) = a + (b - a) s^2 (3 - 2 s),    s = (t - t0) / (t1 - t0).
 
 One scenario in eight is the classic: lid at rest, then a constant speed. Expected
 behaviour: vortices grow from the moving walls, are cut off where a wall turns and
 merge; the flow never settles. Which walls move goes by id, so that every subset holds
-all six choices alike; two that meet in a corner never move both, because their corner
-blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute speed of a wall,
-L the box's width.
+all six choices alike. Two walls that meet in a corner never move both, because their
+corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute speed of
+a wall, L the box's width.
 """
 
 from __future__ import annotations
@@ -45,9 +45,7 @@ _TANGENT = {"left": 1, "right": 1, "bottom": 0, "top": 0}
 
 
 def solver_parameters(size: Size) -> ClosedBoxParameters:
-    """Return the constants of Table 5.2 and design 4.3 at this size; walls hold the
-    fluid.
-    """
+    """Return the constants of thesis Table 5.2 at this size; walls hold the fluid."""
     return constants(ClosedBoxParameters, size, no_slip=True)
 
 
@@ -60,70 +58,86 @@ def is_classic(scenario: int) -> bool:
     return (scenario + scenario // 24) % 8 == 7
 
 
-def _whole(rng: RandomSource, low: float, high: float) -> int:
+def _draw_integer(rng: RandomSource, low: float, high: float) -> int:
     """Draw an integer, end points included."""
     return int(low) + choice(rng, int(high) - int(low) + 1)
 
 
-def _program(rng: RandomSource, size: Size, frames: int) -> NDArray[np.float64]:
+def _draw_program(
+    rng: RandomSource, size: Size, frame_count: int
+) -> NDArray[np.float64]:
     """Draw the speed of a wall towards each frame [length/s], shape [frame]."""
-    fastest = size.value("speed_max")
-    gap = interval(size, "knot_gap")
-    speed = np.empty(frames)
+    speed_max = size.value("speed_max")
+    knot_gap = interval(size, "knot_gap")
+    speed = np.empty(frame_count)
     start = 0
-    before = uniform(rng, -fastest, fastest)
-    while start < frames:
-        end = start + _whole(rng, *gap)
-        after = uniform(rng, 0.0, fastest)
-        after = -after if before > 0.0 else after
-        s = np.arange(min(end, frames) - start) / (end - start)
-        speed[start:end] = before + (after - before) * (s * s * (3.0 - 2.0 * s))
+    start_speed = uniform(rng, -speed_max, speed_max)
+    while start < frame_count:
+        end = start + _draw_integer(rng, *knot_gap)
+        end_speed = uniform(rng, 0.0, speed_max)
+        if start_speed > 0.0:
+            end_speed = -end_speed
+        s = np.arange(min(end, frame_count) - start) / (end - start)
+        rise = s * s * (3.0 - 2.0 * s)
+        speed[start:end] = start_speed + (end_speed - start_speed) * rise
         start = end
-        before = after
+        start_speed = end_speed
     return quantise(speed)
 
 
-def _motion(
+def _draw_motion(
     rng: RandomSource, size: Size, scenario: int, start: int
 ) -> NDArray[np.float64]:
-    """Draw the velocity of each wall towards each frame, ``start`` frames before frame
-    0 included.
+    """Draw the velocity of each wall towards each frame [length/s].
+
+    The shape is [frame, wall, 2]; the ``start`` frames before frame 0 are included.
     """
-    frames = start + size.frame_count(scenario)
-    fastest = size.value("speed_max")
-    first = 0
-    velocity = np.zeros((frames, len(WALLS), 2))
+    frame_count = start + size.frame_count(scenario)
+    speed_max = size.value("speed_max")
+    velocity = np.zeros((frame_count, len(WALLS), 2))
+
+    first_moving_frame = 0
     if is_classic(scenario):
         # In the last given frame at the latest: what is to be predicted is never at
         # rest.
-        first = _whole(
-            rng, start - size.value("lid_lead"), start + size.task.input_frames - 1
-        )
+        earliest = start - size.value("lid_lead")
+        latest = start + size.task.input_frames - 1
+        first_moving_frame = _draw_integer(rng, earliest, latest)
+
     for wall in DRIVEN[scenario % len(DRIVEN)]:
         if is_classic(scenario):
             sign = 2 * choice(rng, 2) - 1
-            speed = np.where(
-                np.arange(frames) >= first,
-                sign * uniform(rng, 0.5 * fastest, fastest),
-                0.0,
-            )
+            constant_speed = sign * uniform(rng, 0.5 * speed_max, speed_max)
+            is_moving = np.arange(frame_count) >= first_moving_frame
+            speed = np.where(is_moving, constant_speed, 0.0)
         else:
-            speed = _program(rng, size, frames)
+            speed = _draw_program(rng, size, frame_count)
         velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
     return velocity
+
+
+def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
+    """Draw how many frames a scenario is simulated before frame 0; the first draw."""
+    del scenario  # the same range for all
+    return _draw_integer(rng, *interval(size, "start_frame"))
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a fluid at rest and the wall motion that drives it through all frames."""
     low, high = closed_box_walls(size)
-    start = _whole(rng, *interval(size, "start_frame"))
-    motion = _motion(rng, size, scenario, start)
+    start = start_frame(size, scenario, rng)
+    motion = _draw_motion(rng, size, scenario, start)
     reynolds = log_uniform(rng, *interval(size, "reynolds"))
     viscosity = 0.5 * size.value("speed_max") * (high - low) / reynolds
+    position = fill(
+        rng, size.particles, low=low, high=high, jitter=size.value("jitter")
+    )
+    if is_classic(scenario):
+        motion_kind = "constant"
+    else:
+        motion_kind = "varying"
     return InitialState(
-        position=fill(
-            rng, size.particles, low=low, high=high, jitter=size.value("jitter")
-        ),
+        position=position,
         velocity=np.zeros((size.particles, 2)),
         affine=np.zeros((size.particles, 2, 2)),
         material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
@@ -133,7 +147,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         start_frame=start,
         parameters={
             "wall": "+".join(DRIVEN[scenario % len(DRIVEN)]),
-            "motion": "constant" if is_classic(scenario) else "varying",
+            "motion": motion_kind,
             "reynolds": reynolds,
             "viscosity": viscosity,
             "dynamic_viscosity": size.value("density") * viscosity,

@@ -1,4 +1,4 @@
-"""Weakly compressible flow in a full box: cavity and curl noise (design 4.3).
+"""Weakly compressible flow in a full box: cavity and curl noise.
 
 Equations, walls and the bounds within which they hold stand in :mod:`.nodal_stress`.
 The settings of the split ``cavity`` reproduce Ghia, Ghia & Shin (1982) at Re 100 and
@@ -21,9 +21,7 @@ from .split import ClosedBoxParameters, InitialState
 
 
 class ClosedBox(Driver[ClosedBoxParameters]):
-    """Solver for scenarios that share :class:`ClosedBoxParameters`; see
-    :class:`.Solver`.
-    """
+    """Solver of a full box; its methods are those of :class:`.Solver`."""
 
     _kernels: NodalStress
 
@@ -34,41 +32,43 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def _start(self, states: Sequence[InitialState]) -> None:
         p = self.parameters
-        k = self._kernels
+        kernels = self._kernels
         self._states = list(states)
         self._move_walls_towards(0)
-        spread = np.array([state.viscosity for state in states]) * p.dt * p.grid**2
-        k.spread.from_numpy(spread.astype(np.float32))
-        for field in (k.node, k.moved, k.gain):
+        # nu dt / dx^2, shape [scenario]
+        viscosity = np.array([state.viscosity for state in states])
+        spread = viscosity * p.dt * p.grid**2
+        kernels.spread.from_numpy(spread.astype(np.float32))
+        for field in (kernels.node, kernels.moved, kernels.gain, kernels.total):
             field.fill(0.0)
-        k.total.fill(0.0)
-        self._averaged = 0
+        self._averaged = 0  # substeps that the sums of velocities hold
 
     def move_walls(self, velocity: NDArray[np.float32]) -> None:
         """Let walls slide [length/s], shape [scenario, 4, 2]; with a program, up to its
         next frame.
         """
-        self._kernels.walls.speed.from_numpy(velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)])
+        # left and right move along y, bottom and top along x
+        tangential = velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)]
+        self._kernels.walls.speed.from_numpy(tangential)
 
     def _move_walls_towards(self, frame: int) -> None:
-        self.move_walls(
-            np.stack([state.walls_towards(frame) for state in self._states]).astype(
-                np.float32
-            )
-        )
+        velocity = np.stack([state.walls_towards(frame) for state in self._states])
+        self.move_walls(velocity.astype(np.float32))
 
     def _drive(self, end: int) -> int:
         if all(state.wall_velocity.ndim == 2 for state in self._states):
             return end
-        frame, past = divmod(self._substeps, self.parameters.substeps_per_frame)
+        interval = self.parameters.substeps_per_frame
+        frame, past = divmod(self._substeps, interval)
         if past == 0:
             self._move_walls_towards(frame + 1)
-        return min(end, (frame + 1) * self.parameters.substeps_per_frame)
+        return min(end, (frame + 1) * interval)
 
     def advance(self, substeps: int, *, average: bool = False) -> None:
         """Advance every scenario."""
         self._kernels.averaging = average
-        self._averaged += substeps if average else 0
+        if average:
+            self._averaged += substeps
         super().advance(substeps)
 
     def jacobian(self) -> NDArray[np.float32]:
@@ -95,17 +95,21 @@ class ClosedBox(Driver[ClosedBoxParameters]):
 
     def health(self) -> list[Health]:
         """Return what each scenario went through during the last advance."""
+        # largest abs(v_x), abs(v_y), J and -J of any particle, shape [scenario, 4]
         extremes = self._read(self._kernels.extremes).max(axis=1)
-        peak = self._kernels.peak.to_numpy().max(axis=1)
-        return [
-            Health(
-                finite=bool(np.isfinite(most).all() and np.isfinite(nodal)),
-                max_speed=float(np.max([most[0], most[1], nodal])),
-                jacobian_min=float(-most[3]),
-                jacobian_max=float(most[2]),
+        # largest velocity component of any node, shape [scenario]
+        peaks = self._kernels.peak.to_numpy().max(axis=1)
+        healths = []
+        for extreme, peak in zip(extremes, peaks, strict=True):
+            is_finite = np.isfinite(extreme).all() and np.isfinite(peak)
+            health = Health(
+                finite=bool(is_finite),
+                max_speed=float(np.max([extreme[0], extreme[1], peak])),
+                jacobian_min=float(-extreme[3]),
+                jacobian_max=float(extreme[2]),
             )
-            for most, nodal in zip(extremes, peak, strict=True)
-        ]
+            healths.append(health)
+        return healths
 
     def close(self) -> None:
         """Give the memory back, for good; kernels of other solvers in this process
@@ -113,35 +117,31 @@ class ClosedBox(Driver[ClosedBoxParameters]):
         """
         self._kernels.release()
 
-    def _broken(self, index: int, health: Health) -> dict[str, str]:
-        bounds = {
-            "J > 0": (health.jacobian_min <= 0.0, health.jacobian_min),
-            f"J <= {JACOBIAN_BOUND:g}": (
-                health.jacobian_max > JACOBIAN_BOUND,
-                health.jacobian_max,
-            ),
-        }
-        return {
-            name: f"J = {value:.6g}" for name, (left, value) in bounds.items() if left
-        }
+    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
+        broken = {}
+        if health.jacobian_min <= 0.0:
+            broken["J > 0"] = f"J = {health.jacobian_min:.6g}"
+        if health.jacobian_max > JACOBIAN_BOUND:
+            broken[f"J <= {JACOBIAN_BOUND:g}"] = f"J = {health.jacobian_max:.6g}"
+        return broken
 
     def _check_state(self, index: int, state: InitialState) -> None:
         super()._check_state(index, state)
-        fastest = self._kernels.speed_bound / 2.0
+        speed_bound = self._kernels.speed_bound / 2.0
+        speeds = np.abs(state.wall_velocity)
+        # of left and right along x, of bottom and top along y
         normal = state.wall_velocity[..., (0, 1, 2, 3), (0, 0, 1, 1)]
-        sliding = bool(np.any(state.wall_velocity != 0.0))
-        steady = bool(np.all(np.abs(state.wall_velocity) <= fastest))
-        if (
-            np.any(normal != 0.0)
-            or not steady
-            or (sliding and not self.parameters.no_slip)
-        ):
+        has_normal_motion = bool(np.any(normal != 0.0))
+        is_slow_enough = bool(np.all(speeds <= speed_bound))
+        is_sliding = bool(np.any(state.wall_velocity != 0.0))
+        may_slide = self.parameters.no_slip or not is_sliding
+        if has_normal_motion or not is_slow_enough or not may_slide:
+            largest_speeds = speeds.reshape(-1, 4, 2).max(axis=0).tolist()
             raise UsageError(
                 "walls can only slide along themselves, and only no-slip walls "
                 "can move",
                 where=f"scenario {index}, wall_velocity in the order "
                 f"{', '.join(WALLS)}",
-                expected=f"speeds up to dx/(2 dt) = {fastest:.6g}",
-                got=f"speeds up to "
-                f"{np.abs(state.wall_velocity).reshape(-1, 4, 2).max(axis=0).tolist()}",
+                expected=f"speeds up to dx/(2 dt) = {speed_bound:.6g}",
+                got=f"speeds up to {largest_speeds}",
             )

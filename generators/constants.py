@@ -1,8 +1,7 @@
-"""From a size in datasets.yaml to its split's module, constants, walls and the ranges
-of what is drawn.
+"""From a size in datasets.yaml to its split's module, constants, walls and ranges.
 
-What the constants of a solver may be: wrong names and values are told before work
-starts.
+This is where the constants of a solver are checked, so that wrong names and values are
+refused before work starts.
 """
 
 from __future__ import annotations
@@ -10,15 +9,15 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, Field, fields
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from lagbench.data.limits import Limit
 from lagbench.errors import UnreadableFileError, UsageError
 
 from .shapes import Region
-from .split import ClosedBoxParameters, FreeSurfaceParameters, Split
+from .split import ClosedBoxParameters, FreeSurfaceParameters, SplitGenerator
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -38,40 +37,38 @@ __all__ = [
 
 ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
 
-_POSITIVE = (
-    *(
-        "dt",
-        "density",
-        "modulus",
-        "liquid_modulus",
-        "jelly_modulus",
-        "rope_modulus",
-        "snow_modulus",
-    ),
-    *("snow_hardening_min", "snow_hardening_max", "snow_jp_min", "snow_jp_max"),
-)
-_NOT_NEGATIVE = (
-    "shift",
-    "liquid_viscosity",
-    "elastic_damping",
-    "snow_stretch",
-    "snow_hardening",
-)
+_POSITIVE = Limit(low=0.0, open_low=True)
+_NOT_NEGATIVE = Limit(low=0.0)
+_SHARE = Limit(low=0.0, high=1.0)
+_POISSON = Limit(low=0.0, high=0.5, open_high=True)
 
 LIMITS = {
     "particles": Limit(low=1, whole=True),
     "grid": Limit(low=4, whole=True),
     "wall": Limit(low=0, whole=True),
     "substeps_per_frame": Limit(low=1, whole=True),
-    **dict.fromkeys(_POSITIVE, Limit(low=0.0, open_low=True)),
-    **dict.fromkeys(_NOT_NEGATIVE, Limit(low=0.0)),
-    **{
-        f"{solid}_poisson": Limit(low=0.0, high=0.5, open_high=True)
-        for solid in ("jelly", "rope", "snow")
-    },
-    "velocity_relaxation": Limit(low=0.0, high=1.0),
-    "jacobian_relaxation": Limit(low=0.0, high=1.0),
-    "density_coupling": Limit(low=0.0, high=1.0),
+    "dt": _POSITIVE,
+    "density": _POSITIVE,
+    "modulus": _POSITIVE,
+    "liquid_modulus": _POSITIVE,
+    "jelly_modulus": _POSITIVE,
+    "rope_modulus": _POSITIVE,
+    "snow_modulus": _POSITIVE,
+    "snow_hardening_min": _POSITIVE,
+    "snow_hardening_max": _POSITIVE,
+    "snow_jp_min": _POSITIVE,
+    "snow_jp_max": _POSITIVE,
+    "shift": _NOT_NEGATIVE,
+    "liquid_viscosity": _NOT_NEGATIVE,
+    "elastic_damping": _NOT_NEGATIVE,
+    "snow_stretch": _NOT_NEGATIVE,
+    "snow_hardening": _NOT_NEGATIVE,
+    "jelly_poisson": _POISSON,
+    "rope_poisson": _POISSON,
+    "snow_poisson": _POISSON,
+    "velocity_relaxation": _SHARE,
+    "jacobian_relaxation": _SHARE,
+    "density_coupling": _SHARE,
     "jacobian_min": Limit(low=0.0, high=1.0, open_low=True),
     "jacobian_max": Limit(low=1.0),
     "snow_compression": Limit(low=0.0, high=1.0, open_high=True),
@@ -82,46 +79,67 @@ finite numbers.
 
 
 def check_constants(
-    kind: ParametersType, given: Mapping[str, object], size: Size
+    kind: ParametersType, values: Mapping[str, object], size: Size
 ) -> None:
-    """Refuse constants that a solver cannot use."""
-    where = f"{size.file}, splits.{size.split}, size {size.name}"
+    """Refuse constants that a solver cannot use.
+
+    Raises:
+        UnreadableFileError: a constant is missing or has an impossible value.
+    """
     for field in fields(kind):
-        if field.name not in given:
-            if field.default is MISSING:
-                known = {other.name for other in fields(kind)}
-                strange = [other for other in size.parameters if other not in known]
-                close = get_close_matches(field.name, strange, n=3)
-                declare = f"declare {field.name} under parameters of the split"
-                raise UnreadableFileError(
-                    "a parameter is missing",
-                    where=f"{where}, parameter {field.name}",
-                    expected=field.name,
-                    got=", ".join(close) or "no name like it",
-                    fix=f"did you mean {close[0]!r}?" if close else declare,
-                )
-            continue
-        limit = LIMITS.get(field.name, Limit())
-        value = given[field.name]
-        if field.type == "bool":
-            good = isinstance(value, bool)
-            expected = "true or false"
-        else:
-            good = limit.holds(value)
-            expected = str(limit)
-        if field.name == "wall" and good:
-            # The box between the walls is four cells wide at least.
-            high = (int(str(given["grid"])) - 4) // 2
-            limit = Limit(low=0, high=high, whole=True)
-            good = limit.holds(value)
-            expected = str(limit)
-        if not good:
-            raise UnreadableFileError(
-                "a parameter has no possible value",
-                where=f"{where}, parameter {field.name}",
-                expected=expected,
-                got=repr(value),
-            )
+        if field.name in values:
+            _check_value(field, values, size)
+        elif field.default is MISSING:
+            raise _missing_parameter(field.name, kind, size)
+
+
+def _place_of(size: Size) -> str:
+    """Return where a size is described, for messages."""
+    return f"{size.file}, splits.{size.split}, size {size.name}"
+
+
+def _missing_parameter(
+    name: str, kind: ParametersType, size: Size
+) -> UnreadableFileError:
+    """Return the error for a missing parameter; it suggests names that are like it."""
+    constant_names = {field.name for field in fields(kind)}
+    unused_names = [other for other in size.parameters if other not in constant_names]
+    similar_names = get_close_matches(name, unused_names, n=3)
+    fix = f"declare {name} under parameters of the split"
+    if similar_names:
+        fix = f"did you mean {similar_names[0]!r}?"
+    return UnreadableFileError(
+        "a parameter is missing",
+        where=f"{_place_of(size)}, parameter {name}",
+        expected=name,
+        got=", ".join(similar_names) or "no name like it",
+        fix=fix,
+    )
+
+
+def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) -> None:
+    """Refuse a constant with an impossible value."""
+    value = values[field.name]
+    limit = LIMITS.get(field.name, Limit())
+    if field.type == "bool":
+        is_possible = isinstance(value, bool)
+        expected = "true or false"
+    else:
+        is_possible = limit.holds(value)
+        expected = str(limit)
+    if field.name == "wall" and is_possible:
+        # The box between the walls is four cells wide at least.
+        high = (int(str(values["grid"])) - 4) // 2
+        limit = Limit(low=0, high=high, whole=True)
+        is_possible = limit.holds(value)
+        expected = str(limit)
+    if not is_possible:
+        raise UnreadableFileError(
+            "a parameter has no possible value",
+            where=f"{_place_of(size)}, parameter {field.name}",
+            expected=expected,
+            got=repr(value),
+        )
 
 
 @contextmanager
@@ -129,33 +147,35 @@ def blamed_on_parameters(size: Size, work: str) -> Iterator[None]:
     """Turn what a split's module raises over its parameters into an error that names
     their file.
     """
-    where = f"{size.file}, splits.{size.split}, size {size.name}"
     try:
         yield
     except UsageError as error:
         raise UnreadableFileError(
             error.what,
-            where=where,
+            where=_place_of(size),
             expected=error.expected,
             got=error.got,
             fix=error.fix,
         ) from error
     except (TypeError, ValueError, ArithmeticError, LookupError) as error:
-        texts = [
-            f"{n} = {p.value!r}"
-            for n, p in size.parameters.items()
-            if isinstance(p.value, bool | str)
-        ]
-        listing = (
-            f"; parameters that are no numbers: {', '.join(texts)}" if texts else ""
-        )
         raise UnreadableFileError(
             f"{work} failed with these parameters",
-            where=where,
+            where=_place_of(size),
             expected=f"parameters that {size.generator} can use",
-            got=f"{type(error).__name__}: {error}{listing}",
+            got=f"{type(error).__name__}: {error}{_list_texts(size)}",
             fix="compare the parameters with those in the datasets.yaml of lagbench",
         ) from error
+
+
+def _list_texts(size: Size) -> str:
+    """Return the end of a sentence that lists the parameters that are no numbers."""
+    texts = []
+    for name, parameter in size.parameters.items():
+        if isinstance(parameter.value, bool | str):
+            texts.append(f"{name} = {parameter.value!r}")
+    if not texts:
+        return ""
+    return f"; parameters that are no numbers: {', '.join(texts)}"
 
 
 Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
@@ -163,12 +183,13 @@ Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
     """Return the solver constants that a size names; others keep their defaults."""
-    given = {
-        f.name: size.value(f.name) for f in fields(kind) if f.name in size.parameters
-    }
-    settled = {"dt": size.dt, **given, **fixed}
-    check_constants(kind, settled, size)
-    return kind(**settled)
+    values: dict[str, Any] = {"dt": size.dt}
+    for field in fields(kind):
+        if field.name in size.parameters:
+            values[field.name] = size.value(field.name)
+    values.update(fixed)
+    check_constants(kind, values, size)
+    return kind(**values)
 
 
 def closed_box_walls(size: Size) -> tuple[float, float]:
@@ -193,8 +214,12 @@ def ranges(size: Size, name: str) -> Region:
     return interval(size, f"{name}_x"), interval(size, f"{name}_y")
 
 
-def split_module(size: Size) -> Split:
-    """Return the module that draws the scenarios of a size."""
+def split_module(size: Size) -> SplitGenerator:
+    """Return the module that draws the scenarios of a size.
+
+    Raises:
+        UsageError: it cannot be imported, or lacks one of the functions of a split.
+    """
     try:
         module = importlib.import_module(size.generator)
     except ImportError as error:
@@ -203,21 +228,20 @@ def split_module(size: Size) -> Split:
             where=size.generator,
             got=error,
         ) from error
-    missing = [
-        name
-        for name in ("solver_parameters", "initial_state")
-        if not hasattr(module, name)
-    ]
+    needed = ("solver_parameters", "initial_state")
+    missing = [name for name in needed if not hasattr(module, name)]
     if missing:
         raise UsageError(
             f"a generator lacks {' and '.join(missing)}", where=size.generator
         )
-    return cast("Split", module)
+    return cast("SplitGenerator", module)
 
 
 def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
-    """Return the constants of the solver of a size; an impossible parameter is an
-    UnreadableFileError.
+    """Return the constants of the solver of a size.
+
+    Raises:
+        UnreadableFileError: a parameter of the size is impossible.
     """
     module = split_module(size)
     with blamed_on_parameters(size, "choosing the solver's constants"):

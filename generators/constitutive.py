@@ -6,7 +6,8 @@ bits.
 
 A 2 x 2 deformation gradient is a scaled rotation plus a scaled reflection,
 
-    F = [[e, -g], [g, e]] + [[h, k], [k, -h]],    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
+    F = [[e, -g], [g, e]] + [[h, k], [k, -h]],
+    q = sqrt(e^2 + g^2),    r = sqrt(h^2 + k^2).
 
 The rotation R of the polar decomposition F = R S has cosine e/q and sine g/q; the
 principal stretches are q + r and q - r (negative when F inverts); det F = q^2 - r^2.
@@ -29,23 +30,24 @@ _SHEAR_EPSILON = 1e-12
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """Return Lame's constants of plane strain, mu = E / (2 (1 + nu)) and E nu / ((1 +
-    nu) (1 - 2 nu)).
+    """Return Lame's constants of plane strain, mu and lambda [mass/s^2].
 
-    E is Young's modulus [mass/s^2], as are they; Poisson's ratio nu is below 1/2.
+    mu = E / (2 (1 + nu)) and lambda = E nu / ((1 + nu) (1 - 2 nu)), with Young's
+    modulus E [mass/s^2] and Poisson's ratio nu below 1/2.
 
     >>> lame(40.0, 0.25)
     (16.0, 16.0)
     """
-    return young / (2.0 * (1.0 + poisson)), young * poisson / (
-        (1.0 + poisson) * (1.0 - 2.0 * poisson)
-    )
+    mu = young / (2.0 * (1.0 + poisson))
+    la = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    return mu, la
 
 
 @ti.func
 def larger(a: ti.f32, b: ti.f32) -> ti.f32:
-    """Return the larger of two numbers, b if a is not a number (one instruction, unlike
-    max).
+    """Return the larger of two numbers, b if a is not a number.
+
+    This is one instruction, unlike max.
     """
     return ti.select(a > b, a, b)
 
@@ -85,13 +87,14 @@ def rotation(f: ti.math.mat2) -> ti.math.vec3:
 
 @ti.func
 def viscous_stress(c: ti.math.mat2, viscosity: ti.f32) -> ti.math.mat2:
-    """Return mu (C + C^T), of a velocity gradient C [1/s] and the dynamic viscosity mu
-    [mass/s].
+    """Return mu (C + C^T).
+
+    C is the velocity gradient [1/s], mu the dynamic viscosity [mass/s].
     """
     shear = viscosity * (c[0, 1] + c[1, 0])
-    return ti.Matrix(
-        [[2.0 * viscosity * c[0, 0], shear], [shear, 2.0 * viscosity * c[1, 1]]]
-    )
+    normal_x = 2.0 * viscosity * c[0, 0]
+    normal_y = 2.0 * viscosity * c[1, 1]
+    return ti.Matrix([[normal_x, shear], [shear, normal_y]])
 
 
 @ti.func
@@ -102,13 +105,15 @@ def liquid_stress(jacobian: ti.f32, modulus: ti.f32) -> ti.f32:
 
 @ti.func
 def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
-    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I, mu and
-    lambda in [mass/s^2].
+    """Return the fixed corotated stress 2 mu (F - R) F^T + lambda (J - 1) J I.
 
     With W = R [[h, k], [k, -h]], a symmetric matrix without trace,
-    (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W.
+    (F - R) F^T = (q (q - 1) + r^2) I + (2 q - 1) W. Lame's constants mu and lambda are
+    in [mass/s^2].
     """
     turn = rotation(f)
+    cosine = turn[0]
+    sine = turn[1]
     q = turn[2]
     h = 0.5 * (f[0, 0] - f[1, 1])
     k = 0.5 * (f[1, 0] + f[0, 1])
@@ -117,18 +122,17 @@ def corotated_stress(f: ti.math.mat2, mu: ti.f32, la: ti.f32) -> ti.math.mat2:
     volumetric = la * (jacobian - 1.0) * jacobian
     mean = 2.0 * mu * (q * (q - 1.0) + square) + volumetric
     stretch = 2.0 * mu * (2.0 * q - 1.0)
-    normal = stretch * (turn[0] * h - turn[1] * k)
-    shear = stretch * (turn[0] * k + turn[1] * h)
+    normal = stretch * (cosine * h - sine * k)
+    shear = stretch * (cosine * k + sine * h)
     return ti.Matrix([[mean + normal, shear], [shear, mean - normal]])
 
 
 @ti.func
 def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> ti.f32:
-    """Return exp(xi (1 - Jp)) within [low, high], caps within exp(-+EXPONENT_MAX):
-    snow's factor on moduli.
+    """Return exp(xi (1 - Jp)) within [low, high], the factor on the moduli of snow.
 
     Below a plastic volume ratio Jp of 1 the snow is compacted and stiffer; ``exponent``
-    is xi [1].
+    is xi [1]. The caps lie within exp(-+EXPONENT_MAX).
     """
     z = bounded(exponent * (1.0 - plastic), -EXPONENT_MAX, EXPONENT_MAX)
     return bounded(exponential(z), low, high)
@@ -136,15 +140,18 @@ def hardening(plastic: ti.f32, exponent: ti.f32, low: ti.f32, high: ti.f32) -> t
 
 @ti.func
 def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
-    """Clamp the principal stretches of F to [low, high]; return (elastic F, volume
-    ratio).
+    """Clamp the principal stretches of the trial gradient F to [low, high].
 
-    F is the trial gradient; the limits are 1 - theta_c and 1 + theta_s. Clamping q + r
-    and q - r gives new q and r, by which rotation and reflection are scaled. The second
-    value is the factor on Jp: trial stretches (at least :data:`STRETCH_MIN`) over
-    clamped ones.
+    The limits are 1 - theta_c and 1 + theta_s. Clamping q + r and q - r gives new q and
+    r, by which rotation and reflection are scaled.
+
+    Returns:
+        The elastic F, and the factor on Jp: trial stretches (at least
+        :data:`STRETCH_MIN`) over clamped ones.
     """
     turn = rotation(f)
+    cosine = turn[0]
+    sine = turn[1]
     q = turn[2]
     h = 0.5 * (f[0, 0] - f[1, 1])
     k = 0.5 * (f[1, 0] + f[0, 1])
@@ -155,9 +162,10 @@ def plastic_return(f: ti.math.mat2, low: ti.f32, high: ti.f32) -> Value:
     if r > _SHEAR_EPSILON:
         shrink = 0.5 * (first - second) / r
     mean = 0.5 * (first + second)
-    e = mean * turn[0]
-    g = mean * turn[1]
+    e = mean * cosine
+    g = mean * sine
     h = shrink * h
     k = shrink * k
+    elastic = ti.Matrix([[e + h, k - g], [k + g, e - h]])
     trial = larger(q + r, STRETCH_MIN) * larger(q - r, STRETCH_MIN)
-    return ti.Matrix([[e + h, k - g], [k + g, e - h]]), trial / (first * second)
+    return elastic, trial / (first * second)

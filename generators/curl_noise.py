@@ -35,28 +35,36 @@ Array = NDArray[np.float64]
 
 
 def solver_parameters(size: Size) -> ClosedBoxParameters:
-    """Return the constants of design 4.3 at this size; walls let the fluid slide."""
+    """Return the solver's constants at this size; walls let the fluid slide."""
     return constants(ClosedBoxParameters, size, no_slip=False)
 
 
 def stream_function(
     position: Array, lattice: Array, *, low: float, high: float, scale: float
 ) -> Jet:
-    """Return psi [length^2/s] and its derivatives at points between walls at low and
-    high [length].
+    """Return psi [length^2/s] and its derivatives at points between the walls.
 
-    Points are of shape [point, 2], Perlin gradients of shape [F + 1, F + 1, 2], the
-    scale is s [length/s]; u = psi.y and v = -psi.x.
+    Args:
+        position: points [length], shape [point, 2].
+        lattice: Perlin gradients, shape [F + 1, F + 1, 2].
+        low: coordinate of the left and bottom walls [length].
+        high: coordinate of the right and top walls [length].
+        scale: s [length/s].
+
+    The velocity is u = psi.y and v = -psi.x.
     """
-    cells = float(len(lattice) - 1)
-    per_length = cells / (high - low)
-    from_low = [axis.shift(-low).scale(per_length) for axis in coordinates(position)]
-    # Measured from its own wall, the ramp is exactly 0 there.
-    from_high = [
-        axis.scale(-1.0).shift(high).scale(per_length) for axis in coordinates(position)
-    ]
-    psi = noise(from_low[0], from_low[1], lattice)
-    for distance in (*from_low, *from_high):
+    cell_count = float(len(lattice) - 1)
+    per_length = cell_count / (high - low)
+    x, y = coordinates(position)
+    # distances from the walls in cells of the lattice; measured from its own wall, the
+    # ramp is exactly 0 there
+    from_left = x.shift(-low).scale(per_length)
+    from_bottom = y.shift(-low).scale(per_length)
+    from_right = x.scale(-1.0).shift(high).scale(per_length)
+    from_top = y.scale(-1.0).shift(high).scale(per_length)
+
+    psi = noise(from_left, from_bottom, lattice)
+    for distance in (from_left, from_bottom, from_right, from_top):
         psi = psi * ramp(distance.scale(2.0))
     return psi.scale(scale * (high - low))
 
@@ -66,7 +74,8 @@ def flow(psi: Jet) -> tuple[Array, Array]:
     2^-20.
     """
     velocity = np.stack([psi.y, -psi.x], axis=-1)
-    affine = np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1).reshape(-1, 2, 2)
+    rows = np.stack([psi.xy, psi.yy, -psi.xx, -psi.xy], axis=-1)
+    affine = rows.reshape(-1, 2, 2)
     return quantise(velocity), quantise(affine)
 
 
@@ -86,15 +95,31 @@ def _grid_rates(lattice: Array, size: Size, scale: float) -> tuple[float, float]
     first = size.value("wall") + 1
     last = size.grid - size.value("wall")
     node = np.arange(first, last) / size.grid
-    points = np.stack(
-        [side.ravel() for side in np.meshgrid(node, node, indexing="ij")], axis=-1
-    )
+    node_count = len(node)
+    x, y = np.meshgrid(node, node, indexing="ij")
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+
     psi = stream_function(points, lattice, low=low, high=high, scale=scale)
-    u, v = (part.reshape(len(node), len(node)) for part in (psi.y, -psi.x))
+    u = psi.y.reshape(node_count, node_count)
+    v = (-psi.x).reshape(node_count, node_count)
+
+    # neighbours of the inner nodes
+    east = slice(2, None), slice(1, -1)
+    west = slice(None, -2), slice(1, -1)
+    north = slice(1, -1), slice(2, None)
+    south = slice(1, -1), slice(None, -2)
     slope = 0.5 * size.grid
-    divergence = (u[2:, 1:-1] - u[:-2, 1:-1] + v[1:-1, 2:] - v[1:-1, :-2]) * slope
-    vorticity = (v[2:, 1:-1] - v[:-2, 1:-1] - u[1:-1, 2:] + u[1:-1, :-2]) * slope
+    divergence = (u[east] - u[west] + v[north] - v[south]) * slope
+    vorticity = (v[east] - v[west] - u[north] + u[south]) * slope
     return _root_mean_square(divergence), _root_mean_square(vorticity)
+
+
+def _scale_of(size: Size, frequency: int) -> float:
+    """Return s0 (F0 / F)^k [length/s]; no power: its bits differ between machines."""
+    scale = float(size.value("velocity_scale"))
+    for _ in range(size.value("scale_falloff")):
+        scale = scale * size.value("frequency_min") / frequency
+    return scale
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
@@ -114,15 +139,13 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     )
     frequency = scenario % size.value("frequency_count") + size.value("frequency_min")
     lattice = gradients(rng, frequency)
-    scale = float(size.value("velocity_scale"))
-    for _ in range(
-        size.value("scale_falloff")
-    ):  # no power: its bits differ from machine to machine
-        scale = scale * size.value("frequency_min") / frequency
+    scale = _scale_of(size, frequency)
+
     psi = stream_function(position, lattice, low=low, high=high, scale=scale)
     velocity, affine = flow(psi)
     divergence, vorticity = _grid_rates(lattice, size, scale)
-    energy = 0.5 * math.fsum(v * v for v in velocity.ravel().tolist()) / size.particles
+    speed_sum = math.fsum(v * v for v in velocity.ravel().tolist())
+    energy = 0.5 * speed_sum / size.particles
     return InitialState(
         position=position,
         velocity=velocity,

@@ -35,8 +35,9 @@ class RandomSource(Protocol):
 
 
 def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
-    """Return what seeds a scenario: the first eight bytes of SHA-256("split/size"),
-    big-endian, and numbers.
+    """Return what seeds a scenario: a word of its data set, its version and its id.
+
+    The word is the first eight bytes of SHA-256("split/size"), big-endian.
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
@@ -47,8 +48,8 @@ def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int,
 
 def generator(split: str, size: str, major: int, scenario: int) -> np.random.Generator:
     """Return the PCG64 stream of one scenario, a function of its four names only."""
-    seeds = np.random.SeedSequence(entropy(split, size, major, scenario))
-    return np.random.Generator(np.random.PCG64(seeds))
+    seed = np.random.SeedSequence(entropy(split, size, major, scenario))
+    return np.random.Generator(np.random.PCG64(seed))
 
 
 def seed_text(split: str, size: str, major: int, scenario: int) -> str:
@@ -62,39 +63,42 @@ def quantise(values: ArrayLike) -> NDArray[np.float64]:
     Such a number below 16 in magnitude is exact in float32, so that nothing is rounded
     again on its way into the solver. Negative zero becomes zero.
     """
-    given = np.asarray(values, dtype=np.float64)
-    if not np.all(np.abs(given) < _LARGEST):
+    exact = np.asarray(values, dtype=np.float64)
+    if not np.all(np.abs(exact) < _LARGEST):
         raise WorkFailedError(
             "a drawn value has no exact float32 form",
             expected=f"finite, magnitude below {_LARGEST}",
-            got=float(np.max(np.abs(given))),
+            got=float(np.max(np.abs(exact))),
             fix="check the ranges and scales of this split in datasets.yaml",
         )
-    # A separate addition of zero, because rint keeps the sign of -0.0.
-    return np.asarray(np.rint(given / QUANTUM) * QUANTUM + 0.0, dtype=np.float64)
+    rounded = np.rint(exact / QUANTUM) * QUANTUM
+    # rint keeps the sign of -0.0, the addition of zero does not
+    return np.asarray(rounded + 0.0, dtype=np.float64)
 
 
-def _unit(rng: RandomSource) -> float:
+def _draw_unit(rng: RandomSource) -> float:
+    """Draw from the uniform distribution on [0, 1)."""
     return float(rng.random((1,))[0])
 
 
 def uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw from the uniform distribution on [low, high), rounded to a multiple of
-    2^-20.
-    """
-    return float(quantise(low + (high - low) * _unit(rng)))
+    """Draw uniformly from [low, high), rounded to a multiple of 2^-20."""
+    return float(quantise(low + (high - low) * _draw_unit(rng)))
 
 
 def log_uniform(rng: RandomSource, low: float, high: float) -> float:
-    """Draw x = low exp(u ln(high / low)), uniform in its logarithm: in 50 decimal
-    digits, rounded once.
+    """Draw x = low exp(u ln(high / low)), uniform in its logarithm.
+
+    It is computed in 50 decimal digits and rounded once.
     """
     if not 0.0 < low <= high:
         raise WorkFailedError(
             "a log-uniform range is empty", expected="0 < low <= high", got=(low, high)
         )
-    span = _PRECISE.ln(_PRECISE.divide(Decimal(high), Decimal(low)))
-    growth = _PRECISE.exp(_PRECISE.multiply(span, Decimal(_unit(rng))))
+    ratio = _PRECISE.divide(Decimal(high), Decimal(low))
+    span = _PRECISE.ln(ratio)
+    share = Decimal(_draw_unit(rng))
+    growth = _PRECISE.exp(_PRECISE.multiply(span, share))
     return float(_PRECISE.multiply(Decimal(low), growth))
 
 
@@ -114,15 +118,16 @@ def normal(
 
 def choice(rng: RandomSource, count: int) -> int:
     """Draw an integer from 0 to ``count - 1``, each equally likely (to 2^-53)."""
-    return math.floor(_unit(rng) * count)
+    return math.floor(_draw_unit(rng) * count)
 
 
 def direction(rng: RandomSource) -> tuple[float, float]:
     """Draw a unit vector, uniform over the circle, without sine or cosine."""
-    while (
-        True
-    ):  # until a point of the square lies in the unit disc, and not at its very centre
-        x, y = (float(2.0 * r - 1.0) for r in rng.random((2,)))
+    # until a point of the square lies in the unit disc, and not at its very centre
+    while True:
+        unit_x, unit_y = rng.random((2,))
+        x = float(2.0 * unit_x - 1.0)
+        y = float(2.0 * unit_y - 1.0)
         square = x * x + y * y
         if 2.0**-20 <= square <= 1.0:
             length = math.sqrt(square)
@@ -135,14 +140,21 @@ def fill(
     """Fill a square with any number of particles, in columns of nearly equal counts.
 
     The columns number floor(sqrt(count)), their counts differ by one at the most, and
-    each spreads its own particles evenly over the height. ``low`` and ``high`` are
-    coordinates of the walls [length], ``jitter`` is the width of the uniform
-    displacement, in spacings [1]. Positions [length] are multiples of 2^-20, shape
-    [particle, 2].
+    each spreads its own particles evenly over the height.
+
+    Args:
+        rng: source of the jitter.
+        count: number of particles.
+        low: coordinate of the left and bottom walls [length].
+        high: coordinate of the right and top walls [length].
+        jitter: width of the uniform displacement, in spacings [1].
+
+    Returns:
+        Positions [length], multiples of 2^-20, shape [particle, 2].
     """
     columns = math.isqrt(count)
     ends = np.array([count * column // columns for column in range(columns + 1)])
-    return _fill_columns(rng, ends, low, high, jitter)
+    return _fill_columns(rng, ends, low=low, high=high, jitter=jitter)
 
 
 def fill_grid(
@@ -155,21 +167,34 @@ def fill_grid(
     jitter: float,
 ) -> NDArray[np.float64]:
     """Fill a square with columns x rows particles; arguments as in :func:`fill`."""
-    return _fill_columns(rng, rows * np.arange(columns + 1), low, high, jitter)
+    ends = rows * np.arange(columns + 1)
+    return _fill_columns(rng, ends, low=low, high=high, jitter=jitter)
 
 
 def _fill_columns(
-    rng: RandomSource, ends: NDArray[np.integer], low: float, high: float, jitter: float
+    rng: RandomSource,
+    ends: NDArray[np.integer],
+    *,
+    low: float,
+    high: float,
+    jitter: float,
 ) -> NDArray[np.float64]:
-    """Put particles near the middles of their cells, column by column: (r - 1/2) jitter
-    spacings off.
+    """Put particles near the middles of their cells, column by column.
+
+    Each is (r - 1/2) jitter spacings off. ``ends`` counts the particles before each
+    column, and all of them last; shape [column + 1].
     """
-    sizes = np.diff(ends)
-    column = np.repeat(np.arange(len(sizes)), sizes)
-    row = np.arange(len(column)) - np.repeat(ends[:-1], sizes)
+    column_sizes = np.diff(ends)
+    column_count = len(column_sizes)
+    # column and row of each particle's cell, shape [particle]
+    column = np.repeat(np.arange(column_count), column_sizes)
+    row = np.arange(len(column)) - np.repeat(ends[:-1], column_sizes)
     cell = np.stack([column, row], axis=-1)
-    cells = np.stack(
-        [np.full(len(column), len(sizes)), np.repeat(sizes, sizes)], axis=-1
-    )
+    # cells across the square each way, shape [particle, 2]
+    columns_across = np.full(len(column), column_count)
+    rows_across = np.repeat(column_sizes, column_sizes)
+    cell_counts = np.stack([columns_across, rows_across], axis=-1)
+
     displacement = (rng.random(cell.shape) - 0.5) * jitter
-    return quantise(low + (high - low) * (cell + 0.5 + displacement) / cells)
+    middle = cell + 0.5
+    return quantise(low + (high - low) * (middle + displacement) / cell_counts)

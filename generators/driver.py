@@ -54,8 +54,9 @@ class Kernels(Protocol):
 
 
 class Driver(ABC, Generic[Parameters]):
-    """A solver around kernels; see :func:`.build` for its arguments and
-    :class:`.Solver` for what it does.
+    """A solver around kernels.
+
+    :func:`.build` explains the arguments, :class:`.Solver` the methods.
     """
 
     def __init__(
@@ -87,9 +88,9 @@ class Driver(ABC, Generic[Parameters]):
         """Return what each scenario went through during the last advance."""
 
     @abstractmethod
-    def _broken(self, index: int, health: Health) -> dict[str, str]:
-        """Return the bounds of this formulation that a scenario has left, and what it
-        reached.
+    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
+        """Return the bounds of this formulation that a scenario has left, each with the
+        value that it reached.
         """
 
     def load(self, states: Sequence[InitialState]) -> None:
@@ -102,20 +103,23 @@ class Driver(ABC, Generic[Parameters]):
             )
         for index, state in enumerate(states):
             self._check_state(index, state)
+
         self._place(stack(states, "position"))
         carried = np.ones((self.scenarios, self.parameters.particles, 4), np.float32)
         carried[..., :2] = stack(states, "velocity")
         self._kernels.carried.from_numpy(carried)
+        affine = stack(states, "affine")
         for axis, field in enumerate((self._kernels.slope_x, self._kernels.slope_y)):
             slope = np.zeros_like(carried)
-            slope[..., :2] = stack(states, "affine")[..., axis]
+            slope[..., :2] = affine[..., axis]
             field.from_numpy(slope)
+
+        # volume of a particle [length^2], shape [scenario]
         self._volume = np.array(
             [state.area / self.parameters.particles for state in states]
         )
-        self._kernels.fill.from_numpy(
-            (self._volume * self.parameters.grid**2).astype(np.float32)
-        )
+        fill = self._volume * self.parameters.grid**2
+        self._kernels.fill.from_numpy(fill.astype(np.float32))
         self._start(states)
         self._substeps = 0
         self._kernels.restart_extremes()
@@ -130,42 +134,53 @@ class Driver(ABC, Generic[Parameters]):
         end = self._substeps + substeps
         while self._substeps < end:
             until = self._drive(end)
-            if self.device is Device.CPU:
-                self._kernels.run_serially(until - self._substeps)
-            else:
-                for _ in range(until - self._substeps):
-                    self._kernels.run_in_parallel()
+            self._run(until - self._substeps)
             self._substeps = until
-        fastest = self._kernels.speed_bound
+        self._check_health(substeps)
+
+    def _run(self, substeps: int) -> None:
+        if self.device is Device.CPU:
+            self._kernels.run_serially(substeps)
+            return
+        for _ in range(substeps):
+            self._kernels.run_in_parallel()
+
+    def _check_health(self, substeps: int) -> None:
+        """Refuse to go on where a scenario left a bound during the last substeps."""
+        speed_bound = self._kernels.speed_bound
         for index, health in enumerate(self.health()):
             broken: dict[str, str] = {}
             if not health.finite:
                 broken["every number is finite"] = "NaN or an infinite number"
-            # NaN breaks no bound here: it is told above, and as a value it would say
-            # nothing.
-            if health.max_speed > fastest:
-                broken[f"CFL: abs(v) <= dx/dt = {fastest:.6g}"] = (
-                    f"abs(v) = {health.max_speed:.6g}"
-                )
-            broken |= self._broken(index, health)
+            # NaN breaks no bound here: "finite" above tells of it, and as a value it
+            # would say nothing.
+            if health.max_speed > speed_bound:
+                bound = f"CFL: abs(v) <= dx/dt = {speed_bound:.6g}"
+                broken[bound] = f"abs(v) = {health.max_speed:.6g}"
+            broken |= self._broken_bounds(index, health)
             if broken:
-                span = (
-                    f"substep {end}"
-                    if substeps == 1
-                    else f"substeps {end - substeps} to {end}"
-                )
-                raise WorkFailedError(
-                    "the simulation blew up",
-                    where=f"scenario {index}, {span}",
-                    expected="; ".join(broken),
-                    got="; ".join(broken.values()),
-                    fix="a smaller dt (a larger substeps_per_frame), a softer "
-                    "material or smaller velocities",
-                )
+                raise self._blow_up(index, substeps, broken)
+
+    def _blow_up(
+        self, index: int, substeps: int, broken: dict[str, str]
+    ) -> WorkFailedError:
+        end = self._substeps
+        span = f"substeps {end - substeps} to {end}"
+        if substeps == 1:
+            span = f"substep {end}"
+        return WorkFailedError(
+            "the simulation blew up",
+            where=f"scenario {index}, {span}",
+            expected="; ".join(broken),
+            got="; ".join(broken.values()),
+            fix="a smaller dt (a larger substeps_per_frame), a softer "
+            "material or smaller velocities",
+        )
 
     def _drive(self, end: int) -> int:
-        """Set what acts from outside now; return the substep up to which it does,
-        ``end`` at most.
+        """Set what acts from outside now; return the substep up to which it acts.
+
+        The result is ``end`` at most.
         """
         return end
 
@@ -192,57 +207,64 @@ class Driver(ABC, Generic[Parameters]):
         self._place(self.position() + offset.astype(np.float32))
 
     def _place(self, position: NDArray[np.float32]) -> None:
-        kept = np.clip(
-            position, np.float32(self._kernels.least), np.float32(self._kernels.most)
-        )
-        self._kernels.x.from_numpy(np.concatenate((kept, np.zeros_like(kept)), axis=-1))
+        """Set the positions, clipped to the box; the fields hold two zeros beside."""
+        least = np.float32(self._kernels.least)
+        most = np.float32(self._kernels.most)
+        inside = np.clip(position, least, most)
+        padded = np.concatenate((inside, np.zeros_like(inside)), axis=-1)
+        self._kernels.x.from_numpy(padded)
 
     def _check_state(self, index: int, state: InitialState) -> None:
-        count = self.parameters.particles
-        shapes: dict[str, tuple[int, ...]] = {
-            "position": (count, 2),
-            "velocity": (count, 2),
-        }
-        shapes |= {"affine": (count, 2, 2), "material": (count,)}
-        for name, shape in shapes.items():
-            held = np.asarray(getattr(state, name))
-            if held.shape != shape or held.dtype.kind not in (
-                "iu" if name == "material" else "f"
-            ):
-                raise UsageError(
-                    f"wrong shape of {name} in an initial state, or no such numbers",
-                    where=f"scenario {index}",
-                    expected=f"{shape}, {'whole' if name == 'material' else 'floating'}",
-                    got=f"{held.shape}, {held.dtype}",
-                )
-        known = [int(one) for one in Material]
+        """Refuse a state that the kernels cannot start from."""
+        self._check_arrays(index, state)
+        material_values = [material.value for material in Material]
         area = np.float64(state.area)
-        outside = np.count_nonzero((state.position < 0.0) | (state.position > 1.0))
-        if outside or not np.isin(state.material, known).all() or not 0.0 < area <= 1.0:
+        is_outside = (state.position < 0.0) | (state.position > 1.0)
+        outside_count = np.count_nonzero(is_outside)
+        has_known_materials = np.isin(state.material, material_values).all()
+        if outside_count or not has_known_materials or not 0.0 < area <= 1.0:
             raise UsageError(
                 "no such initial state",
                 where=f"scenario {index}",
-                expected=f"positions in the unit box, materials of {known}, an "
-                f"area up to 1",
-                got=f"{outside} coordinates outside, materials "
+                expected=f"positions in the unit box, materials of {material_values}, "
+                "an area up to 1",
+                got=f"{outside_count} coordinates outside, materials "
                 f"{np.unique(state.material)}, area {area:g}",
                 fix="mend the split's initial_state",
             )
-        fastest = self._kernels.speed_bound
+
+        speed_bound = self._kernels.speed_bound
         speed = np.abs(state.velocity).max()
         stretch = np.abs(state.affine).max() * self.parameters.dt
-        if not (
-            np.isfinite(state.position).all() and speed <= fastest and stretch <= 2.0
-        ):
+        is_finite = np.isfinite(state.position)
+        if not (is_finite.all() and speed <= speed_bound and stretch <= 2.0):
             raise WorkFailedError(
                 "the initial state is outside the solver's bounds",
                 where=f"scenario {index}",
-                expected=f"finite positions, abs(v) <= dx/dt = {fastest:.6g}, "
-                f"abs(C) dt <= 2",
+                expected=f"finite positions, abs(v) <= dx/dt = {speed_bound:.6g}, "
+                "abs(C) dt <= 2",
                 got=f"abs(v) = {speed:.6g}, abs(C) dt = {stretch:.6g}, "
-                f"{np.count_nonzero(~np.isfinite(state.position))} coordinates that "
-                f"are not finite",
+                f"{np.count_nonzero(~is_finite)} coordinates that are not finite",
             )
+
+    def _check_arrays(self, index: int, state: InitialState) -> None:
+        """Refuse arrays of another shape or kind of number than the kernels take."""
+        count = self.parameters.particles
+        expected_arrays = (
+            ("position", (count, 2), "floating", "f"),
+            ("velocity", (count, 2), "floating", "f"),
+            ("affine", (count, 2, 2), "floating", "f"),
+            ("material", (count,), "whole", "iu"),
+        )
+        for name, shape, number, kinds in expected_arrays:
+            array = np.asarray(getattr(state, name))
+            if array.shape != shape or array.dtype.kind not in kinds:
+                raise UsageError(
+                    f"wrong shape of {name} in an initial state, or no such numbers",
+                    where=f"scenario {index}",
+                    expected=f"{shape}, {number}",
+                    got=f"{array.shape}, {array.dtype}",
+                )
 
 
 @ti.kernel

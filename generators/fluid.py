@@ -15,7 +15,16 @@ from numpy.typing import NDArray
 
 from .constants import constants, free_surface_walls, interval, ranges
 from .draws import RandomSource, choice, direction, normal, quantise, uniform
-from .shapes import Blobs, Body, Disc, Rectangle, Shape, place, seeds
+from .shapes import (
+    Blobs,
+    Body,
+    Disc,
+    Rectangle,
+    Region,
+    Shape,
+    place,
+    sample_points,
+)
 from .split import FreeSurfaceParameters, InitialState, Material
 
 if TYPE_CHECKING:
@@ -32,43 +41,64 @@ _START = dict(zip(FAMILIES, ("falling", "thrown", "falling", "splash"), strict=T
 
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
-    """Return the constants of design 4.4 at this size."""
+    """Return the solver's constants at this size."""
     return constants(FreeSurfaceParameters, size)
 
 
-def _shape(rng: RandomSource, family: str, area: float, size: Size) -> Shape:
+def _draw_shape(rng: RandomSource, family: str, area: float, size: Size) -> Shape:
     if family == "splash":
-        # All discs reach a common point, so that the body is one piece.
-        reach = interval(size, "blob_offset")
-        offsets = [
-            (uniform(rng, *reach), direction(rng))
-            for _ in range(size.value("blob_count"))
-        ]
-        arrangement = np.array([(r * x, r * y) for r, (x, y) in offsets])
-        return Blobs.of_area(area, arrangement, cells=size.value("blob_cells"))
-    if family == "falling-circle" or (family == "thrown" and choice(rng, 2) == 1):
+        return _draw_blobs(rng, area, size)
+    if family == "falling-circle":
+        return Disc.of_area(area)
+    if family == "thrown" and choice(rng, 2) == 1:
         return Disc.of_area(area)
     return Rectangle.of_area(area, uniform(rng, *interval(size, "aspect")))
 
 
-def _splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array:
+def _draw_blobs(rng: RandomSource, area: float, size: Size) -> Blobs:
+    """Draw discs that all reach a common point, so that the body is one piece."""
+    reach = interval(size, "blob_offset")
+    centres = []
+    for _ in range(size.value("blob_count")):
+        distance = uniform(rng, *reach)
+        x, y = direction(rng)
+        centres.append((distance * x, distance * y))
+    return Blobs.of_area(area, np.array(centres), cells=size.value("blob_cells"))
+
+
+def _draw_splash(rng: RandomSource, body: Body, position: Array, size: Size) -> Array:
     """Return velocities of the blobs, blended by inverse squared distance, plus noise.
 
     v(x) = sum_k v_k / d_k^2 / sum_k 1 / d_k^2, with d_k the distance from the centre of
-    disc k (softened): noise of single particles alone is averaged away by the grid.
+    disc k (softened): noise of single particles alone is averaged away by the grid. A
+    body that is no union of blobs has no such velocities.
     """
     if not isinstance(body.shape, Blobs):
         return np.zeros_like(position)
-    own = normal(rng, size.value("blob_speed"), (size.value("blob_count"), 2))
+
+    blob_count = size.value("blob_count")
+    blob_velocities = normal(rng, size.value("blob_speed"), (blob_count, 2))
     softening = size.value("blob_softening")
     total = np.zeros_like(position)
     weights = np.zeros((len(position), 1))
-    for centre, velocity in zip(body.shape.centres, own, strict=True):
+    for centre, velocity in zip(body.shape.centres, blob_velocities, strict=True):
         x, y = (position - body.centre - np.array(centre)).T
-        weight = (1.0 / (x * x + y * y + softening * softening))[:, None]
+        weight = 1.0 / (x * x + y * y + softening * softening)
+        weight = weight[:, None]  # shape [particle, 1]
         total = total + weight * velocity
         weights = weights + weight
     return total / weights + normal(rng, size.value("particle_speed"), position.shape)
+
+
+def _start_region(size: Size, start: str) -> Region:
+    """Return where a body may lie: its family's region, within the walls' margin."""
+    (left, right), (bottom, top) = ranges(size, start)
+    low, high = free_surface_walls(size)
+    least = low + size.value("margin")
+    most = high - size.value("margin")
+    horizontal = (max(left, least), min(right, most))
+    vertical = (max(bottom, least), min(top, most))
+    return horizontal, vertical
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
@@ -76,20 +106,18 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     family = FAMILIES[scenario % len(FAMILIES)]
     start = _START[family]
     area = uniform(rng, *interval(size, "area"))
-    shape = _shape(rng, family, area, size)
-    (left, right), (bottom, top) = ranges(size, start)
-    low, high = free_surface_walls(size)
-    least = low + size.value("margin")
-    most = high - size.value("margin")
-    region = (max(left, least), min(right, most)), (max(bottom, least), min(top, most))
-    body = place(rng, shape, region)
-    drift = [
-        uniform(rng, *component) for component in ranges(size, f"{start}_velocity")
-    ]
-    position = seeds(rng, body, size.particles)
+    shape = _draw_shape(rng, family, area, size)
+    body = place(rng, shape, _start_region(size, start))
+
+    horizontal_speeds, vertical_speeds = ranges(size, f"{start}_velocity")
+    velocity_x = uniform(rng, *horizontal_speeds)
+    velocity_y = uniform(rng, *vertical_speeds)
+    position = sample_points(rng, body, size.particles)
+    splash = _draw_splash(rng, body, position, size)
+    velocity = quantise(np.array([velocity_x, velocity_y]) + splash)
     return InitialState(
         position=position,
-        velocity=quantise(np.array(drift) + _splash(rng, body, position, size)),
+        velocity=velocity,
         affine=np.zeros((size.particles, 2, 2)),
         material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
         area=area,
@@ -98,7 +126,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             "area": area,
             "centre_x": float(body.centre[0]),
             "centre_y": float(body.centre[1]),
-            "velocity_x": drift[0],
-            "velocity_y": drift[1],
+            "velocity_x": velocity_x,
+            "velocity_y": velocity_y,
         },
     )

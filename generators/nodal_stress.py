@@ -5,14 +5,16 @@ mirror images of the outermost interior nodes. Per substep, for particles of equ
 m, positions x_p, grid spacing dx and weights w_ip:
 
 1. P2G: n_i = sum w,  (n J)_i = sum w J_p,  (n v)_i = sum w (v_p + C_p (x_i - x_p)).
-2. Fold: ghosts give what they received to their mirror images, normal momentum reversed,
-   tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a free-slip wall. Then
-   v = (n v)/n,  Jbar = (n J)/n,  relative density r = n m / (rho dx^2); ghosts mirror them.
+2. Fold: ghosts give what they received to their mirror images, normal momentum
+   reversed, tangential momentum n (2 u_wall - v) at a no-slip wall and n v at a
+   free-slip wall. Then v = (n v)/n,  Jbar = (n J)/n,  relative density
+   r = n m / (rho dx^2); ghosts mirror them.
 3. Forces: a = (E/rho) grad Jbar + nu lap v,  v <- v + dt a; ghosts mirror v and a.
-4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),  grad q = (4/dx^2) sum w q (x_i - x_p),
-   C = grad v, shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
-   v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s
-   x_p <- x_p + dt v* + s, kept in the box
+4. G2P: v* = sum w v,  a* = sum w a,  r = max(sum w r, 1/2),
+   grad q = (4/dx^2) sum w q (x_i - x_p),  C = grad v,
+   shift s = -beta dx^2 grad(r)/r, each component within 0.1 dx,
+   v_p <- (v_p + dt a*) + lambda (v* - v_p - dt a*) + C s,
+   x_p <- x_p + dt v* + s, kept in the box,
    J_p <- J_p (1 + dt tr C) + kappa (Jbar - J_p) + theta (1/r - Jbar).
 
 The mass of a particle cancels everywhere but in r, so nodes count particles, n, and no
@@ -23,6 +25,8 @@ Valid while max abs(v) dt <= dx, which also bounds every fixed-point sum, and wh
 stays in (0, 8]. Settings that reproduce Ghia, Ghia & Shin (1982) are those of the split
 ``cavity``.
 """
+
+from typing import Any
 
 import taichi as ti
 
@@ -67,13 +71,14 @@ class NodalStress:
         threads: int,
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = p = parameters  # constants that the scenarios share
+        p = parameters
+        dx = 1.0 / p.grid
+        self.parameters = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
         self.averaging = False  # whether the substeps to come count for the total
         self.walls = Walls(grid=p.grid, wall=p.wall, no_slip=p.no_slip)
-        dx = 1.0 / p.grid
         self.inv_dx = float(p.grid)
         self.width = p.grid + 1
         self.dt = p.dt
@@ -90,6 +95,11 @@ class NodalStress:
         self.gradient = 4.0 * self.inv_dx
         self.shift = -p.shift * dx * dx
         self.shift_bound = 0.1 * dx
+        self._declare_fields()
+        self._tree = self._place_fields()
+
+    def _declare_fields(self) -> None:
+        """Name the fields; they have no memory yet."""
         # particle positions [length], and two zeros
         self.x = ti.Vector.field(4, ti.f32)
         self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
@@ -113,13 +123,34 @@ class NodalStress:
         self.total = ti.Vector.field(2, ti.f64)  # sum over time of the nodal velocities
         self.spread = ti.field(ti.f32)  # nu dt / dx^2, shape [scenario]
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
-        of_particles = (self.x, self.carried, self.slope_x, self.slope_y)
-        of_particles += (*self.rows, self.here, self.push, self.extremes)
-        of_nodes = (self.sums, self.node, self.moved, self.gain, self.peak, self.total)
-        self._tree = backend.place(
-            *(((scenarios, p.particles), [field]) for field in of_particles),
-            *(((scenarios, self.width**2), [field]) for field in of_nodes),
-            ((scenarios,), [self.walls.speed, self.spread, self.fill]),
+
+    def _place_fields(self) -> Any:  # noqa: ANN401 (Taichi is untyped)
+        """Give the fields their memory, each an array of its own."""
+        particle_fields = (
+            self.x,
+            self.carried,
+            self.slope_x,
+            self.slope_y,
+            *self.rows,
+            self.here,
+            self.push,
+            self.extremes,
+        )
+        node_fields = (
+            self.sums,
+            self.node,
+            self.moved,
+            self.gain,
+            self.peak,
+            self.total,
+        )
+        particle_shape = (self.scenarios, self.parameters.particles)
+        node_shape = (self.scenarios, self.width**2)
+        scenario_fields = [self.walls.speed, self.spread, self.fill]
+        return backend.place(
+            *((particle_shape, [field]) for field in particle_fields),
+            *((node_shape, [field]) for field in node_fields),
+            ((self.scenarios,), scenario_fields),
         )
 
     def release(self) -> None:
@@ -140,12 +171,11 @@ class NodalStress:
 
     @ti.func
     def locate(self, s: ti.i32, p: ti.i32) -> None:
-        """Keep for P2G and G2P which nodes a particle touches, and with what
-        weights.
-        """
-        self.rows[0][s, p], self.rows[1][s, p], self.rows[2][s, p] = stencil(
-            self.x[s, p], self.inv_dx, self.width
-        )
+        """Keep for P2G and G2P which nodes a particle touches, and the weights."""
+        first, second, third = stencil(self.x[s, p], self.inv_dx, self.width)
+        self.rows[0][s, p] = first
+        self.rows[1][s, p] = second
+        self.rows[2][s, p] = third
 
     @ti.func
     def p2g(self, s: ti.i32, p: ti.i32) -> None:
@@ -166,43 +196,39 @@ class NodalStress:
         c_y = only_v * self.slope_y[s, p]
         middle = scale * self.carried[s, p] - offset[0] * c_x - offset[1] * c_y
         for i, j in ti.static(ti.ndrange(3, 3)):
-            value = stepped(stepped(middle, c_x, i - 1), c_y, j - 1)
+            column = stepped(middle, c_x, i - 1)
+            value = stepped(column, c_y, j - 1)
             node = ti.Vector([s, base + i * self.width + j])
-            accumulate(self.sums, node, self.rows[i][s, p][j] * value, self.atomic)
+            weight = self.rows[i][s, p][j]
+            accumulate(self.sums, node, weight * value, self.atomic)
 
     @ti.func
     def received(self, s: ti.i32, i: ti.i32, j: ti.i32) -> Value:
-        """Return a node's sums and its mirror images' ones, and the momentum that
-        moving walls add.
+        """Return the sums of a node and its mirror images, and the drag of the walls.
+
+        The drag is the momentum that moving walls add.
         """
         total = self.sums[s, self.at(i, j)]
         drag = ti.Vector([0.0, 0.0])
+        tangential = self.walls.tangential
         x_ghost = self.walls.beyond(i)
         y_ghost = self.walls.beyond(j)
         if x_ghost != i:
             image = self.sums[s, self.at(x_ghost, j)]
-            total += ti.Vector([-1, self.walls.tangential, 1, 1]) * image
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(
-                image[2], self.count_unit
-            )
+            total += ti.Vector([-1, tangential, 1, 1]) * image
+            count = from_fixed(image[2], self.count_unit)
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * count
         if y_ghost != j:
             image = self.sums[s, self.at(i, y_ghost)]
-            total += ti.Vector([self.walls.tangential, -1, 1, 1]) * image
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(
-                image[2], self.count_unit
-            )
+            total += ti.Vector([tangential, -1, 1, 1]) * image
+            count = from_fixed(image[2], self.count_unit)
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * count
         if x_ghost != i and y_ghost != j:
             image = self.sums[s, self.at(x_ghost, y_ghost)]
-            total += (
-                ti.Vector([-self.walls.tangential, -self.walls.tangential, 1, 1])
-                * image
-            )
-            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * from_fixed(
-                image[2], self.count_unit
-            )
-            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * from_fixed(
-                image[2], self.count_unit
-            )
+            total += ti.Vector([-tangential, -tangential, 1, 1]) * image
+            count = from_fixed(image[2], self.count_unit)
+            drag[0] += self.walls.doubled_speed(s, 2, y_ghost) * count
+            drag[1] += self.walls.doubled_speed(s, 0, x_ghost) * count
         return total, drag
 
     @ti.func
@@ -212,58 +238,56 @@ class NodalStress:
         state = ti.Vector([0.0, 0.0, 0.0, 1.0])
         if total[2] > 0:
             count = from_fixed(total[2], self.count_unit)
-            state[0] = (from_fixed(total[0], self.velocity_unit) + drag[0]) / count
-            state[1] = (from_fixed(total[1], self.velocity_unit) + drag[1]) / count
+            momentum_x = from_fixed(total[0], self.velocity_unit) + drag[0]
+            momentum_y = from_fixed(total[1], self.velocity_unit) + drag[1]
+            state[0] = momentum_x / count
+            state[1] = momentum_y / count
             state[2] = count * fill
             state[3] = from_fixed(total[3], self.count_unit) / count
         self.node[s, self.at(i, j)] = state
 
     @ti.func
     def mirror(self, state: Template, s: ti.i32, k: ti.i32) -> None:
-        """Fill the k-th ghost node of (v, r, Jbar): r and Jbar even, v odd about the
-        wall's.
+        """Fill the k-th ghost node of (v, r, Jbar).
+
+        r and Jbar are even about the wall, v is odd about the velocity of the wall.
         """
         i, j = self.walls.ring(k)
-        image = state[s, self.at(self.walls.source(i), self.walls.source(j))]
+        source = self.at(self.walls.source(i), self.walls.source(j))
+        image = state[s, source]
         sign = self.walls.reflection(i, j)
-        add = self.walls.drive(s, i, j)
-        state[s, self.at(i, j)] = ti.Vector(
-            [
-                sign[0] * image[0] + add[0],
-                sign[1] * image[1] + add[1],
-                image[2],
-                image[3],
-            ]
-        )
+        drive = self.walls.drive(s, i, j)
+        v_x = sign[0] * image[0] + drive[0]
+        v_y = sign[1] * image[1] + drive[1]
+        state[s, self.at(i, j)] = ti.Vector([v_x, v_y, image[2], image[3]])
 
     @ti.func
     def mirror_gain(self, s: ti.i32, k: ti.i32) -> None:
         """Fill the k-th ghost node of dt a: as the velocity by walls at rest."""
         i, j = self.walls.ring(k)
-        self.gain[s, self.at(i, j)] = (
-            self.walls.reflection(i, j)
-            * self.gain[s, self.at(self.walls.source(i), self.walls.source(j))]
-        )
+        source = self.at(self.walls.source(i), self.walls.source(j))
+        sign = self.walls.reflection(i, j)
+        self.gain[s, self.at(i, j)] = sign * self.gain[s, source]
 
     @ti.func
     def force(self, s: ti.i32, i: ti.i32, j: ti.i32) -> None:
-        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v; gradients weighted 1/8, 3/4,
-        1/8 across.
+        """Add dt a = dt (E/rho) grad Jbar + dt nu lap v.
+
+        Gradients are weighted 1/8, 3/4, 1/8 across.
         """
         east = self.node[s, self.at(i + 1, j)]
         west = self.node[s, self.at(i - 1, j)]
         north = self.node[s, self.at(i, j + 1)]
         south = self.node[s, self.at(i, j - 1)]
-        rising = (
-            self.node[s, self.at(i + 1, j + 1)][3]
-            - self.node[s, self.at(i - 1, j - 1)][3]
-        )
-        falling = (
-            self.node[s, self.at(i + 1, j - 1)][3]
-            - self.node[s, self.at(i - 1, j + 1)][3]
-        )
+        north_east = self.node[s, self.at(i + 1, j + 1)][3]
+        south_west = self.node[s, self.at(i - 1, j - 1)][3]
+        rising = north_east - south_west
+        south_east = self.node[s, self.at(i + 1, j - 1)][3]
+        north_west = self.node[s, self.at(i - 1, j + 1)][3]
+        falling = south_east - north_west
         grad_x = 0.75 * (east[3] - west[3]) + 0.125 * (rising + falling)
         grad_y = 0.75 * (north[3] - south[3]) + 0.125 * (rising - falling)
+
         here = self.node[s, self.at(i, j)]
         laplacian = ((east + west) + (north + south)) - 4.0 * here
         gain_x = self.pressure * grad_x + self.spread[s] * laplacian[0]
@@ -272,9 +296,8 @@ class NodalStress:
         v_y = here[1] + gain_y
         self.gain[s, self.at(i, j)] = ti.Vector([gain_x, gain_y])
         self.moved[s, self.at(i, j)] = ti.Vector([v_x, v_y, here[2], here[3]])
-        self.peak[s, self.at(i, j)] = largest(
-            ti.abs(v_x), largest(ti.abs(v_y), self.peak[s, self.at(i, j)])
-        )
+        peak = largest(ti.abs(v_y), self.peak[s, self.at(i, j)])
+        self.peak[s, self.at(i, j)] = largest(ti.abs(v_x), peak)
 
     @ti.func
     def g2p(self, s: ti.i32, p: ti.i32) -> None:
@@ -304,19 +327,22 @@ class NodalStress:
         slope_x = self.slope_x[s, p]
         slope_y = self.slope_y[s, p]
         volume = 1.0 / largest(here[2], 0.5)
-        push = self.shift * volume * ti.Vector([slope_x[2], slope_y[2]])
-        push = bounded(push, -self.shift_bound, self.shift_bound)
+        density_slope = ti.Vector([slope_x[2], slope_y[2]])
+        shift = self.shift * volume * density_slope
+        shift = bounded(shift, -self.shift_bound, self.shift_bound)
+
         grid_v = ti.Vector([here[0], here[1]])
         v = ti.Vector([self.carried[s, p][0], self.carried[s, p][1]])
         v = v + ti.Vector([self.push[s, p][0], self.push[s, p][1]])
         v = v + self.parameters.velocity_relaxation * (grid_v - v)
-        v = v + (
-            push[0] * ti.Vector([slope_x[0], slope_x[1]])
-            + push[1] * ti.Vector([slope_y[0], slope_y[1]])
-        )
+        along_x = shift[0] * ti.Vector([slope_x[0], slope_x[1]])
+        along_y = shift[1] * ti.Vector([slope_y[0], slope_y[1]])
+        v = v + (along_x + along_y)
+
         x = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
-        x = bounded(x + (self.dt * grid_v + push), self.least, self.most)
+        x = bounded(x + (self.dt * grid_v + shift), self.least, self.most)
         self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
+
         jacobian = self.carried[s, p][3]
         jacobian = (
             jacobian
@@ -414,14 +440,14 @@ class NodalStress:
 
     @ti.kernel
     def _restart_extremes(self, particles: ti.i32, nodes: ti.i32) -> Nothing:
-        # Counts are arguments: of some constants, such as 4,000, LLVM makes code for
+        # Counts are arguments: with some constants, such as 4,000, LLVM compiles for
         # twenty seconds.
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
             now = self.carried[s, p]
-            self.extremes[s, p] = ti.Vector(
-                [ti.abs(now[0]), ti.abs(now[1]), now[3], -now[3]]
-            )
+            speed_x = ti.abs(now[0])
+            speed_y = ti.abs(now[1])
+            self.extremes[s, p] = ti.Vector([speed_x, speed_y, now[3], -now[3]])
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, n in ti.ndrange(self.scenarios, nodes):
             self.peak[s, n] = 0.0

@@ -37,7 +37,14 @@ class Jet:
 
     def __add__(self, other: Jet) -> Jet:
         """Add term by term."""
-        return Jet(*(a + b for a, b in zip(self._terms(), other._terms(), strict=True)))
+        return Jet(
+            self.value + other.value,
+            self.x + other.x,
+            self.y + other.y,
+            self.xx + other.xx,
+            self.xy + other.xy,
+            self.yy + other.yy,
+        )
 
     def __sub__(self, other: Jet) -> Jet:
         """Subtract term by term."""
@@ -47,18 +54,23 @@ class Jet:
         """Multiply by the product rule."""
         f = self
         g = other
-        return Jet(
-            f.value * g.value,
-            f.x * g.value + f.value * g.x,
-            f.y * g.value + f.value * g.y,
-            f.xx * g.value + 2.0 * (f.x * g.x) + f.value * g.xx,
-            f.xy * g.value + f.x * g.y + f.y * g.x + f.value * g.xy,
-            f.yy * g.value + 2.0 * (f.y * g.y) + f.value * g.yy,
-        )
+        x = f.x * g.value + f.value * g.x
+        y = f.y * g.value + f.value * g.y
+        xx = f.xx * g.value + 2.0 * (f.x * g.x) + f.value * g.xx
+        xy = f.xy * g.value + f.x * g.y + f.y * g.x + f.value * g.xy
+        yy = f.yy * g.value + 2.0 * (f.y * g.y) + f.value * g.yy
+        return Jet(f.value * g.value, x, y, xx, xy, yy)
 
     def scale(self, factor: Array | float) -> Jet:
         """Multiply by numbers that do not depend on the point's coordinates."""
-        return Jet(*(factor * term for term in self._terms()))
+        return Jet(
+            factor * self.value,
+            factor * self.x,
+            factor * self.y,
+            factor * self.xx,
+            factor * self.xy,
+            factor * self.yy,
+        )
 
     def shift(self, amount: Array | float) -> Jet:
         """Add numbers that do not depend on the point's coordinates."""
@@ -71,22 +83,22 @@ class Jet:
             result = (result * self).shift(coefficient)
         return result
 
-    def _terms(self) -> tuple[Array, Array, Array, Array, Array, Array]:
-        return self.value, self.x, self.y, self.xx, self.xy, self.yy
-
 
 def coordinates(position: Array) -> tuple[Jet, Jet]:
     """Return x and y as jets at the given points, shape [point, 2]."""
     zero = np.zeros(len(position))
     one = np.ones(len(position))
     x, y = position.T
-    return Jet(x, one, zero, zero, zero, zero), Jet(y, zero, one, zero, zero, zero)
+    x_jet = Jet(x, one, zero, zero, zero, zero)
+    y_jet = Jet(y, zero, one, zero, zero, zero)
+    return x_jet, y_jet
 
 
 def gradients(rng: RandomSource, frequency: int) -> NDArray[np.float64]:
     """Draw the unit gradients of a lattice, shape [frequency + 1, frequency + 1, 2]."""
-    nodes = range(frequency + 1)
-    return np.array([[direction(rng) for _ in nodes] for _ in nodes])
+    node_count = frequency + 1
+    vectors = [direction(rng) for _ in range(node_count * node_count)]
+    return np.array(vectors).reshape(node_count, node_count, 2)
 
 
 def fade(t: Jet) -> Jet:
@@ -97,23 +109,25 @@ def fade(t: Jet) -> Jet:
 
 
 def noise(x: Jet, y: Jet, lattice: NDArray[np.float64]) -> Jet:
-    """Return gradient noise of a lattice [node, node, 2] at points given in its cells
-    (Eqs. 5.40, 5.41).
+    """Return gradient noise of a lattice at points in units of its cells.
 
-    It is 0 at every node and its slope there is the node's gradient.
+    Eqs. 5.40 and 5.41 of the thesis. It is 0 at every node and its slope there is the
+    node's gradient. The lattice has the shape [node, node, 2].
     """
     last = len(lattice) - 2
     # A point on the far wall belongs to the last cell, not to one beyond the lattice.
     i = np.minimum(np.floor(x.value).astype(np.int64), last)
     j = np.minimum(np.floor(y.value).astype(np.int64), last)
+    # distances from the low corner of the cell
     p = x.shift(-i.astype(np.float64))
     q = y.shift(-j.astype(np.float64))
 
     def corner(k: int, m: int) -> Jet:
+        """Return the ramp along the gradient of one corner of the cell."""
         slope = lattice[i + k, j + m]
-        return p.shift(-float(k)).scale(slope[:, 0]) + q.shift(-float(m)).scale(
-            slope[:, 1]
-        )
+        along_x = p.shift(-float(k)).scale(slope[:, 0])
+        along_y = q.shift(-float(m)).scale(slope[:, 1])
+        return along_x + along_y
 
     u = fade(p)
     w = fade(q)
@@ -126,9 +140,13 @@ def ramp(t: Jet) -> Jet:
     """Return Bridson's ramp: (15 t - 10 t^3 + 3 t^5) / 8 up to t = 1, with two
     derivatives, then 1.
     """
-    value, *derivatives = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)._terms()
+    rising = t.polynomial(0.0, 1.875, 0.0, -1.25, 0.0, 0.375)
     below = t.value < 1.0
     return Jet(
-        np.where(below, value, 1.0),
-        *(np.where(below, term, 0.0) for term in derivatives),
+        np.where(below, rising.value, 1.0),
+        np.where(below, rising.x, 0.0),
+        np.where(below, rising.y, 0.0),
+        np.where(below, rising.xx, 0.0),
+        np.where(below, rising.xy, 0.0),
+        np.where(below, rising.yy, 0.0),
     )

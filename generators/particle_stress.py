@@ -1,5 +1,4 @@
-"""One substep of MLS-MPM with a free surface: liquid, jelly, snow and rope (design
-4.4).
+"""One substep of MLS-MPM with a free surface: liquid, jelly, snow and rope.
 
 For particles of equal mass m, positions x_p, grid spacing dx, weights w_ip and
 o = (x_i - x_p) / dx:
@@ -10,9 +9,11 @@ o = (x_i - x_p) / dx:
    Coulomb friction, at most ``friction`` times as much tangential velocity. Jbar = (n
    J)/n. Relative density r_i = n_i m / (rho dx^2), where n_i counts mirror images at
    the walls.
-3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,   x_p <- x_p + dt v_p, kept in the box.
-   Liquid: J <- J (1 + dt tr C) + kappa (Jbar - J), then J <- J + theta (1/max(r, 1) - J),
-   within [J_min, J_max]. Solids: F <- (I + dt C) F; snow then yields.
+3. G2P:  v_p = sum w v_i,   C_p = (4/dx) sum w v_i o^T,
+   x_p <- x_p + dt v_p, kept in the box.
+   Liquid: J <- J (1 + dt tr C) + kappa (Jbar - J), then
+   J <- J + theta (1/max(r, 1) - J), within [J_min, J_max].
+   Solids: F <- (I + dt C) F; snow then yields.
 
 The mass of a particle cancels everywhere but in r, so nodes count particles. Sums are
 integers (:mod:`.transfer`): no order of particles or threads changes a bit. The
@@ -70,7 +71,8 @@ class ParticleStress:
         threads: int,
     ) -> None:
         """Round the constants and take the memory."""
-        self.parameters = p = parameters  # constants that the scenarios share
+        p = parameters
+        self.parameters = parameters  # constants that the scenarios share
         self.scenarios = scenarios  # scenarios advanced together
         self.atomic = atomic  # whether several threads run the phases
         self.threads = threads  # threads of the parallel loops on a CPU
@@ -100,6 +102,11 @@ class ParticleStress:
         self.snow = lame(p.snow_modulus, p.snow_poisson)
         self.yield_low = 1.0 - p.snow_compression
         self.yield_high = 1.0 + p.snow_stretch
+        self._declare_fields()
+        self._place_fields()
+
+    def _declare_fields(self) -> None:
+        """Name the fields; they have no memory yet."""
         # particle positions [length], and two zeros
         self.x = ti.Vector.field(4, ti.f32)
         # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
@@ -124,7 +131,10 @@ class ParticleStress:
         self.fill = ti.field(ti.f32)  # m / (rho dx^2), shape [scenario]
         # Coulomb friction of the walls, shape [scenario]
         self.friction = ti.field(ti.f32)
-        carried = (
+
+    def _place_fields(self) -> None:
+        """Give the fields their memory, each an array of its own."""
+        particle_fields = (
             self.x,
             self.carried,
             self.slope_x,
@@ -132,18 +142,21 @@ class ParticleStress:
             self.f,
             self.matter,
             self.extremes,
+            *self.rows,
+            self.a_x,
+            self.a_y,
+            self.here,
         )
-        derived = (*self.rows, self.a_x, self.a_y, self.here)
+        particle_shape = (self.scenarios, self.parameters.particles)
+        node_shape = (self.scenarios, self.width**2)
         backend.place(
-            *(((scenarios, p.particles), [field]) for field in carried + derived),
-            *(
-                ((scenarios, self.width**2), [field])
-                for field in (self.sums, self.node)
-            ),
-            ((scenarios,), [self.fill, self.friction]),
+            *((particle_shape, [field]) for field in particle_fields),
+            (node_shape, [self.sums]),
+            (node_shape, [self.node]),
+            ((self.scenarios,), [self.fill, self.friction]),
         )
 
-    # --- one substep: each function is one phase at one particle or node --------------
+    # The phases: each function is one phase at one particle or node.
 
     @ti.func
     def stress(
@@ -172,9 +185,8 @@ class ParticleStress:
                 mu = self.snow[0] * factor
                 la = self.snow[1] * factor
                 damping = 0.0
-            tau = ti.select(
-                kind == _LIQUID, tau, corotated_stress(self.f[s, p], mu, la)
-            )
+            elastic = corotated_stress(self.f[s, p], mu, la)
+            tau = ti.select(kind == _LIQUID, tau, elastic)
             viscosity = ti.select(kind == _LIQUID, viscosity, damping)
         return tau + viscous_stress(c, viscosity)
 
@@ -188,15 +200,20 @@ class ParticleStress:
     @ti.func
     def prepare(self, s: ti.i32, p: ti.i32, solid: Template) -> None:
         """Compute the stencil of a particle, and the slope A of what it carries."""
-        self.rows[0][s, p], self.rows[1][s, p], self.rows[2][s, p] = stencil(
-            self.x[s, p], self.inv_dx, self.width
-        )
+        first, second, third = stencil(self.x[s, p], self.inv_dx, self.width)
+        self.rows[0][s, p] = first
+        self.rows[1][s, p] = second
+        self.rows[2][s, p] = third
         c = self.gradient(s, p)
-        a = self.dx * c - self.impulse * self.stress(s, p, c, solid)
+        tau = self.stress(s, p, c, solid)
+        a = self.dx * c - self.impulse * tau
+
         v = self.carried[s, p]
         seen = self.extremes[s, p]
-        reach_x = ti.abs(v[0]) + 1.5 * (ti.abs(a[0, 0]) + ti.abs(a[0, 1]))
-        reach_y = ti.abs(v[1]) + 1.5 * (ti.abs(a[1, 0]) + ti.abs(a[1, 1]))
+        slope_x = ti.abs(a[0, 0]) + ti.abs(a[0, 1])
+        slope_y = ti.abs(a[1, 0]) + ti.abs(a[1, 1])
+        reach_x = ti.abs(v[0]) + 1.5 * slope_x
+        reach_y = ti.abs(v[1]) + 1.5 * slope_y
         reach = larger(largest_of(reach_x, reach_y), seen[3])
         self.extremes[s, p] = ti.Vector([seen[0], seen[1], seen[2], reach])
         scaled = self.velocity_scale * a
@@ -219,9 +236,11 @@ class ParticleStress:
         a_y = self.a_y[s, p]
         middle = scale * self.carried[s, p] - offset[0] * a_x - offset[1] * a_y
         for i, j in ti.static(ti.ndrange(3, 3)):
-            value = stepped(stepped(middle, a_x, i - 1), a_y, j - 1)
+            column = stepped(middle, a_x, i - 1)
+            value = stepped(column, a_y, j - 1)
             node = ti.Vector([s, base + i * self.width + j])
-            accumulate(self.sums, node, self.rows[i][s, p][j] * value, self.atomic)
+            weight = self.rows[i][s, p][j]
+            accumulate(self.sums, node, weight * value, self.atomic)
 
     @ti.func
     def at(self, i: ti.i32, j: ti.i32) -> ti.i32:
@@ -249,40 +268,43 @@ class ParticleStress:
             jacobian = from_fixed(total[3], self.count_unit) / n
             u, v = self.contact(i, u, v, friction)
             v, u = self.contact(j, v, u, friction)
-        density = from_fixed(self.mirrored_count(s, i, j), self.count_unit) * fill
+        count = self.mirrored_count(s, i, j)
+        density = from_fixed(count, self.count_unit) * fill
         self.node[s, self.at(i, j)] = ti.Vector([u, v, density, jacobian])
 
     @ti.func
     def contact(
         self, index: ti.i32, normal: ti.f32, tangential: ti.f32, friction: ti.f32
     ) -> Value:
-        """Return the (normal, tangential) velocity that the two walls across an axis
-        leave.
+        """Return the normal and tangential velocity behind the contact with a wall.
+
+        ``index`` counts nodes along the normal of the two walls across an axis.
         """
-        kept = normal
-        braked = tangential
+        new_normal = normal
+        new_tangential = tangential
         if (index <= self.low and normal < 0.0) or (
             index >= self.high and normal > 0.0
         ):
             loss = friction * ti.abs(normal) / larger(ti.abs(tangential), 1e-9)
-            kept = 0.0
-            braked = tangential * larger(1.0 - loss, 0.0)
-        return kept, braked
+            new_normal = 0.0
+            new_tangential = tangential * larger(1.0 - loss, 0.0)
+        return new_normal, new_tangential
 
     @ti.func
     def image(self, index: ti.i32) -> ti.i32:
         """Return the mirror image of a node within a cell of a wall, else -1."""
-        found = -1
+        mirrored = -1
         if index <= self.low + 1:
-            found = 2 * self.low - index
+            mirrored = 2 * self.low - index
         if index >= self.high - 1:
-            found = 2 * self.high - index
-        return found
+            mirrored = 2 * self.high - index
+        return mirrored
 
     @ti.func
     def mirrored_count(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.i64:
-        """Return n of a node with its images: a wall node holds half a cell, a corner a
-        quarter.
+        """Return n of a node with its mirror images.
+
+        Without them a wall node would hold half a cell and a corner a quarter.
         """
         count = self.sums[s, self.at(i, j)][2]
         image_i = self.image(i)
@@ -317,10 +339,9 @@ class ParticleStress:
         here = self.here[s, p]
         kind = self.matter[s, p][0]
         old = self.matter[s, p][1]
-        moved = ti.Vector([self.x[s, p][0], self.x[s, p][1]]) + self.dt * ti.Vector(
-            [here[0], here[1]]
-        )
-        x = bounded(moved, self.least, self.most)
+        position = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
+        velocity = ti.Vector([here[0], here[1]])
+        x = bounded(position + self.dt * velocity, self.least, self.most)
         self.x[s, p] = ti.Vector([x[0], x[1], 0.0, 0.0])
         c = self.gradient(s, p)
         j = old + self.dt * (c[0, 0] + c[1, 1]) * old
@@ -334,18 +355,17 @@ class ParticleStress:
             resting = self.f[s, p]
             f = resting + self.dt * (c @ resting)
             yielded, growth = plastic_return(f, self.yield_low, self.yield_high)
-            jp = bounded(
-                old * growth, self.parameters.snow_jp_min, self.parameters.snow_jp_max
-            )
+            jp_min = self.parameters.snow_jp_min
+            jp_max = self.parameters.snow_jp_max
+            jp = bounded(old * growth, jp_min, jp_max)
             # Chosen, not branched upon: else no vectors.
-            f = ti.select(
-                kind == _LIQUID, resting, ti.select(kind == _SNOW, yielded, f)
-            )
+            deformed = ti.select(kind == _SNOW, yielded, f)
+            f = ti.select(kind == _LIQUID, resting, deformed)
             self.f[s, p] = f
-            ratio = ti.select(kind == _LIQUID, j, ti.select(kind == _SNOW, jp, old))
-            jacobian = ti.select(
-                kind == _LIQUID, j, f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
-            )
+            plastic = ti.select(kind == _SNOW, jp, old)
+            ratio = ti.select(kind == _LIQUID, j, plastic)
+            determinant = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
+            jacobian = ti.select(kind == _LIQUID, j, determinant)
             spread = ti.select(kind == _LIQUID, j, 1.0)
         self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
         self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
@@ -355,7 +375,7 @@ class ParticleStress:
         most = larger(jacobian, seen[2])
         self.extremes[s, p] = ti.Vector([larger(speed, seen[0]), least, most, seen[3]])
 
-    # --- the drivers: the same phases in the same order -------------------------------
+    # The drivers: the same phases in the same order.
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread, on the nodes that
@@ -437,7 +457,10 @@ class ParticleStress:
 
 @ti.func
 def largest_of(a: ti.f32, b: ti.f32) -> ti.f32:
-    """Return the larger of two positive values, :data:`_HUGE` if either is not a
-    number.
+    """Return the larger of two positive values.
+
+    It is :data:`_HUGE` if either is not a number.
     """
-    return larger(ti.select(a < _HUGE, a, _HUGE), ti.select(b < _HUGE, b, _HUGE))
+    finite_a = ti.select(a < _HUGE, a, _HUGE)
+    finite_b = ti.select(b < _HUGE, b, _HUGE)
+    return larger(finite_a, finite_b)

@@ -1,4 +1,4 @@
-"""Record what a generated data set measures: its hashes, statistics and twin floor.
+"""Record what a generated data set measures: hashes, statistics, predictability limit.
 
 usage: python -m lagbench.generators.record --split cavity --size tiny [--root FOLDER]
            [--registry datasets.yaml] [--released tests/data/released_hashes.json]
@@ -32,27 +32,33 @@ MARKER = "\nmeasured:"  # where the generated part of datasets.yaml begins
 _NOTICE = (
     "# Written by `python -m lagbench.generators.record`; do not edit below this line."
 )
-_SHORT = 16
+_SHORT = 16  # digits of a scenario's hash that datasets.yaml holds
 # numbers of a list in a line of at most 110 characters
 _PER_LINE = (110 - 10) // len("-1.00000000e-05, ")
 
 
 def measured_values(manifest: Manifest) -> Measured:
-    """Return what datasets.yaml shall say about a complete data set."""
-    twins = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
-    if not manifest.complete or manifest.dataset_sha256 is None or not all(twins):
+    """Return what datasets.yaml shall say about a complete data set.
+
+    Raises:
+        DataError: a scenario, or the predictability limit of one of test, is missing.
+    """
+    limits = [entry.twin_floor for entry in manifest.files if entry.subset == "test"]
+    if not manifest.complete or manifest.dataset_sha256 is None or not all(limits):
         raise DataError(
             "the data set is incomplete",
             where=f"{manifest.split} {manifest.size}",
-            expected="all scenarios of train, valid and test, and twins of test",
+            expected="all scenarios of train, valid and test, and perturbed runs of "
+            "test",
             fix=f"lagbench generate --split {manifest.split} --size {manifest.size}",
         )
+    hashes: dict[int, str] = {}
+    for entry in manifest.files:
+        hashes[entry.scenario] = entry.content_sha256[:_SHORT]
     return Measured(
         dataset_sha256=manifest.dataset_sha256,
         subset_sha256=manifest.subset_sha256,
-        scenario_sha256={
-            entry.scenario: entry.content_sha256[:_SHORT] for entry in manifest.files
-        },
+        scenario_sha256=hashes,
         statistics=manifest.statistics,
         twin_floor=manifest.mean_twin_floor(),
     )
@@ -64,36 +70,37 @@ def render(measured: Mapping[str, Mapping[str, Measured]]) -> str:
     for split, sizes in sorted(measured.items()):
         lines.append(f"  {split}:")
         for size, values in sorted(sizes.items()):
-            lines += [
-                f"    {size}:",
-                f'      dataset_sha256: "{values.dataset_sha256}"',
-            ]
-            lines.append("      subset_sha256:")
-            lines += [
-                f'        {subset}: "{digest}"'
-                for subset, digest in values.subset_sha256.items()
-            ]
-            lines.append("      scenario_sha256:")
-            lines += [
-                f'        {i}: "{digest}"'
-                for i, digest in sorted(values.scenario_sha256.items())
-            ]
-            lines.append("      statistics:")
-            for name, row in values.statistics.items():
-                lines.append(f"        {name}: [{', '.join(map(_number, row))}]")
-            numbers = [_number(value) for value in values.twin_floor]
-            rows = [
-                ", ".join(numbers[k : k + _PER_LINE])
-                for k in range(0, len(numbers), _PER_LINE)
-            ]
-            lines += [
-                "      twin_floor:",
-                "        [" + ",\n         ".join(rows) + "]",
-            ]
+            lines.append(f"    {size}:")
+            lines += _render_size(values)
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float) -> str:
+def _render_size(values: Measured) -> list[str]:
+    lines = [f'      dataset_sha256: "{values.dataset_sha256}"']
+
+    lines.append("      subset_sha256:")
+    for subset, digest in values.subset_sha256.items():
+        lines.append(f'        {subset}: "{digest}"')
+
+    lines.append("      scenario_sha256:")
+    for scenario, digest in sorted(values.scenario_sha256.items()):
+        lines.append(f'        {scenario}: "{digest}"')
+
+    lines.append("      statistics:")
+    for name, row in values.statistics.items():
+        numbers = ", ".join(map(_format_number, row))
+        lines.append(f"        {name}: [{numbers}]")
+
+    limits = [_format_number(value) for value in values.twin_floor]
+    rows = []
+    for start in range(0, len(limits), _PER_LINE):
+        rows.append(", ".join(limits[start : start + _PER_LINE]))
+    lines.append("      twin_floor:")
+    lines.append("        [" + ",\n         ".join(rows) + "]")
+    return lines
+
+
+def _format_number(value: float) -> str:
     """Return nine digits in the one form that YAML 1.1 reads as a float."""
     return f"{value:.8e}"
 
@@ -121,40 +128,71 @@ def record(
 ) -> Measured:
     """Write what a manifest measures to datasets.yaml and to the list of released
     hashes.
+
+    Args:
+        size: size that the manifest belongs to.
+        manifest: manifest of a complete data set.
+        registry: the datasets.yaml to write.
+        released: the list of released hashes; None for no list.
+        allow: whether a hash of the same MAJOR version may change.
+
+    Raises:
+        DataError: the data set is incomplete, or a hash would change.
     """
     values = measured_values(manifest)
-    hashes = (
-        json.loads(released.read_text())
-        if released is not None and released.exists()
-        else {}
-    )
-    before = hashes.get(released_name(size)) or (
-        size.measured.dataset_sha256 if size.measured else None
-    )
-    if before not in (None, values.dataset_sha256) and not allow:
+    released_hashes = {}
+    if released is not None and released.exists():
+        released_hashes = json.loads(released.read_text())
+
+    old_hash = released_hashes.get(released_name(size))
+    if not old_hash and size.measured:
+        old_hash = size.measured.dataset_sha256
+    if old_hash not in (None, values.dataset_sha256) and not allow:
         raise DataError(
             "the bits changed and MAJOR did not",
             where=f"{registry}, {size.split} {size.name} {size.version}",
-            expected=before,
+            expected=old_hash,
             got=values.dataset_sha256,
             fix="raise MAJOR of the split, or pass --allow-change before a release",
         )
-    known = load(registry).measured
-    sizes = {**known.get(size.split, {}), size.name: values}
-    text = replace_measured(
-        registry.read_text(encoding="utf-8"), {**known, size.split: sizes}
-    )
+
+    measured = load(registry).measured
+    sizes = {**measured.get(size.split, {}), size.name: values}
+    old_text = registry.read_text(encoding="utf-8")
+    text = replace_measured(old_text, {**measured, size.split: sizes})
     write_atomically(registry, text.encode())
     if released is not None:
-        hashes[released_name(size)] = values.dataset_sha256
-        write_atomically(
-            released, (json.dumps(hashes, indent=1, sort_keys=True) + "\n").encode()
-        )
+        released_hashes[released_name(size)] = values.dataset_sha256
+        listing = json.dumps(released_hashes, indent=1, sort_keys=True) + "\n"
+        write_atomically(released, listing.encode())
     return values
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line of this module; return its exit code."""
+    options = _parse(arguments)
+    try:
+        size = load(options.registry).size(options.split, options.size)
+        manifest = _checked_manifest(size, resolve_root(options.root))
+        released = options.released
+        checkout = options.registry.parent / "tests"
+        if released is None and checkout.is_dir():
+            released = checkout / "data" / "released_hashes.json"
+        values = record(
+            size,
+            manifest,
+            registry=options.registry,
+            released=released,
+            allow=options.allow_change,
+        )
+    except LagbenchError as error:
+        sys.stderr.write(f"record: {error}\n")
+        return error.exit_code
+    sys.stdout.write(f"{size.split} {size.name}: {values.dataset_sha256}\n")
+    return 0
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -164,41 +202,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--registry", type=Path, default=default_path().resolve())
     parser.add_argument("--released", type=Path)
     parser.add_argument("--allow-change", action="store_true")
-    options = parser.parse_args(arguments)
-    root = resolve_root(options.root)
-    try:
-        size = load(options.registry).size(options.split, options.size)
-        folder = dataset_folder(root, size.split, size.name, size.major)
-        manifest = read_manifest(root, size.split, size.name, size.major)
-        if manifest is None:
-            raise DataError("the data set has no manifest", where=str(folder))
-        for entry in manifest.files:
-            path = folder / entry.path
-            if not path.is_file() or file_sha256(path) != entry.file_sha256:
-                raise DataError(
-                    "a file is not the one that the manifest describes",
-                    where=str(path),
-                    fix=f"lagbench generate --split {manifest.split} --size "
-                    f"{manifest.size}",
-                )
-        released = options.released
-        checkout = options.registry.parent / "tests"
-        if released is None and checkout.is_dir():
-            released = checkout / "data" / "released_hashes.json"
-        # what the manifest says of train is not taken on trust
-        train = [
-            folder / entry.path for entry in manifest.files if entry.subset == "train"
-        ]
-        manifest = manifest.model_copy(update={"statistics": file_statistics(train)})
-        allow = options.allow_change
-        values = record(
-            size, manifest, registry=options.registry, released=released, allow=allow
-        )
-    except LagbenchError as error:
-        sys.stderr.write(f"record: {error}\n")
-        return error.exit_code
-    sys.stdout.write(f"{size.split} {size.name}: {values.dataset_sha256}\n")
-    return 0
+    return parser.parse_args(arguments)
+
+
+def _checked_manifest(size: Size, root: Path) -> Manifest:
+    """Return a manifest whose files are those on disk, with statistics computed anew.
+
+    What the manifest says of train is not taken on trust.
+    """
+    folder = dataset_folder(root, size.split, size.name, size.major)
+    manifest = read_manifest(root, size.split, size.name, size.major)
+    if manifest is None:
+        raise DataError("the data set has no manifest", where=str(folder))
+
+    train_paths = []
+    for entry in manifest.files:
+        path = folder / entry.path
+        if not path.is_file() or file_sha256(path) != entry.file_sha256:
+            options = f"--split {manifest.split} --size {manifest.size}"
+            raise DataError(
+                "a file is not the one that the manifest describes",
+                where=str(path),
+                fix=f"lagbench generate {options}",
+            )
+        if entry.subset == "train":
+            train_paths.append(path)
+    statistics = file_statistics(train_paths)
+    return manifest.model_copy(update={"statistics": statistics})
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ __all__ = [
     "Shape",
     "body_at",
     "place",
-    "seeds",
+    "sample_points",
 ]
 
 Array = NDArray[np.float64]
@@ -62,9 +62,7 @@ class Rectangle:
 
     @classmethod
     def of_area(cls, area: float, aspect: float) -> Rectangle:
-        """Return the level rectangle of this area [length^2] and length over width
-        [1].
-        """
+        """Return the level rectangle of an area [length^2] and an aspect ratio [1]."""
         length = math.sqrt(area * aspect)
         return cls(length, area / length)
 
@@ -78,19 +76,22 @@ class Rectangle:
         """Half the bounding box of the turned rectangle."""
         c = abs(self.axis[0])
         s = abs(self.axis[1])
-        return 0.5 * (c * self.length + s * self.width), 0.5 * (
-            s * self.length + c * self.width
-        )
+        width = c * self.length + s * self.width
+        height = s * self.length + c * self.width
+        return 0.5 * width, 0.5 * height
 
     def distance(self, position: Array) -> Array:
         """Return the exact signed distance."""
-        (c, s), (x, y) = self.axis, position.T
+        c, s = self.axis
+        x, y = position.T
+        # distances beyond the ends and beyond the sides, negative between them
         along = np.abs(c * x + s * y) - 0.5 * self.length
         across = np.abs(c * y - s * x) - 0.5 * self.width
         inside = np.minimum(np.maximum(along, across), 0.0)
         along = np.maximum(along, 0.0)
         across = np.maximum(across, 0.0)
-        return np.asarray(np.sqrt(along * along + across * across) + inside)
+        outside = np.sqrt(along * along + across * across)
+        return np.asarray(outside + inside)
 
 
 @dataclass(frozen=True)
@@ -130,45 +131,46 @@ class Blobs:
 
     @classmethod
     def of_area(cls, area: float, offsets: Array, *, cells: int) -> Blobs:
-        """Scale an arrangement of unit discs, centres in radii [disc, 2], until their
-        union covers an area.
+        """Scale an arrangement of unit discs until their union covers an area.
 
-        The union of unit discs is measured once, by counting cells of a grid, so many
-        across the bounding box; at 512 the error is about 1e-3. Any other area follows
-        by its scale.
+        The union of unit discs is measured by counting cells of a grid; at 512 cells
+        the error is about 1e-3. Any other area follows by its scale.
+
+        Args:
+            area: area of the scaled union [length^2].
+            offsets: centres of the unit discs [radius], shape [disc, 2].
+            cells: cells of the grid across the bounding box.
         """
         low = offsets.min(axis=0) - 1.0
         high = offsets.max(axis=0) + 1.0
         centres = offsets - 0.5 * (low + high)
         extent = high - low
         middle = (np.arange(cells) + 0.5) / cells - 0.5
-        x, y = (
-            side.ravel() for side in np.meshgrid(middle * extent[0], middle * extent[1])
-        )
+        x, y = np.meshgrid(middle * extent[0], middle * extent[1])
+        x = x.ravel()
+        y = y.ravel()
         covered = np.zeros(cells * cells, dtype=np.bool_)
         for centre in centres:
             dx = x - centre[0]
             dy = y - centre[1]
             covered |= dx * dx + dy * dy <= 1.0
-        counted = float(np.count_nonzero(covered) * (extent[0] * extent[1])) / (
-            cells * cells
-        )
-        scale = math.sqrt(area / counted)
-        placed = tuple((float(x) * scale, float(y) * scale) for x, y in centres)
-        return cls(placed, scale, area)
+        box_area = extent[0] * extent[1]
+        unit_area = float(np.count_nonzero(covered) * box_area) / (cells * cells)
+        scale = math.sqrt(area / unit_area)
+        scaled = tuple((float(x) * scale, float(y) * scale) for x, y in centres)
+        return cls(scaled, scale, area)
 
     @property
     def reach(self) -> tuple[float, float]:
         """Half the bounding box of all discs."""
-        x, y = (max(axis) + self.radius for axis in zip(*self.centres, strict=True))
-        return x, y
+        x, y = zip(*self.centres, strict=True)
+        return max(x) + self.radius, max(y) + self.radius
 
     def distance(self, position: Array) -> Array:
         """Return the signed distance, exact outside and on the outline."""
-        discs = [
-            Disc(self.radius).distance(position - np.array(c)) for c in self.centres
-        ]
-        return np.asarray(np.minimum.reduce(discs))
+        disc = Disc(self.radius)
+        distances = [disc.distance(position - np.array(c)) for c in self.centres]
+        return np.asarray(np.minimum.reduce(distances))
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,11 @@ def body_at(shape: Shape, x: float, y: float) -> Body:
 
 
 def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
-    """Put a shape uniformly at random where its bounding box lies within a region."""
+    """Put a shape uniformly at random where its bounding box lies within a region.
+
+    Raises:
+        WorkFailedError: the region is too small for it.
+    """
     centre = []
     for reach, (low, high) in zip(shape.reach, region, strict=True):
         if high - low < 2.0 * reach:
@@ -203,27 +209,31 @@ def place(rng: RandomSource, shape: Shape, region: Region) -> Body:
     return body_at(shape, *centre)
 
 
-def seeds(rng: RandomSource, body: Body, count: int) -> Array:
-    """Spread particles evenly inside a body: multiples of 2^-20 [length], shape [count,
-    2].
+def sample_points(rng: RandomSource, body: Body, count: int) -> Array:
+    """Spread particles evenly inside a body.
 
-    The first ``count`` points inside it of Roberts' R2 low-discrepancy sequence, laid
-    by a random shift over the smallest square about the bounding box, so that spacings
-    are alike in both directions however slender the body is.
+    These are the first ``count`` points inside it of Roberts' R2 low-discrepancy
+    sequence. The sequence is laid by a random shift over the smallest square about the
+    bounding box, so that spacings are alike in both directions however slender the
+    body is.
+
+    Returns:
+        Positions [length], multiples of 2^-20, shape [count, 2].
     """
     shift = rng.random((2,))
     side = 2.0 * max(body.shape.reach)
-    # at once: a million particles take no memory beside their own
-    block = min(4 * count, 1 << 16)
-    found = [np.empty((0, 2))]
-    missing = count
+    # in blocks: a million particles take no memory beside their own
+    block_size = min(4 * count, 1 << 16)
+    blocks = [np.empty((0, 2))]
+    missing_count = count
     start = 1
-    while missing > 0:
-        index = np.arange(start, start + block, dtype=np.float64)[:, None]
+    while missing_count > 0:
+        index = np.arange(start, start + block_size, dtype=np.float64)[:, None]
         turns = shift + index * _R2
         local = (turns - np.floor(turns) - 0.5) * side
-        inside = local[body.shape.distance(local) <= 0.0][:missing]
-        found.append(inside)
-        missing -= len(inside)
-        start += block
-    return quantise(body.centre + np.concatenate(found))
+        is_inside = body.shape.distance(local) <= 0.0
+        points = local[is_inside][:missing_count]
+        blocks.append(points)
+        missing_count -= len(points)
+        start += block_size
+    return quantise(body.centre + np.concatenate(blocks))

@@ -1,18 +1,18 @@
-"""Simulate scenarios of a size and write each to its file.
+"""Simulate scenarios of a size, write each to its file, and perturb those of test.
 
 Neither xarray nor pandas is imported, which keeps a worker below 400 MB.
 
-The twin floor: how far a scenario drifts from a copy of itself that was nudged.
-
-At the last frame that a model is given, every coordinate of every particle moves by
-+2^-20 or -2^-20 (seeded signs), far below anything that a frame shows. The position
-RMSE between this twin and the truth at each predicted frame is what no model can be
+The predictability limit: how far a scenario drifts from a perturbed run of itself. At
+the last frame that a model is given, every coordinate of every particle moves by +2^-20
+or -2^-20 (seeded signs), far below anything that a frame shows. The position RMSE
+between the perturbed run and the truth at each predicted frame is what no model can be
 expected to undercut::
 
-    floor(f) = sqrt(mean over particles and axes of (x_twin(f) - x(f))^2)
+    limit(f) = sqrt(mean over particles and axes of (x_perturbed(f) - x(f))^2)
 
 It starts at 2^-20 = 9.5e-7, stays near it while the flow is regular, and grows where
-trajectories diverge. A prediction that lies below it has seen the answer.
+trajectories diverge. A prediction that lies below it has seen the answer. Manifests
+call it ``twin_floor``.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ from lagbench.data.registry import Size, Task
 from lagbench.data.scenario import read_scenario
 from lagbench.data.writer import ScenarioWriter
 
-from .batch import Batch, Report, SimulationJob, substeps_of
+from .batch import Report, ScenarioBatch, SimulationJob, substep_count
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
+from .solver import Health
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
@@ -41,15 +42,15 @@ OUTCOMES = ("active_frames",)
 """Parameters of a file that follow from its simulation; all others are known before it.
 """
 
-# frames on the way to which kernels are compiled: one is read out, then one is advanced
-# to
+# frames on the way to which kernels are compiled: the first is read out, the solver
+# advances to the second
 COMPILING = 2
 # drawn parameters that files call by their CF-like long name
 _FILE_NAMES = {"reynolds": "reynolds_number"}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
+class SimulationDiagnostics:
     """What one simulated scenario went through; its file and the manifest state it."""
 
     start_frame: int  # frames simulated before frame 0
@@ -66,7 +67,7 @@ class Facts:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pace:
+class SimulationPace:
     """How long a scenario took for how much, once everything was compiled."""
 
     seconds: float  # processor time [s]
@@ -75,12 +76,12 @@ class Pace:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Simulated:
+class SimulatedScenario:
     """A scenario that was simulated and written."""
 
     scenario: int  # its id
     content_sha256: str  # content hash of its file
-    pace: Pace | None = None  # of a scenario that was simulated alone
+    pace: SimulationPace | None = None  # of a scenario that was simulated alone
 
 
 def _particle_mass(size: Size, state: InitialState) -> float:
@@ -91,11 +92,13 @@ def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
     """Return what a scenario's file states and hashes: constants, then what was
     drawn.
     """
-    constants = {name: parameter.value for name, parameter in size.parameters.items()}
-    drawn = {
-        _FILE_NAMES.get(name, name): value for name, value in state.parameters.items()
-    }
-    return {**constants, **drawn, "start_frame": state.start_frame}
+    parameters: dict[str, object] = {}
+    for name, parameter in size.parameters.items():
+        parameters[name] = parameter.value
+    for name, value in state.parameters.items():
+        parameters[_FILE_NAMES.get(name, name)] = value
+    parameters["start_frame"] = state.start_frame
+    return parameters
 
 
 def scenario_writer(
@@ -103,23 +106,25 @@ def scenario_writer(
 ) -> ScenarioWriter:
     """Return the writer of a scenario's file, with all that is known before it runs."""
     size = job.size
-    walls = None
     key = size.key(scenario)
+    frame_count = size.frame_count(scenario)
+
+    wall_velocity = None
     if isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters):
         # of each wall towards each recorded frame [length/s], shape [frame, 4, 2]
-        frames = range(
-            state.start_frame, state.start_frame + size.frame_count(scenario)
-        )
-        walls = np.stack([state.walls_towards(frame) for frame in frames])
+        first_frame = state.start_frame
+        frames = range(first_frame, first_frame + frame_count)
+        wall_velocity = np.stack([state.walls_towards(frame) for frame in frames])
+
     return ScenarioWriter(
         scenario_path(job.root, key),
         key,
         particles=size.particles,
-        frames=size.frame_count(scenario),
+        frames=frame_count,
         frame_interval=size.frame_interval,
         material=state.material,
         particle_mass=_particle_mass(size, state),
-        wall_velocity=walls,
+        wall_velocity=wall_velocity,
         parameters=file_parameters(size, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
@@ -134,9 +139,11 @@ def active_frames(energies: Sequence[float], task: Task) -> int:
     its greatest value from frame 0 to the end of the horizon.
     """
     span = energies[: task.input_frames + task.horizon]
-    last = max(
-        frame for frame, energy in enumerate(span) if energy >= STILL * max(span)
-    )
+    threshold = STILL * max(span)
+    last = 0
+    for frame, energy in enumerate(span):
+        if energy >= threshold:
+            last = frame
     return max(0, last + 1 - task.input_frames)
 
 
@@ -145,70 +152,90 @@ def simulate(
     report: Report,
     *,
     clock: Callable[[], float] = time.process_time,
-) -> list[Simulated]:
+) -> list[SimulatedScenario]:
     """Simulate the scenarios of a job and write their files, all or none of them.
 
     Kernels compile on the way to the first two frames, so time is taken from there on.
     """
-    batch = Batch(job, report)
     size = job.size
+    batch = ScenarioBatch(job, report)
     masses = [_particle_mass(size, state) for state in batch.states]
-    # energies by scenario, frame by frame
-    kinetic: list[list[float]] = [[] for _ in masses]
-    begun = clock()
+    # kinetic energies by scenario, frame by frame
+    energies: list[list[float]] = [[] for _ in masses]
+    started = clock()
     with ExitStack() as stack:
-        pairs = zip(job.scenarios, batch.states, strict=True)
-        writers = [
-            stack.enter_context(scenario_writer(job, scenario, state))
-            for scenario, state in pairs
-        ]
+        writers = []
+        for scenario, state in zip(job.scenarios, batch.states, strict=True):
+            writer = scenario_writer(job, scenario, state)
+            writers.append(stack.enter_context(writer))
+
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
             writers[index].append(position, velocity)
-            speed = velocity.astype(np.float64).ravel()
-            # An exact sum: which frames are active enters the content hash.
-            kinetic[index].append(
-                0.5 * masses[index] * math.fsum((speed * speed).tolist())
-            )
+            energies[index].append(_kinetic_energy(velocity, masses[index]))
             if frame == COMPILING - 1:
-                begun = clock()
-        for writer, energies, state, seen in zip(
-            writers, kinetic, batch.states, batch.extremes, strict=True
-        ):
-            if isinstance(batch.solver.parameters, FreeSurfaceParameters):
-                writer.state(active_frames=active_frames(energies, size.task))
-            largest = max(energies)
-            facts = Facts(
-                start_frame=state.start_frame,
-                kinetic_energy_first=energies[0],
-                kinetic_energy_last=energies[-1],
-                kinetic_energy_max=largest,
-                kinetic_energy_mean=math.fsum(energies) / len(energies),
-                energy_last_over_max=energies[-1] / largest if largest > 0.0 else 0.0,
-                max_speed=seen.max_speed,
-                cfl=seen.max_speed * size.dt * size.grid,
-                jacobian_min=seen.jacobian_min,
-                jacobian_max=seen.jacobian_max,
+                started = clock()
+
+        is_free_surface = isinstance(batch.solver.parameters, FreeSurfaceParameters)
+        for index, writer in enumerate(writers):
+            if is_free_surface:
+                writer.state(active_frames=active_frames(energies[index], size.task))
+            diagnostics = _diagnose(
+                size,
+                batch.states[index],
+                energies=energies[index],
+                extremes=batch.extremes[index],
             )
-            writer.state_facts(asdict(facts))
-    timed = size.frame_count(job.scenarios[0]) - COMPILING
-    pace = Pace(
-        seconds=clock() - begun,
-        particle_substeps=timed * size.substeps_per_frame * size.particles,
-        frames=timed,
-    )
+            writer.state_facts(asdict(diagnostics))
+    seconds = clock() - started
+
+    pace = None
+    timed_frames = size.frame_count(job.scenarios[0]) - COMPILING
+    if timed_frames > 0 and len(job.scenarios) == 1:
+        pace = SimulationPace(
+            seconds=seconds,
+            particle_substeps=timed_frames * size.substeps_per_frame * size.particles,
+            frames=timed_frames,
+        )
     return [
-        Simulated(
-            scenario=scenario,
-            content_sha256=writer.content_sha256,
-            pace=pace if timed > 0 and len(job.scenarios) == 1 else None,
+        SimulatedScenario(
+            scenario=scenario, content_sha256=writer.content_sha256, pace=pace
         )
         for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
 
 
-def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
-    """Return the displacement of a scenario's twin [length], shape [particle, 2]."""
+def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:
+    """Return sum of m v^2 / 2 over particles of one mass [mass length^2/s^2]."""
+    speed = velocity.astype(np.float64).ravel()
+    # An exact sum: which frames are active enters the content hash.
+    return 0.5 * mass * math.fsum((speed * speed).tolist())
+
+
+def _diagnose(
+    size: Size, state: InitialState, *, energies: Sequence[float], extremes: Health
+) -> SimulationDiagnostics:
+    """Return what a scenario went through, of its kinetic energies frame by frame."""
+    largest = max(energies)
+    last_over_max = 0.0
+    if largest > 0.0:
+        last_over_max = energies[-1] / largest
+    return SimulationDiagnostics(
+        start_frame=state.start_frame,
+        kinetic_energy_first=energies[0],
+        kinetic_energy_last=energies[-1],
+        kinetic_energy_max=largest,
+        kinetic_energy_mean=math.fsum(energies) / len(energies),
+        energy_last_over_max=last_over_max,
+        max_speed=extremes.max_speed,
+        cfl=extremes.max_speed * size.dt * size.grid,
+        jacobian_min=extremes.jacobian_min,
+        jacobian_max=extremes.jacobian_max,
+    )
+
+
+def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
+    """Return the displacement of a perturbed run [length], shape [particle, 2]."""
     # a random stream of its own: the scenario's seed and a 1
     seed = (*entropy(size.split, size.name, size.major, scenario), 1)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
@@ -216,40 +243,51 @@ def nudge(size: Size, scenario: int) -> NDArray[np.float32]:
     return (QUANTUM * signs).astype(np.float32)
 
 
-def twin_substeps(size: Size, scenario: int) -> int:
-    """Return how many substeps a scenario's twin takes."""
-    return (
-        substeps_of(size, scenario)
-        - size.frames_behind(scenario) * size.substeps_per_frame
-    )
+def perturbed_substep_count(size: Size, scenario: int) -> int:
+    """Return how many substeps a perturbed run takes: it ends with the horizon."""
+    omitted = size.frames_behind(scenario) * size.substeps_per_frame
+    return substep_count(size, scenario) - omitted
 
 
-def twin_floors(job: SimulationJob, report: Report) -> dict[int, tuple[float, ...]]:
-    """Simulate twins of scenarios beside their files; return the RMSE of each predicted
-    frame [length].
+def measure_predictability(
+    job: SimulationJob, report: Report
+) -> dict[int, tuple[float, ...]]:
+    """Simulate perturbed runs of scenarios beside their files.
+
+    Returns:
+        The predictability limit of each scenario: the RMSE of each predicted frame
+        [length].
     """
     size = job.size
-    counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
-    batch = Batch(job, report, frames=counts)
-    offsets = np.zeros((len(counts), size.particles, 2), dtype=np.float32)
-    floors: list[list[float]] = [[] for _ in counts]
+    input_frames = size.task.input_frames
+    frame_counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
+    batch = ScenarioBatch(job, report, frames=frame_counts)
+    # displacements of the batch [length], shape [scenario, particle, 2]
+    offsets = np.zeros((len(frame_counts), size.particles, 2), dtype=np.float32)
+    limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
-        paths = [size.path(job.root, scenario) for scenario in job.scenarios]
-        truths = [stack.enter_context(read_scenario(path)) for path in paths]
+        truths = []
+        for scenario in job.scenarios:
+            file = read_scenario(size.path(job.root, scenario))
+            truths.append(stack.enter_context(file))
+
         for index, frame in batch.recordings():
-            if frame == size.task.input_frames - 1:
+            if frame == input_frames - 1:
                 offsets[:] = 0.0
-                offsets[index] = nudge(size, job.scenarios[index])
+                offsets[index] = draw_perturbation(size, job.scenarios[index])
                 batch.displace(offsets)
-            elif frame >= size.task.input_frames:
+            elif frame >= input_frames:
+                position, _ = batch.frame(index)
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                error = batch.frame(index)[0].astype(np.float64) - truth.astype(
-                    np.float64
-                )
-                floors[index].append(
-                    math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)
-                )
+                limits[index].append(_root_mean_square_error(position, truth))
     return {
-        scenario: tuple(floor)
-        for scenario, floor in zip(job.scenarios, floors, strict=True)
+        scenario: tuple(limit)
+        for scenario, limit in zip(job.scenarios, limits, strict=True)
     }
+
+
+def _root_mean_square_error(
+    position: NDArray[np.float32], truth: NDArray[np.float32]
+) -> float:
+    error = position.astype(np.float64) - truth.astype(np.float64)
+    return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

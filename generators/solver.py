@@ -85,19 +85,24 @@ def build(
     scenarios: int = 1,
     threads: int | None = None,
 ) -> Solver:
-    """Compile the solver that belongs to the parameters, whose type chooses the
-    formulation.
+    """Compile the solver that belongs to the parameters.
 
-    ``scenarios`` advance together, one on ``Device.CPU``; ``threads`` are those of
-    ``Device.PARALLEL``, by default all that the process may use. A device or count that
-    cannot be is a UsageError.
+    Args:
+        parameters: constants; their type chooses the formulation.
+        device: where the substeps run.
+        scenarios: how many advance together; one on ``Device.CPU``.
+        threads: those of ``Device.PARALLEL``; all that the process may use when None.
+
+    Raises:
+        UsageError: a device or count that cannot be.
     """
-    module, name = _IMPLEMENTATIONS[type(parameters)]
+    module_name, class_name = _IMPLEMENTATIONS[type(parameters)]
     package = __name__.rpartition(".")[0]
     # before Taichi itself, which it keeps quiet
     importlib.import_module(".backend", package)
-    implementation = getattr(importlib.import_module(module, package), name)
-    return cast(
-        "Solver",
-        implementation(parameters, device=device, scenarios=scenarios, threads=threads),
+    module = importlib.import_module(module_name, package)
+    solver_class = getattr(module, class_name)
+    solver = solver_class(
+        parameters, device=device, scenarios=scenarios, threads=threads
     )
+    return cast("Solver", solver)

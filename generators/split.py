@@ -21,13 +21,14 @@ __all__ = [
     "FreeSurfaceParameters",
     "InitialState",
     "Material",
-    "Split",
+    "SplitGenerator",
 ]
 
 
 class Material(enum.IntEnum):
-    """Constitutive model of a particle; the values are the CF ``flag_values`` of the
-    files.
+    """Constitutive model of a particle.
+
+    The values are the CF ``flag_values`` of the files.
     """
 
     LIQUID = 0
@@ -38,10 +39,10 @@ class Material(enum.IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedBoxParameters:
-    """Constants of the weakly compressible, nodal-stress solver (design 4.3).
+    """Constants of the weakly compressible solver with stress at the nodes.
 
-    The walls lie half-way between nodes, at ``(wall + 1/2) / grid`` and its mirror
-    image.
+    The equations stand in :mod:`.nodal_stress`. The walls lie half-way between nodes,
+    at ``(wall + 1/2) / grid`` and its mirror image.
     """
 
     particles: int  # particles in one scenario
@@ -64,9 +65,10 @@ class ClosedBoxParameters:
 
 @dataclass(frozen=True, kw_only=True)
 class FreeSurfaceParameters:
-    """Constants of the MLS-MPM solver for liquid, jelly, snow and rope (design 4.4).
+    """Constants of the MLS-MPM solver for liquid, jelly, snow and rope.
 
-    The walls are free-slip and lie on node ``wall`` and its mirror image.
+    The equations stand in :mod:`.particle_stress`. The walls are free-slip and lie on
+    node ``wall`` and its mirror image.
     """
 
     particles: int  # particles in one scenario
@@ -117,8 +119,8 @@ class InitialState:
     # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
     viscosity: float = 0.0
     # velocity of each wall in the order of WALLS [length/s], shape [4, 2], or a program
-    # of shape [frame, 4, 2]: row f acts from frame f-1 to f after the first substep,
-    # row 0 never, the last one for good
+    # of shape [frame, 4, 2]: row f acts from frame f-1 to f, counted from the first
+    # substep; row 0 never acts, the last row acts from its frame on
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
     friction: float = 0.0  # Coulomb friction of the walls (free surface only) [1]
     start_frame: int = 0  # frames simulated before frame 0 is recorded
@@ -130,13 +132,19 @@ class InitialState:
         [length/s], shape [4, 2].
         """
         program = self.wall_velocity
-        return program if program.ndim == 2 else program[min(frame, len(program) - 1)]
+        if program.ndim == 2:
+            return program
+        row: NDArray[np.float64] = program[min(frame, len(program) - 1)]
+        return row
 
 
-class Split(Protocol):
+class SplitGenerator(Protocol):
     """What an entry point of the group ``lagbench.generators`` must name: a split.
 
-    A module with these two functions is one.
+    A module with these two functions is one. A split whose scenarios are simulated for
+    a while before frame 0 is recorded also has a third,
+    ``start_frame(size, scenario, rng) -> int``. It returns the ``start_frame`` of the
+    initial state from the same random stream, so that work is planned without a draw.
     """
 
     def solver_parameters(

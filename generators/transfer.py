@@ -8,8 +8,8 @@ the weight w_i w_j, where f = x/dx - base lies in [1/2, 3/2) and per axis
 Nodes sum 64-bit integers, q = round(scale x value): integer addition commutes, so
 neither the order of particles nor threads nor devices can change a bit of the sum.
 
-What is stored of a particle is vectors of four, each in an array of its own. Loops that
-only look at one particle (stencil, stress, motion) then have one stride, and LLVM takes
+A particle is stored as vectors of four, each in an array of its own. Loops that only
+look at one particle (stencil, stress, motion) then have one stride, and LLVM takes
 eight particles at a time; P2G and G2P, whose nodes lie anywhere, take the four numbers
 of a node at a time.
 
@@ -40,8 +40,7 @@ _SHIFT_BITS = 0x4338000000000000  # of that float64
 
 
 def fixed_point_scale(particles: int, bound: float) -> float:
-    """Return the largest power of two for which no nodal sum of contributions can
-    overflow.
+    """Return the largest power of two for which no nodal sum can overflow.
 
     A contribution of at most ``bound`` scales to at most 2^50 (:func:`to_fixed` is
     exact below 2^51), and ``particles`` of them sum to less than 2^62.
@@ -50,17 +49,18 @@ def fixed_point_scale(particles: int, bound: float) -> float:
     True
     """
     bits = min(50, 62 - (particles - 1).bit_length())
-    mantissa, exponent = math.frexp(bound)  # the mantissa of a power of two is a half
-    return math.ldexp(1.0, bits - (exponent - (mantissa == 0.5)))
+    mantissa, exponent = math.frexp(bound)
+    if mantissa == 0.5:  # a power of two
+        exponent -= 1
+    return math.ldexp(1.0, bits - exponent)
 
 
 @ti.func
 def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
-    """Return three rows of weights w_i w_j, and in their fourth places what else a
-    transfer needs.
+    """Return three rows of weights w_i w_j, each with a fourth number.
 
-    These are the bits of the base node's index i width + j, and the offset f - 1 along
-    x and y.
+    The fourth numbers are what else a transfer needs: the bits of the base node's index
+    i width + j, and the offset f - 1 along x and along y.
     """
     scaled = ti.Vector([x[0], x[1]]) * inv_dx
     base = ti.cast(scaled - 0.5, ti.i32)
@@ -72,21 +72,26 @@ def stencil(x: ti.math.vec4, inv_dx: ti.f32, width: ti.i32) -> Value:
     mid = 0.75 - to_mid * to_mid
     high = 0.5 * (to_high * to_high)
     node = ti.bit_cast(base[0] * width + base[1], ti.f32)
+    weight = ti.Vector([low[1], mid[1], high[1]])  # along y
+    first = low[0] * weight
+    second = mid[0] * weight
+    third = high[0] * weight
     return (
-        ti.Vector([low[0] * low[1], low[0] * mid[1], low[0] * high[1], node]),
-        ti.Vector([mid[0] * low[1], mid[0] * mid[1], mid[0] * high[1], to_mid[0]]),
-        ti.Vector([high[0] * low[1], high[0] * mid[1], high[0] * high[1], to_mid[1]]),
+        ti.Vector([first[0], first[1], first[2], node]),
+        ti.Vector([second[0], second[1], second[2], to_mid[0]]),
+        ti.Vector([third[0], third[1], third[2], to_mid[1]]),
     )
 
 
 @ti.func
 def base_node(rows: Template, s: ti.i32, p: ti.i32) -> Value:
-    """Return a particle's base node, and its offset from the middle one in cells, from
-    its stencil.
+    """Return a particle's base node and its offset from the middle node [cells].
+
+    Both stand in its stencil, see :func:`stencil`.
     """
-    return ti.bit_cast(rows[0][s, p][3], ti.i32), ti.Vector(
-        [rows[1][s, p][3], rows[2][s, p][3]]
-    )
+    base = ti.bit_cast(rows[0][s, p][3], ti.i32)
+    offset = ti.Vector([rows[1][s, p][3], rows[2][s, p][3]])
+    return base, offset
 
 
 @ti.func
@@ -102,9 +107,8 @@ def to_fixed(scaled: Value) -> Value:
 @ti.func
 def shifted(scaled: Value) -> Value:
     """Return :func:`to_fixed` plus the bits of the shift."""
-    return ti.bit_cast(
-        ti.cast(scaled, ti.f64) + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64
-    )
+    precise = ti.cast(scaled, ti.f64)
+    return ti.bit_cast(precise + ti.cast(_ROUNDING_SHIFT, ti.f64), ti.i64)
 
 
 @ti.func
@@ -117,8 +121,9 @@ def from_fixed(total: Value, inverse_scale: ti.f32) -> Value:
 def accumulate(
     sums: Template, node: ti.math.ivec2, scaled: ti.math.vec4, atomic: Template
 ) -> None:
-    """Add contributions, times their scales, to one node's sums; atomic where other
-    threads may as well.
+    """Add contributions, times their scales, to the sums of one node.
+
+    ``atomic``: whether other threads may add to it at the same time.
     """
     # Even in serial code `+=` is an atomic, which costs five times as much.
     if ti.static(atomic):

@@ -19,19 +19,19 @@ class Walls:
         """Set the indices; the field ``speed`` is the caller's to place."""
         self.ghost = (wall, grid - wall)  # low and high index of the ghost nodes
         # low and high index of the interior nodes
-        self.edge = wall + 1, grid - wall - 1
+        self.edge = (wall + 1, grid - wall - 1)
         self.span = grid - 2 * wall
         self.ring_size = 4 * self.span  # number of ghost nodes around one scenario
         # sign with which a wall mirrors a tangential component
-        self.tangential = -1 if no_slip else 1
+        self.tangential = 1
+        if no_slip:
+            self.tangential = -1
         # tangential velocity of each wall [length/s], order of WALLS; shape [scenario]
         self.speed = ti.Vector.field(4, ti.f32)
 
     @ti.func
     def beyond(self, i: ti.i32) -> ti.i32:
-        """Return the ghost index next to an outermost interior index, others as they
-        are.
-        """
+        """Return the ghost index next to an outermost interior index; others stay."""
         ghost = i
         if i == self.edge[0]:
             ghost = self.ghost[0]
@@ -41,8 +41,9 @@ class Walls:
 
     @ti.func
     def doubled_speed(self, s: ti.i32, first: Template, ghost: ti.i32) -> ti.f32:
-        """Return 2 u_wall of the wall before a ghost node; ``first`` is the low wall of
-        the pair.
+        """Return 2 u_wall of the wall before a ghost node [length/s].
+
+        ``first`` is the index of the low wall of the pair.
         """
         speed = self.speed[s][first]
         if ghost == self.ghost[1]:
@@ -51,9 +52,7 @@ class Walls:
 
     @ti.func
     def source(self, i: ti.i32) -> ti.i32:
-        """Return the interior index that a ghost index mirrors, an interior index
-        itself.
-        """
+        """Return the interior index that a ghost index mirrors; interior ones stay."""
         return ti.min(ti.max(i, self.edge[0]), self.edge[1])
 
     @ti.func
@@ -79,27 +78,29 @@ class Walls:
     @ti.func
     def reflection(self, i: ti.i32, j: ti.i32) -> ti.math.vec2:
         """Return the signs with which a ghost node mirrors a vector."""
+        tangential = float(self.tangential)
         sign = ti.Vector([1.0, 1.0])
         if i != self.source(i):
-            sign = ti.Vector([-1.0, float(self.tangential)])
+            sign = ti.Vector([-1.0, tangential])
         if j != self.source(j):
-            sign = ti.Vector([sign[0] * float(self.tangential), -sign[1]])
+            sign = ti.Vector([sign[0] * tangential, -sign[1]])
         return sign
 
     @ti.func
     def drive(self, s: ti.i32, i: ti.i32, j: ti.i32) -> ti.math.vec2:
-        """Return what moving walls add to a ghost's velocity: half in the last cells, 0
-        in corners.
+        """Return what moving walls add to a ghost's velocity [length/s].
+
+        It is half as much in the last cells before a corner, and 0 in corners.
         """
-        add = ti.Vector([0.0, 0.0])
+        velocity = ti.Vector([0.0, 0.0])
         across_x = i != self.source(i)
         across_y = j != self.source(j)
         if across_x and not across_y:
-            add[1] = self.doubled_speed(s, 0, i)
+            velocity[1] = self.doubled_speed(s, 0, i)
             if j == self.edge[0] or j == self.edge[1]:
-                add[1] = 0.5 * add[1]
+                velocity[1] = 0.5 * velocity[1]
         if across_y and not across_x:
-            add[0] = self.doubled_speed(s, 2, j)
+            velocity[0] = self.doubled_speed(s, 2, j)
             if i == self.edge[0] or i == self.edge[1]:
-                add[0] = 0.5 * add[0]
-        return add
+                velocity[0] = 0.5 * velocity[0]
+        return velocity

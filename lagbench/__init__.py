@@ -38,7 +38,7 @@ __all__ = [
     "windows",
 ]
 
-_HOMES = {
+_MODULES = {
     "open_split": "store.dataset",
     "list_splits": "store.dataset",
     "load_manifest": "store.dataset",
@@ -63,8 +63,9 @@ def __getattr__(name: str) -> object:
         value = version("lagbench")
     elif name == "submission":
         value = importlib.import_module(".submission", __name__)
-    elif name in _HOMES:
-        value = getattr(importlib.import_module(f".{_HOMES[name]}", __name__), name)
+    elif name in _MODULES:
+        module = importlib.import_module(f".{_MODULES[name]}", __name__)
+        value = getattr(module, name)
     else:
         message = f"module {__name__!r} has no attribute {name!r}"
         raise AttributeError(message)
@@ -73,5 +74,5 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    """List the public names too that are not loaded yet."""
+    """List all public names, also those that are not loaded yet."""
     return sorted({*globals(), *__all__})

@@ -1,6 +1,4 @@
-"""The program `lagbench`: its commands in the order in which a user meets them, and
-their errors.
-"""
+"""The program `lagbench`: its commands, and how they end."""
 
 from __future__ import annotations
 
@@ -18,18 +16,22 @@ from typer.core import TyperGroup
 
 from .cli import board, data, draw, exchange, scoring, training
 from .cli import demo as tour
-from .errors import LagbenchError, WorkFailedError, package_at_fault, printable
+from .errors import (
+    LagbenchError,
+    WorkFailedError,
+    escape_unprintable,
+    find_faulty_package,
+)
 
 INTERRUPTED = 130
 FAILED = 5
-RESUMED = {
-    "demo",
-    "generate",
-    "download",
-    "train",
-}  # commands that go on where they stopped
-UNREAD = 141  # what shells say of a command whose reader left, 128 + SIGPIPE
-FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+PIPE_CLOSED = 141
+"""Exit code that shells report when the reader of a pipe left, 128 + SIGPIPE."""
+
+RESUMABLE_COMMANDS = {"demo", "generate", "download", "train"}
+"""Commands that go on where they stopped."""
+
+DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class _Commands(TyperGroup):
@@ -37,50 +39,61 @@ class _Commands(TyperGroup):
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
         for stream in (sys.stdout, sys.stderr):
-            if isinstance(
-                stream, io.TextIOWrapper
-            ):  # a letter that a stream lacks shall not end the work
+            # A character that a stream cannot encode shall not end the work.
+            if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")
-        with _told(), _refused_output():  # --help and --version print here
+        # --help and --version print here.
+        with _errors_as_messages(), _output_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
         try:
-            with _plain_warnings(), _told(), _refused_output():
+            with _short_warnings(), _errors_as_messages(), _output_errors():
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            again = "; the same command" + (
-                ", without --force," if "--force" in sys.argv else ""
-            )
-            if ctx.invoked_subcommand in RESUMED:
-                more = f"{again} goes on where it stopped"
-            else:
-                more = ""
-            typer.echo(f"lagbench: interrupted{more}", err=True)
+            message = _interruption_message(ctx.invoked_subcommand)
+            typer.echo(message, err=True)
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
-            # click's usage errors, or typer's own copy of them, are typer's to show
-            usage = any(
-                kind.__name__ == "ClickException" for kind in type(error).__mro__
-            )
-            if usage or os.environ.get("LAGBENCH_DEBUG") == "1":
+            if _is_click_error(error) or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
-            again = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
-            fix = f"this is a fault of lagbench; please report it with the output of\n       {again}"
-            if (place := package_at_fault(error)) is not None:
-                fix = f"mend or uninstall the package of {place};\n       {again} has the whole trace"
-            said = printable(", ".join([str(error), *getattr(error, "__notes__", ())]))
-            typer.echo(
-                f"lagbench: unexpected {type(error).__name__}: {said}\n  fix: {fix}",
-                err=True,
-            )
+            typer.echo(_unexpected_error_message(error), err=True)
             raise typer.Exit(FAILED) from error
 
 
+def _is_click_error(error: Exception) -> bool:
+    """Tell whether an error is click's or typer's copy of it; typer shows those."""
+    return any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
+
+
+def _interruption_message(command: str | None) -> str:
+    if command not in RESUMABLE_COMMANDS:
+        return "lagbench: interrupted"
+    same_command = "the same command"
+    if "--force" in sys.argv:
+        same_command += ", without --force,"
+    return f"lagbench: interrupted; {same_command} goes on where it stopped"
+
+
+def _unexpected_error_message(error: Exception) -> str:
+    debug_command = f"LAGBENCH_DEBUG=1 lagbench {' '.join(sys.argv[1:])}"
+    place = find_faulty_package(error)
+    if place is None:
+        advice = "this is a fault of lagbench; please report it with the output of"
+        fix = f"{advice}\n       {debug_command}"
+    else:
+        advice = f"mend or uninstall the package of {place};"
+        fix = f"{advice}\n       {debug_command} has the whole trace"
+    texts = [str(error), *getattr(error, "__notes__", ())]
+    description = escape_unprintable(", ".join(texts))
+    kind = type(error).__name__
+    return f"lagbench: unexpected {kind}: {description}\n  fix: {fix}"
+
+
 @contextmanager
-def _told() -> Iterator[None]:
+def _errors_as_messages() -> Iterator[None]:
     """Print our errors, and end with their exit codes."""
     try:
         yield
@@ -90,23 +103,22 @@ def _told() -> Iterator[None]:
 
 
 @contextmanager
-def _refused_output() -> Iterator[None]:
-    """End in silence where the reader of a pipe has left; say that there is no space to
-    write to.
-    """
+def _output_errors() -> Iterator[None]:
+    """End in silence when the reader of a pipe has left; explain a full disk."""
     try:
         yield
-    except (BrokenPipeError, SystemExit) as left:
-        # rich makes one of the other
-        if isinstance(left, SystemExit) and not isinstance(
-            left.__context__, BrokenPipeError
-        ):
+    except (BrokenPipeError, SystemExit) as error:
+        # rich turns a BrokenPipeError into a SystemExit.
+        is_broken_pipe = isinstance(error, BrokenPipeError) or isinstance(
+            error.__context__, BrokenPipeError
+        )
+        if not is_broken_pipe:
             raise
-        with suppress(
-            AttributeError, OSError
-        ):  # what is still buffered would fail again at the end
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(UNREAD) from None
+        # The buffered output would fail again at the end.
+        with suppress(AttributeError, OSError):
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null_device, sys.stdout.fileno())
+        raise typer.Exit(PIPE_CLOSED) from None
     except OSError as error:
         if isinstance(error, PermissionError) and error.filename is not None:
             raise WorkFailedError(
@@ -116,23 +128,23 @@ def _refused_output() -> Iterator[None]:
                 got=error.strerror,
                 fix="see who owns it, or name another",
             ) from error
-        if error.errno not in FULL:
+        if error.errno not in DISK_FULL_ERRORS:
             raise
-        where = error.filename or "standard output, or another file that is written"
         raise WorkFailedError(
-            "cannot write there", where=where, got=error.strerror, fix="free disk space"
+            "cannot write there",
+            where=error.filename or "standard output, or another output file",
+            got=error.strerror,
+            fix="free disk space",
         ) from error
 
 
 @contextmanager
-def _plain_warnings() -> Iterator[None]:
-    """Tell our users' warnings in one line; those for developers keep their place in
-    the code.
-    """
+def _short_warnings() -> Iterator[None]:
+    """Print warnings for users in one line; those for developers keep their place."""
     with warnings.catch_warnings():
-        show = warnings.showwarning
+        show_in_full = warnings.showwarning
 
-        def tell(
+        def show(
             message: Warning | str,
             category: type[Warning],
             *place: Any,  # noqa: ANN401
@@ -141,9 +153,9 @@ def _plain_warnings() -> Iterator[None]:
             if category.__module__.startswith("lagbench."):
                 typer.echo(f"warning: {message}", err=True)
             else:
-                show(message, category, *place, **more)
+                show_in_full(message, category, *place, **more)
 
-        warnings.showwarning = tell
+        warnings.showwarning = show
         yield
 
 
@@ -157,8 +169,8 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _print_version(is_requested: bool) -> None:
+    if is_requested:
         from importlib.metadata import version
 
         typer.echo(version("lagbench"))
@@ -170,13 +182,14 @@ def _lagbench(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_version, is_eager=True, help="Print the version."
+            "--version",
+            callback=_print_version,
+            is_eager=True,
+            help="Print the version.",
         ),
     ] = False,
 ) -> None:
-    """Bit-reproducible particle data sets for neural surrogates of continuum
-    simulators.
-    """
+    """Bit-reproducible particle data sets for neural surrogates of simulators."""
 
 
 COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
@@ -187,7 +200,7 @@ COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (data.verify, "verify --split cavity --size tiny --regenerate 2"),
     (exchange.download, "download --split cavity --size mini --from https://host/data"),
     (exchange.export, "export cavity --size mini --format gns-npz -o cavity-gns"),
-    (exchange.import_split, "import WaterDrop --format gns-npz --allow-pickle -o drop"),
+    (exchange.import_split, "import WaterDrop --format gns-npz -o drop"),
     (exchange.adopt, "adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1"),
     (scoring.template, "template cavity --size tiny -o predictions.nc"),
     (scoring.validate, "validate predictions.nc"),
@@ -203,10 +216,15 @@ COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (data.doctor, "doctor"),
     (data.clean, "clean --split cavity --size tiny --dry-run"),
 )
-"""Every command, and the example below its help, which begins with its name."""
+"""Every command, in the order in which a user meets them, and the example in its help.
+
+The example begins with the name of the command.
+"""
 
 for function, example in COMMANDS:
-    app.command(example.split()[0], epilog=f"Example: lagbench {example}")(function)
+    command_name = example.split()[0]
+    register = app.command(command_name, epilog=f"Example: lagbench {example}")
+    register(function)
 app.add_typer(
     board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show"
 )

@@ -1,6 +1,4 @@
-"""Files that appear whole or not at all (temporary name, fsync, rename), and that are
-files at all.
-"""
+"""Files that appear whole or not at all: temporary name, fsync, rename."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ SUFFIX = ".partial"
 """Ending of temporary names; nothing but this module creates or removes such files."""
 
 ROOT_OPTION = "--root or LAGBENCH_ROOT"
-"""What names the folder that most files go to."""
+"""The option that names the folder for most files."""
 
 
 @contextmanager
@@ -28,6 +26,9 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     The parent folder is created. Before the rename the file is flushed to disk, after
     it the folder is, so that a crash at any time leaves the old file or the new one.
     When the body raises, the temporary file is removed and the target stays as it was.
+
+    Raises:
+        WorkFailedError: the operating system refused.
     """
     temporary = temporary_name(target)
     try:
@@ -39,7 +40,7 @@ def atomic_path(target: Path, *, option: str = ROOT_OPTION) -> Iterator[Path]:
     except LagbenchError:
         raise
     except OSError as error:
-        raise _refused(target, option, error) from error
+        raise _write_error(target, option, error) from error
     finally:
         _discard(temporary)
 
@@ -53,35 +54,34 @@ def write_atomically(target: Path, data: bytes, *, option: str = ROOT_OPTION) ->
 def move_together(moves: Sequence[tuple[Path, Path]]) -> None:
     """Rename files to places on the same disk, in their order.
 
-    What may fail comes first: files are flushed and folders made before the first one
-    is moved.
+    The steps that may fail come first: files are flushed and folders made before the
+    first file is moved.
     """
     for source, target in moves:
         _flush(source)
         target.parent.mkdir(parents=True, exist_ok=True)
     refuse_folders(target for _, target in moves)
+
     for source, target in moves:
         source.replace(target)
+
     for folder in {target.parent for _, target in moves}:
         _flush_folder(folder)
 
 
 def refuse_folders(paths: Iterable[Path]) -> None:
-    """Raise IsADirectoryError for a folder where a file is to be replaced or
-    removed.
-    """
+    """Raise IsADirectoryError for a folder where a file is replaced or removed."""
     for path in paths:
         if path.is_dir() and not path.is_symlink():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
-    """Make a folder and see that files can be written there, before work whose result
-    goes there.
+    """Make a folder and check, before the work, that its result can be written there.
 
     Args:
         folder: the folder.
-        option: what the user names another folder with, for the message.
+        option: the option that names another folder, for the message.
 
     Raises:
         WorkFailedError: the operating system refused.
@@ -91,7 +91,7 @@ def check_writable(folder: Path, *, option: str = ROOT_OPTION) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()
     except OSError as error:
-        raise _refused(folder, option, error) from error
+        raise _write_error(folder, option, error) from error
     finally:
         _discard(probe)
 
@@ -101,51 +101,50 @@ def remove_leftovers(folder: Path) -> list[Path]:
 
     Call it only while holding the lock of the data set.
     """
-    found = sorted(folder.rglob(f".*{SUFFIX}"))
-    for path in found:
+    leftovers = sorted(folder.rglob(f".*{SUFFIX}"))
+    for path in leftovers:
         path.unlink(missing_ok=True)
-    return found
+    return leftovers
 
 
 def temporary_name(target: Path) -> Path:
-    """Return this process's own temporary name beside a target, of which nothing may be
-    left.
-    """
-    return target.with_name(f".{target.name}.{os.getpid()}-{_mark()}{SUFFIX}")
+    """Return a temporary name beside a target that no other process uses."""
+    return target.with_name(f".{target.name}.{os.getpid()}-{_process_token()}{SUFFIX}")
 
 
 @functools.cache
-def _mark() -> str:
-    """Return what tells equal process ids of several machines apart."""
+def _process_token() -> str:
+    """Return a random word; process ids of several machines may be equal."""
     return secrets.token_hex(4)
 
 
-def _refused(target: Path, option: str, error: OSError) -> WorkFailedError:
-    remedy = "free disk space"
+def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
+    hint = "free disk space"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
-        remedy = "a file is where a folder has to be: remove it"
+        hint = "a file is where a folder has to be: remove it"
     if isinstance(error, IsADirectoryError):
-        remedy = "a folder is where the file has to be: remove it"
+        hint = "a folder is where the file has to be: remove it"
     return WorkFailedError(
         "cannot write there",
         where=str(target),
         got=error.strerror or error,
-        fix=f"{remedy}, or name a folder that you may write to: {option}",
+        fix=f"{hint}, or name a folder that you may write to: {option}",
     )
 
 
 def _discard(path: Path) -> None:
-    try:
+    # A folder that is missing or read-only holds no temporary file of ours.
+    with suppress(OSError):
         path.unlink(missing_ok=True)
-    except (
-        OSError
-    ):  # the folder is missing or read-only: then there is nothing to remove
-        return
 
 
 def _flush(path: Path) -> None:
-    # Windows flushes what is open for writing only.
-    descriptor = os.open(path, os.O_RDWR if os.name == "nt" else os.O_RDONLY)
+    # Windows flushes only files that are open for writing.
+    if os.name == "nt":
+        flags = os.O_RDWR
+    else:
+        flags = os.O_RDONLY
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:

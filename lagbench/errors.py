@@ -1,12 +1,12 @@
 """Errors that say what, where, expected, got and how to fix it.
 
-Every error a user can cause is a :class:`LagbenchError`; its ``exit_code`` is what the
-command line returns. Codes: 1 checks failed, 2 usage, 3 a file the user gave is
-unreadable, 4 data set missing, damaged or of another hash, 5 the work itself failed.
+Every error that a user can cause is a :class:`LagbenchError`. Its ``exit_code`` is what
+the command line returns: 1 for failed checks, 2 for wrong usage, 3 for an unreadable
+file of the user, 4 for a data set that is missing, damaged or of another hash, and 5
+for work that failed.
 
-Files that a user names: refused unless they are regular and of bounded length. Optional
-dependencies: import one, or say which extra installs it. Packages that add something:
-import them.
+The module also refuses files that are not regular or too long, and imports optional
+dependencies and the modules that other packages add.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
+
+PLUGIN_GROUPS = ("lagbench.baselines", "lagbench.generators", "lagbench.metrics")
+"""Entry points by which other packages add models, splits and metrics."""
 
 
 class LagbenchError(Exception):
@@ -42,27 +45,25 @@ class LagbenchError(Exception):
         self.what = what  # what is wrong, one clause without a full stop
         self.where = where  # file, key, variable or flag concerned
         self.expected = expected  # what would have been right
-        self.got = got  # what was found
+        self.got = got  # the value that is wrong
         self.fix = fix  # what the user can do about it
         super().__init__(self._compose())
 
     def _compose(self) -> str:
-        parts = [self.what]
-        labelled = {
+        labelled_parts = {
             "where": self.where,
             "expected": self.expected,
             "got": self.got,
             "fix": self.fix,
         }
-        parts += [
-            f"{label}: {text}" for label, text in labelled.items() if text is not None
-        ]
-        return printable("\n  ".join(parts))
+        lines = [self.what]
+        for label, part in labelled_parts.items():
+            if part is not None:
+                lines.append(f"{label}: {part}")
+        return escape_unprintable("\n  ".join(lines))
 
     def add_note(self, note: str, /) -> None:
-        """Say more of where it is, in place of Python's notes, which no message of ours
-        shows.
-        """
+        """Add a place to ``where``; our messages do not show Python's own notes."""
         if self.where is None:
             self.where = note
         else:
@@ -71,7 +72,7 @@ class LagbenchError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Rebuild with keyword arguments, so that errors cross process borders."""
-        return _rebuild, (
+        state = (
             type(self),
             self.what,
             self.where,
@@ -79,22 +80,26 @@ class LagbenchError(Exception):
             self.got,
             self.fix,
         )
+        return _rebuild, state
 
 
-def printable(text: str) -> str:
-    r"""Spell out what is no printable character: in a stranger's words it would command
-    the terminal.
+def escape_unprintable(text: str) -> str:
+    r"""Return a text with its unprintable characters escaped.
 
-    >>> print(printable("a\x1b[2J\nb"))
+    In a text from a stranger, such characters would command the terminal.
+
+    >>> print(escape_unprintable("a\x1b[2J\nb"))
     a\x1b[2J
     b
     """
-    return "".join(
-        letter
-        if letter.isprintable() or letter == "\n"
-        else letter.encode("unicode_escape").decode("ascii")
-        for letter in text
-    )
+    characters = []
+    for character in text:
+        if character.isprintable() or character == "\n":
+            characters.append(character)
+        else:
+            escaped = character.encode("unicode_escape")
+            characters.append(escaped.decode("ascii"))
+    return "".join(characters)
 
 
 def _rebuild(
@@ -109,25 +114,25 @@ def _rebuild(
 
 
 class ChecksFailedError(LagbenchError):
-    """Something was checked and did not hold."""
+    """A check did not hold."""
 
     exit_code = 1
 
 
 class UsageError(LagbenchError):
-    """A name, option or value that the caller gave does not exist or does not fit."""
+    """A name, option or value of the caller does not exist or does not fit."""
 
     exit_code = 2
 
 
-class Mistakes:
-    """Usage errors gathered from several ``with`` blocks, to be told together."""
+class ErrorCollector:
+    """Collect the usage errors of several ``with`` blocks, to raise them together."""
 
     def __init__(self) -> None:
-        self._found: list[UsageError] = []
+        self._errors: list[UsageError] = []
 
     def __enter__(self) -> None:
-        """Begin what may be a mistake."""
+        """Begin a block that may raise a usage error."""
 
     def __exit__(
         self, kind: object, error: BaseException | None, trace: object
@@ -135,25 +140,28 @@ class Mistakes:
         """Keep a usage error and go on after the block; anything else is raised."""
         if not isinstance(error, UsageError):
             return False
-        self._found.append(error)
+        self._errors.append(error)
         return True
 
-    def tell(self) -> None:
-        """Raise what was found, if anything.
+    def raise_errors(self) -> None:
+        """Raise the collected errors, if there are any.
 
         Raises:
-            UsageError: the one mistake, or all of them numbered.
+            UsageError: the one error, or all of them numbered.
         """
-        if len(self._found) == 1:
-            raise self._found[0]
-        if self._found:
-            told = (str(error).replace("\n", "\n   ") for error in self._found)
-            lines = (f"\n  {number}. {text}" for number, text in enumerate(told, 1))
-            raise UsageError(f"{len(self._found)} mistakes" + "".join(lines))
+        if not self._errors:
+            return
+        if len(self._errors) == 1:
+            raise self._errors[0]
+        lines = [f"{len(self._errors)} mistakes"]
+        for number, error in enumerate(self._errors, start=1):
+            indented = str(error).replace("\n", "\n   ")
+            lines.append(f"\n  {number}. {indented}")
+        raise UsageError("".join(lines))
 
 
 class UnreadableFileError(LagbenchError):
-    """A file that the user gave cannot be read."""
+    """A file of the user cannot be read."""
 
     exit_code = 3
 
@@ -173,10 +181,13 @@ class WorkFailedError(LagbenchError):
 def check_regular(
     path: Path, *, longest: int | None = None, fix: str | None = None
 ) -> int:
-    """Refuse what is no regular file, or a long one; return its length [bytes].
+    """Refuse a path that is no regular file, or a long one; return its length [bytes].
 
-    Devices never end and a FIFO waits for ever, so this comes before anything is
+    Devices never end and a FIFO waits for ever, so this check comes before anything is
     opened.
+
+    Raises:
+        UnreadableFileError: the path is missing, no regular file, or too long.
     """
     try:
         status = path.stat()
@@ -207,60 +218,68 @@ def check_regular(
     return status.st_size
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a remedy that names the known word nearest to a wrong one.
+def suggest_name(name: str, known_names: Iterable[str]) -> str:
+    """Return a hint that names the known word nearest to a wrong one.
 
-    >>> nearest("cavty", ["fluid", "cavity"])
+    >>> suggest_name("cavty", ["fluid", "cavity"])
     "did you mean 'cavity'? known: cavity, fluid"
     """
-    words = sorted(known)
-    close = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
+    words = sorted(known_names)
+    close_words = difflib.get_close_matches(name, words, n=1, cutoff=0.5)
     listing = f"known: {', '.join(words) or 'none'}"
-    if close:
-        return f"did you mean {close[0]!r}? {listing}"
+    if close_words:
+        return f"did you mean {close_words[0]!r}? {listing}"
     return listing
 
 
-def package_at_fault(error: BaseException) -> str | None:
-    """Return the innermost place of a trace in what another package adds; None where
-    there is none.
-    """
-    from importlib.metadata import (
-        entry_points,
-    )  # half of what importing lagbench would take
+def find_faulty_package(error: BaseException) -> str | None:
+    """Return the innermost place of a trace in a package that adds to lagbench.
 
-    groups = (f"lagbench.{group}" for group in ("baselines", "generators", "metrics"))
-    points = [point for group in groups for point in entry_points(group=group)]
-    added = {
-        point.value.partition(":")[0].split(".")[0].strip() for point in points
-    } - {"lagbench"}
+    None where no such package is in the trace.
+    """
+    # Importing it takes half as long as importing the rest of lagbench.
+    from importlib.metadata import entry_points
+
+    package_names = set()
+    for group in PLUGIN_GROUPS:
+        for point in entry_points(group=group):
+            module_name = point.value.partition(":")[0]
+            package_names.add(module_name.split(".")[0].strip())
+    package_names.discard("lagbench")
+
     place = None
     for frame, line in traceback.walk_tb(error.__traceback__):
-        if str(frame.f_globals.get("__name__")).split(".")[0] in added:
+        module_name = str(frame.f_globals.get("__name__"))
+        if module_name.split(".")[0] in package_names:
             place = f"{frame.f_code.co_filename}, line {line}"
     return place
 
 
-def loaded(point: EntryPoint) -> Any:  # noqa: ANN401 (a stranger's)
-    """Import what an entry point of another package names.
+def load_entry_point(point: EntryPoint) -> Any:  # noqa: ANN401 (any object)
+    """Import the object that an entry point of another package names.
 
     Raises:
         ImportError: its module would end the program. Others raise what they like.
     """
     try:
         return point.load()
-    except SystemExit as left:
-        raise ImportError(f"its module would end the program: {left!r}") from left
+    except SystemExit as error:
+        raise ImportError(f"its module would end the program: {error!r}") from error
 
 
 def require(module: str, *, extra: str) -> ModuleType:
-    """Import an optional module."""
+    """Import an optional module.
+
+    Raises:
+        UsageError: it is not installed; the message holds the command that installs it.
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] != module.split(".")[0]:
+        missing_package = (error.name or "").split(".")[0]
+        if missing_package != module.split(".")[0]:
             raise
-        raise _missing(module, extra) from None
+        raise _not_installed(module, extra) from None
 
 
 def check_installed(module: str, *, extra: str) -> None:
@@ -270,12 +289,13 @@ def check_installed(module: str, *, extra: str) -> None:
         UsageError: it is not installed; the message holds the command that installs it.
     """
     if importlib.util.find_spec(module) is None:
-        raise _missing(module, extra)
+        raise _not_installed(module, extra)
 
 
-def _missing(module: str, extra: str) -> UsageError:
+def _not_installed(module: str, extra: str) -> UsageError:
+    package = module.split(".")[0]
     return UsageError(
-        f"{module.split('.')[0]} is not installed",
+        f"{package} is not installed",
         where=f"this needs the extra {extra!r}",
         fix=f"pip install 'lagbench[{extra}]'",
     )

@@ -1,4 +1,4 @@
-"""Windows of consecutive frames as tensors: one, and several side by side."""
+"""Windows of consecutive frames as tensors: one window, and several side by side."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from lagbench.errors import UsageError
 
 
-class Window(NamedTuple):
+class TensorWindow(NamedTuple):
     """Consecutive frames of one scenario."""
 
     position: Tensor  # particle positions [length], float32, shape [particle, frame, 2]
@@ -35,10 +35,9 @@ class Batch:
     # window that each particle belongs to, ascending, int64, shape [particle]
     sample: Tensor
     material: Tensor  # 0 liquid, 1 jelly, 2 snow, 3 rope, int64, shape [particle]
-    # what acts on the way to each frame of the windows, and to those after them as far
-    # as it is known: the forcing of a scenario is given for all frames. Velocity of the
-    # walls [length/s], shape [window, frame, wall, 2]; None in a split without moving
-    # walls.
+    # velocity of the walls [length/s], shape [window, frame, wall, 2]: the forcing on
+    # the way to each frame of the windows, and to later frames as far as it is known;
+    # None in a split without moving walls
     wall_velocity: Tensor | None
     scenario: Tensor  # scenario id of each window, int64, shape [window]
     frame: Tensor  # absolute number of each window's first frame, int64, shape [window]
@@ -57,74 +56,99 @@ class Batch:
         return self.position.shape[1]
 
     def part(self, frames: slice) -> Self:
-        """Return consecutive frames of every window; `frame` follows, and the forcing
-        of later frames stays.
+        """Return consecutive frames of every window.
+
+        `frame` follows, and the forcing of later frames stays.
 
         Raises:
             UsageError: no frame is left, or not every frame is taken: forcing is given
                 per frame.
         """
-        kept = range(self.frames)[frames]
-        if not kept or kept.step != 1:
-            what = "a part of a batch is of consecutive frames"
-            expected = f"some of {self.frames} frames, in steps of 1"
-            raise UsageError(what, where="Batch.part", expected=expected, got=frames)
-        first = kept[0]
-        if self.wall_velocity is None:
-            walls = None
-        else:
-            walls = self.wall_velocity[:, first:]
+        frame_numbers = range(self.frames)[frames]
+        if not frame_numbers or frame_numbers.step != 1:
+            raise UsageError(
+                "a part of a batch has consecutive frames",
+                where="Batch.part",
+                expected=f"some of {self.frames} frames, in steps of 1",
+                got=frames,
+            )
+        first = frame_numbers[0]
+        wall_velocity = self.wall_velocity
+        if wall_velocity is not None:
+            wall_velocity = wall_velocity[:, first:]
         return replace(
             self,
             position=self.position[:, frames],
-            wall_velocity=walls,
+            wall_velocity=wall_velocity,
             frame=self.frame + first,
         )
 
     def to(self, device: torch.device | str) -> Self:
         """Return the batch on a device."""
-        held = {
-            name: value
-            for name, value in vars(self).items()
-            if isinstance(value, Tensor)
-        }
-        return replace(self, **{name: value.to(device) for name, value in held.items()})
+        moved_tensors = {}
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                moved_tensors[name] = value.to(device)
+        return replace(self, **moved_tensors)
 
     def followed_by(self, position: Tensor) -> Self:
-        """Return the windows one frame later: the first frame leaves, the next one
-        joins.
+        """Return the windows one frame later, without their first frame.
 
-        Its positions [length] have shape [particle, 2].
+        Args:
+            position: particle positions of the next frame [length], shape
+                [particle, 2].
         """
-        if self.wall_velocity is None:
-            walls = None
-        else:
-            walls = self.wall_velocity[:, 1:]
-        joined = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
-        return replace(self, position=joined, wall_velocity=walls, frame=self.frame + 1)
+        wall_velocity = self.wall_velocity
+        if wall_velocity is not None:
+            wall_velocity = wall_velocity[:, 1:]
+        next_positions = torch.cat([self.position[:, 1:], position[:, None]], dim=1)
+        return replace(
+            self,
+            position=next_positions,
+            wall_velocity=wall_velocity,
+            frame=self.frame + 1,
+        )
 
 
-def collate(windows: Sequence[Window]) -> Batch:
-    """Put windows side by side."""
-    walls = [
-        window.wall_velocity for window in windows if window.wall_velocity is not None
-    ]
-    origins = [window.origin for window in windows if window.origin is not None]
-    frames = {window.position.shape[1] for window in windows}
-    if len(frames) != 1 or not {len(walls), len(origins)} <= {0, len(windows)}:
-        what = "windows do not fit side by side"
-        expected = "windows of one split and one length"
-        got = f"lengths {sorted(frames)}, {len(walls)} of {len(windows)} with moving walls,"
-        got += f" {len(origins)} with their first frame"
-        raise UsageError(what, where="collate", expected=expected, got=got)
-    particles = torch.tensor([len(window.material) for window in windows])
+def collate(windows: Sequence[TensorWindow]) -> Batch:
+    """Put windows side by side.
+
+    Raises:
+        UsageError: the windows differ in length, or in whether walls move.
+    """
+    wall_velocities = []
+    origins = []
+    lengths = set()
+    for window in windows:
+        lengths.add(window.position.shape[1])
+        if window.wall_velocity is not None:
+            wall_velocities.append(window.wall_velocity)
+        if window.origin is not None:
+            origins.append(window.origin)
+
+    all_or_none = {0, len(windows)}
+    is_uniform = len(wall_velocities) in all_or_none and len(origins) in all_or_none
+    if len(lengths) != 1 or not is_uniform:
+        raise UsageError(
+            "windows do not fit side by side",
+            where="collate",
+            expected="windows of one split and one length",
+            got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
+            f"with moving walls, {len(origins)} with their first frame",
+        )
+
+    particle_counts = torch.tensor([len(window.material) for window in windows])
+    forcing = None
+    if wall_velocities:
+        shared_length = min(len(velocity) for velocity in wall_velocities)
+        forcing = torch.stack(
+            [velocity[:shared_length] for velocity in wall_velocities]
+        )
     return Batch(
         position=torch.cat([window.position for window in windows]),
-        sample=torch.arange(len(windows)).repeat_interleave(particles),
+        sample=torch.arange(len(windows)).repeat_interleave(particle_counts),
         material=torch.cat([window.material for window in windows]),
-        wall_velocity=torch.stack([wall[: min(map(len, walls))] for wall in walls])
-        if walls
-        else None,
+        wall_velocity=forcing,
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
         origin=torch.cat(origins) if origins else None,

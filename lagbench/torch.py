@@ -1,12 +1,14 @@
-"""Windows of a split as PyTorch tensors: data set, order and batches; rollouts of a
-model.
+"""Windows of a split as PyTorch tensors: data set, sampler, batches and rollouts.
 
 >>> from torch.utils.data import DataLoader
 >>> from lagbench.torch import WindowDataset, WindowSampler, collate
 >>> data = WindowDataset("cavity", size="mini")  # doctest: +SKIP
->>> loader = DataLoader(data, 2, sampler=WindowSampler(data, seed=0), collate_fn=collate)  # doctest: +SKIP
+>>> sampler = WindowSampler(data, seed=0)  # doctest: +SKIP
+>>> loader = DataLoader(
+...     data, batch_size=2, sampler=sampler, collate_fn=collate
+... )  # doctest: +SKIP
 
-``shuffle=True`` works too; the sampler's order reads each frame about once, where a
+``shuffle=True`` works too. The sampler's order reads each frame about once where the
 data set is larger than the cache. Needs PyTorch: ``pip install 'lagbench[baselines]'``.
 """
 
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +29,8 @@ from torch.utils.data import Dataset, Sampler
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.store.windows import CACHE_BYTES, WindowReader
-from lagbench.store.windows import Window as Arrays
-from lagbench.tensors import Batch, Window, collate
+from lagbench.store.windows import Window as ArrayWindow
+from lagbench.tensors import Batch, TensorWindow, collate
 
 __all__ = [
     "POOL_BYTES",
@@ -44,20 +47,29 @@ __all__ = [
 ]
 
 
-def tensors(window: Arrays) -> Window:
+Window = TensorWindow
+"""Public name of a window of tensors."""
+
+
+def tensors(window: ArrayWindow) -> Window:
     """Return a window's arrays as tensors; float32 arrays are shared, not copied."""
-    walls = window.wall_velocity
-    return Window(
-        torch.from_numpy(window.position),
-        torch.from_numpy(window.material).long(),
-        None if walls is None else torch.from_numpy(walls),
-        window.scenario,
-        window.frame,
-        None if window.origin is None else torch.from_numpy(window.origin),
+    wall_velocity = None
+    if window.wall_velocity is not None:
+        wall_velocity = torch.from_numpy(window.wall_velocity)
+    origin = None
+    if window.origin is not None:
+        origin = torch.from_numpy(window.origin)
+    return TensorWindow(
+        position=torch.from_numpy(window.position),
+        material=torch.from_numpy(window.material).long(),
+        wall_velocity=wall_velocity,
+        scenario=window.scenario,
+        frame=window.frame,
+        origin=origin,
     )
 
 
-class WindowDataset(WindowReader, Dataset[Window]):
+class WindowDataset(WindowReader, Dataset[TensorWindow]):
     """Map-style data set of all windows of ``history + future`` consecutive frames.
 
     Give `collate` to the DataLoader: windows may differ in their number of particles.
@@ -67,11 +79,11 @@ class WindowDataset(WindowReader, Dataset[Window]):
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        history: frames that a model is given; those of the task by default.
+        history: given frames of the model; those of the task by default.
         future: frames after them.
-        registry: what describes the data set; ours by default.
+        registry: description of the data sets; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower,
             never different.
         origin: whether windows hold the positions in the scenario's first frame too.
@@ -81,31 +93,37 @@ class WindowDataset(WindowReader, Dataset[Window]):
         DataError: scenarios are missing; the message has the command that makes them.
     """
 
-    def __getitem__(self, index: int) -> Window:
+    def __getitem__(self, index: int) -> TensorWindow:
         """Return a window as tensors of its own."""
         return tensors(self.read(index))
 
 
 RUN = 32
-"""Windows that follow each other in a scenario and are drawn from one pool, to share
-their frames.
-"""
+"""Consecutive windows of a scenario that enter a pool together and share frames."""
 
 POOL_BYTES = CACHE_BYTES
 """Frames of the windows that are shuffled together [bytes]."""
 
 
 class WindowSampler(Sampler[int]):
-    """Draw every window once an epoch, in an order that follows from seed and epoch
-    alone.
+    """Draw every window once an epoch, in an order that follows from seed and epoch.
 
-    Windows of one scenario that follow each other are cut into runs of 32. An epoch is
-    a random order of all runs, taken in pools whose frames fill 256 MiB; the windows of
-    a pool are shuffled. So a frame is decompressed about once, not once for each window
-    that holds it; where all frames fit one pool, every order is equally likely.
+    Consecutive windows of one scenario are cut into runs of 32. An epoch is a random
+    order of all runs, taken in pools whose frames fill 256 MiB; the windows of a pool
+    are shuffled. So a frame is decompressed about once, not once for each window that
+    holds it. Where all frames fit one pool, every order is equally likely.
 
-    With several ranks each takes every ranks-th window of the one order, and the last
-    few windows that do not go round are left out.
+    With several ranks, each takes every ranks-th window of the one order, and the last
+    windows that do not fill a turn of all ranks are left out.
+
+    Args:
+        data: the windows.
+        seed: seed of all epochs.
+        rank: rank of this process; that of torch.distributed by default.
+        ranks: number of ranks; that of torch.distributed by default.
+
+    Raises:
+        UsageError: the ranks are more than the windows, or the rank is not one of them.
     """
 
     def __init__(
@@ -116,29 +134,23 @@ class WindowSampler(Sampler[int]):
         rank: int | None = None,
         ranks: int | None = None,
     ) -> None:
-        grouped = (
-            torch.distributed.is_available() and torch.distributed.is_initialized()
-        )
-        if rank is not None:
-            self.rank = rank
-        else:
-            self.rank = torch.distributed.get_rank() if grouped else 0
-        if ranks is not None:
-            self.ranks = ranks
-        else:
-            self.ranks = torch.distributed.get_world_size() if grouped else 1
-        if not 0 <= self.rank < self.ranks <= len(data):
-            expected = f"0 <= rank < ranks <= {len(data)}"
-            got = f"rank {self.rank} of {self.ranks}"
+        group_rank, group_size = _process_group()
+        if rank is None:
+            rank = group_rank
+        if ranks is None:
+            ranks = group_size
+        if not 0 <= rank < ranks <= len(data):
             raise UsageError(
                 "no window for a rank",
                 where="WindowSampler",
-                expected=expected,
-                got=got,
+                expected=f"0 <= rank < ranks <= {len(data)}",
+                got=f"rank {rank} of {ranks}",
             )
-        self.data = data  # what is drawn from
-        self.seed = _natural(seed, "seed")  # seed of all epochs
-        self.epoch = 0  # epoch that is drawn from
+        self.rank = rank
+        self.ranks = ranks
+        self.data = data
+        self.seed = _check_natural(seed, "seed")  # seed of all epochs
+        self.epoch = 0  # the present epoch
         self.position = 0  # windows of its order that the ranks together have drawn
 
     def __len__(self) -> int:
@@ -146,33 +158,28 @@ class WindowSampler(Sampler[int]):
         return len(self.data) // self.ranks
 
     def order(self, epoch: int) -> NDArray[np.int64]:
-        """Return the windows of an epoch in the order of all ranks together, shape
-        [window].
-        """
-        rng = np.random.Generator(
-            np.random.PCG64(np.random.SeedSequence([self.seed, epoch]))
-        )
-        runs = [
-            np.arange(first, min(first + RUN, stop))
-            for start, stop in zip(self.data.starts, self.data.starts[1:], strict=False)
-            for first in range(start, stop, RUN)
-        ]
-        shuffled = [runs[i] for i in _permutation(rng, len(runs))]
-        pool = max(
-            1, POOL_BYTES // (self.data.frame_bytes * (RUN + self.data.length - 1))
-        )
-        pools = [
-            np.concatenate(shuffled[i : i + pool])
-            for i in range(0, len(shuffled), pool)
-        ]
-        return np.concatenate(
-            [windows[_permutation(rng, len(windows))] for windows in pools]
-        )
+        """Return the windows of an epoch in the order of all ranks, shape [window]."""
+        seeds = np.random.SeedSequence([self.seed, epoch])
+        rng = np.random.Generator(np.random.PCG64(seeds))
+
+        starts = self.data.starts
+        runs = []
+        for start, stop in pairwise(starts):
+            for first in range(start, stop, RUN):
+                runs.append(np.arange(first, min(first + RUN, stop)))
+        shuffled_runs = [runs[i] for i in _draw_permutation(rng, len(runs))]
+
+        frames_per_run = RUN + self.data.length - 1
+        run_bytes = self.data.frame_bytes * frames_per_run
+        runs_per_pool = max(1, POOL_BYTES // run_bytes)
+        pools = []
+        for first in range(0, len(shuffled_runs), runs_per_pool):
+            pools.append(np.concatenate(shuffled_runs[first : first + runs_per_pool]))
+        shuffled_pools = [pool[_draw_permutation(rng, len(pool))] for pool in pools]
+        return np.concatenate(shuffled_pools)
 
     def __iter__(self) -> Iterator[int]:
-        """Yield this rank's windows from the position to the end of the epoch; begin
-        the next one.
-        """
+        """Yield this rank's windows to the end of the epoch; begin the next epoch."""
         order = self.order(self.epoch)
         for turn in range(self.position // self.ranks, len(self)):
             self.position = (turn + 1) * self.ranks
@@ -180,24 +187,26 @@ class WindowSampler(Sampler[int]):
         self.seek(self.epoch + 1)
 
     def seek(self, epoch: int, position: int = 0) -> None:
-        """Continue at a place of an epoch.
+        """Continue at a position of an epoch.
 
         Loaders with worker processes draw ahead of the training: give the position that
         follows from the steps taken.
 
         Raises:
-            UsageError: there is no such place.
+            UsageError: there is no such position.
         """
-        place = (_natural(epoch, "epoch"), _natural(position, "position"))
-        most = len(self.data)
-        if place[1] > most:
+        epoch = _check_natural(epoch, "epoch")
+        position = _check_natural(position, "position")
+        window_count = len(self.data)
+        if position > window_count:
             raise UsageError(
-                "no such place",
+                "no such position",
                 where="WindowSampler",
-                expected=f"at most {most}",
+                expected=f"at most {window_count}",
                 got=position,
             )
-        self.epoch, self.position = place
+        self.epoch = epoch
+        self.position = position
 
     def state_dict(self) -> dict[str, int]:
         """Return what `load_state_dict` takes to continue here, in mid-epoch too."""
@@ -205,35 +214,45 @@ class WindowSampler(Sampler[int]):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Continue where another sampler of the same data stood."""
-        seed = _natural(state["seed"], "seed")
+        seed = _check_natural(state["seed"], "seed")
         self.seek(state["epoch"], state["position"])
         self.seed = seed
 
 
-def _natural(value: object, name: str) -> int:
+def _process_group() -> tuple[int, int]:
+    """Return rank and size of the process group; 0 and 1 where there is none."""
+    distributed = torch.distributed
+    if distributed.is_available() and distributed.is_initialized():
+        return distributed.get_rank(), distributed.get_world_size()
+    return 0, 1
+
+
+def _check_natural(value: object, name: str) -> int:
+    """Return a whole number from 0; refuse anything else."""
     try:
         number = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
         number = -1
     if number < 0:
-        what = f"{name} does not fit"
-        expected = "a whole number from 0"
         raise UsageError(
-            what, where="WindowSampler", expected=expected, got=repr(value)
+            f"{name} does not fit",
+            where="WindowSampler",
+            expected="a whole number from 0",
+            got=repr(value),
         )
     return number
 
 
-def _permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
+def _draw_permutation(rng: np.random.Generator, length: int) -> NDArray[np.intp]:
     """Return a random order; NumPy promises the same bits for `random` alone."""
     return np.argsort(rng.random(length), kind="stable")
 
 
 Step = Callable[[Batch], Tensor]
-"""A model: from windows of given frames to the positions of the next one [length],
-shape [particle, 2].
+"""A model: windows of given frames in, positions of the next frame out.
 
-``batch.wall_velocity[:, batch.frames]`` is what acts on the way there.
+The positions [length] have shape [particle, 2]. The slice
+``batch.wall_velocity[:, batch.frames]`` is the forcing on the way to the next frame.
 """
 
 
@@ -242,47 +261,50 @@ def roll_out(step: Step, given: Batch, frames: int) -> Tensor:
 
     Args:
         step: the model; it may not write to its batch.
-        given: the frames that it starts from, with the forcing of those to predict:
-            windows of a loader cut by ``batch.part(slice(history))``.
+        given: the given frames, with the forcing of the frames to predict: windows of a
+            loader cut by ``batch.part(slice(history))``.
         frames: frames to predict.
 
     Returns:
-        Positions of the frames after the given ones [length], shape [particle, frame,
-        2].
+        Positions of the predicted frames [length], shape [particle, frame, 2].
 
     Raises:
         UsageError: frames below 1 or beyond the known forcing, or the model returns no
             [particle, 2].
     """
-    walls = given.wall_velocity
-    if walls is None:
-        known = max(1, frames)
+    # Beyond the known forcing a model would take the last known one.
+    if given.wall_velocity is None:
+        longest = max(1, frames)
     else:
-        known = walls.shape[1] - given.frames
-    if (
-        not 1 <= frames <= known
-    ):  # beyond the forcing a model would take the last one known
-        fix = "give longer windows, cut by batch.part(slice(history))"
+        longest = given.wall_velocity.shape[1] - given.frames
+    if not 1 <= frames <= longest:
         raise UsageError(
             "no such frames",
             where="roll_out",
-            expected=f"1 to {known}",
+            expected=f"1 to {longest}",
             got=frames,
-            fix=fix,
+            fix="give longer windows, cut by batch.part(slice(history))",
         )
-    predicted = []
-    expected = given.position[:, -1].shape
+    batch = given
+    shape = batch.position[:, -1].shape
+    predicted_frames = []
     for _ in range(frames):
-        position = step(given)
-        if not isinstance(position, Tensor) or position.shape != expected:
-            what = "a model returned no positions of the next frame"
-            shape = f"a tensor of shape {list(expected)}: [particle, 2]"
-            got = getattr(position, "shape", None) or type(position).__name__
-            raise UsageError(what, where="roll_out, step", expected=shape, got=got)
-        given = given.followed_by(position)
-        # a copy: the model may use the memory of its answer again
-        predicted.append(given.position[:, -1])
-    return torch.stack(predicted, dim=1)
+        position = step(batch)
+        _check_step_result(position, shape)
+        batch = batch.followed_by(position)
+        # A copy: the model may use the memory of its answer again.
+        predicted_frames.append(batch.position[:, -1])
+    return torch.stack(predicted_frames, dim=1)
+
+
+def _check_step_result(position: object, shape: torch.Size) -> None:
+    if not isinstance(position, Tensor) or position.shape != shape:
+        raise UsageError(
+            "a model returned no positions of the next frame",
+            where="roll_out, step",
+            expected=f"a tensor of shape {list(shape)}: [particle, 2]",
+            got=getattr(position, "shape", None) or type(position).__name__,
+        )
 
 
 def predict(
@@ -296,31 +318,29 @@ def predict(
     registry: Registry | None = None,
     device: torch.device | str = "cpu",
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    """Roll a model out over every scenario of a subset, from the frames that the task
-    gives.
+    """Roll a model out over every scenario of a subset, from the task's given frames.
 
     ``dict(predict(...))`` is what `lagbench.submission.write` takes;
-    `PredictionsWriter` takes one scenario after the other. A network with dropout or
-    batch norm is to be set to ``eval()`` before.
+    `PredictionsWriter` takes one scenario after the other. Set a network with dropout
+    or batch norm to ``eval()`` first.
 
     Args:
         step: the model.
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        history: the last of the given frames that the model sees; all of them by
-            default.
-        registry: what describes the data set; ours by default.
-        device: where the model is.
+        history: how many of the last given frames the model sees; all by default.
+        registry: description of the data sets; ours by default.
+        device: device of the model.
 
     Yields:
         Scenario id, and positions of the frames to predict [length], float32, shape
         [frame, particle, 2].
 
     Raises:
-        UsageError: unknown split, size or subset, fewer frames are given than the model
-            is to see, or a scenario has fewer than the task; raised, like all, when the
+        UsageError: unknown split, size or subset, history beyond the given frames, or a
+            scenario with fewer frames than the task. All errors are raised when the
             first scenario is asked for.
         DataError: scenarios are missing; the message has the command that makes them.
     """
@@ -328,29 +348,37 @@ def predict(
         split, subset=subset, size=size, root=root, future=0, registry=registry
     )
     task = data.size.task
-    if history is not None and not 1 <= history <= task.input_frames:
-        what = "a model cannot see that many of the given frames"
-        expected = f"history from 1 to {task.input_frames}"
-        raise UsageError(what, where="predict", expected=expected, got=history)
-    seen = slice(task.input_frames - (history or task.input_frames), None)
-    needed = task.input_frames + task.horizon
-    for scenario, first in zip(data.scenarios, data.starts, strict=False):
-        if (held := data.size.frame_count(scenario)) < needed:
-            what = "a scenario is too short to be predicted"
-            where = f"predict, {data.size.split} {data.size.name}, scenario {scenario}"
-            fix = "predict the subset test, whose scenarios are long enough"
-            raise UsageError(
-                what, where=where, expected=f"{needed} frames", got=held, fix=fix
-            )
-        _, walls = data.store.constants(scenario)
-        # The forcing is given for all frames, unlike the positions.
-        if walls is None:
-            forcing = None
-        else:
-            forcing = torch.from_numpy(walls.copy())
-        given = (
-            collate([data[first]._replace(wall_velocity=forcing)]).part(seen).to(device)
+    if history is None:
+        history = task.input_frames
+    if not 1 <= history <= task.input_frames:
+        raise UsageError(
+            "a model cannot see that many of the given frames",
+            where="predict",
+            expected=f"history from 1 to {task.input_frames}",
+            got=history,
         )
+    visible_frames = slice(task.input_frames - history, None)
+    needed_frames = task.input_frames + task.horizon
+    for scenario, first in zip(data.scenarios, data.starts, strict=False):
+        frame_count = data.size.frame_count(scenario)
+        if frame_count < needed_frames:
+            tier = data.size
+            raise UsageError(
+                "a scenario is too short to be predicted",
+                where=f"predict, {tier.split} {tier.name}, scenario {scenario}",
+                expected=f"{needed_frames} frames",
+                got=frame_count,
+                fix="predict the subset test, whose scenarios are long enough",
+            )
+        # The forcing is given for all frames, unlike the positions.
+        _, wall_velocity = data.store.constants(scenario)
+        forcing = None
+        if wall_velocity is not None:
+            forcing = torch.from_numpy(wall_velocity.copy())
+        window = data[first]._replace(wall_velocity=forcing)
+        given = collate([window]).part(visible_frames).to(device)
         with torch.no_grad():
             positions = roll_out(step, given, task.horizon)
-        yield scenario, positions.transpose(0, 1).float().cpu().numpy()
+        # from [particle, frame, 2] to [frame, particle, 2]
+        by_frame = positions.transpose(0, 1)
+        yield scenario, by_frame.float().cpu().numpy()

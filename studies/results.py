@@ -58,8 +58,8 @@ thesis, University of Leeds, 2025)."""
 HOW_TO_READ = """\
 ## How to read this page
 
-- **Reference predictors** learn nothing. A naive baseline predicts without equations; a
-  classical solver integrates the equations on a coarser grid
+- **Reference predictors** are not trained. A naive baseline neither learns nor
+  integrates the equations; a classical solver integrates them on a coarser grid
   ([references](references.md)).
 - **Skill** is 1 - score / score of the best naive baseline. 1 is perfect, 0 is as good
   as that baseline, and below 0 is worse.

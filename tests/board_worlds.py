@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.board.entry import (
-    Cost,
     DataSet,
     Entry,
     EntryBudget,
-    Flag,
+    EntryCost,
+    EntryFlag,
     Prediction,
     ScoreBlock,
     ScoredFile,
@@ -23,17 +23,17 @@ from lagbench.board.entry import (
 )
 from lagbench.board.model import (
     Board,
+    BoardRow,
     Curve,
     Histogram,
     Pictures,
     ReferenceRow,
-    Row,
     Tab,
     Value,
 )
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS
-from lagbench.scoring.stored import reported_frames
+from lagbench.scoring.score_file_checks import reported_frames
 from lagbench.submission.task_checks import frames_to_predict
 
 Floats = NDArray[np.float64]
@@ -161,11 +161,11 @@ def make_tab(
         energy=world.banded(3.1e-3 * (1 - 0.3 * world.share), 0.1),
         truth=world.truth,
         rows=(*ranked, *gone),
-        floors=tuple(world.floor(name) for name in REFERENCES),
+        references=tuple(world.floor(name) for name in REFERENCES),
     )
 
 
-def with_entry(row: Row, **changes: Any) -> Row:
+def with_entry(row: BoardRow, **changes: Any) -> BoardRow:
     """Return a row whose entry says something else, checked or not."""
     return replace(row, entry=row.entry.model_copy(update=changes))
 
@@ -219,7 +219,9 @@ class _World:
         energy = self.banded(np.full(len(f), 1e-9) if still else moved, 0.1)
         return {"values": values, "curves": curves, "energy": energy}
 
-    def row(self, name: str, place: int, split: str, size: str, *, skill: bool) -> Row:
+    def row(
+        self, name: str, place: int, split: str, size: str, *, skill: bool
+    ) -> BoardRow:
         """Return the row of the method in a place."""
         bad = 1.0 + 0.35 * place
         rng = np.random.Generator(np.random.PCG64([self.seed, place]))
@@ -235,7 +237,7 @@ class _World:
             low=mean - 0.1,
             high=mean + 0.1,
         )
-        return Row(
+        return BoardRow(
             entry=make_entry(
                 name, place, split, size, None if place % 7 == 6 else _cost(bad, rng)
             ),
@@ -328,14 +330,18 @@ class _World:
 
 
 def make_entry(
-    name: str, place: int, split: str, size: str, cost: Cost | None
+    name: str, place: int, split: str, size: str, cost: EntryCost | None
 ) -> Entry:
     """Return an entry that says a little of everything."""
     seeds: list[int | None] = [0, 1, 2] if place % 2 == 0 else [None]
     hashes = [f"{k}f" * 32 for k in range(len(seeds))]
-    flags = {4: Flag(name="physics", reasons=("14 times the truth's kinetic energy",))}
-    flags[6] = Flag(name="copy_suspect", reasons=("the error drops within one frame",))
-    outside = Flag(
+    flags = {
+        4: EntryFlag(name="physics", reasons=("14 times the truth's kinetic energy",))
+    }
+    flags[6] = EntryFlag(
+        name="copy_suspect", reasons=("the error drops within one frame",)
+    )
+    outside = EntryFlag(
         name="in_domain", reasons=("41 positions lie outside the box",), share=0.059
     )
     files = [
@@ -398,10 +404,12 @@ def make_entry(
     )
 
 
-def _cost(bad: float, rng: np.random.Generator) -> Cost:
+def _cost(bad: float, rng: np.random.Generator) -> EntryCost:
     seconds = 0.08 / bad**1.2 * (0.5 + rng.random())
     device = "NVIDIA H200" if rng.random() < 0.5 else "AMD EPYC 9354, 2 cores"
-    return Cost(seconds_per_frame=seconds, device=device, solver_seconds_per_frame=0.21)
+    return EntryCost(
+        seconds_per_frame=seconds, device=device, solver_seconds_per_frame=0.21
+    )
 
 
 def _metrics(kind: str) -> list[str]:

@@ -98,7 +98,8 @@ class Page:
         """
         self.value("document.activeElement.blur(), 0")
         box = self.value(
-            f"(e => {{ e.scrollIntoView({{block: 'center'}}); const b = e.getBoundingClientRect();"
+            f"(e => {{ e.scrollIntoView({{block: 'center'}});"
+            " const b = e.getBoundingClientRect();"
             " return {x: b.x + scrollX - 6, y: b.y + scrollY - 6, width: b.width + "
             "12, height: b.height + 12}"
             f" }})(document.querySelector({json.dumps(selector)}))"
@@ -109,7 +110,8 @@ class Page:
             picture = Image.open(io.BytesIO(base64.b64decode(data))).convert("L")
             pictures.append(np.asarray(picture, np.int16))
             self.value(
-                f"document.querySelector({json.dumps(selector)}).focus({{preventScroll: true}}), 0"
+                f"document.querySelector({json.dumps(selector)})"
+                ".focus({preventScroll: true}), 0"
             )
         return bool((abs(pictures[1] - pictures[0]) > CLEAR).sum() >= MARKED)
 
@@ -197,6 +199,7 @@ class Browser:
         page.call("Emulation.setEmulatedMedia", features=[scheme])
         page.call("Page.navigate", url=path.absolute().as_uri())
         self.wait("Page.loadEventFired")
+        wait_for_script(page)
         return page
 
     def close(self) -> None:
@@ -289,17 +292,27 @@ def until(page: Page, condition: str) -> None:
     raise AssertionError(condition)
 
 
+def wait_for_script(page: Page) -> None:
+    """Wait until the script of a leaderboard has decompressed its data and drawn."""
+    has_data = "document.getElementById('page-data') !== null"
+    is_ready = "document.documentElement.dataset.ready !== undefined"
+    until(page, f"!({has_data}) || {is_ready}")
+
+
 def restored(page: Page, address: str) -> None:
     """Load the page anew at an address."""
     run(page, f"location.hash = {json.dumps(address)}")
     page.browser.events.clear()
     page.call("Page.reload")
     page.browser.wait("Page.loadEventFired")
+    wait_for_script(page)
 
 
 def seen(page: Page) -> list[list[str]]:
     """Return the texts of the table in view: rank, name, numbers."""
-    rows = "section.tab:not([hidden]) tr:is([data-entry], [data-floor]):not([hidden])"
+    rows = (
+        "section.tab:not([hidden]) tr:is([data-entry], [data-reference]):not([hidden])"
+    )
     found: list[list[str]] = page.value(
         f"[...document.querySelectorAll('{rows}')].map(tr =>"
         " [tr.cells[0], tr.querySelector('.name'),"

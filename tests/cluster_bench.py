@@ -19,8 +19,9 @@ TESTS = Path(__file__).parent
 
 ALONE = """
 from distributed import LocalCluster
-options = dict(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None)
-with LocalCluster(**options, protocol="tcp://") as cluster:
+options = dict(n_workers=1, threads_per_worker=1, processes=False)
+options |= dict(dashboard_address=None, protocol="tcp://")
+with LocalCluster(**options) as cluster:
     print(cluster.scheduler_address, flush=True)
     input()
 """

@@ -31,18 +31,24 @@ from lagbench.data.layout import dataset_folder
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.make import cards
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
-from lagbench.scoring.score_file import StoredScores, read_statistics
-from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
+from lagbench.scoring.score_file import SubmissionStatistics, read_statistics
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
-from lagbench.submission.format import Anatomy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
+from lagbench.work.progress import Meter
 from lagbench.work.run import ONE_THREAD
 
 # The same code gives the same verdict: what Hypothesis finds by chance is to be found
@@ -60,10 +66,18 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
-OUTCOMES = scored._outcomes
-DRAW = cards._draw
+SCORE_SCENARIOS = scored.score_scenarios
+PAINT = painting.paint_pictures
 Names = tuple[str, ...]
-READERS = ("audit", "build", "check", "findings", "ranking", "seeds", "submit")
+READERS = (
+    "build",
+    "folder_checks",
+    "identity",
+    "publish",
+    "ranking",
+    "rescoring",
+    "seeds",
+)
 
 SPLIT = "curl-noise"
 SIZE = "tiny"
@@ -116,7 +130,7 @@ def lasting_workers() -> Iterator[None]:
         try:
             yield pool
         finally:
-            if pool._waiting or any(worker.attempt for worker in pool._workers):
+            if pool._queue or any(worker.attempt for worker in pool._workers):
                 held.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
@@ -149,7 +163,7 @@ def quick(home: Path) -> Iterator[None]:
         """Leave the pictures of cards blank: to draw them takes longer than to generate
         tiny data.
         """
-        for name in cards.PICTURES:
+        for name in PICTURES:
             path = dataset_folder(root, size.split, size.name, size.major) / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"")
@@ -158,7 +172,7 @@ def quick(home: Path) -> Iterator[None]:
         patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
         for module in ("scoring.score", "board.submit"):
             patch.setattr(f"lagbench.{module}.validate", validated)
-        patch.setattr(cards, "_draw", draw)
+        patch.setattr(painting, "paint_pictures", draw)
         # Commands are built from their signatures once, not at every call, which may
         # take less.
         patch.setattr("typer.testing._get_command", functools.cache(get_command))
@@ -172,34 +186,50 @@ def references_once() -> Iterator[None]:
     """
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
-    def outcomes(
+    def score_once(
         task: ScoredTask,
         path: Path,
-        anatomy: Anatomy,
+        info: FileInfo,
+        *,
         metrics: Names,
-        floors: Names,
-        *others: Any,
+        references: Names,
+        workers: int | None,
+        scheduler: str | None,
+        meter: Meter,
     ) -> list[ScenarioScores]:
-        workers, scheduler, _ = others
-        if not floors or scheduler is not None or (workers or 1) > 1:
-            return OUTCOMES(task, path, anatomy, metrics, floors, *others)
-        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        key = metrics, floors, repr((task.size, task.setting)), *map(file_sha256, files)
-        found = OUTCOMES(
-            task, path, anatomy, metrics, () if key in known else floors, *others
+        score_rows = functools.partial(
+            SCORE_SCENARIOS,
+            task,
+            path,
+            info,
+            metrics=metrics,
+            workers=workers,
+            scheduler=scheduler,
+            meter=meter,
         )
-        if key not in known:
+        if not references or scheduler is not None or (workers or 1) > 1:
+            return score_rows(references=references)
+
+        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
+        hashes = [file_sha256(file) for file in files]
+        key = (metrics, references, repr((task.size, task.config)), *hashes)
+        if key in known:
+            outcomes = score_rows(references=())
+        else:
+            outcomes = score_rows(references=references)
             known[key] = {
-                one.scenario: {name: one.tallies[name] for name in floors}
-                for one in found
+                outcome.scenario: {name: outcome.tallies[name] for name in references}
+                for outcome in outcomes
             }
-        return [
-            replace(one, tallies={**one.tallies, **known[key][one.scenario]})
-            for one in found
-        ]
+
+        completed = []
+        for outcome in outcomes:
+            tallies = {**outcome.tallies, **known[key][outcome.scenario]}
+            completed.append(replace(outcome, tallies=tallies))
+        return completed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagbench.scoring.score._outcomes", outcomes)
+        patch.setattr("lagbench.scoring.score.score_scenarios", score_once)
         yield
 
 
@@ -208,30 +238,30 @@ def stored_once() -> Iterator[None]:
     """Read score files of equal bytes once: commands read all of a board's, several
     times.
     """
-    known: dict[Hashable, Stored] = {}
+    known: dict[Hashable, ScoreFile] = {}
 
     @functools.cache
-    def statistics(_: str, path: Path) -> StoredScores:
+    def statistics(_: str, path: Path) -> SubmissionStatistics:
         stored = read_statistics(path)
         # no test of tables adds metrics
         object.__setattr__(stored, "scores", functools.cache(stored.scores))
         return stored
 
-    def read(path: Path, size: Size | None = None) -> Stored:
+    def read(path: Path, size: Size | None = None) -> ScoreFile:
         if (
             path.is_symlink()
             or not path.is_file()
             or path.stat().st_size > MAX_SCORE_BYTES
         ):
-            return read_stored(path, size)
+            return read_score_file(path, size)
         key = file_sha256(path), size and repr(size)
         if key not in known:
-            known[key] = read_stored(path, size)
+            known[key] = read_score_file(path, size)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
         for module in READERS:
-            patch.setattr(f"lagbench.board.{module}.read_stored", read)
+            patch.setattr(f"lagbench.board.{module}.read_score_file", read)
         reader = "studies.thesis.split_results.read_statistics"
         patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
         yield
@@ -247,9 +277,9 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("scoring.score", "board.submit"):
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
     for module in READERS:
-        monkeypatch.setattr(f"lagbench.board.{module}.read_stored", read_stored)
-    monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
-    monkeypatch.setattr(cards, "_draw", DRAW)
+        monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", SCORE_SCENARIOS)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from lagbench.generators.draws import quantise
 from lagbench.generators.free_surface import FreeSurface
-from lagbench.generators.shapes import Shape, body_at, seeds
+from lagbench.generators.shapes import Shape, body_at, sample_points
 from lagbench.generators.solver import Device
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
 
@@ -66,7 +66,7 @@ def scenario(
     ).astype(int)
     counts = np.diff(ends)
     bodies = [
-        seeds(rng, body_at(part.shape, *part.centre), n)
+        sample_points(rng, body_at(part.shape, *part.centre), n)
         for part, n in zip(parts, counts, strict=True)
     ]
     return InitialState(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 
@@ -21,7 +22,7 @@ class Element:
 
 @dataclass
 class Reading:
-    """What was read."""
+    """The elements of a page, and what is wrong with it."""
 
     elements: list[Element] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
@@ -32,14 +33,18 @@ class Reading:
 
     def of_class(self, kind: str) -> list[Element]:
         """Return the elements of a class."""
-        return [
-            e for e in self.elements if kind in e.attributes.get("class", "").split()
-        ]
+        matches = []
+        for element in self.elements:
+            classes = element.attributes.get("class", "").split()
+            if kind in classes:
+                matches.append(element)
+        return matches
 
     @property
     def ids(self) -> list[str]:
         """All ids in order."""
-        return [e.attributes["id"] for e in self.elements if "id" in e.attributes]
+        attributes = [element.attributes for element in self.elements]
+        return [names["id"] for names in attributes if "id" in names]
 
 
 class _Reader(HTMLParser):
@@ -59,12 +64,13 @@ class _Reader(HTMLParser):
             self.reading.faults.append(f"<{tag}/>")
 
     def handle_endtag(self, tag: str) -> None:
-        if not self.open or self.open[-1].name != tag:
-            self.reading.faults.append(
-                f"</{tag}> closes {self.open[-1].name if self.open else 'nothing'}"
-            )
-        else:
+        innermost = "nothing"
+        if self.open:
+            innermost = self.open[-1].name
+        if innermost == tag:
             self.open.pop()
+        else:
+            self.reading.faults.append(f"</{tag}> closes {innermost}")
 
     def handle_data(self, data: str) -> None:
         for element in self.open:
@@ -84,11 +90,10 @@ def read_html(text: str) -> Reading:
     reader = _Reader()
     reader.feed(text)
     reader.close()
-    reader.reading.faults += [
-        f"<{element.name}> is never closed" for element in reader.open
-    ]
-    ids = reader.reading.ids
-    reader.reading.faults += [
-        f"id {name} twice" for name in sorted(set(ids)) if ids.count(name) > 1
-    ]
-    return reader.reading
+    reading = reader.reading
+    for element in reader.open:
+        reading.faults.append(f"<{element.name}> is never closed")
+    for name, count in Counter(reading.ids).items():
+        if count > 1:
+            reading.faults.append(f"id {name} twice")
+    return reading

@@ -19,16 +19,18 @@ from numpy.typing import NDArray
 
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
+from lagbench.board.publish import SubmitResult
 from lagbench.board.ranking import combine, summarise
-from lagbench.board.submit import SubmitResult, submit
+from lagbench.board.submit import submit
 from lagbench.data.checksums import dataset_hash, file_sha256, subset_hash
+from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Registry, Size, default_path, load
-from lagbench.data.writer import ScenarioWriter, scenario_path
-from lagbench.data.yamlfile import read_yaml, spell_yaml
+from lagbench.data.writer import ScenarioWriter
+from lagbench.data.yamlfile import format_yaml, read_yaml
 from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
@@ -207,7 +209,7 @@ def _registry(size: Size, hashes: Mapping[int, str]) -> str:
         "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
     }
     file["measured"] = {size.split: {size.name: measured}}
-    return spell_yaml(file)
+    return format_yaml(file)
 
 
 def still(truth: Floats, n: int, h: int) -> Floats:
@@ -309,7 +311,10 @@ class BoardBench:
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [read_stored(self.folder / path).scores for path in entry.score_paths]
+        stored = [
+            read_score_file(self.folder / path).scores.tallies
+            for path in entry.score_paths
+        ]
         plain = {
             name: summary.model_dump()
             for name, summary in summarise(combine(stored)).items()

@@ -16,7 +16,7 @@ from typing import Any
 
 import fsspec
 import pytest
-from lying_server import Mirror, serving
+from faulty_server import Mirror, serving
 from moto.server import ThreadedMotoServer
 
 from lagbench.data.layout import NOTES_NAME

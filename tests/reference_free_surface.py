@@ -1,5 +1,4 @@
-"""The free-surface solver in plain NumPy float32, written from the equations of design
-4.4.
+"""The free-surface solver in plain NumPy float32, written from the equations.
 
 Independent of Taichi and of ``generators/``: it reads only parameters and initial
 states. Every operation rounds to float32 in the order in which the equation is written;
@@ -29,9 +28,9 @@ WEIGHT_SCALE = 2.0**50
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
     """Lame's constants in float64."""
-    return young / (2 * (1 + poisson)), young * poisson / (
-        (1 + poisson) * (1 - 2 * poisson)
-    )
+    mu = young / (2 * (1 + poisson))
+    la = young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+    return mu, la
 
 
 def fixed(value: Floats, scale: float) -> NDArray[np.int64]:
@@ -51,7 +50,7 @@ def exp(z: Floats) -> Floats:
 
 
 @dataclass
-class Split:
+class PolarParts:
     """F = q R + [[h, k], [k, -h]], with the rotation R = [[cos, -sin], [sin, cos]]."""
 
     q: Floats
@@ -61,7 +60,7 @@ class Split:
     k: Floats
 
     @classmethod
-    def of(cls, f: Components) -> Split:
+    def of(cls, f: Components) -> PolarParts:
         """Divide gradients into a scaled rotation and a scaled reflection."""
         a, b, c, d = f
         e = HALF * (a + d)
@@ -76,8 +75,9 @@ class Split:
 
 @dataclass
 class Stencil:
-    """Where a particle touches the grid: lowest node, distance to it [cells], weights
-    per axis.
+    """Where a particle touches the grid.
+
+    These are the lowest node, the distance to it [cells] and the weights per axis.
     """
 
     base: NDArray[np.int32]
@@ -90,33 +90,34 @@ class Stencil:
         scaled = position * Float(grid)
         base = (scaled - HALF).astype(np.int32)
         d = scaled - base.astype(Float)
-        weights = (
-            HALF * ((Float(1.5) - d) * (Float(1.5) - d)),
-            Float(0.75) - (d - ONE) * (d - ONE),
-            HALF * ((d - HALF) * (d - HALF)),
-        )
-        return cls(base, d, weights)
+        outer = Float(1.5) - d
+        middle = d - ONE
+        inner = d - HALF
+        low = HALF * (outer * outer)
+        mid = Float(0.75) - middle * middle
+        high = HALF * (inner * inner)
+        return cls(base, d, (low, mid, high))
 
     def nodes(
         self,
     ) -> Iterator[tuple[NDArray[np.int32], NDArray[np.int32], Floats, Floats, Floats]]:
-        """Yield (node i, node k, weight, offset x [cells], offset y [cells]) for the
-        nine nodes.
-        """
+        """Yield node i, node k, weight and offsets x, y [cells] of the nine nodes."""
         for i, k in np.ndindex(3, 3):
             weight = self.weights[i][:, 0] * self.weights[k][:, 1]
-            offset = Float(i) - self.distance[:, 0], Float(k) - self.distance[:, 1]
-            yield self.base[:, 0] + i, self.base[:, 1] + k, weight, *offset
+            offset_x = Float(i) - self.distance[:, 0]
+            offset_y = Float(k) - self.distance[:, 1]
+            node_i = self.base[:, 0] + i
+            node_k = self.base[:, 1] + k
+            yield node_i, node_k, weight, offset_x, offset_y
 
 
 class FreeSurfaceReference:
     """One scenario of the free-surface solver."""
 
     def __init__(self, parameters: FreeSurfaceParameters, state: InitialState) -> None:
-        """Start from an initial state; constants are computed in float64, then rounded
-        once.
-        """
-        p = self.p = parameters
+        """Start from a state; constants are computed in float64, then rounded once."""
+        p = parameters
+        self.p = parameters
         count = len(state.position)
         self.position = state.position.astype(Float)  # [length], shape [particle, 2]
         self.velocity = state.velocity.astype(Float)  # [length/s], shape [particle, 2]
@@ -134,46 +135,42 @@ class FreeSurfaceReference:
             Material.SNOW: lame(p.snow_modulus, p.snow_poisson),
             Material.ROPE: lame(p.rope_modulus, p.rope_poisson),
         }
-        self.mu, self.la = np.array(
-            [moduli[Material(m)] for m in state.material], Float
-        ).T
-        kinematic = np.where(
-            self.liquid, p.liquid_viscosity, np.where(self.snow, 0.0, p.elastic_damping)
-        )
+        constants = [moduli[Material(m)] for m in state.material]
+        self.mu, self.la = np.array(constants, Float).T
+        damping = np.where(self.snow, 0.0, p.elastic_damping)
+        kinematic = np.where(self.liquid, p.liquid_viscosity, damping)
         self.viscosity = (p.density * kinematic).astype(Float)
         self.friction = Float(state.friction)
         self.node_share = Float(state.area / count * p.grid**2)
         # Velocities up to 64 cells per substep, in 62 bits less those of the particle
         # count.
         bits = min(50, 62 - (count - 1).bit_length())
-        self.velocity_scale = 2.0 ** (
-            bits - int(np.ceil(np.log2(64 / (p.grid * p.dt))))
-        )
+        speed_bits = int(np.ceil(np.log2(64 / (p.grid * p.dt))))
+        self.velocity_scale = 2.0 ** (bits - speed_bits)
 
     def advance(self, substeps: int) -> None:
         """Run substeps."""
         for _ in range(substeps):
             stencil = Stencil.at(self.position, self.p.grid)
-            self.to_particles(stencil, *self.grid_update(self.to_grid(stencil)))
+            nodes = self.grid_update(self.to_grid(stencil))
+            self.to_particles(stencil, *nodes)
 
     def stress(self) -> tuple[Floats, Floats, Floats]:
         """Kirchhoff stress (xx, xy, yy)."""
         p = self.p
-        f = Split.of(self.deformation)
-        exponent = np.clip(
-            Float(p.snow_hardening) * (ONE - self.ratio), Float(-4), Float(4)
-        )
-        stiff = np.clip(
-            exp(exponent), Float(p.snow_hardening_min), Float(p.snow_hardening_max)
-        )
+        f = PolarParts.of(self.deformation)
+        exponent = Float(p.snow_hardening) * (ONE - self.ratio)
+        exponent = np.clip(exponent, Float(-4), Float(4))
+        softest = Float(p.snow_hardening_min)
+        hardest = Float(p.snow_hardening_max)
+        stiff = np.clip(exp(exponent), softest, hardest)
         factor = np.where(self.snow, stiff, ONE)
         mu = self.mu * factor
         la = self.la * factor
         square = f.h * f.h + f.k * f.k
         jacobian = f.q * f.q - square
-        mean = (
-            TWO * mu * (f.q * (f.q - ONE) + square) + la * (jacobian - ONE) * jacobian
-        )
+        volumetric = la * (jacobian - ONE) * jacobian
+        mean = TWO * mu * (f.q * (f.q - ONE) + square) + volumetric
         stretch = TWO * mu * (TWO * f.q - ONE)
         normal = stretch * (f.cos * f.h - f.sin * f.k)
         xy = stretch * (f.cos * f.k + f.sin * f.h)
@@ -188,10 +185,10 @@ class FreeSurfaceReference:
         )
 
     def to_grid(self, stencil: Stencil) -> NDArray[np.int64]:
-        """Sum weighted velocity (x, y), weights and weighted J at the nodes, shape [4,
-        node, node].
+        """Sum weighted velocity (x, y), weights and weighted J at the nodes.
 
-        All particles of a scenario weigh the same, so that their mass cancels.
+        The shape is [4, node, node]. All particles of a scenario weigh the same, so
+        that their mass cancels.
         """
         nodes = self.p.grid + 1
         dx = Float(1 / self.p.grid)
@@ -207,13 +204,11 @@ class FreeSurfaceReference:
             a = slopes_x[component]
             b = slopes_y[component]
             centre = self.velocity[:, component] - x * a - y * b
-            for (i, k), (node_i, node_k, w, _, _) in zip(
-                np.ndindex(3, 3), stencil.nodes(), strict=True
-            ):
+            pairs = zip(np.ndindex(3, 3), stencil.nodes(), strict=True)
+            for (i, k), (node_i, node_k, w, _, _) in pairs:
                 value = w * ((centre + Float(i - 1) * a) + Float(k - 1) * b)
-                np.add.at(
-                    sums[component], (node_i, node_k), fixed(value, self.velocity_scale)
-                )
+                rounded = fixed(value, self.velocity_scale)
+                np.add.at(sums[component], (node_i, node_k), rounded)
         for node_i, node_k, w, _, _ in stencil.nodes():
             np.add.at(sums[2], (node_i, node_k), fixed(w, WEIGHT_SCALE))
             np.add.at(sums[3], (node_i, node_k), fixed(w * jacobian, WEIGHT_SCALE))
@@ -222,14 +217,15 @@ class FreeSurfaceReference:
     def grid_update(
         self, sums: NDArray[np.int64]
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return nodal velocity (x, y), relative density and J after gravity and
-        walls.
-        """
+        """Return nodal velocity (x, y), density and J after gravity and walls."""
         low = self.p.wall
         high = self.p.grid - self.p.wall
         filled = sums[2] > 0
-        n, mj = (sums[c].astype(Float) / Float(WEIGHT_SCALE) for c in (2, 3))
-        px, py = (sums[c].astype(Float) / Float(self.velocity_scale) for c in (0, 1))
+        px, py, n, mj = sums.astype(Float)
+        px = px / Float(self.velocity_scale)
+        py = py / Float(self.velocity_scale)
+        n = n / Float(WEIGHT_SCALE)
+        mj = mj / Float(WEIGHT_SCALE)
         n = np.where(filled, n, ONE)
         u = np.where(filled, px / n, Float(0))
         v = np.where(filled, py / n - Float(self.p.gravity * self.p.dt), Float(0))
@@ -257,13 +253,10 @@ class FreeSurfaceReference:
         below: NDArray[np.bool_],
         above: NDArray[np.bool_],
     ) -> tuple[Floats, Floats]:
-        """Remove the outward normal velocity; Coulomb friction brakes the tangential
-        one by its share.
-        """
+        """Remove the outward normal velocity; friction brakes the tangential one."""
         hits = (below & (normal < 0)) | (above & (normal > 0))
-        loss = (
-            self.friction * np.abs(normal) / np.maximum(np.abs(tangential), Float(1e-9))
-        )
+        sliding = np.maximum(np.abs(tangential), Float(1e-9))
+        loss = self.friction * np.abs(normal) / sliding
         braked = tangential * np.maximum(Float(0), ONE - loss)
         return np.where(hits, Float(0), normal), np.where(hits, braked, tangential)
 
@@ -292,9 +285,8 @@ class FreeSurfaceReference:
         dx = 1 / self.p.grid
         low = Float((self.p.wall + 1e-3) * dx)
         high = Float((self.p.grid - self.p.wall - 1e-3) * dx)
-        self.position = np.clip(
-            self.position + Float(self.p.dt) * self.velocity, low, high
-        )
+        moved = self.position + Float(self.p.dt) * self.velocity
+        self.position = np.clip(moved, low, high)
         # J <- J (1 + dt tr C) + kappa (Jbar - J); J <- J + theta (1 / max(r, 1) - J);
         # limits.
         p = self.p
@@ -302,18 +294,15 @@ class FreeSurfaceReference:
         j = old + Float(p.dt) * (self.affine[0] + self.affine[3]) * old
         j = j + Float(p.jacobian_relaxation) * (smooth - old)
         j = j + Float(p.density_coupling) * (ONE / np.maximum(r, ONE) - j)
-        self.ratio = np.where(
-            self.liquid, np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max)), old
-        )
+        j = np.clip(j, Float(p.jacobian_min), Float(p.jacobian_max))
+        self.ratio = np.where(self.liquid, j, old)
         self.deform()
 
     def deform(self) -> None:
         """F <- (I + dt C) F for solids; snow then yields."""
-        (a, b, c, d), (cxx, cxy, cyx, cyy), dt = (
-            self.deformation,
-            self.affine,
-            Float(self.p.dt),
-        )
+        a, b, c, d = self.deformation
+        cxx, cxy, cyx, cyy = self.affine
+        dt = Float(self.p.dt)
         trial = (
             a + dt * (cxx * a + cxy * c),
             b + dt * (cxx * b + cxy * d),
@@ -323,29 +312,29 @@ class FreeSurfaceReference:
         # Snow: the principal stretches are clamped; Jp takes the rest.
         low = Float(1 - self.p.snow_compression)
         high = Float(1 + self.p.snow_stretch)
-        f = Split.of(trial)  # type: ignore[arg-type]
+        f = PolarParts.of(trial)  # type: ignore[arg-type]
         r = np.sqrt(f.h * f.h + f.k * f.k)
         first = np.clip(f.q + r, low, high)
         second = np.clip(f.q - r, low, high)
         sheared = r > Float(1e-12)
-        shrink = np.where(
-            sheared, HALF * (first - second) / np.where(sheared, r, ONE), Float(0)
-        )
+        divisor = np.where(sheared, r, ONE)
+        shrink = np.where(sheared, HALF * (first - second) / divisor, Float(0))
         mean = HALF * (first + second)
         e = mean * f.cos
         g = mean * f.sin
         h = shrink * f.h
         k = shrink * f.k
-        floor = Float(0.1)
-        factor = (
-            np.maximum(f.q + r, floor) * np.maximum(f.q - r, floor) / (first * second)
-        )
-        elastic = e + h, k - g, k + g, e - h
-        plastic = np.clip(
-            self.ratio * factor, Float(self.p.snow_jp_min), Float(self.p.snow_jp_max)
-        )
+        least_stretch = Float(0.1)
+        trial_first = np.maximum(f.q + r, least_stretch)
+        trial_second = np.maximum(f.q - r, least_stretch)
+        factor = trial_first * trial_second / (first * second)
+        plastic_min = Float(self.p.snow_jp_min)
+        plastic_max = Float(self.p.snow_jp_max)
+        plastic = np.clip(self.ratio * factor, plastic_min, plastic_max)
         self.ratio = np.where(self.snow, plastic, self.ratio)
-        self.deformation = tuple(  # type: ignore[assignment]
-            np.where(self.liquid, old, np.where(self.snow, kept, new))
-            for old, kept, new in zip(self.deformation, elastic, trial, strict=True)
-        )
+        elastic = (e + h, k - g, k + g, e - h)
+        components = []
+        for old, yielded, new in zip(self.deformation, elastic, trial, strict=True):
+            solid = np.where(self.snow, yielded, new)
+            components.append(np.where(self.liquid, old, solid))
+        self.deformation = tuple(components)  # type: ignore[assignment]

@@ -43,50 +43,44 @@ RECORD = {
 
 
 def a_score(values: list[float], metric: str) -> Score:
-    """Return a score with values over the horizon, the same at the cavity's frame 54,
-    its only one.
-    """
-    held = np.array(values)
+    """Return a score with these values over the horizon and at its only frame, 54."""
+    scenario_values = np.array(values)
     return Score(
         METRICS[metric],
         tuple(range(len(values))),
         (54,),
-        held[:, None],
-        held,
+        scenario_values[:, None],
+        scenario_values,
         (0,) * len(values),
     )
 
 
 def a_method(name: str, *seeds: list[float]) -> Method:
     """Return a model whose every metric has these values, one list per seed."""
-    held = [
-        ScoredTraining(
-            seed=i,
-            scores={m: a_score(values, m) for m in METRICS},
-            record={},
-            path=Path(),
+    trainings = []
+    for seed, values in enumerate(seeds):
+        scores = {metric: a_score(values, metric) for metric in METRICS}
+        trainings.append(
+            ScoredTraining(seed=seed, scores=scores, record={}, path=Path())
         )
-        for i, values in enumerate(seeds)
-    ]
-    return Method(name=name, trainings=tuple(held))
+    return Method(name=name, trainings=tuple(trainings))
 
 
-def known(models: Mapping[str, list[float]]) -> SplitResults:
-    """Return what is known of the mini cavity: models and floors of one seed each."""
-    evidence = SplitResults(Sources(board=None), SPLIT, "mini")
-    evidence.methods = {name: a_method(name, values) for name, values in models.items()}
-    return evidence
+def made_up_results(models: Mapping[str, list[float]]) -> SplitResults:
+    """Return results of the mini cavity: models and baselines of one seed each."""
+    results = SplitResults(Sources(board=None), SPLIT, "mini")
+    results.methods = {name: a_method(name, values) for name, values in models.items()}
+    return results
 
 
 def noisy(noise: float) -> Predict:
-    """Return a model that knows the truth, with noise."""
+    """Return a model that predicts the truth with noise."""
     draw = np.random.default_rng(0)
 
     def predict(truth: Floats, n: int, h: int) -> Floats:
-        held = truth[n : n + h]
-        return np.asarray(
-            np.clip(held + noise * draw.standard_normal(held.shape), 0.0, 1.0)
-        )
+        future = truth[n : n + h]
+        noisy_future = future + noise * draw.standard_normal(future.shape)
+        return np.asarray(np.clip(noisy_future, 0.0, 1.0))
 
     return predict
 

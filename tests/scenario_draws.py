@@ -29,52 +29,51 @@ EVERY = [(split, size) for split in SPLITS for size in SIZES]
 
 @functools.cache
 def turn() -> int:
-    """Return the number of commits so far: it picks what this run does of what is too
-    much for one.
+    """Return the number of commits so far, 0 where git does not tell.
 
-    0 where git does not tell. ``LAGBENCH_TURN`` is taken before it: a number, or
-    ``all``, which is 0 here.
+    It picks what this run does of what is too much for one. ``LAGBENCH_TURN`` is taken
+    before it: a number, or ``all``, which is 0 here.
     """
-    wanted = os.environ.get("LAGBENCH_TURN", "")
-    if wanted:
-        return int(wanted) if wanted != "all" else 0
-    asked = ["git", "rev-list", "--count", "HEAD"]
+    chosen = os.environ.get("LAGBENCH_TURN", "")
+    if chosen == "all":
+        return 0
+    if chosen:
+        return int(chosen)
+    command = ["git", "rev-list", "--count", "HEAD"]
+    folder = Path(__file__).parent
     try:
-        told = subprocess.run(
-            asked, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, check=True
         )
     except (OSError, subprocess.CalledProcessError):
         return 0
-    return int(told.stdout)
+    return int(done.stdout)
 
 
 def of_this_turn(cases: Sequence[Case], *, turns: int, shift: int = 0) -> list[Case]:
-    """Return every so many-th case, the next ones after another commit; all with
-    ``LAGBENCH_TURN=all``.
+    """Return one case in ``turns``, the next ones after another commit.
+
+    With ``LAGBENCH_TURN=all`` these are all cases.
     """
     if os.environ.get("LAGBENCH_TURN") == "all":
         return list(cases)
-    return [
-        case
-        for place, case in enumerate(cases)
-        if (place + turn() + shift) % turns == 0
-    ]
+    first = -(turn() + shift) % turns
+    return list(cases[first::turns])
 
 
 def changed(size: registry.Size, **values: float) -> registry.Size:
     """Return a size with other parameter values."""
-    new = {
-        k: size.parameters[k].model_copy(update={"value": v}) for k, v in values.items()
-    }
-    return size.model_copy(update={"parameters": {**size.parameters, **new}})
+    parameters = dict(size.parameters)
+    for name, value in values.items():
+        parameters[name] = parameters[name].model_copy(update={"value": value})
+    return size.model_copy(update={"parameters": parameters})
 
 
 def draw(size: registry.Size, scenario: int) -> InitialState:
     """Draw a scenario of a size from its own seed."""
+    generator = draws.generator(size.split, size.name, size.major, scenario)
     # nothing but ``random`` can be used of the generator
-    rng = SimpleNamespace(
-        random=draws.generator(size.split, size.name, size.major, scenario).random
-    )
+    rng = SimpleNamespace(random=generator.random)
     module = importlib.import_module(size.generator)
     state: InitialState = module.initial_state(size, scenario, rng)
     return state
@@ -88,9 +87,8 @@ def state_of(split: str, size: str, scenario: int) -> InitialState:
 
 def all_of(split: str, size: str = "full") -> list[InitialState]:
     """Return all scenarios of a size in the order of their ids."""
-    return [
-        state_of(split, size, i) for i in registry.load().size(split, size).scenarios
-    ]
+    ids = registry.load().size(split, size).scenarios
+    return [state_of(split, size, scenario) for scenario in ids]
 
 
 def digest(state: InitialState) -> str:
@@ -98,19 +96,22 @@ def digest(state: InitialState) -> str:
     total = hashlib.sha256()
     for field in dataclasses.fields(state):
         value = getattr(state, field.name)
-        total.update(
-            value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode()
-        )
+        if isinstance(value, np.ndarray):
+            total.update(value.tobytes())
+        else:
+            total.update(repr(value).encode())
     return total.hexdigest()
 
 
 def neighbours(
     position: NDArray[np.float64], count: int, among: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return distance and index of the nearest points, by SciPy's k-d tree, shape
-    [point, count].
+    """Return distance and index of the nearest points, by SciPy's k-d tree.
+
+    Both have the shape [point, count].
     """
-    found = cKDTree(position if among is None else among).query(
-        position, k=list(range(1, count + 1))
-    )
-    return np.asarray(found[0]), np.asarray(found[1])
+    if among is None:
+        among = position
+    ranks = list(range(1, count + 1))
+    distance, index = cKDTree(among).query(position, k=ranks)
+    return np.asarray(distance), np.asarray(index)

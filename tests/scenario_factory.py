@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.writer import ScenarioKey, ScenarioWriter, scenario_path
+from lagbench.data.layout import ScenarioKey, scenario_path
+from lagbench.data.writer import ScenarioWriter
 
 PARAMETERS = {"dt": 0.002, "grid": 16, "start_frame": 2, "wall_moving": "top"}
 

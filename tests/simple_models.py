@@ -130,12 +130,12 @@ class Bursting(Drift):
 
 def install(monkeypatch: pytest.MonkeyPatch, **models: type) -> None:
     """Let packages seem installed that add baselines, by name."""
-    own = tuple(catalogue.installed(catalogue.GROUP))
+    own = tuple(catalogue.list_entry_points(catalogue.GROUP))
     added = tuple(
         EntryPoint(name, f"{model.__module__}:{model.__name__}", catalogue.GROUP)
         for name, model in models.items()
     )
-    monkeypatch.setattr(catalogue, "installed", lambda group: own + added)
+    monkeypatch.setattr(catalogue, "list_entry_points", lambda group: own + added)
 
 
 def trainer(

@@ -200,10 +200,9 @@ def test_a_script_beside_the_clone_imports_the_package(tmp_path: Path) -> None:
             "import lagbench.figures.report.report",
             {"matplotlib", "PIL", "taichi", "torch"},
         ),
-        (
-            "import lagbench.figures.plot, lagbench.figures.animate, lagbench.make.cards",
-            DRAWN,
-        ),
+        ("import lagbench.figures.plot, lagbench.figures.animate", DRAWN),
+        ("import lagbench.make.cards", DRAWN),
+        ("import lagbench.figures.colours", HEAVY - {"numpy"}),
     ],
 )
 def test_light_things_stay_light(code: str, forbidden: set[str]) -> None:

@@ -135,7 +135,7 @@ def test_a_crash_on_windows_is_the_files_fault(monkeypatch: pytest.MonkeyPatch) 
     """
     ended = subprocess.CompletedProcess([], 0xC0000005, stdout=b"1\n2", stderr=b"")
     monkeypatch.setattr(machine.subprocess, "run", lambda *_, **__: ended)
-    found = machine.in_child("any.function", [0, 0], seconds=1.0, wall=1.0)
+    found = machine.run_in_child("any.function", [0, 0], seconds=1.0, wall=1.0)
     assert found == ([1], "it ended with exit code 0xc0000005")
 
 

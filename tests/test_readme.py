@@ -202,7 +202,7 @@ def dam_break(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("PYTHONPATH", folder)
     monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
     point = EntryPoint(name="dam-break", value="dam_break", group=registry.GROUP)
-    monkeypatch.setattr(registry, "installed", lambda group: [point])
+    monkeypatch.setattr(registry, "list_entry_points", lambda group: [point])
     registry._load.cache_clear()
     yield
     registry._load.cache_clear()

@@ -1,8 +1,7 @@
-"""Build the leaderboard: read entries and score files, form every number anew, write
-the page.
+"""Build the leaderboard from entries and score files.
 
-What the YAML files say of scores is not used; ``lagbench leaderboard check`` compares
-it.
+Every number is formed anew, then the page is written. The scores in the YAML files are
+not used; ``lagbench leaderboard check`` compares them.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
-from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -35,68 +33,96 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.scoring.card import Preview, skill
-from lagbench.scoring.stored import Stored, read_stored, reported_frames
+from lagbench.scoring.card import Preview
+from lagbench.scoring.score_file_checks import (
+    ScoreFile,
+    read_score_file,
+    reported_frames,
+)
+from lagbench.scoring.skill import compute_skill
 from lagbench.submission.task_checks import frames_to_predict
 
-from .entry import Cost, Entry, Status, Verification
-from .entry_file import read_entry, read_verified, schema_bytes, verification_of
-from .findings import CHECKS
+from .entry import Entry, EntryCost, Status, Verification
+from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
-from .model import Board, Curve, Histogram, Pictures, ReferenceRow, Row, Tab, Value
-from .page import LINKS, render
-from .payload import spaced
-from .ranking import Combined, combine, is_current, read_references
+from .issues import CHECKS
+from .model import Board, BoardRow, Curve, Histogram, Pictures, ReferenceRow, Tab, Value
+from .page import LINKS, links_in, render, same_page
+from .ranking import CombinedScore, combine, is_current, read_references
+from .sampling import spaced
+from .verified import read_verified, verification_of
 
 COLUMNS = (
-    *(
-        "vorticity_nrmse",
-        "cloud_distance",
-        "vorticity_rmse",
-        "mse_avg",
-        "vorticity_pearson",
-    ),
-    *(
-        "stable_frames",
-        "position_rmse_20",
-        "position_rmse",
-        "spectrum_error",
-        "velocity_rmse",
-    ),
-    *("density_rmse", "momentum_error", "shape_error", "connectivity", "sliced_w2"),
+    "vorticity_nrmse",
+    "cloud_distance",
+    "vorticity_rmse",
+    "mse_avg",
+    "vorticity_pearson",
+    "stable_frames",
+    "position_rmse_20",
+    "position_rmse",
+    "spectrum_error",
+    "velocity_rmse",
+    "density_rmse",
+    "momentum_error",
+    "shape_error",
+    "connectivity",
+    "sliced_w2",
 )
 """Metrics to show at first where a data set has them, the ranking one aside."""
 
 CURVES = (
-    *(
-        "vorticity_rmse",
-        "attribute_mse",
-        "position_rmse",
-        "vorticity_pearson",
-        "energy_ratio",
-    ),
-    *("density_rmse", "divergence_rms"),
+    "vorticity_rmse",
+    "attribute_mse",
+    "position_rmse",
+    "vorticity_pearson",
+    "energy_ratio",
+    "density_rmse",
+    "divergence_rms",
 )
 """Metrics that details have curves of, beside the ranking one."""
 
 TRIAL = "tiny"  # the size for trying out: nobody is asked to submit to it
 
-ENERGIES = ("energy_true", "energy_predicted")
+TRUE_ENERGY = "energy_true"
+PREDICTED_ENERGY = "energy_predicted"
 
-TRUTH = 0
-PREDICTION = 1  # sides of a preview
+TRUTH = 0  # sides of a preview
+PREDICTION = 1
+
 CURVE_FRAMES = 120  # most frames of a curve
 RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Held:
-    """What a row is made of."""
+class ScoredMethod:
+    """An entry with its score files, from which a row is made."""
 
     entry: Entry
-    current: bool
-    stored: Sequence[Stored]  # score file of each seed
-    scores: Mapping[str, Combined]  # by metric, all seeds together
+    is_current: bool
+    stored: Sequence[ScoreFile]  # score file of each seed
+    scores: Mapping[str, CombinedScore]  # by metric, all seeds together
+
+    @property
+    def method(self) -> str:
+        """Id of the method."""
+        return self.entry.method
+
+    @property
+    def ranking(self) -> str:
+        """Name of the ranking metric."""
+        return self.stored[0].scores.ranking
+
+    @property
+    def preview(self) -> Preview:
+        """Pictures of the first seed."""
+        return self.stored[0].preview
+
+    @property
+    def is_ranked(self) -> bool:
+        """Whether it takes part in the ranking."""
+        is_active = self.entry.status is Status.ACTIVE
+        return is_active and self.is_current and self.ranking in self.scores
 
 
 def collect(
@@ -105,115 +131,149 @@ def collect(
     only: Collection[tuple[str, str]] | None = None,
     registry: Registry | None = None,
 ) -> Board:
-    """Return the board of a leaderboard's folder; of some (split, size) ``only``, or of
-    all.
+    """Return the board of a leaderboard's folder.
+
+    Args:
+        folder: the leaderboard's folder.
+        only: (split, size) to read; all of them when None.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: no leaderboard.
+        UnreadableFileError: an entry or a score file cannot be read.
+        ChecksFailedError: an entry does not fit the schema or its place.
+        DataError: an entry is of a split that is not known.
     """
-    place = Folder(folder)
+    board = Folder(folder)
     described = registry or load()
-    place.require()
-    found: dict[tuple[str, str], list[_Held]] = {}
-    for path in place.entries():
+    board.require()
+
+    methods: dict[tuple[str, str], list[ScoredMethod]] = {}
+    for path in board.entries():
         if only is not None and path.parts[1:3] not in only:
             continue
-        entry = read_entry(place.path / path)
-        if entry.yaml_path != path:
-            what = "an entry lies in another place than it says"
-            expected = str(entry.yaml_path)
-            raise ChecksFailedError(
-                what, where=str(path), expected=expected, fix=CHECKS["place"].fix
-            )
-        try:
-            size = described.size(entry.split, entry.size)
-        except UsageError as error:
-            missing = "install the package that adds the split; lagbench list names those that are known"
-            if entry.split in described.splits:
-                fix = error.fix
-            else:
-                fix = missing
-            where = str(place.path / path)
-            raise DataError(
-                error.what, where=where, expected=error.expected, fix=fix
-            ) from error
-        current = is_current(entry.dataset, size)
-        try:
-            stored = [
-                read_stored(place.path / path, size) for path in entry.score_paths
-            ]
-        except UnreadableFileError:
-            if current:
-                raise
-            continue  # old scores that do not fit the task of today
-        scores = combine([held.scores for held in stored])
-        if lacking := [
-            name for name in (stored[0].scores.ranking, *ENERGIES) if name not in scores
-        ]:
-            what = "a score file lacks metrics that every one has"
-            file = place.path / entry.score_paths[0]
-            fix = "score the predictions again: lagbench submit"
-            raise UnreadableFileError(
-                what, where=str(file), expected=", ".join(lacking), fix=fix
-            )
-        held = _Held(entry=entry, current=current, stored=stored, scores=scores)
-        found.setdefault((entry.split, entry.size), []).append(held)
-    verified = read_verified(place)
+        method = _read_method(board, path, described)
+        if method is not None:
+            data_set = (method.entry.split, method.entry.size)
+            methods.setdefault(data_set, []).append(method)
+
+    verified = read_verified(board)
     tabs = []
     empty = []
-    for split, about in described.splits.items():
-        for name in about.sizes:
-            if only is not None and (split, name) not in only:
+    for split, description in described.splits.items():
+        for name in description.sizes:
+            data_set = (split, name)
+            if only is not None and data_set not in only:
                 continue
             size = described.size(split, name)
-            if (split, name) in found:
-                floors = read_references(place, size)
-                tabs.append(
-                    _tab(size, about.title, found[split, name], floors, verified)
+            if data_set in methods:
+                tab = _make_tab(
+                    size,
+                    description.title,
+                    methods=methods[data_set],
+                    references=read_references(board, size),
+                    verified=verified,
                 )
+                tabs.append(tab)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
-                empty.append((split, name))
-    seen = {name for tab in tabs for row in tab.lines for name in row.values}
-    metrics = {name: metric for name, metric in METRICS.items() if name in seen}
+                empty.append(data_set)
+
+    shown: set[str] = set()
+    for tab in tabs:
+        for row in tab.lines:
+            shown.update(row.values)
+    metrics = {name: metric for name, metric in METRICS.items() if name in shown}
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
 
 
-def _tab(
+def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod | None:
+    """Return an entry with its scores; None for old scores of another task."""
+    entry = read_entry(board.path / path)
+    if entry.yaml_path != path:
+        raise ChecksFailedError(
+            "an entry lies in another place than it says",
+            where=str(path),
+            expected=str(entry.yaml_path),
+            fix=CHECKS["place"].fix,
+        )
+    size = _size_of(entry, registry, where=board.path / path)
+    current = is_current(entry.dataset, size)
+    try:
+        stored = [
+            read_score_file(board.path / path, size) for path in entry.score_paths
+        ]
+    except UnreadableFileError:
+        if current:
+            raise
+        return None
+
+    scores = combine([seed.scores.tallies for seed in stored])
+    needed = (stored[0].scores.ranking, TRUE_ENERGY, PREDICTED_ENERGY)
+    missing = [name for name in needed if name not in scores]
+    if missing:
+        raise UnreadableFileError(
+            "a score file lacks metrics that every one has",
+            where=str(board.path / entry.score_paths[0]),
+            expected=", ".join(missing),
+            fix="score the predictions again: lagbench submit",
+        )
+    return ScoredMethod(entry=entry, is_current=current, stored=stored, scores=scores)
+
+
+def _size_of(entry: Entry, registry: Registry, *, where: Path) -> Size:
+    try:
+        return registry.size(entry.split, entry.size)
+    except UsageError as error:
+        fix = error.fix
+        if entry.split not in registry.splits:
+            fix = (
+                "install the package that adds the split; lagbench list names those "
+                "that are known"
+            )
+        raise DataError(
+            error.what, where=str(where), expected=error.expected, fix=fix
+        ) from error
+
+
+def _make_tab(
     size: Size,
     title: str,
-    found: Sequence[_Held],
-    floors: Sequence[ReferenceScores],
+    *,
+    methods: Sequence[ScoredMethod],
+    references: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
 ) -> Tab:
-    # maps of truth and prediction share one packing: an explosion leaves nothing of the
-    # truth
-    witness = min(found, key=lambda held: (held.stored[0].precision, held.entry.method))
-    ranking = witness.stored[0].scores.ranking
-    ranked = {
-        held.entry.method: held.scores[ranking].seeds
-        for held in found
-        if held.current
-        and held.entry.status is Status.ACTIVE
-        and ranking in held.scores
-    }
-    places = standings(ranked)
+    # Maps of truth and prediction share one packing: an explosion leaves nothing of the
+    # truth. The reference entry is the one with the finest packing.
+    reference_entry = min(methods, key=_coarseness)
+    ranking = reference_entry.ranking
+    places = _rank(methods, ranking)
 
-    def order(held: _Held) -> tuple[bool, float, str]:
-        if ranking in held.scores:
-            loss = mean_loss(held.scores[ranking].seeds)
-        else:
-            loss = math.inf
-        return held.entry.method not in ranked, loss, held.entry.method
+    def order(method: ScoredMethod) -> tuple[bool, float, str]:
+        loss = math.inf
+        if ranking in method.scores:
+            loss = mean_loss(method.scores[ranking].seeds)
+        return method.method not in places, loss, method.method
 
-    rows = [
-        _row(
-            held,
+    rows = []
+    for method in sorted(methods, key=order):
+        row = _make_row(
+            method,
             size,
-            places.get(held.entry.method),
-            verification_of(held.entry, verified),
-            floors,
+            standing=places.get(method.method),
+            verified=verification_of(method.entry, verified),
+            references=references,
         )
-        for held in sorted(found, key=order)
-    ]
-    shown = {name for row in rows for name in row.values}
-    curved = {name for row in rows for name in row.curves}
+        rows.append(row)
+
+    columns = []
+    for name in dict.fromkeys((ranking, *COLUMNS)):
+        if any(name in row.values for row in rows):
+            columns.append(name)
+    curves = []
+    for name in _names_of_curves(ranking):
+        if any(name in row.curves for row in rows):
+            curves.append(name)
     scenarios = tuple(sorted(size.subsets["test"]))
     return Tab(
         size=size,
@@ -223,186 +283,228 @@ def _tab(
         marked=reported_frames(size),
         ranking=ranking,
         decided=len(scenarios) >= FEWEST_SCENARIOS,
-        columns=tuple(
-            name for name in dict.fromkeys((ranking, *COLUMNS)) if name in shown
-        ),
-        curves=tuple(name for name in _with_curves(ranking) if name in curved),
-        energy=curve(witness.scores[ENERGIES[0]].score),
-        truth=_pictures(witness.stored[0].preview, TRUTH),
+        columns=tuple(columns),
+        curves=tuple(curves),
+        energy=make_curve(reference_entry.scores[TRUE_ENERGY].score),
+        truth=_make_pictures(reference_entry.preview, TRUTH),
         rows=tuple(rows),
-        floors=tuple(_floor(held, size, ranking) for held in floors),
+        references=tuple(_make_reference(r, size, ranking) for r in references),
         solver_seconds=solver_seconds(size),
     )
 
 
-def _row(
-    held: _Held,
+def _coarseness(method: ScoredMethod) -> tuple[float, str]:
+    return method.stored[0].precision, method.method
+
+
+def _rank(methods: Sequence[ScoredMethod], ranking: str) -> Mapping[str, Standing]:
+    ranked = {}
+    for method in methods:
+        if method.is_ranked and ranking in method.scores:
+            ranked[method.method] = method.scores[ranking].seeds
+    return standings(ranked)
+
+
+def _make_row(
+    method: ScoredMethod,
     size: Size,
+    *,
     standing: Standing | None,
     verified: Verification | None,
-    floors: Sequence[ReferenceScores],
-) -> Row:
-    preview = held.stored[0].preview
-    ranking = held.stored[0].scores.ranking
-    scores = {name: found.score for name, found in held.scores.items()}
-    known = {
-        f.name: f.scores[ranking]
-        for f in floors
-        if f.name in COUNTING and ranking in f.scores
-    }
-    better = None
-    if held.current and (found := skill(held.scores[ranking].seeds, known)) is not None:
-        low, high = found.interval
-        better = Value(
-            mean=found.value,
-            std=found.std,
-            low=low,
-            high=high,
-            per_scenario=(),
-            at={},
-            undefined=0,
+    references: Sequence[ReferenceScores],
+) -> BoardRow:
+    values = {}
+    scores = {}
+    for name, combined in method.scores.items():
+        scores[name] = combined.score
+        values[name] = _make_value(
+            combined.score, interval=combined.interval, std=combined.std, size=size
         )
-    return Row(
-        entry=held.entry,
-        current=held.current,
-        rank=standing.rank if standing else None,
-        tied=standing is not None and standing.tied and not math.isnan(standing.p),
-        p=standing.p if standing else math.nan,
+
+    rank = None
+    is_tied = False
+    p = math.nan
+    if standing is not None:
+        rank = standing.rank
+        p = standing.p
+        is_tied = standing.tied and not math.isnan(p)
+    return BoardRow(
+        entry=method.entry,
+        current=method.is_current,
+        rank=rank,
+        tied=is_tied,
+        p=p,
         verified=verified,
-        skill=better,
-        values={
-            name: _value(one.score, one.interval, one.std, size)
-            for name, one in held.scores.items()
-        },
-        seed_means=held.scores[ranking].means,
-        curves=_curves(scores, ranking),
-        energy=curve(scores[ENERGIES[1]]),
-        pictures=_pictures(preview, PREDICTION),
-        residuals=residuals(preview),
+        skill=_skill_of(method, references),
+        values=values,
+        seed_means=method.scores[method.ranking].means,
+        curves=_make_curves(scores, method.ranking),
+        energy=make_curve(scores[PREDICTED_ENERGY]),
+        pictures=_make_pictures(method.preview, PREDICTION),
+        residuals=residual_histograms(method.preview),
     )
 
 
-def _floor(held: ReferenceScores, size: Size, ranking: str) -> ReferenceRow:
-    energy = held.scores.get(ENERGIES[1])
-    about = REFERENCES[held.name]
-    cost = Cost.model_construct(
-        seconds_per_frame=held.seconds_per_frame,
-        device="one core, where the floors were measured",
-        solver_seconds_per_frame=solver_seconds(size),
+def _skill_of(
+    method: ScoredMethod, references: Sequence[ReferenceScores]
+) -> Value | None:
+    """Return the skill beside the best naive baseline, where one was scored."""
+    if not method.is_current:
+        return None
+    ranking = method.ranking
+    baselines = {}
+    for reference in references:
+        if reference.name in COUNTING and ranking in reference.scores:
+            baselines[reference.name] = reference.scores[ranking]
+    found = compute_skill(method.scores[ranking].seeds, baselines)
+    if found is None:
+        return None
+    low, high = found.interval
+    return Value(
+        mean=found.value,
+        std=found.std,
+        low=low,
+        high=high,
+        per_scenario=(),
+        at={},
+        undefined=0,
     )
+
+
+def _make_reference(
+    reference: ReferenceScores, size: Size, ranking: str
+) -> ReferenceRow:
+    description = REFERENCES[reference.name]
+    values = {}
+    for name, score in reference.scores.items():
+        values[name] = _make_value(
+            score, interval=score.interval, std=math.nan, size=size
+        )
+
+    energy = None
+    energy_score = reference.scores.get(PREDICTED_ENERGY)
+    if energy_score is not None:
+        defined_share = np.isfinite(energy_score.per_frame).mean()
+        if defined_share > 0.5:
+            energy = make_curve(energy_score)
+
+    cost = None
+    if not math.isnan(reference.seconds_per_frame):
+        cost = EntryCost.model_construct(
+            seconds_per_frame=reference.seconds_per_frame,
+            device="one core, where the reference predictors were measured",
+            solver_seconds_per_frame=solver_seconds(size),
+        )
     return ReferenceRow(
-        name=held.name,
-        definition=about.definition,
-        values={
-            name: _value(score, score.interval, math.nan, size)
-            for name, score in held.scores.items()
-        },
-        curves=_curves(held.scores, ranking),
-        energy=curve(energy)
-        if energy is not None and np.isfinite(energy.per_frame).mean() > 0.5
-        else None,
-        counts=about.counts,
-        cost=None if math.isnan(held.seconds_per_frame) else cost,
+        name=reference.name,
+        definition=description.definition,
+        values=values,
+        curves=_make_curves(reference.scores, ranking),
+        energy=energy,
+        counts=description.counts,
+        cost=cost,
     )
 
 
-def _value(
-    score: Score, interval: tuple[float, float], std: float, size: Size
+def _make_value(
+    score: Score, *, interval: tuple[float, float], std: float, size: Size
 ) -> Value:
     low, high = interval
-    frames = [frame for frame in reported_frames(size) if frame in score.frames]
+    at = {}
+    if score.metric.per_frame:
+        for frame in reported_frames(size):
+            if frame in score.frames:
+                at[frame] = mean(score.at(frame))
     return Value(
         mean=score.mean,
         std=std,
         low=low,
         high=high,
         per_scenario=tuple(score.values.tolist()),
-        at={frame: mean(score.at(frame)) for frame in frames}
-        if score.metric.per_frame
-        else {},
+        at=at,
         undefined=sum(score.undefined),
     )
 
 
-def _with_curves(ranking: str) -> dict[str, None]:
-    """Return the metrics to draw over frames, the ranking one or what stands for it
-    first.
+def _names_of_curves(ranking: str) -> tuple[str, ...]:
+    """Return the metrics to draw over frames, the ranking one or its parts first."""
+    return tuple(dict.fromkeys((ranking, *METRICS[ranking].of, *CURVES)))
+
+
+def _make_curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
+    curves = {}
+    for name in _names_of_curves(ranking):
+        score = scores.get(name)
+        if score is not None and score.metric.per_frame and score.frames:
+            curves[name] = make_curve(score)
+    return curves
+
+
+def make_curve(score: Score) -> Curve:
+    """Return mean, lowest and highest of a metric over scenarios per frame.
+
+    Some metrics have a value at every tenth frame: the other frames are left out, they
+    are no gaps.
     """
-    return dict.fromkeys((ranking, *METRICS[ranking].of, *CURVES))
-
-
-def _curves(scores: Mapping[str, Score], ranking: str) -> dict[str, Curve]:
-    known = {name: scores[name] for name in _with_curves(ranking) if name in scores}
-    return {
-        name: curve(score)
-        for name, score in known.items()
-        if score.metric.per_frame and score.frames
-    }
-
-
-def curve(score: Score) -> Curve:
-    """Return the mean of a metric over scenarios per frame, and the lowest and highest
-    of them.
-
-    Some metrics have a value at every tenth frame: the others are left out, they are no
-    gaps.
-    """
-    measured = np.flatnonzero(np.isfinite(score.per_frame).any(axis=0))
+    is_measured = np.isfinite(score.per_frame).any(axis=0)
+    measured = np.flatnonzero(is_measured)
     step = int(np.diff(measured).min(initial=len(score.frames)))
-    sampled = range(
-        int(measured[0]) % step if len(measured) else 0, len(score.frames), step
-    )
+    first = 0
+    if len(measured):
+        first = int(measured[0]) % step
+    sampled = range(first, len(score.frames), step)
     chosen = [sampled[i] for i in spaced(len(sampled), CURVE_FRAMES)]
-    values = score.per_frame[:, chosen]
+
+    values = score.per_frame[:, chosen]  # shape [scenario, frame]
     with warnings.catch_warnings():
         # a frame where nothing is defined is NaN
         warnings.simplefilter("ignore", RuntimeWarning)
         middle = np.nanmean(values, axis=0)
         low = np.nanmin(values, axis=0)
         high = np.nanmax(values, axis=0)
-    return Curve(
-        frames=tuple(score.frames[i] for i in chosen), mean=middle, low=low, high=high
-    )
+    frames = tuple(score.frames[i] for i in chosen)
+    return Curve(frames=frames, mean=middle, low=low, high=high)
 
 
-def _pictures(preview: Preview, side: int) -> Pictures:
+def _make_pictures(preview: Preview, side: int) -> Pictures:
+    histograms = []
     ranges = preview.histogram_range.astype(np.float64).tolist()
     shares = preview.histogram[side].astype(np.float64)
+    for (low, high), frame_shares in zip(ranges, shares, strict=True):
+        histograms.append(Histogram(low=low, high=high, shares=frame_shares))
     return Pictures(
         scenario=preview.scenario,
         map_frames=preview.map_frames,
         vorticity=preview.vorticity[side],
-        histograms=tuple(
-            Histogram(low=a, high=b, shares=s)
-            for (a, b), s in zip(ranges, shares, strict=True)
-        ),
+        histograms=tuple(histograms),
         film_frames=preview.film_frames,
         material=preview.material,
         film=preview.film[side],
     )
 
 
-def residuals(preview: Preview) -> tuple[Histogram, ...]:
-    """Return shares of predicted minus true vorticity at each map frame, over +- its
-    greatest.
+def residual_histograms(preview: Preview) -> tuple[Histogram, ...]:
+    """Return shares of predicted minus true vorticity at each map frame.
+
+    The range is symmetric, up to the greatest residual.
     """
     truth, prediction = preview.vorticity.astype(np.float64)
-    found = []
+    half = RESIDUAL_BINS // 2
+    histograms = []
     for difference in prediction - truth:
         values = difference[~np.isnan(difference)]
-        end = float(np.max(np.abs(values), initial=0.0))
-        half = RESIDUAL_BINS // 2
+        if not values.size:
+            no_shares = np.full(RESIDUAL_BINS, np.nan)
+            histograms.append(Histogram(low=0.0, high=0.0, shares=no_shares))
+            continue
+        greatest = float(np.max(np.abs(values)))
         # a field without any error is one bin, not a division by 0
-        bins = np.rint((values / end if end else values) * half).astype(int) + half
+        relative = values / greatest if greatest else values
+        bins = np.rint(relative * half).astype(int) + half
         counts = np.bincount(bins, minlength=RESIDUAL_BINS)
-        if values.size:
-            shares = counts / values.size
-        else:
-            shares = np.full(RESIDUAL_BINS, np.nan)
-        found.append(
-            Histogram(low=-end if values.size else 0.0, high=end, shares=shares)
-        )
-    return tuple(found)
+        shares = counts / values.size
+        histograms.append(Histogram(low=-greatest, high=greatest, shares=shares))
+    return tuple(histograms)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -413,52 +515,71 @@ class BuildResult:
     bytes: int
     tabs: int  # splits and sizes on it
     rows: int  # entries on it
-    written: tuple[Path, ...]  # files that were missing or had other bytes
+    written: tuple[Path, ...]  # files that were missing or had another content
 
 
 def build(
     board: str | Path, *, check: bool = False, registry: Registry | None = None
 ) -> BuildResult:
-    """Write page and schema.json where they are stale; with ``check`` nothing: what is
-    stale is an error.
+    """Write page and schema.json where they are stale.
+
+    Args:
+        board: the leaderboard's folder.
+        check: whether to write nothing; stale files are an error then.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        ChecksFailedError: with ``check``, a file is stale.
+        UsageError, UnreadableFileError, DataError: see :func:`collect`.
     """
     folder = Folder(board)
-    held = collect(board, registry=registry)
-    links = {
-        label: path for label, path in LINKS.items() if (folder.path / path).exists()
-    }
     page = folder.path / PAGE
-    if (
-        check and page.is_file()
-    ):  # a copy of the folder elsewhere still has the links of where it was drawn
-        said = page.read_bytes()
-        links = {
-            n: path
-            for n, path in LINKS.items()
-            if str(tag("a", n, href=path)).encode() in said
-        }
-    wanted = {page: render(held, links).encode(), folder.path / SCHEMA: schema_bytes()}
-    stale = [
-        path
-        for path, data in wanted.items()
-        if path.is_symlink() or not path.is_file() or path.read_bytes() != data
-    ]
+    schema = folder.path / SCHEMA
+    content = collect(board, registry=registry)
+    new_page = render(content, _links_of(folder, check=check))
+    new_schema = schema_bytes()
+
+    stale = {}
+    if not _is_file(page) or not same_page(page.read_bytes(), new_page.encode()):
+        stale[page] = new_page.encode()
+    if not _is_file(schema) or schema.read_bytes() != new_schema:
+        stale[schema] = new_schema
     if stale and check:
         raise ChecksFailedError(
             "the page is not what the submissions give",
             where=", ".join(str(path) for path in stale),
             expected=", ".join(
-                f"{path.name} of {len(wanted[path])} bytes" for path in stale
+                f"{path.name} of {len(data)} bytes" for path, data in stale.items()
             ),
             got="another content, or no file",
             fix=f"lagbench leaderboard build --board {board}",
         )
-    for path in stale:
-        write_atomically(path, wanted[path], option="--board")
+    for path, data in stale.items():
+        write_atomically(path, data, option="--board")
     return BuildResult(
         page=page,
-        bytes=len(wanted[page]),
-        tabs=len(held.tabs),
-        rows=sum(len(tab.rows) for tab in held.tabs),
+        bytes=page.stat().st_size,
+        tabs=len(content.tabs),
+        rows=sum(len(tab.rows) for tab in content.tabs),
         written=tuple(stale),
     )
+
+
+def _is_file(path: Path) -> bool:
+    return path.is_file() and not path.is_symlink()
+
+
+def _links_of(folder: Folder, *, check: bool) -> dict[str, str]:
+    """Return the links of the page: to files that are there.
+
+    A copy of the folder elsewhere still has the links of where its page was drawn, so a
+    page that is checked keeps its links.
+    """
+    page = folder.path / PAGE
+    if check and page.is_file():
+        return links_in(page.read_bytes())
+    links = {}
+    for label, address in LINKS.items():
+        if (folder.path / address).exists():
+            links[label] = address
+    return links

@@ -1,21 +1,20 @@
-"""Columns of the board's tables, what a row has in each, and the presets that choose
-among them.
-"""
+"""Columns of the board's tables, the values of rows in them, and presets of columns."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from lagbench.figures.html import MISSING, sentence, text, words
 from lagbench.metrics.metric import Direction, Metric, mean
 
-from .entry import EntryBudget
-from .model import ReferenceRow, Row, Tab, Value
+from .entry import EntryBudget, EntryCost
+from .model import BoardRow, ReferenceRow, Tab, Value
+
+TableRow = BoardRow | ReferenceRow
 
 MAIN_METRICS = 5
 """Metrics of the first table, the ranking one among them; with more it would be wider
@@ -24,50 +23,53 @@ than a screen.
 
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "position": (
-        *(
-            "cloud_distance",
-            "position_rmse_20",
-            "position_rmse",
-            "position_mae",
-            "velocity_rmse",
-        ),
-        *(
-            "velocity_mae",
-            "attribute_mse",
-            "mse_avg",
-            "mse_end",
-            "sliced_w2",
-            "sinkhorn",
-            "sinkhorn_pot",
-        ),
-        *(
-            f"position_rmse_{material}"
-            for material in ("liquid", "jelly", "snow", "rope")
-        ),
+        "cloud_distance",
+        "position_rmse_20",
+        "position_rmse",
+        "position_mae",
+        "velocity_rmse",
+        "velocity_mae",
+        "attribute_mse",
+        "mse_avg",
+        "mse_end",
+        "sliced_w2",
+        "sinkhorn",
+        "sinkhorn_pot",
+        "position_rmse_liquid",
+        "position_rmse_jelly",
+        "position_rmse_snow",
+        "position_rmse_rope",
     ),
     "vorticity": (
-        *(
-            "vorticity_nrmse",
-            "vorticity_rmse",
-            "vorticity_mae",
-            "vorticity_pearson",
-            "stable_frames",
-        ),
-        *("spectrum_error", "vorticity_residual_std", "vorticity_residual_max"),
-        *(
-            "vorticity_residual_slope",
-            "vorticity_kl",
-            "vorticity_kl_hist",
-            "vorticity_w1",
-        ),
+        "vorticity_nrmse",
+        "vorticity_rmse",
+        "vorticity_mae",
+        "vorticity_pearson",
+        "stable_frames",
+        "spectrum_error",
+        "vorticity_residual_std",
+        "vorticity_residual_max",
+        "vorticity_residual_slope",
+        "vorticity_kl",
+        "vorticity_kl_hist",
+        "vorticity_w1",
     ),
     "energy": (
-        *("energy_error", "energy_ratio", "energy_retention", "energy_retention_true"),
-        *("energy_predicted", "energy_true"),
+        "energy_error",
+        "energy_ratio",
+        "energy_retention",
+        "energy_retention_true",
+        "energy_predicted",
+        "energy_true",
     ),
     "conservation": (
-        *("momentum_error", "angular_momentum_error", "density_rmse"),
-        *("divergence_rms", "divergence_rms_true", "shape_error", "connectivity"),
+        "momentum_error",
+        "angular_momentum_error",
+        "density_rmse",
+        "divergence_rms",
+        "divergence_rms_true",
+        "shape_error",
+        "connectivity",
     ),
     "training": (
         "track",
@@ -90,6 +92,8 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
 first.
 """
 
+COUNT_UNITS = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
@@ -101,10 +105,10 @@ class Column:
     direction: Direction = Direction.NONE
     perfect: float | None = None
     form: str = "number"  # how cells are written: number, count, factor or text
-    reported: bool = False  # said by the submitter, computed again by nobody
+    reported: bool = False  # stated by the submitter, computed again by nobody
     meaning: str
-    # what a row has there, where no metric stands behind
-    of: Callable[[Row | ReferenceRow], object] | None = None
+    # value of a row, where the column shows no metric
+    read: Callable[[TableRow], object] | None = None
 
     @property
     def quantity(self) -> str:
@@ -114,14 +118,75 @@ class Column:
         return self.label
 
     def loss(self, value: float) -> float:
-        """Return the value turned so that smaller is better; NaN for what is not
+        """Return the value turned so that smaller is better; NaN where nothing is
         judged.
         """
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
-        return {Direction.LOWER: value, Direction.HIGHER: -value}.get(
-            self.direction, math.nan
-        )
+        if self.direction is Direction.LOWER:
+            return value
+        if self.direction is Direction.HIGHER:
+            return -value
+        return math.nan
+
+
+def _cost_of(row: TableRow) -> EntryCost | None:
+    if isinstance(row, ReferenceRow):
+        return row.cost
+    return row.entry.cost
+
+
+def _read_cost(key: str) -> Callable[[TableRow], object]:
+    """Return a function that reads a part of a row's cost."""
+    return lambda row: getattr(_cost_of(row), key, None)
+
+
+def _read_entry(key: str) -> Callable[[TableRow], object]:
+    """Return a function that reads a key of a row's entry."""
+
+    def read(row: TableRow) -> object:
+        if isinstance(row, ReferenceRow):
+            return None
+        return getattr(row.entry, key)
+
+    return read
+
+
+def _read_budget(key: str) -> Callable[[TableRow], object]:
+    """Return a function that reads a part of a row's budget."""
+    read_budget = _read_entry("budget")
+    return lambda row: getattr(read_budget(row), key, None)
+
+
+def _describe_budget(row: TableRow) -> str:
+    """Return the computing time of one training in words."""
+    if isinstance(row, ReferenceRow) or row.entry.budget is None:
+        return ""
+    budget: EntryBudget = row.entry.budget
+    hours = []
+    if budget.cpu_hours:
+        hours.append(f"{text(budget.cpu_hours)} CPU h")
+    if budget.gpu_hours:
+        hours.append(f"{text(budget.gpu_hours)} GPU h")
+    if hours:
+        return " + ".join(hours)
+    if budget.windows:
+        return f"{_format_count(float(budget.windows))} windows"
+    return ""
+
+
+def _count_seeds(row: TableRow) -> int | None:
+    if isinstance(row, ReferenceRow):
+        return None
+    return len(row.entry.predictions)
+
+
+def _describe_check(row: TableRow) -> str:
+    if isinstance(row, ReferenceRow):
+        return ""
+    if row.verified is None:
+        return "as submitted"
+    return "verified"
 
 
 SKILL = Column(
@@ -129,60 +194,52 @@ SKILL = Column(
     label="skill",
     direction=Direction.HIGHER,
     perfect=1.0,
-    meaning="1 - score / score of the best floor, by the ranking metric: 0 is nothing "
-    "learned, 1 perfect.",
+    meaning="1 - score / score of the best naive baseline, by the ranking metric: 0 is "
+    "nothing learned, 1 perfect.",
 )
 
-
-def _of(part: str, key: str) -> Callable[[Row | ReferenceRow], object]:
-    def of(row: Row | ReferenceRow) -> object:
-        said = row.entry if isinstance(row, Row) else row
-        return getattr(getattr(said, part, None) if part else said, key, None)
-
-    return of
-
-
-def _reported(part: str, key: str, label: str, meaning: str, **how: Any) -> Column:  # noqa: ANN401
-    """Return a column of what submitters say."""
-    return Column(
-        key=key, label=label, meaning=meaning, reported=True, of=_of(part, key), **how
-    )
-
-
-SPEED_UP = "Time of the solver over that of the model per frame."
-TIME = "Wall time of a frame of one scenario."
-TRACK = "Equal compute for all, or trained until it no longer helped."
-OF_ENTRY = (
-    _reported(
-        "cost",
-        "speed_up",
-        "speed\u2011up",
-        SPEED_UP,
+ENTRY_COLUMNS = (
+    Column(
+        key="speed_up",
+        label="speed\u2011up",
         form="factor",
         direction=Direction.HIGHER,
+        reported=True,
+        meaning="Time of the solver over that of the model per frame.",
+        read=_read_cost("speed_up"),
     ),
-    _reported(
-        "cost",
-        "seconds_per_frame",
-        "time per frame",
-        TIME,
+    Column(
+        key="seconds_per_frame",
+        label="time per frame",
         unit="s",
         direction=Direction.LOWER,
+        reported=True,
+        meaning="Wall time of a frame of one scenario.",
+        read=_read_cost("seconds_per_frame"),
     ),
-    _reported(
-        "cost",
-        "solver_seconds_per_frame",
-        "solver time per frame",
-        "On the same machine.",
+    Column(
+        key="solver_seconds_per_frame",
+        label="solver time per frame",
         unit="s",
+        reported=True,
+        meaning="On the same machine.",
+        read=_read_cost("solver_seconds_per_frame"),
     ),
-    _reported("cost", "device", "device", "Machine of both times.", form="text"),
-    _reported(
-        "",
-        "parameters",
-        "parameters",
-        "Trainable parameters of the model.",
+    Column(
+        key="device",
+        label="device",
+        form="text",
+        reported=True,
+        meaning="Machine of both times.",
+        read=_read_cost("device"),
+    ),
+    Column(
+        key="parameters",
+        label="parameters",
         form="count",
+        reported=True,
+        meaning="Trainable parameters of the model.",
+        read=_read_entry("parameters"),
     ),
     Column(
         key="budget",
@@ -190,19 +247,53 @@ OF_ENTRY = (
         form="text",
         reported=True,
         meaning="Computing time of one training.",
-        of=lambda row: _budget(row.entry.budget) if isinstance(row, Row) else "",
+        read=_describe_budget,
     ),
-    _reported("budget", "track", "track", TRACK, form="text"),
-    _reported("budget", "windows", "windows", "Training windows seen.", form="count"),
-    _reported("budget", "epochs", "epochs", "Passes over the training subset."),
-    _reported("budget", "cpu_hours", "CPU time", "Of one training.", unit="h"),
-    _reported("budget", "gpu_hours", "GPU time", "Of one training.", unit="h"),
+    Column(
+        key="track",
+        label="track",
+        form="text",
+        reported=True,
+        meaning="Equal compute for all, or trained until it no longer helped.",
+        read=_read_budget("track"),
+    ),
+    Column(
+        key="windows",
+        label="windows",
+        form="count",
+        reported=True,
+        meaning="Training windows seen.",
+        read=_read_budget("windows"),
+    ),
+    Column(
+        key="epochs",
+        label="epochs",
+        reported=True,
+        meaning="Passes over the training subset.",
+        read=_read_budget("epochs"),
+    ),
+    Column(
+        key="cpu_hours",
+        label="CPU time",
+        unit="h",
+        reported=True,
+        meaning="Of one training.",
+        read=_read_budget("cpu_hours"),
+    ),
+    Column(
+        key="gpu_hours",
+        label="GPU time",
+        unit="h",
+        reported=True,
+        meaning="Of one training.",
+        read=_read_budget("gpu_hours"),
+    ),
     Column(
         key="seeds",
         label="seeds",
         form="count",
         meaning="Trainings behind the row; with one it speaks of these weights only.",
-        of=lambda row: len(row.entry.predictions) if isinstance(row, Row) else None,
+        read=_count_seeds,
     ),
     Column(
         key="checked",
@@ -210,59 +301,48 @@ OF_ENTRY = (
         form="text",
         meaning="Verified: the maintainers scored these predictions again. As "
         "submitted: they did not.",
-        of=lambda row: (
-            ("verified" if row.verified else "as submitted")
-            if isinstance(row, Row)
-            else ""
-        ),
+        read=_describe_check,
     ),
     Column(
         key="date",
         label="date",
         form="text",
         meaning="Of the submission.",
-        of=_of("", "date"),
+        read=_read_entry("date"),
     ),
 )
-"""Columns that no metric stands behind."""
-
-
-def _budget(budget: EntryBudget | None) -> str:
-    """Return the computing time of a training in words."""
-    if budget is None:
-        return ""
-    hours = {"CPU": budget.cpu_hours, "GPU": budget.gpu_hours}
-    said = [f"{text(value)} {kind} h" for kind, value in hours.items() if value]
-    return " + ".join(said) or (
-        f"{_count(float(budget.windows))} windows" if budget.windows else ""
-    )
+"""Columns that show no metric."""
 
 
 def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
-    """Return all columns of a tab by key: skill, the metrics to show at first, the
-    others, then the rest.
+    """Return all columns of a tab by key.
+
+    The skill comes first, then the metrics to show at first, the other metrics, and the
+    columns that show no metric.
     """
-    found = {name for row in tab.lines for name in row.values}
-    names = [name for name in dict.fromkeys((*tab.columns, *metrics)) if name in found]
+    columns = {}
     if any(row.skill for row in tab.rows):
-        columns = [SKILL]
-    else:
-        columns = []
-    for metric in (metrics[name] for name in names):
-        if metric.unit == "1":
-            unit = ""
-        else:
-            unit = metric.unit.replace("^2", "²")
-        shown = Column(
-            key=metric.name,
-            label=words(metric.name),
-            unit=unit,
-            meaning=sentence(metric),
-        )
-        columns.append(
-            replace(shown, direction=metric.direction, perfect=metric.perfect)
-        )
-    return {column.key: column for column in (*columns, *OF_ENTRY)}
+        columns[SKILL.key] = SKILL
+    for name in dict.fromkeys((*tab.columns, *metrics)):
+        if any(name in row.values for row in tab.lines):
+            columns[name] = _metric_column(metrics[name])
+    for column in ENTRY_COLUMNS:
+        columns[column.key] = column
+    return columns
+
+
+def _metric_column(metric: Metric) -> Column:
+    unit = ""
+    if metric.unit != "1":
+        unit = metric.unit.replace("^2", "²")
+    return Column(
+        key=metric.name,
+        label=words(metric.name),
+        unit=unit,
+        direction=metric.direction,
+        perfect=metric.perfect,
+        meaning=sentence(metric),
+    )
 
 
 def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
@@ -270,72 +350,83 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     last.
     """
     main = ("skill", *tab.columns[:MAIN_METRICS], "speed_up", "budget", "checked")
-    return {
-        name: tuple(key for key in columns if key in ("skill", tab.ranking, *keys))
-        for name, keys in {"main": main, **PRESETS, "all": tuple(columns)}.items()
-        if any(key in columns for key in keys)
-    }
+    keys_by_name = {"main": main, **PRESETS, "all": tuple(columns)}
+    presets = {}
+    for name, keys in keys_by_name.items():
+        if columns.keys().isdisjoint(keys):
+            continue
+        shown_keys = {"skill", tab.ranking, *keys}
+        presets[name] = tuple(key for key in columns if key in shown_keys)
+    return presets
 
 
-def value_of(row: Row | ReferenceRow, column: Column) -> float | str:
-    """Return what a row has in a column; NaN, or an empty text, where it has
-    nothing.
-    """
-    if (value := held(row, column.key)) is not None:
+def value_of(row: TableRow, column: Column) -> float | str:
+    """Return the value of a row in a column; NaN or an empty text where it has none."""
+    value = metric_value(row, column.key)
+    if value is not None:
         return value.mean
-    if column.of:
-        found = column.of(row)
-    else:
-        found = None
+    content = None
+    if column.read is not None:
+        content = column.read(row)
     if column.form == "text":
-        return str(found or "")
-    if found is None:
+        return str(content or "")
+    if content is None:
         return math.nan
-    return float(str(found))
+    return float(str(content))
 
 
-def loss_of(row: Row | ReferenceRow, column: Column) -> float:
-    """Return what a row loses in a column, smaller is better; NaN where nothing is
+def loss_of(row: TableRow, column: Column) -> float:
+    """Return the loss of a row in a column, smaller is better; NaN where nothing is
     judged.
 
-    Of a metric that aims at a value the mean of the scenarios' losses: beside and
-    beyond do not cancel.
+    Where the metric aims at a value, the loss is the mean over scenarios of their
+    distances from it: values below and above do not cancel.
     """
     value = value_of(row, column)
-    found = held(row, column.key)
-    if column.direction is Direction.TARGET and found is not None:
-        return mean(np.array([column.loss(one) for one in found.per_scenario]))
+    metric = metric_value(row, column.key)
+    if column.direction is Direction.TARGET and metric is not None:
+        losses = [column.loss(scenario_mean) for scenario_mean in metric.per_scenario]
+        return mean(np.array(losses))
     if isinstance(value, str):
         return math.nan
     return column.loss(value)
 
 
-def held(row: Row | ReferenceRow, key: str) -> Value | None:
+def metric_value(row: TableRow, key: str) -> Value | None:
     """Return the value of a metric, or the skill; None where a row has none."""
-    if key == "skill" and isinstance(row, Row):
+    if key == SKILL.key and isinstance(row, BoardRow):
         return row.skill
     return row.values.get(key)
 
 
-def written(value: float | str, form: str) -> str:
+def format_value(value: float | str, form: str) -> str:
     """Return the text of a cell.
 
-    >>> written(0.012345, "number"), written(1612345.0, "count"), written(17.25, "factor")
-    ('0.0123', '1.61 M', '17.2×')
+    >>> format_value(0.012345, "number"), format_value(1612345.0, "count")
+    ('0.0123', '1.61 M')
+    >>> format_value(17.25, "factor")
+    '17.2×'
     """
     if isinstance(value, str):
         return value or MISSING
     if form == "count":
-        return _count(value)
-    said = text(value)
+        return _format_count(value)
     if form == "factor" and math.isfinite(value):
-        return f"{said}×"
-    return said
-
-
-def _count(value: float) -> str:
-    """Return a whole number with at most three digits and what they stand for."""
-    for unit, name in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if value >= 0.9995 * unit:
-            return f"{text(value / unit)} {name}"
+        return f"{text(value)}×"
     return text(value)
+
+
+def _format_count(value: float) -> str:
+    """Return a whole number with at most three digits and a unit of counts."""
+    for factor, name in COUNT_UNITS:
+        if value >= 0.9995 * factor:
+            return f"{text(value / factor)} {name}"
+    return text(value)
+
+
+def leader_of(rows: Sequence[BoardRow]) -> BoardRow | None:
+    """Return the first ranked row; None where nothing is ranked."""
+    for row in rows:
+        if row.rank is not None:
+            return row
+    return None

@@ -1,169 +1,52 @@
-"""An entry of the leaderboard: one method on one split and size, as its YAML file says
-it.
+"""An entry of the leaderboard: one method on one split and size, as its YAML file.
 
-Everything but the score block is written by whoever submits; the score block is written
-by ``lagbench submit`` alone. Strangers write these files, so every text has a length,
-every number a range, links are http(s) and nothing else, and unknown keys are refused.
-Whether the maintainers scored the predictions again is said elsewhere: verified.yaml.
+A submitter writes everything but the score block; ``lagbench submit`` alone writes the
+score block. Unknown keys are refused. Whether the maintainers scored the predictions
+again stands elsewhere: in verified.yaml.
 """
 
 from __future__ import annotations
 
-import datetime
 import enum
-import ipaddress
-import unicodedata
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
-from urllib.parse import urlsplit
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    StringConstraints,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lagbench.data.checksums import round_digits
 from lagbench.submission.budget import Budget, Track, track_of
 from lagbench.submission.format import Header
+from lagbench.submission.provenance import TrainingProvenance
 
+from .fields import (
+    MOST_BYTES,
+    MOST_SEEDS,
+    Date,
+    Hash,
+    InnerPath,
+    Label,
+    Line,
+    Link,
+    Long,
+    Name,
+    Number,
+    Seconds,
+    Seed,
+    Short,
+    Version,
+)
 from .folder import Place, entry_path, score_paths, weights_path
-
-ID = r"^[a-z0-9]+(-[a-z0-9]+)*$"
-# nothing that could end an HTML attribute
-WEB = r"^https?://[A-Za-z0-9][!#-&(-;=?-\[\]_a-z~]*$"
-SHA256 = r"^[0-9a-f]{64}$"
-RELEASE = r"^[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}$"
-LABEL = r"^[a-z0-9_]+$"
-
-PATTERNS: Mapping[str, str] = {
-    ID: "small letters, digits and single hyphens, as in my-model",
-    WEB: "an http:// or https:// address, without spaces and quotes",
-    SHA256: "64 hexadecimal digits",
-    RELEASE: "a version, as in 1.0.0",
-    LABEL: "small letters, digits and underscores",
-}
-"""What texts have to be, in words; people do not read regular expressions."""
-
-LONGEST_ID = 60
-LONGEST_TEXT = 1000
-MOST_SEEDS = 20
-MOST_BYTES = 2**40
-# combining marks on one letter; no script needs more, piles of them cover the
-# neighbours
-MOST_MARKS = 3
 
 OUTSIDE = "in_domain"  # the warning that comes with a share of the positions
 
-BLANKS = frozenset("\u115f\u1160\u2800\u3164\uffa0")
-"""Letters and symbols that show nothing, though Unicode counts them as printable."""
-
-
-def last_day() -> datetime.date:
-    """Return the last day that an entry may be of: somewhere it is tomorrow."""
-    return datetime.datetime.now(datetime.UTC).date() + datetime.timedelta(days=1)
-
-
-def _line(text: str) -> str:
-    marks = 0
-    for letter in unicodedata.normalize("NFC", text):
-        if unicodedata.category(letter).startswith("M"):
-            marks = marks + 1
-        else:
-            marks = 0
-        if marks > MOST_MARKS:
-            raise ValueError("holds letters under piles of marks")
-    if not text.isprintable() or BLANKS.intersection(text):
-        raise ValueError("holds characters that cannot be printed, such as line breaks")
-    return text
-
-
-def _lines(text: str) -> str:
-    _line(text.replace("\n", ""))
-    return text
-
-
-def _visible(text: str) -> str:
-    if text != text.strip() or not any(letter.isalnum() for letter in text):
-        raise ValueError("holds no letter or digit, or begins or ends with a blank")
-    return text
-
-
-def _named_host(address: str) -> str:
-    """Refuse hosts that read as another one, or that are no name that anybody could
-    look up.
-    """
-    labels: list[str] = []
-    with suppress(
-        ValueError
-    ):  # of what is no address, and of a name, which is no number
-        host = urlsplit(address).hostname or ""
-        labels = host.split(".")
-        ipaddress.ip_address(host.strip("[]"))
-        labels = []
-    puny = any(part.startswith("xn--") for part in labels)
-    if "@" in address or "" in labels[:-1] or len(labels) < 2 or puny:
-        raise ValueError(
-            "is not the address of a named host, without user and punycode"
-        )
-    return address
-
-
-def _inside(path: str) -> str:
-    if (
-        path.startswith("/")
-        or "\\" in path
-        or any(part in ("", ".", "..") for part in path.split("/"))
-    ):
-        raise ValueError(
-            "is no path inside the leaderboard's folder: relative, without '..', "
-            "parted by '/'"
-        )
-    return path
-
-
-Name = Annotated[str, StringConstraints(pattern=ID, max_length=LONGEST_ID)]
-Label = Annotated[str, StringConstraints(pattern=LABEL, max_length=LONGEST_ID)]
-Short = Annotated[
-    str,
-    StringConstraints(min_length=1, max_length=100),
-    AfterValidator(_line),
-    AfterValidator(_visible),
-]
-Line = Annotated[str, StringConstraints(max_length=200), AfterValidator(_line)]
-Long = Annotated[
-    str, StringConstraints(max_length=LONGEST_TEXT), AfterValidator(_lines)
-]
-Link = Annotated[
-    str, StringConstraints(pattern=WEB, max_length=300), AfterValidator(_named_host)
-]
-InnerPath = Annotated[
-    str,
-    StringConstraints(min_length=1, max_length=200),
-    AfterValidator(_line),
-    AfterValidator(_inside),
-]
-Hash = Annotated[str, StringConstraints(pattern=SHA256)]
-Version = Annotated[str, StringConstraints(pattern=RELEASE)]
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
-Seconds = Annotated[float, Field(ge=1e-7, lt=1e9, allow_inf_nan=False)]
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Date = Annotated[
-    datetime.date,
-    BeforeValidator(
-        lambda x: datetime.date.fromisoformat(x) if isinstance(x, str) else x
-    ),
-]
+BUDGET_COUNTS = ("windows", "steps", "start_steps")
+BUDGET_AMOUNTS = ("epochs", "cpu_hours", "validation_hours", "gpu_hours")
+BUDGET_LABELS = ("device", "threads", "metric")
 
 
 class Status(enum.StrEnum):
-    """Where an entry stands in its life."""
+    """Status of an entry on the board."""
 
     ACTIVE = "active"
     SUPERSEDED = "superseded"
@@ -207,64 +90,65 @@ class Prediction(Strict):
     budget: Budget | None = Field(
         default=None, description="what its training took, as the file says"
     )
+    provenance: TrainingProvenance | None = Field(
+        default=None, description="the training behind it, as the file says"
+    )
     weights: Weights | None = None
 
 
-class Cost(Strict):
-    """What a predicted frame costs, and what the solver takes on the same machine."""
+class EntryCost(Strict):
+    """The cost of a predicted frame, and that of the solver on the same machine."""
 
     seconds_per_frame: Seconds
     device: Short
     solver_seconds_per_frame: Seconds | None = None
 
-    @staticmethod
-    def told(
-        headers: Sequence[Header], solver: float | None = None
-    ) -> dict[str, object] | None:
-        """Return the mean cost over files of predictions; None unless all tell it and
-        one machine.
-
-        The solver's time is the one that is given, else the mean of those that the
-        files tell [s]. Predictions may say what no entry may, so these are keys and
-        values to examine, not a cost.
-        """
-        times = [
-            header.seconds_per_frame
-            for header in headers
-            if header.seconds_per_frame is not None
-        ]
-        device = headers[0].device
-        if (
-            len(times) < len(headers)
-            or not device
-            or any(header.device != device for header in headers)
-        ):
-            return None
-        told = [
-            held
-            for one in headers
-            if (held := one.solver_seconds_per_frame) is not None
-        ]
-        return {
-            "seconds_per_frame": round_digits(sum(times) / len(times), 6),
-            "device": device[:100],
-            "solver_seconds_per_frame": solver
-            or (round_digits(sum(told) / len(told), 6) if told else None),
-        }
-
     @property
     def speed_up(self) -> float | None:
         """Solver time over model time; None without the former."""
-        solver = self.solver_seconds_per_frame
-        if solver is None:
+        solver_seconds = self.solver_seconds_per_frame
+        if solver_seconds is None:
             return None
-        return solver / self.seconds_per_frame
+        return solver_seconds / self.seconds_per_frame
+
+
+def mean_cost(
+    headers: Sequence[Header], solver_seconds: float | None = None
+) -> dict[str, object] | None:
+    """Return the mean cost over files of predictions, as keys of an EntryCost.
+
+    The solver's time is the one that is given, else the mean of those in the files [s].
+    Predictions may hold values that no entry may have, so the result is not checked.
+    None unless all files name a time and the same machine.
+    """
+    device = headers[0].device
+    if not device:
+        return None
+
+    model_times = []
+    solver_times = []
+    for header in headers:
+        if header.seconds_per_frame is None or header.device != device:
+            return None
+        model_times.append(header.seconds_per_frame)
+        if header.solver_seconds_per_frame is not None:
+            solver_times.append(header.solver_seconds_per_frame)
+
+    if not solver_seconds and solver_times:
+        solver_seconds = _rounded_mean(solver_times)
+    return {
+        "seconds_per_frame": _rounded_mean(model_times),
+        "device": device[:100],
+        "solver_seconds_per_frame": solver_seconds,
+    }
+
+
+def _rounded_mean(values: Sequence[float]) -> float:
+    return round_digits(sum(values) / len(values), 6)
 
 
 class EntryBudget(Budget):
-    """What the training of one seed took: of several the mean, and the track that all
-    of them belong to.
-    """
+    """The mean training budget over seeds, and the track that all of them belong to."""
 
     track: Track | None = Field(
         default=None,
@@ -272,33 +156,36 @@ class EntryBudget(Budget):
     )
 
     @classmethod
-    def of(cls, size: str, seeds: Sequence[Budget | None]) -> Self | None:
-        """Return the mean over seeds, with the track that all belong to; None unless
-        each has a budget.
+    def mean_over_seeds(cls, size: str, seeds: Sequence[Budget | None]) -> Self | None:
+        """Return the mean over seeds, with the track of all of them.
+
+        None unless each seed has a budget.
         """
-        known = [seed for seed in seeds if seed is not None]
-        if len(known) < len(seeds):
+        budgets = [budget for budget in seeds if budget is not None]
+        if len(budgets) < len(seeds):
             return None
-        held: dict[str, Any] = {}
-        counts = ("windows", "steps", "start_steps")
-        for name in (*counts, "epochs", "cpu_hours", "validation_hours", "gpu_hours"):
-            values = [
-                value for seed in known if (value := getattr(seed, name)) is not None
-            ]
-            if len(values) == len(known):
-                mean = sum(values) / len(values)
-                if name in counts:
-                    held[name] = round(mean)
-                else:
-                    held[name] = round_digits(mean, 6)
-        for name in ("device", "threads", "metric"):
-            if len({getattr(seed, name) for seed in known}) == 1:
-                held[name] = getattr(known[0], name)
-        tracks = {track_of(size, seed) for seed in known}
-        return cls(**held, track=tracks.pop() if len(tracks) == 1 else None)
+
+        fields: dict[str, Any] = {}
+        for name in (*BUDGET_COUNTS, *BUDGET_AMOUNTS):
+            values = [getattr(budget, name) for budget in budgets]
+            if None in values:
+                continue
+            if name in BUDGET_COUNTS:
+                fields[name] = round(sum(values) / len(values))
+            else:
+                fields[name] = _rounded_mean(values)
+        for name in BUDGET_LABELS:
+            labels = {getattr(budget, name) for budget in budgets}
+            if len(labels) == 1:
+                fields[name] = labels.pop()
+
+        tracks = {track_of(size, budget) for budget in budgets}
+        if len(tracks) == 1:
+            fields["track"] = tracks.pop()
+        return cls(**fields)
 
 
-class Flag(Strict):
+class EntryFlag(Strict):
     """A flag of the scorer or a warning of the validation."""
 
     name: Label
@@ -320,23 +207,19 @@ class Summary(Strict):
 
 
 class ScoredFile(Strict):
-    """The score file of one predictions.nc, and what the scorer said beside its
-    numbers.
-    """
+    """The score file of one predictions.nc, with flags and warnings of the scorer."""
 
     sha256: Hash = Field(description="of the score file")
     predictions_sha256: Hash
     diverged_at: Annotated[dict[int, int], Field(max_length=10_000)] = Field(
         default_factory=dict
     )
-    flags: Annotated[tuple[Flag, ...], Field(max_length=20, strict=False)] = ()
-    warnings: Annotated[tuple[Flag, ...], Field(max_length=100, strict=False)] = ()
+    flags: Annotated[tuple[EntryFlag, ...], Field(max_length=20, strict=False)] = ()
+    warnings: Annotated[tuple[EntryFlag, ...], Field(max_length=100, strict=False)] = ()
 
 
 class ScoreBlock(Strict):
-    """What `lagbench submit` writes; `lagbench leaderboard check` forms its numbers
-    again.
-    """
+    """The scores in an entry; `lagbench submit` alone writes them."""
 
     lagbench: Short = Field(description="version of the scorer")
     dataset_sha256: Hash
@@ -348,7 +231,7 @@ class ScoreBlock(Strict):
 
 
 class Verification(Strict):
-    """What the maintainers found of an entry when they scored its predictions again."""
+    """A line of verified.yaml: the maintainers scored these predictions again."""
 
     scores: Annotated[
         tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)
@@ -358,7 +241,7 @@ class Verification(Strict):
 
 
 class About(Strict):
-    """What a submitter says of a method."""
+    """The description of a method by its submitter."""
 
     name: Short | None = Field(default=None, description="what the method is called")
     authors: Annotated[tuple[Short, ...], Field(max_length=50, strict=False)] = ()
@@ -378,13 +261,11 @@ class About(Strict):
     command: Long = Field(
         default="", description="shell commands that make the predictions again"
     )
-    cost: Cost | None = None
+    cost: EntryCost | None = None
 
 
 class Meta(About):
-    """What a submitter says of a method and of this submission of it: keys of
-    ``--from``.
-    """
+    """The description of a method and of one submission of it: keys of ``--from``."""
 
     method: Name | None = Field(
         default=None, description="names the entry; by default what the predictions say"
@@ -396,38 +277,32 @@ class Meta(About):
 class Entry(About):
     """The whole file leaderboard/submissions/<split>/<size>/<method>.yaml."""
 
-    ORDER: ClassVar[tuple[str, ...]] = (
-        *(
-            "format",
-            "split",
-            "size",
-            "method",
-            "name",
-            "authors",
-            "affiliation",
-            "licence",
-            "code",
-            "paper",
-        ),
-        *(
-            "weights",
-            "date",
-            "notes",
-            "status",
-            "superseded_by",
-            "reason",
-            "training",
-            "budget",
-        ),
-        *(
-            "parameters",
-            "hardware",
-            "command",
-            "dataset",
-            "predictions",
-            "cost",
-            "score",
-        ),
+    KEY_ORDER: ClassVar[tuple[str, ...]] = (
+        "format",
+        "split",
+        "size",
+        "method",
+        "name",
+        "authors",
+        "affiliation",
+        "licence",
+        "code",
+        "paper",
+        "weights",
+        "date",
+        "notes",
+        "status",
+        "superseded_by",
+        "reason",
+        "training",
+        "budget",
+        "parameters",
+        "hardware",
+        "command",
+        "dataset",
+        "predictions",
+        "cost",
+        "score",
     )
 
     format: Literal[2]
@@ -450,18 +325,21 @@ class Entry(About):
     score: ScoreBlock
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        seeds = [made.seed for made in self.predictions]
+    def _check_consistency(self) -> Self:
+        seeds = self.seeds
         if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
             raise ValueError("predictions: several need seeds that differ")
-        if [made.sha256 for made in self.predictions] != [
-            f.predictions_sha256 for f in self.score.files
-        ]:
+
+        predicted = [prediction.sha256 for prediction in self.predictions]
+        scored = [file.predictions_sha256 for file in self.score.files]
+        if predicted != scored:
             raise ValueError(
                 "predictions: their hashes are not those of score.files, in the "
                 "same order"
             )
-        if (self.status is Status.SUPERSEDED) != (self.superseded_by is not None):
+
+        is_superseded = self.status is Status.SUPERSEDED
+        if is_superseded != (self.superseded_by is not None):
             raise ValueError(
                 "superseded_by: goes with status: superseded, and only with it"
             )
@@ -474,27 +352,33 @@ class Entry(About):
 
     @property
     def yaml_path(self) -> Path:
-        """Where the entry lies, relative to the leaderboard's folder."""
+        """Path of the entry, relative to the leaderboard's folder."""
         return entry_path(self.place)
 
     @property
+    def seeds(self) -> tuple[int | None, ...]:
+        """Seed of each of the predictions."""
+        return tuple(prediction.seed for prediction in self.predictions)
+
+    @property
     def score_paths(self) -> tuple[Path, ...]:
-        """Where its score files lie, relative to the folder, in the order of the
-        predictions.
-        """
-        return score_paths(self.place, [made.seed for made in self.predictions])
+        """Paths of the score files, relative to the folder, one per prediction."""
+        return score_paths(self.place, self.seeds)
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Score files, then weights with what their trainings recorded: all that lies
-        beside the entry.
-        """
-        weights = [
-            weights_path(self.place, made.seed)
-            for made in self.predictions
-            if made.weights
-        ]
-        return (
-            *self.score_paths,
-            *(path.with_suffix(end) for path in weights for end in (".pt", ".json")),
-        )
+        """Paths of all files beside the entry: scores, weights and training logs."""
+        paths = list(self.score_paths)
+        for prediction in self.predictions:
+            if prediction.weights is not None:
+                path = weights_path(self.place, prediction.seed)
+                paths += [path, path.with_suffix(".json")]
+        return tuple(paths)
+
+    @property
+    def provenance(self) -> TrainingProvenance | None:
+        """Training behind the first seed; None where words of a person describe it."""
+        provenance = self.predictions[0].provenance
+        if provenance is None:
+            return TrainingProvenance.from_sentence(self.training)
+        return provenance

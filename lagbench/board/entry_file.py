@@ -1,139 +1,162 @@
-"""Read and write YAML files: those of submitters, where all stays text, and the list of
-verified entries.
+"""Read and write the YAML files of entries.
 
-That list, leaderboard/verified.yaml, names the entries whose predictions the
-maintainers scored again. It lies apart from the entries, so that nobody can claim it
-for his own: ``leaderboard check --base`` names every change to it. A line holds while
-the entry has the very score files that it names;
-``leaderboard check --predictions FILE --record`` writes it.
+Strangers write these files: their kind and length are looked at before they are read,
+and all that does not fit the schema is reported together.
 """
 
 from __future__ import annotations
 
-import datetime
 import enum
 import json
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar, get_args
 
-from pydantic import BaseModel, RootModel, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from lagbench.atomic import write_atomically
 from lagbench.data.checksums import file_sha256
-from lagbench.data.yamlfile import read_yaml, spell_yaml
-from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError, nearest
-from lagbench.submission.findings import quoted
+from lagbench.data.yamlfile import format_yaml, read_yaml
+from lagbench.errors import (
+    ChecksFailedError,
+    UnreadableFileError,
+    UsageError,
+    suggest_name,
+)
+from lagbench.submission.issues import quote
 
-from .entry import PATTERNS, Entry, Meta, Status, Verification
-from .folder import VERIFIED, Folder, Place, entry_path
+from .entry import Entry, Meta, Status
+from .fields import PATTERNS
+from .folder import Folder, Place, entry_path
 
 MAX_ENTRY_BYTES = 64_000
 """Longest YAML file of an entry [bytes]; twenty seeds and all metrics take half of it.
 """
 
-MOST_MISTAKES = 20  # mistakes of one file that are told
-
-
-@dataclass(frozen=True, kw_only=True)
-class Mistake:
-    """One thing in a file that does not fit its schema."""
-
-    where: str  # key, as in "predictions.0.url"
-    what: str
-    got: str  # what stands there, shortened and escaped
-    fix: str | None = None  # the nearest known key where one is unknown
-
-    def __str__(self) -> str:
-        """Return the mistake as one line."""
-        return f"{self.where}: {self.what}; got {self.got}" + (
-            f"; {self.fix}" if self.fix else ""
-        )
-
+MOST_ISSUES = 20  # issues of one file that are reported
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
+@dataclass(frozen=True, kw_only=True)
+class SchemaIssue:
+    """One place where a file does not fit its schema."""
+
+    where: str  # key, as in "predictions.0.url"
+    what: str
+    got: str  # the value there, shortened and escaped
+    fix: str | None = None  # the nearest known key where one is unknown
+
+    def __str__(self) -> str:
+        """Return the issue as one line."""
+        line = f"{self.where}: {self.what}; got {self.got}"
+        if self.fix:
+            return f"{line}; {self.fix}"
+        return line
+
+
 def load_plain(path: Path) -> Any:  # noqa: ANN401
-    """Return what a YAML file of a submitter holds, after looking at its kind and
-    length.
+    """Return the content of a submitter's YAML file as plain values.
+
+    Raises:
+        UnreadableFileError: no regular file, too long, or no plain YAML.
     """
     try:
-        regular = path.is_file()
+        is_regular = path.is_file()
         length = path.stat().st_size
     except OSError as error:
         raise UnreadableFileError(
             "cannot read the YAML file", where=str(path), got=error.strerror
         ) from error
-    if not regular or length > MAX_ENTRY_BYTES:
-        raise UnreadableFileError(
-            "not a YAML file of an entry",
-            where=str(path),
-            expected=f"a regular file of at most {MAX_ENTRY_BYTES} bytes",
-            got=f"{length} bytes" if regular else "something that is no regular file",
-            fix="describe the method in a few lines; predictions go elsewhere",
-        )
-    return read_yaml(path)
+
+    if is_regular and length <= MAX_ENTRY_BYTES:
+        return read_yaml(path)
+    if is_regular:
+        got = f"{length} bytes"
+    else:
+        got = "something that is no regular file"
+    raise UnreadableFileError(
+        "not a YAML file of an entry",
+        where=str(path),
+        expected=f"a regular file of at most {MAX_ENTRY_BYTES} bytes",
+        got=got,
+        fix="describe the method in a few lines; predictions go elsewhere",
+    )
 
 
 def examine(
     kind: type[Model], value: object
-) -> tuple[Model | None, tuple[Mistake, ...]]:
-    """Return the model that a value describes, or what is wrong with it."""
+) -> tuple[Model | None, tuple[SchemaIssue, ...]]:
+    """Return the model that a value describes, or None and what is wrong with it."""
     try:
         return kind.model_validate(value), ()
     except ValidationError as error:
-        found = error.errors(include_url=False)
-    # a list with a faulty member is said to be too short as well
-    inner = {
-        item["loc"][:depth] for item in found for depth in range(1, len(item["loc"]))
-    }
-    told = [item for item in found if item["loc"] not in inner][:MOST_MISTAKES]
-    return None, tuple(_mistake(kind, item) for item in told)
+        errors = error.errors(include_url=False)
+
+    # pydantic reports a list with a faulty member as too short, too
+    containers = set()
+    for item in errors:
+        for depth in range(1, len(item["loc"])):
+            containers.add(item["loc"][:depth])
+    innermost = [item for item in errors if item["loc"] not in containers]
+    return None, tuple(_issue_from(kind, item) for item in innermost[:MOST_ISSUES])
 
 
-def listed(mistakes: Sequence[Mistake]) -> str:
-    """Return mistakes one below the other."""
-    return "\n    ".join(["", *map(str, mistakes)])
+def format_issues(issues: Sequence[SchemaIssue]) -> str:
+    """Return issues one below the other."""
+    return "\n    ".join(["", *map(str, issues)])
 
 
 def read_entry(path: Path) -> Entry:
-    """Read the entry of a YAML file."""
-    entry, mistakes = examine(Entry, load_plain(path))
+    """Read the entry of a YAML file.
+
+    Raises:
+        UnreadableFileError: the file cannot be read.
+        ChecksFailedError: it does not fit the schema.
+    """
+    entry, issues = examine(Entry, load_plain(path))
     if entry is None:
-        fix = "mend the keys named above; docs/submitting.md describes them"
-        what = f"{len(mistakes)} mistake(s) in an entry"
-        raise ChecksFailedError(what, where=str(path), got=listed(mistakes), fix=fix)
+        raise ChecksFailedError(
+            f"{len(issues)} mistake(s) in an entry",
+            where=str(path),
+            got=format_issues(issues),
+            fix="mend the keys named above; docs/submitting.md describes them",
+        )
     return entry
 
 
 def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
-    """Return what a YAML file and options say; options win, None and empty ones are not
-    given.
+    """Return the description of a method from a YAML file and options.
+
+    Options win. None and empty options count as not given.
+
+    Raises:
+        UsageError: the file holds no keys, or a key does not fit.
+        UnreadableFileError: the file cannot be read.
     """
-    held: object
-    if path is None:
-        held = {}
-    else:
-        held = load_plain(path)
-    if not isinstance(held, dict):
-        expected = "lines of key: value"
+    keys: object = {}
+    if path is not None:
+        keys = load_plain(path)
+    if not isinstance(keys, dict):
         raise UsageError(
-            "the file does not describe a method", where=str(path), expected=expected
+            "the file does not describe a method",
+            where=str(path),
+            expected="lines of key: value",
         )
-    given = {
-        key: value for key, value in options.items() if value not in (None, "", (), [])
-    }
-    meta, mistakes = examine(Meta, {**held, **given})
+    for key, value in options.items():
+        if value not in (None, "", (), []):
+            keys = keys | {key: value}
+
+    meta, issues = examine(Meta, keys)
     if meta is None:
+        where = "options"
+        if path is not None:
+            where = f"{path}, or options"
         raise UsageError(
-            "what is said of the method does not fit",
-            where="options" if path is None else f"{path}, or options",
-            got=listed(mistakes),
+            "the description of the method does not fit",
+            where=where,
+            got=format_issues(issues),
             fix="docs/submitting.md describes the keys",
         )
     return meta
@@ -141,168 +164,107 @@ def read_meta(path: Path | None, options: Mapping[str, object]) -> Meta:
 
 def schema_bytes() -> bytes:
     """Return the JSON schema of an entry as the bytes of leaderboard/schema.json."""
-    schema = {
-        **Entry.model_json_schema(),
-        "$schema": "https://json-schema.org/draft/2020-12/schema",
-    }
+    schema = Entry.model_json_schema()
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "Entry of the lagbench leaderboard"
     return f"{json.dumps(schema, indent=1, ensure_ascii=False)}\n".encode()
 
 
-def spell(value: Any) -> bytes:  # noqa: ANN401
-    """Return an entry, or plain values, as the bytes of a YAML file; equal ones give
-    equal bytes.
-    """
-    if isinstance(value, Entry):
-        held = value.model_dump(mode="python", exclude_defaults=True)
-        value = {key: held[key] for key in Entry.ORDER if key in held}
-    return spell_yaml(_plain(value), default_flow_style=None).encode()
+def entry_bytes(entry: Entry) -> bytes:
+    """Return the bytes of an entry's YAML file; equal entries give equal bytes."""
+    values = entry.model_dump(mode="python", exclude_defaults=True)
+    ordered = {key: values[key] for key in Entry.KEY_ORDER if key in values}
+    return yaml_bytes(ordered)
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401
+def yaml_bytes(value: object) -> bytes:
+    """Return plain values as the bytes of a YAML file."""
+    return format_yaml(_to_plain(value), default_flow_style=None).encode()
+
+
+def _to_plain(value: object) -> object:
     if isinstance(value, dict):
-        return {key: _plain(held) for key, held in value.items()}
+        return {key: _to_plain(member) for key, member in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(held) for held in value]
+        return [_to_plain(member) for member in value]
     if isinstance(value, enum.Enum):
         return str(value)
     return value
 
 
-def _mistake(kind: type[BaseModel], item: ErrorDetails) -> Mistake:
-    place = item["loc"]
-    given = quoted(item["input"])
-    where = quoted(".".join(map(str, place)))[1:-1] or "the file"
+def _issue_from(kind: type[BaseModel], item: ErrorDetails) -> SchemaIssue:
+    """Return one error of pydantic as an issue."""
+    location = item["loc"]
+    where = quote(".".join(map(str, location)))[1:-1] or "the file"
+    got = quote(item["input"])
+
     if item["type"] == "extra_forbidden":
-        for key in place[:-1]:
-            if (
-                isinstance(key, str) and key in kind.model_fields
-            ):  # else a position, or a name in a mapping
-                kind = _model_in(kind.model_fields[key].annotation) or kind
-        fix = nearest(str(place[-1])[:100], list(kind.model_fields))
-        return Mistake(where=where, what="unknown key", got=given, fix=fix)
+        owner = _model_at(kind, location[:-1])
+        fix = suggest_name(str(location[-1])[:100], list(owner.model_fields))
+        return SchemaIssue(where=where, what="unknown key", got=got, fix=fix)
     if item["type"] == "missing":
-        return Mistake(where=where, what="this key is missing", got="no such key")
+        return SchemaIssue(where=where, what="this key is missing", got="no such key")
+
     pattern = item.get("ctx", {}).get("pattern", "")
-    wanted = "a list" if item["type"] == "tuple_type" else PATTERNS.get(pattern)
-    what = (
-        item["msg"].removeprefix("Value error, ")
-        if wanted is None
-        else f"is not {wanted}"
-    )
-    return Mistake(where=where, what=what, got=given)
+    if item["type"] == "tuple_type":
+        what = "is not a list"
+    elif pattern in PATTERNS:
+        what = f"is not {PATTERNS[pattern]}"
+    else:
+        what = item["msg"].removeprefix("Value error, ")
+    return SchemaIssue(where=where, what=what, got=got)
+
+
+def _model_at(
+    kind: type[BaseModel], location: tuple[int | str, ...]
+) -> type[BaseModel]:
+    """Return the model that stands at a location inside a model."""
+    for key in location:
+        # a number is a position in a list; other texts are names in a mapping
+        if isinstance(key, str) and key in kind.model_fields:
+            kind = _model_in(kind.model_fields[key].annotation) or kind
+    return kind
 
 
 def _model_in(annotation: object) -> type[BaseModel] | None:
     """Return the model that a type names, inside a tuple, mapping or option too."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next(
-        (found for inner in get_args(annotation) if (found := _model_in(inner))), None
-    )
-
-
-def readable(path: Path) -> Entry | None:
-    """Return an entry; None of none and of one that cannot be read: `leaderboard check`
-    tells of those.
-    """
-    with suppress(ChecksFailedError, UnreadableFileError):
-        if path.exists():
-            return read_entry(path)
-        return None
+    for inner in get_args(annotation):
+        model = _model_in(inner)
+        if model is not None:
+            return model
     return None
 
 
-def is_there(folder: Folder, path: Path, sha256: str) -> bool:
-    """Tell whether a file lies where its entry says, as it says, and not behind a
-    link.
+def read_entry_if_valid(path: Path) -> Entry | None:
+    """Return an entry; None where there is none and where it cannot be read.
+
+    `lagbench leaderboard check` reports entries that cannot be read.
     """
+    if not path.exists():
+        return None
+    try:
+        return read_entry(path)
+    except (ChecksFailedError, UnreadableFileError):
+        return None
+
+
+def is_unchanged(folder: Folder, path: Path, sha256: str) -> bool:
+    """Tell whether a file has the hash that its entry names, and is no link."""
     file = folder.path / path
-    return (
-        file.is_file() and folder.link_in(path) is None and file_sha256(file) == sha256
-    )
+    if not file.is_file() or folder.link_in(path) is not None:
+        return False
+    return file_sha256(file) == sha256
 
 
-def active_beside(folder: Folder, place: Place) -> dict[Path, Entry]:
-    """Return the other active entries of a split and size, by their paths in the
-    folder.
-    """
-    beside = [
-        path
-        for path in folder.entries()
-        if path.parts[1:3] == place[:2] and path != entry_path(place)
-    ]
-    found = {path: readable(folder.path / path) for path in beside}
-    return {
-        path: one
-        for path, one in found.items()
-        if one is not None and one.status is Status.ACTIVE
-    }
-
-
-class _List(RootModel[dict[str, Verification]]):
-    """Entries, by path relative to the leaderboard's folder."""
-
-
-def read_verified(folder: Folder) -> Mapping[str, Verification]:
-    """Return the list; empty where there is none."""
-    path = folder.path / VERIFIED
-    if not path.exists() and not path.is_symlink():
-        return {}
-    held = load_plain(path)
-    found, mistakes = examine(_List, {} if held is None else held)
-    if found is None:
-        raise ChecksFailedError(
-            "the list of verified entries does not fit",
-            where=str(path),
-            expected="entry path: {scores: [SHA-256, ...], lagbench: VERSION, date: "
-            "YYYY-MM-DD}",
-            got=listed(mistakes),
-            fix="`lagbench leaderboard check --predictions FILE --record` writes it",
-        )
-    return found.root
-
-
-def verification_of(
-    entry: Entry, known: Mapping[str, Verification]
-) -> Verification | None:
-    """Return the line of an entry; None without one, or if it is of other score
-    files.
-    """
-    line = known.get(entry.yaml_path.as_posix())
-    if line and line.scores == tuple(held.sha256 for held in entry.score.files):
-        return line
-    return None
-
-
-def unverified(folder: Folder, entry: Entry) -> bytes | None:
-    """Return the list without an entry's line of other score files; None where it has
-    no such line.
-    """
-    known = read_verified(folder)
-    name = entry.yaml_path.as_posix()
-    if name not in known or verification_of(entry, known) is not None:
-        return None
-    return spell(
-        {path: line.model_dump() for path, line in known.items() if path != name}
-    )
-
-
-def record(folder: Folder, entries: Sequence[Entry]) -> None:
-    """Add entries to the list, or renew their lines; without any the list stays as it
-    is.
-    """
-    if not entries:
-        return
-    held: dict[str, object] = {
-        path: line.model_dump() for path, line in read_verified(folder).items()
-    }
-    for entry in entries:
-        held[entry.yaml_path.as_posix()] = {
-            "scores": tuple(file.sha256 for file in entry.score.files),
-            "lagbench": version("lagbench"),
-            "date": datetime.datetime.now(datetime.UTC).date(),
-        }
-    write_atomically(
-        folder.path / VERIFIED, spell(dict(sorted(held.items()))), option="--board"
-    )
+def read_rivals(folder: Folder, place: Place) -> dict[Path, Entry]:
+    """Return the other active entries of a split and size, by path in the folder."""
+    rivals = {}
+    for path in folder.entries():
+        if path.parts[1:3] != place[:2] or path == entry_path(place):
+            continue
+        entry = read_entry_if_valid(folder.path / path)
+        if entry is not None and entry.status is Status.ACTIVE:
+            rivals[path] = entry
+    return rivals

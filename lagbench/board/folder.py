@@ -2,8 +2,8 @@
 
     submissions/<split>/<size>/<method>.yaml      entries
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
-    floors/<split>/<size>/<name>.nc               scores of the floors
-    weights/<split>/<size>/<method>_<seed>.pt     weights, with the .json that their trainings recorded
+    floors/<split>/<size>/<name>.nc               scores of the reference predictors
+    weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
     verified.yaml, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
@@ -36,16 +36,15 @@ ENDINGS = {
     REFERENCES: (".nc",),
     WEIGHTS: (".pt", ".json"),
 }
-KEPT = ".gitkeep"
+PLACEHOLDER = ".gitkeep"  # keeps an empty folder in git
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-"""What a folder or file may be called: nothing that a terminal or a CI log would obey.
-"""
+"""Names of folders and files: nothing that a terminal or a CI log would obey."""
 
 DEPTH = 4  # parts of a path: submissions or scores, split, size, file name
 
 
 def entry_path(place: Place) -> Path:
-    """Return where an entry lies, relative to the folder.
+    """Return the path of an entry, relative to the folder.
 
     >>> entry_path(("cavity", "mini", "gns")).as_posix()
     'submissions/cavity/mini/gns.yaml'
@@ -55,7 +54,7 @@ def entry_path(place: Place) -> Path:
 
 
 def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
-    """Return where the score files of an entry lie, relative to the folder.
+    """Return the paths of the score files of an entry, relative to the folder.
 
     The names follow from the entry, so that nothing in it can point elsewhere. An
     underscore, which no method has, parts method and seed.
@@ -72,7 +71,7 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
 
 
 def weights_path(place: Place, seed: int | None) -> Path:
-    """Return where the weights of a seed lie, relative to the folder.
+    """Return the path of the weights of a seed, relative to the folder.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
     'weights/cavity/mini/gns_3.pt'
@@ -93,142 +92,140 @@ class Folder:
     ) -> None:
         """Refuse a folder that is no leaderboard."""
         if not (self.path / SUBMISSIONS).is_dir():
-            expected = f"a folder that holds {SUBMISSIONS}/"
             raise UsageError(
-                "no leaderboard here", where=str(self.path), expected=expected, fix=fix
+                "no leaderboard here",
+                where=str(self.path),
+                expected=f"a folder that holds {SUBMISSIONS}/",
+                fix=fix,
             )
 
     def require_room(self) -> None:
-        """Refuse to begin a leaderboard among other files, which its page could
-        replace.
+        """Refuse to begin a leaderboard among other files: its page could replace
+        them.
         """
         if (self.path / SUBMISSIONS).is_dir() or not self.path.exists():
             return
-        others = sorted(
-            name for name in os.listdir(self.path) if name[0] != "." and name != README
+        other_names = []
+        for name in sorted(os.listdir(self.path)):
+            if not name.startswith(".") and name != README:
+                other_names.append(name)
+        if not other_names:
+            return
+
+        shown = ", ".join(ascii(name) for name in other_names[:3])
+        if len(other_names) > 3:
+            shown += " and more"
+        raise UsageError(
+            "no room for a leaderboard",
+            where=str(self.path),
+            expected="a folder that is not there yet, or is empty",
+            got=shown,
+            fix="name another: --board FOLDER",
         )
-        if others:
-            raise UsageError(
-                "no room for a leaderboard",
-                where=str(self.path),
-                expected="a folder that is not there yet, or is empty",
-                got=", ".join(map(ascii, others[:3]))
-                + (" and more" if len(others) > 3 else ""),
-                fix="name another: --board FOLDER",
-            )
 
     def entries(self) -> tuple[Path, ...]:
-        """Return the YAML files of entries, relative to the folder, in the order of
-        their names.
-        """
-        return self._sound(SUBMISSIONS)
+        """Return the YAML files of entries, relative to the folder, ordered by name."""
+        return self._fit_files(SUBMISSIONS)
 
     def data_sets(self) -> tuple[tuple[str, str], ...]:
         """Return the (split, size) that have entries."""
         self.require()
-        return tuple(
-            dict.fromkeys((path.parts[1], path.parts[2]) for path in self.entries())
-        )
+        data_sets = {(path.parts[1], path.parts[2]): None for path in self.entries()}
+        return tuple(data_sets)
 
     def score_files(self) -> tuple[Path, ...]:
-        """Return the score files, relative to the folder, in the order of their
-        names.
-        """
-        return self._sound(SCORES)
+        """Return the score files, relative to the folder, ordered by name."""
+        return self._fit_files(SCORES)
 
     def reference_files(self, split: str = "", size: str = "") -> tuple[Path, ...]:
-        """Return the scores of floors, of one split and size or all, in the order of
-        their names.
-        """
-        return tuple(
-            path
-            for path in self._sound(REFERENCES)
-            if path.parts[1:3] == (split, size) or not split
-        )
+        """Return the score files of reference predictors of a data set, or of all."""
+        paths = self._fit_files(REFERENCES)
+        if not split:
+            return paths
+        return tuple(path for path in paths if path.parts[1:3] == (split, size))
 
     def weight_files(self) -> tuple[Path, ...]:
-        """Return weights and records of their trainings, in the order of their
-        names.
-        """
-        return self._sound(WEIGHTS)
+        """Return weights and the logs of their trainings, ordered by name."""
+        return self._fit_files(WEIGHTS)
 
-    def claims(self) -> set[Place]:
-        """Return split, size and method of all that lies where an entry would, whatever
-        it is.
-        """
-        ends = ENDINGS[SUBMISSIONS]
-        files = [
-            p
-            for p in self._files(SUBMISSIONS)
-            if len(p.parts) == DEPTH and p.suffix in ends
-        ]
-        return {(path.parts[1], path.parts[2], path.stem) for path in files}
+    def claimed_places(self) -> set[Place]:
+        """Return split, size and method of every path where an entry would lie.
 
-    def odd(self, expected: Collection[Path]) -> Iterator[tuple[Path, str]]:
-        """Yield what should not lie in the folder, and why."""
-        known = {Path(name) for name in (PAGE, SCHEMA, VERIFIED, README)} | set(
-            expected
-        )
+        A link or a folder claims a place, too.
+        """
+        places = set()
+        for path in self._files(SUBMISSIONS):
+            if len(path.parts) == DEPTH and path.suffix in ENDINGS[SUBMISSIONS]:
+                places.add((path.parts[1], path.parts[2], path.stem))
+        return places
+
+    def find_misplaced(
+        self, expected_paths: Collection[Path]
+    ) -> Iterator[tuple[Path, str]]:
+        """Yield the files that should not lie in the folder, and why."""
+        names = (PAGE, SCHEMA, VERIFIED, README)
+        known_paths = {Path(name) for name in names} | set(expected_paths)
         for path in self._files(""):
-            if path.parts[0] in ENDINGS:
-                reason = self.oddity(path)
+            if path in known_paths:
+                is_link = path == self.link_in(path)
+                reason = f"{path} is a symbolic link" if is_link else None
+            elif path.parts[0] in ENDINGS:
+                reason = self.reason_unfit(path)
             else:
                 reason = "nothing here knows it"
-            if path in known:
-                if path == self.link_in(path):
-                    reason = f"{path} is a symbolic link"
-                else:
-                    reason = None
             if reason is not None:
                 yield path, reason
 
-    def oddity(self, path: Path) -> str | None:
-        """Return why a relative path cannot be an entry or a score file, None if it
-        can.
-        """
-        if (link := self.link_in(path)) is not None:
+    def reason_unfit(self, path: Path) -> str | None:
+        """Return why a relative path cannot be an entry or a score file, else None."""
+        link = self.link_in(path)
+        if link is not None:
             return f"{link} is a symbolic link"
         if not stat.S_ISREG((self.path / path).lstat().st_mode):
             return "no regular file"
-        endings = ENDINGS[path.parts[0]]
         if not all(PART.fullmatch(part) for part in path.parts):
             return "a name with other characters than letters, digits, '-', '_' and '.'"
+        endings = ENDINGS[path.parts[0]]
         if path.suffix not in endings or len(path.parts) != DEPTH:
             return f"not {path.parts[0]}/<split>/<size>/<name>{' or '.join(endings)}"
         return None
 
     def link_in(self, path: Path) -> Path | None:
-        """Return the first part of a relative path that is a symbolic link, None
-        without any.
+        """Return the first part of a relative path that is a symbolic link, else
+        None.
         """
-        whole = [*reversed(path.parents), path][1:]
-        return next((part for part in whole if (self.path / part).is_symlink()), None)
+        parts_from_top = [*reversed(path.parents), path][1:]
+        for part in parts_from_top:
+            if (self.path / part).is_symlink():
+                return part
+        return None
 
     def require_unlinked(self, paths: Iterable[Path]) -> None:
         """Refuse to write to places behind symbolic links, which may lie anywhere."""
         for path in paths:
-            if (link := self.link_in(path)) is not None:
-                fix = "put the folder or file itself in its place"
+            link = self.link_in(path)
+            if link is not None:
                 raise UsageError(
-                    "a leaderboard holds no links", where=str(self.path / link), fix=fix
+                    "a leaderboard holds no links",
+                    where=str(self.path / link),
+                    fix="put the folder or file itself in its place",
                 )
 
-    def _sound(self, top: str) -> tuple[Path, ...]:
-        return tuple(path for path in self._files(top) if self.oddity(path) is None)
+    def _fit_files(self, top: str) -> tuple[Path, ...]:
+        return tuple(p for p in self._files(top) if self.reason_unfit(p) is None)
 
     def _files(self, top: str) -> list[Path]:
-        """Return everything under a subfolder that is no folder, links to folders
-        included.
+        """Return everything under a subfolder that is no folder.
+
+        Links to folders are included and not followed.
         """
         if top and (self.path / top).is_symlink():
             return [Path(top)]
-        found: list[Path] = []
-        for folder, names, files in os.walk(self.path / top, followlinks=False):
+        paths: list[Path] = []
+        for folder, folder_names, file_names in os.walk(self.path / top):
             here = Path(folder)
-            links = [name for name in names if (here / name).is_symlink()]
-            found += [
-                (here / name).relative_to(self.path)
-                for name in (*links, *files)
-                if name != KEPT
-            ]
-        return sorted(found, key=lambda path: path.parts)
+            links = [name for name in folder_names if (here / name).is_symlink()]
+            for name in (*links, *file_names):
+                if name != PLACEHOLDER:
+                    paths.append((here / name).relative_to(self.path))
+        return sorted(paths, key=lambda path: path.parts)

@@ -1,4 +1,4 @@
-"""What a board shows: tabs, rows and floors, every number formed from score files.
+"""The content of a board: tabs and rows, every number formed from score files.
 
 Plain values only, so that a page, a table in the terminal and a test read the same
 thing. Undefined numbers are NaN. Text of entries comes from strangers: it is data,
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lagbench.data.registry import Size
 from lagbench.metrics.metric import Metric
 
-from .entry import Cost, Entry, Flag, Status, Verification
+from .entry import Entry, EntryCost, EntryFlag, Status, Verification
 
 Floats = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ class Histogram:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pictures:
-    """What is drawn of one scenario, of the truth or of one prediction."""
+    """Maps and film of one scenario, of the truth or of one prediction."""
 
     scenario: int
     map_frames: tuple[int, ...]  # frames of interest and the last one
@@ -74,20 +74,20 @@ class Pictures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceRow:
-    """What costs no learning: a row that is never ranked."""
+    """A reference predictor: it learns nothing and is never ranked."""
 
     name: str
     definition: str
     values: Mapping[str, Value]
     curves: Mapping[str, Curve]
     energy: Curve | None
-    counts: bool = True  # whether it may be the best floor
-    # what a frame costs it and the solver, on the machine that measured
-    cost: Cost | None = None
+    counts: bool = True  # whether skill may be measured from it
+    # cost of a frame, and that of the solver, on the machine that measured
+    cost: EntryCost | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Row:
+class BoardRow:
     """One method on one split and size."""
 
     entry: Entry
@@ -97,7 +97,7 @@ class Row:
     # against the leader, corrected by Holm; NaN for the leader and without a claim
     p: float
     verified: Verification | None  # the maintainers scored these predictions again
-    # 1 - score / score of the best floor, where the score files say it
+    # 1 - score / score of the best naive baseline, where the score files say it
     skill: Value | None
     values: Mapping[str, Value]
     seed_means: tuple[float, ...]  # mean of the ranking metric of each seed
@@ -117,16 +117,14 @@ class Row:
         return self.entry.status is Status.ACTIVE and self.current
 
     @property
-    def flags(self) -> tuple[Flag, ...]:
-        """What the scorer raised for any seed."""
-        return _merged([flag for file in self.entry.score.files for flag in file.flags])
+    def flags(self) -> tuple[EntryFlag, ...]:
+        """Flags that the scorer raised for any seed."""
+        return _merge_flags([file.flags for file in self.entry.score.files])
 
     @property
-    def warnings(self) -> tuple[Flag, ...]:
-        """What the validation warned of for any seed."""
-        return _merged(
-            [flag for file in self.entry.score.files for flag in file.warnings]
-        )
+    def warnings(self) -> tuple[EntryFlag, ...]:
+        """Warnings of the validation for any seed."""
+        return _merge_flags([file.warnings for file in self.entry.score.files])
 
     @property
     def diverged(self) -> int:
@@ -134,25 +132,27 @@ class Row:
         return sum(len(file.diverged_at) for file in self.entry.score.files)
 
 
-def _merged(found: Sequence[Flag]) -> tuple[Flag, ...]:
-    """Return flags by name, each once, with the reasons that any seed gave and the
-    greatest share.
-    """
-    held: dict[str, list[Flag]] = {}
-    for flag in found:
-        held.setdefault(flag.name, []).append(flag)
-    return tuple(
-        Flag.model_construct(
-            name=name,
-            reasons=tuple(
-                dict.fromkeys(reason for flag in flags for reason in flag.reasons)
-            ),
-            share=max(
-                (flag.share for flag in flags if flag.share is not None), default=None
-            ),
+def _merge_flags(
+    flags_of_seeds: Sequence[Sequence[EntryFlag]],
+) -> tuple[EntryFlag, ...]:
+    """Return each flag once, with all reasons of the seeds and the greatest share."""
+    reasons: dict[str, dict[str, None]] = {}
+    shares: dict[str, float | None] = {}
+    for flags in flags_of_seeds:
+        for flag in flags:
+            reasons.setdefault(flag.name, {}).update(dict.fromkeys(flag.reasons))
+            share = shares.setdefault(flag.name, flag.share)
+            if flag.share is not None and (share is None or flag.share > share):
+                shares[flag.name] = flag.share
+
+    merged = []
+    for name in reasons:
+        # names and reasons were checked when the entries were read
+        flag = EntryFlag.model_construct(
+            name=name, reasons=tuple(reasons[name]), share=shares[name]
         )
-        for name, flags in held.items()
-    )
+        merged.append(flag)
+    return tuple(merged)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -171,8 +171,8 @@ class Tab:
     curves: tuple[str, ...]
     energy: Curve  # true kinetic energy
     truth: Pictures  # those of the rows have the same scenario and frames
-    rows: tuple[Row, ...]  # ranked ones by rank, then the others
-    floors: tuple[ReferenceRow, ...]
+    rows: tuple[BoardRow, ...]  # ranked ones by rank, then the others
+    references: tuple[ReferenceRow, ...]
     # processor time of a frame of the solver itself [s]
     solver_seconds: float | None = None
 
@@ -182,15 +182,16 @@ class Tab:
         return f"{self.size.split}-{self.size.name}"
 
     @property
-    def lines(self) -> tuple[Row | ReferenceRow, ...]:
-        """All that the table shows."""
-        return (*self.rows, *self.floors)
+    def lines(self) -> tuple[BoardRow | ReferenceRow, ...]:
+        """All rows of the table."""
+        return (*self.rows, *self.references)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Board:
-    """Everything that a page draws; equal submissions give equal boards, in any file
-    order.
+    """Everything that a page draws.
+
+    Equal submissions give equal boards, in any order of the files.
     """
 
     tabs: tuple[Tab, ...]  # in the order of the registry

@@ -1,20 +1,20 @@
 """The page of the leaderboard: one HTML file that asks nothing of the network.
 
-All text and every number of the tables is plain HTML; a script of our own sorts,
-filters and draws. A content security policy lets only that script and style sheet run,
-by their hashes, so that text of strangers could do nothing even if it were not escaped.
-Equal boards give equal bytes.
+All text and every number of the tables is plain HTML; a script of ours sorts, filters
+and draws from data that stand in the page. A content security policy lets only that
+script and style sheet run, by their hashes, so that text of strangers could do nothing
+even if it were not escaped. Equal boards give pages with equal content.
 """
 
 from __future__ import annotations
 
 import base64
-import bisect
 import functools
 import hashlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from itertools import groupby
 
@@ -31,20 +31,27 @@ from lagbench.figures.html import (
 )
 from lagbench.metrics.metric import Direction, Metric
 
-from .columns import columns_of, presets_of, value_of, written
+from .columns import format_value, leader_of, value_of
 from .cost import cost_figure
-from .model import Board, Row, Tab
-from .payload import FINENESS, Fineness, embedded, payload
-from .table import EXPLAINED, draw_table
-
-# bytes that an entry shall take, all in all; more only where its coarsest data need
-# them
-BUDGET = 40_000
-FEWEST = 50  # fewer entries than these share what so many may take, 2 MB
+from .encoding import decode, encode
+from .model import Board, BoardRow, Tab
+from .page_data import page_data
+from .table import draw_table
+from .table_view import LABELS, TableView, make_table
 
 SCRIPTS = (
-    *("codec", "text", "scale", "chart", "state", "table"),
-    *("overview", "maps", "film", "stage", "detail", "main"),
+    "data",
+    "text",
+    "scale",
+    "chart",
+    "state",
+    "table",
+    "overview",
+    "maps",
+    "film",
+    "hero",
+    "detail",
+    "main",
 )
 """Parts of the script, in this order."""
 
@@ -54,283 +61,340 @@ LINKS: Mapping[str, str] = {
     "How to submit": "../docs/submitting.md",
     "Citation": "../CITATION.cff",
 }
-"""What the page leads to, from the leaderboard's folder; what is not there is left out.
+"""Links of the page, from the leaderboard's folder; links to missing files are left
+out.
 """
 
 FOOT = (
     "Velocity and vorticity are per frame; lengths are in units of the box. Times are "
-    "of each entry's own"
-    " machine.",
+    "of each entry's own machine.",
     "This page is one file, built by lagbench leaderboard build from the score files, "
-    "and asks nothing of the"
-    " network. How to cite a data set: lagbench cite.",
+    "and asks nothing of the network. How to cite a data set: lagbench cite.",
 )
+
+DATA_ELEMENT = re.compile(
+    rb'(<script type="text/plain" id="page-(?:data|arrays)">)([A-Za-z0-9+/=]*)(?=</)'
+)
+"""The elements that hold encoded data."""
 
 
 def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     """Return the page."""
-    theme = _part("theme.js")
-    parts = "\n".join(_part(f"{name}.js") for name in SCRIPTS)
-    script = f'(() => {{\n"use strict";\n{parts}}})();\n'
-    # colours by choice of the reader are those of the two schemes once more
-    light = f"color-scheme:light;{format_variables(LIGHT)}"
-    dark = f"color-scheme:dark;{format_variables(DARK)}"
-    chosen = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
-    style = load_style_sheet() + chosen + _part("page.css")
-    allowed = " ".join(_source(one) for one in (theme, script))
-    held = {
-        "policy": f"default-src 'none'; script-src {allowed}; style-src "
-        f"{_source(style)}; img-src data:;"
-        " base-uri 'none'; form-action 'none'",
+    theme = _read_part("theme.js")
+    script = _script()
+    style = _style_sheet()
+    views = [make_table(tab, board.metrics) for tab in board.tabs]
+    data, arrays = page_data(views)
+
+    link_tags = [tag("a", label, href=address) for label, address in links.items()]
+    sections = [draw_overview(board)]
+    sections += [draw_section(view, board.metrics) for view in views]
+    parts = {
+        "policy": _policy(scripts=(theme, script), style=style),
         "style": style,
         "theme": theme,
         "script": script,
-        "links": join(
-            tag("a", label, href=address) for label, address in links.items()
-        ),
-        "lede": lede(board),
-        "stage": stage(board),
-        "navigation": navigation(board),
-        "sections": join(
-            [overview(board), *(section(tab, board.metrics) for tab in board.tabs)],
-            "\n",
-        ),
-        "empty": empty(board),
-        "foot": join(tag("p", line) for line in FOOT),
+        "links": join(link_tags),
+        "intro": draw_intro(board),
+        "hero": draw_hero(board),
+        "navigation": draw_navigation(board),
+        "sections": join(sections, "\n"),
+        "empty": draw_empty(board),
+        "foot": join([tag("p", line) for line in FOOT]),
+        "data": encode(data),
+        "arrays": encode(arrays),
     }
-    entries = sum(len(tab.rows) for tab in board.tabs)
-    room = BUDGET * max(FEWEST, entries) - sum(
-        len(one.encode()) for one in held.values()
-    )
+    # one pass: a part that is filled in is not looked at again
+    template = _read_part("page.html")
+    return re.sub(r"\{\{([a-z]+)\}\}", lambda match: parts[match[1]], template)
 
-    drawn = functools.cache(lambda fineness: embedded(payload(board, fineness)))
 
-    def fits(fineness: Fineness) -> bool:
-        return len(drawn(fineness).encode()) <= room
+def same_page(first: bytes, second: bytes) -> bool:
+    """Tell whether two pages have the same content.
 
-    # the finest data that take no more room, else the coarsest; mostly it is the finest
-    # of all
-    if fits(FINENESS[0]):
-        first = 0
-    else:
-        first = 1 + bisect.bisect_left(FINENESS[1:-1], True, key=fits)
-    held["payload"] = drawn(FINENESS[first])
-    # one pass: what is filled in is not looked at again
-    return re.sub(r"\{\{([a-z]+)\}\}", lambda found: held[found[1]], _part("page.html"))
+    Their compressed data may differ: zlib gives other bytes where it was built
+    otherwise. The first page may be a stranger's: what it encodes is read only up to
+    the length of the data in the second.
+    """
+    if first == second:
+        return True
+    first_parts = DATA_ELEMENT.split(first)
+    second_parts = DATA_ELEMENT.split(second)
+    if len(first_parts) != len(second_parts):
+        return False
+    for number, (a, b) in enumerate(zip(first_parts, second_parts, strict=True)):
+        if a == b:
+            continue
+        # text, opening tag and data take turns
+        is_data = number % 3 == 2
+        if not is_data or not _encode_same(a.decode(), b.decode()):
+            return False
+    return True
+
+
+def _encode_same(first: str, second: str) -> bool:
+    expected = decode(second, longest=2**30)
+    try:
+        return decode(first, longest=len(expected)) == expected
+    except ValueError:
+        return False
+
+
+def links_in(page: bytes) -> dict[str, str]:
+    """Return those of our links that a page has."""
+    links = {}
+    for label, address in LINKS.items():
+        if str(tag("a", label, href=address)).encode() in page:
+            links[label] = address
+    return links
 
 
 @functools.cache
-def _part(name: str) -> str:
+def _read_part(name: str) -> str:
     return files(__package__).joinpath("page", name).read_text("utf-8")
 
 
-def _source(said: str) -> str:
+def _script() -> str:
+    """Return the script: an asynchronous function, as data are decompressed first."""
+    parts = [_read_part(f"{name}.js") for name in SCRIPTS]
+    body = "\n".join(parts)
+    return f'(async () => {{\n"use strict";\n{body}}})();\n'
+
+
+def _style_sheet() -> str:
+    """Return the rules of all pages, two schemes to choose from, and our rules."""
+    light = f"color-scheme:light;{format_variables(LIGHT)}"
+    dark = f"color-scheme:dark;{format_variables(DARK)}"
+    schemes = f":root[data-theme=light]{{{light}}}\n:root[data-theme=dark]{{{dark}}}\n"
+    return load_style_sheet() + schemes + _read_part("page.css")
+
+
+def _policy(*, scripts: Sequence[str], style: str) -> str:
+    script_sources = " ".join(_source_of(script) for script in scripts)
     return (
-        f"'sha256-{base64.b64encode(hashlib.sha256(said.encode()).digest()).decode()}'"
+        f"default-src 'none'; script-src {script_sources}; "
+        f"style-src {_source_of(style)}; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
     )
 
 
-def lede(board: Board) -> Markup:
+def _source_of(content: str) -> str:
+    digest = hashlib.sha256(content.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
+
+
+def draw_intro(board: Board) -> Markup:
     """Return the sentence under the title."""
-    rows = [row for tab in board.tabs for row in tab.rows]
-    entries = len(rows)
-    many = len(board.tabs)
-    checked = sum(row.verified is not None for row in rows)
-    shown = f"{entries} {'entry' if entries == 1 else 'entries'} on {many} data set{'s' * (many != 1)}"
-    if checked:
-        told = f"those of {checked}"
-    else:
-        told = "none yet"
+    entry_count = 0
+    verified_count = 0
+    for tab in board.tabs:
+        entry_count += len(tab.rows)
+        verified_count += sum(row.verified is not None for row in tab.rows)
+    entries = _count(entry_count, "entry", "entries")
+    data_sets = _count(len(board.tabs), "data set", "data sets")
+    rescored = "none yet"
+    if verified_count:
+        rescored = f"those of {verified_count}"
     return escaped(
         "Neural surrogates of Lagrangian continuum simulators on data that anyone "
-        "regenerates bit for bit:"
-        f" {shown}. Every score follows from a score file; predictions that the "
-        f"maintainers scored again:"
-        f" {told}. Costs are self-reported."
+        f"regenerates bit for bit: {entries} on {data_sets}. Every score follows from "
+        "a score file; predictions that the maintainers scored again: "
+        f"{rescored}. Costs are self-reported."
     )
 
 
-def stage(board: Board) -> Markup:
+def _count(count: int, singular: str, plural: str) -> str:
+    if count == 1:
+        return f"1 {singular}"
+    return f"{count} {plural}"
+
+
+def draw_hero(board: Board) -> Markup:
     """Return the place of the film above the fold, which the script fills."""
     if not board.tabs:
         return Markup("")
     return tag(
         "figure",
-        id="stage",
+        id="hero",
         class_="scripted",
         aria_label="The truth beside the leader",
     )
 
 
-def navigation(board: Board) -> Markup:
+def draw_navigation(board: Board) -> Markup:
     """Return links to the overview and the tabs, grouped by split."""
     if not board.tabs:
         return Markup("")
-    groups = [
-        tag(
-            "div",
-            _link("overview", "Overview", "Overview of all splits"),
-            class_="group",
-        )
-    ]
+    overview = _tab_link("overview", "Overview", "Overview of all splits")
+    groups = [tag("div", overview, class_="group")]
     for split, tabs in groupby(board.tabs, key=lambda tab: tab.size.split):
-        links = [
-            _link(tab.id, tab.size.name, f"{split} {tab.size.name}") for tab in tabs
-        ]
-        groups.append(
-            tag("div", tag("span", split, class_="split"), *links, class_="group")
-        )
+        links = []
+        for tab in tabs:
+            name = tab.size.name
+            links.append(_tab_link(tab.id, name, f"{split} {name}"))
+        heading = tag("span", split, class_="split")
+        groups.append(tag("div", heading, *links, class_="group"))
     return tag("nav", *groups, class_="tabs", aria_label="Data sets")
 
 
-def _link(name: str, label: str, said: str) -> Markup:
-    return tag("a", label, href=f"#{name}", data_tab=name, aria_label=said)
+def _tab_link(name: str, label: str, description: str) -> Markup:
+    return tag("a", label, href=f"#{name}", data_tab=name, aria_label=description)
 
 
-def empty(board: Board) -> Markup:
-    """Name the data sets without an entry, with the commands that begin one."""
+def draw_empty(board: Board) -> Markup:
+    """Return the names of data sets without an entry, and commands that begin one."""
     if not board.empty:
         return Markup("")
     split, size = board.empty[0]
-    names = ", ".join(map(" ".join, board.empty))
-    commands = f"lagbench generate --split {split} --size {size}\n"
-    commands += "lagbench submit predictions.nc --from meta.yaml"
+    names = ", ".join(" ".join(data_set) for data_set in board.empty)
+    commands = (
+        f"lagbench generate --split {split} --size {size}\n"
+        "lagbench submit predictions.nc --from meta.yaml"
+    )
+    beginning = "There are no entries yet"
     if board.tabs:
-        first = "No entry yet"
-    else:
-        first = "There are no entries yet"
+        beginning = "No entry yet"
     return tag(
         "section",
-        tag("p", f"{first}: {names}. Yours can be the first:"),
+        tag("p", f"{beginning}: {names}. Yours can be the first:"),
         tag("pre", tag("code", commands)),
         class_="empty",
     )
 
 
-def overview(board: Board) -> Markup:
-    """Return one row per method over all splits, by mean skill: its skill where that is
-    known, and rank.
-    """
+@dataclass(frozen=True)
+class MethodOverview:
+    """A method on all data sets."""
+
+    method: str
+    rows: Mapping[str, BoardRow]  # ranked rows, by id of the tab
+    skills: Sequence[float]
+    # A data set without an entry counts 0, so that nobody leads by the one data set
+    # that suits.
+    mean_skill: float
+
+    @property
+    def name(self) -> str:
+        """Name of the method."""
+        first_row = next(iter(self.rows.values()))
+        return first_row.entry.name
+
+
+def draw_overview(board: Board) -> Markup:
+    """Return one row per method over all splits, by mean skill."""
     if not board.tabs:
         return Markup("")
-    rows: dict[str, dict[str, Row]] = {}
-    for tab in board.tabs:
-        for row in tab.rows:
-            if row.rank is not None:
-                rows.setdefault(row.id, {})[tab.id] = row
-    ranked = {
-        tab.id: sum(row.rank is not None for row in tab.rows) for tab in board.tabs
-    }
-    skills = {
-        method: [
-            row.skill.mean
-            for row in held.values()
-            if row.skill and math.isfinite(row.skill.mean)
-        ]
-        for method, held in rows.items()
-    }
-    # a gap counts as the best floor, so that nobody leads by the one data set that
-    # suits
-    means = {method: sum(held) / len(board.tabs) for method, held in skills.items()}
-    heads = [
-        tag(
-            "th",
-            tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}"),
-            scope="col",
-        )
-        for tab in board.tabs
-    ]
-    lines = []
-    for method in sorted(
-        rows, key=lambda method: (not skills[method], -means[method], method)
-    ):
-        name = next(iter(rows[method].values())).entry.name
-        cells = [
-            _summary(rows[method].get(tab.id), tab, ranked[tab.id])
-            for tab in board.tabs
-        ]
-        head = tag("th", clipped(name, 60), scope="row", class_="method")
-        mean = tag(
-            "span", text(means[method] if skills[method] else math.nan), class_="n"
-        )
-        of = tag("span", f"{len(skills[method])} of {len(board.tabs)}", class_="ci")
-        lines.append(tag("tr", head, tag("td", mean, of), *cells))
-    caption = (
-        "Skill on every data set (0: the best floor, 1: perfect) where it is known, "
-        "and rank; bold leads."
-        " Methods stand in the order of their mean skill, in which a gap counts 0."
-    )
-    first = [
+    headings = [
         tag("th", "method", scope="col", class_="method"),
         tag("th", "mean skill", scope="col"),
     ]
+    for tab in board.tabs:
+        link = tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}")
+        headings.append(tag("th", link, scope="col"))
+    lines = [_overview_line(method, board) for method in _order_methods(board)]
+    caption = (
+        "Skill on every data set (0: the best naive baseline, 1: perfect) where it is "
+        "known, and rank; bold leads. Methods stand in the order of their mean skill, "
+        "in which a data set without an entry counts 0."
+    )
     table = tag(
         "table",
         tag("caption", caption, class_="unseen"),
-        tag("thead", tag("tr", *first, *heads)),
+        tag("thead", tag("tr", *headings)),
         tag("tbody", *lines),
         class_="board across",
+    )
+    region = tag(
+        "div",
+        table,
+        class_="scroll",
+        role="region",
+        aria_label="Overview",
+        tabindex=0,
     )
     return tag(
         "section",
         tag("h2", "All data sets"),
         tag("p", caption, class_="facts"),
-        tag(
-            "div",
-            table,
-            class_="scroll",
-            role="region",
-            aria_label="Overview",
-            tabindex=0,
-        ),
+        region,
         id="overview",
         class_="tab",
     )
 
 
-def _summary(row: Row | None, tab: Tab, of: int) -> Markup:
+def _order_methods(board: Board) -> list[MethodOverview]:
+    """Return the ranked methods, by mean skill; methods without any come last."""
+    rows_by_method: dict[str, dict[str, BoardRow]] = {}
+    for tab in board.tabs:
+        for row in tab.rows:
+            if row.rank is not None:
+                rows_by_method.setdefault(row.id, {})[tab.id] = row
+
+    methods = []
+    for method, rows in rows_by_method.items():
+        skills = []
+        for row in rows.values():
+            if row.skill is not None and math.isfinite(row.skill.mean):
+                skills.append(row.skill.mean)
+        mean_skill = sum(skills) / len(board.tabs)
+        methods.append(MethodOverview(method, rows, skills, mean_skill))
+    return sorted(methods, key=lambda m: (not m.skills, -m.mean_skill, m.method))
+
+
+def _overview_line(method: MethodOverview, board: Board) -> Markup:
+    mean_skill = math.nan
+    if method.skills:
+        mean_skill = method.mean_skill
+    coverage = f"{len(method.skills)} of {len(board.tabs)}"
+    cells = [
+        tag("th", clipped(method.name, 60), scope="row", class_="method"),
+        tag(
+            "td",
+            tag("span", text(mean_skill), class_="n"),
+            tag("span", coverage, class_="ci"),
+        ),
+    ]
+    for tab in board.tabs:
+        cells.append(_overview_cell(method.rows.get(tab.id), tab))
+    return tag("tr", *cells)
+
+
+def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row is None:
         return tag("td", "")
-    rank = f"{row.rank}{' ≈' if row.tied else ''} of {of}"
-    big, small = (text(row.skill.mean), f"rank {rank}") if row.skill else (rank, "")
-    parts = [
-        tag("span", big, class_="n"),
-        tag("span", small, class_="ci") if small else "",
-    ]
+    ranked_count = sum(other.rank is not None for other in tab.rows)
+    rank = f"{row.rank} of {ranked_count}"
+    if row.tied:
+        rank = f"{row.rank} ≈ of {ranked_count}"
+    if row.skill is None:
+        parts = [tag("span", rank, class_="n")]
+    else:
+        parts = [
+            tag("span", text(row.skill.mean), class_="n"),
+            tag("span", f"rank {rank}", class_="ci"),
+        ]
     link = tag("a", *parts, href=f"#tab={tab.id}&entry={row.id}")
     return tag("td", link, class_="best" if row.rank == 1 else None)
 
 
-def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
+def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
     """Return the section of a tab."""
-    if metrics[tab.ranking].direction is Direction.HIGHER:
-        better = "higher"
-    else:
-        better = "lower"
-    if tab.size.measured:
-        sha256 = tab.size.measured.dataset_sha256
-    else:
-        sha256 = tab.rows[0].entry.dataset.sha256
-    facts = (
-        f"Given {tab.size.task.input_frames} frames of each of {len(tab.scenarios)} "
-        f"test scenarios of"
-        f" {tab.size.particles} particles, predict the next {len(tab.frames)}. Ranked "
-        f"by {words(tab.ranking)}"
-        f" over the horizon, {better} is better. Data set version {tab.size.version}, "
-        f"SHA-256 {sha256[:12]}…"
+    tab = view.tab
+    table = tag(
+        "div",
+        draw_table(view),
+        class_="table scroll",
+        role="region",
+        aria_label="Scores",
+        tabindex=0,
     )
-    region: dict[str, object] = {
-        "role": "region",
-        "aria_label": "Scores",
-        "tabindex": 0,
-    }
     return tag(
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
-        tag("p", facts, class_="facts"),
-        tag("ul", *_tiles(tab, metrics), class_="tiles"),
-        _tools(tab, presets_of(tab, columns_of(tab, metrics))),
-        tag("div", draw_table(tab, metrics), class_="table scroll", **region),
+        tag("p", _describe_task(tab, metrics), class_="facts"),
+        tag("ul", *_tiles(view, metrics), class_="tiles"),
+        _tools(view),
+        table,
         tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
         tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
@@ -338,77 +402,123 @@ def section(tab: Tab, metrics: Mapping[str, Metric]) -> Markup:
     )
 
 
-def _tiles(tab: Tab, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
-    ranked = [row for row in tab.rows if row.rank is not None]
-    ranking = columns_of(tab, metrics)[tab.ranking]
-    if ranked:
-        leader = ranked[0]
-        tied = sum(row.tied for row in ranked)
-        who = clipped(leader.entry.name, 40) + (
-            f", and {tied} that cannot be told from it" if tied else ""
-        )
-        if leader.skill:
-            yield _tile("skill of the leader", text(leader.skill.mean), who)
-        value = float(value_of(leader, ranking))
-        yield _tile(f"leader by {ranking.quantity}", text(value), who)
-        losses = [
-            (ranking.loss(float(value_of(one, ranking))), one.name)
-            for one in tab.floors
-            if one.counts
-        ]
-        known = [held for held in losses if held[0] > 0.0]
-        if known and metrics[tab.ranking].direction is Direction.LOWER:
-            loss, best = min(known, key=lambda held: held[0])
-            yield _tile(
-                "leader beside the best floor", f"{text(value / loss, 2)}×", best
-            )
-    # who is fast and learned nothing is no example
-    learned = [row for row in ranked if row.skill and row.skill.mean > 0.0]
-    fast = [
-        (cost.speed_up, row, cost.device)
-        for row in learned
-        if (cost := row.entry.cost) and cost.speed_up
-    ]
-    if fast:
-        speed, row, device = max(fast, key=lambda held: held[0])
-        beside = f"{'slower' if speed < 1.0 else 'faster'} than the solver"
-        yield _tile(
-            "speed of the fastest entry with skill, solver = 1×",
-            written(speed, "factor"),
-            f"{beside}: {clipped(row.entry.name, 40)}, {device}; self-reported",
-        )
-    rest = len(tab.rows) - len(ranked)
+def _describe_task(tab: Tab, metrics: Mapping[str, Metric]) -> str:
+    size = tab.size
+    better = "lower"
+    if metrics[tab.ranking].direction is Direction.HIGHER:
+        better = "higher"
+    sha256 = tab.rows[0].entry.dataset.sha256
+    if size.measured:
+        sha256 = size.measured.dataset_sha256
+    return (
+        f"Given {size.task.input_frames} frames of each of {len(tab.scenarios)} test "
+        f"scenarios of {size.particles} particles, predict the next "
+        f"{len(tab.frames)}. Ranked by {words(tab.ranking)} over the horizon, {better} "
+        f"is better. Data set version {size.version}, SHA-256 {sha256[:12]}…"
+    )
+
+
+def _tiles(view: TableView, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
+    tab = view.tab
+    leader = leader_of(tab.rows)
+    if leader is not None:
+        yield from _leader_tiles(view, leader, metrics)
+    yield from _speed_tiles(tab)
+    ranked_count = sum(row.rank is not None for row in tab.rows)
+    unranked_count = len(tab.rows) - ranked_count
+    more = "all ranked"
+    if unranked_count:
+        more = f"and {unranked_count} not ranked"
+    yield _tile("entries", str(ranked_count), more)
+
+
+def _leader_tiles(
+    view: TableView, leader: BoardRow, metrics: Mapping[str, Metric]
+) -> Iterator[Markup]:
+    tab = view.tab
+    ranking = view.columns[tab.ranking]
+    tied_count = sum(row.tied for row in tab.rows if row.rank is not None)
+    name = clipped(leader.entry.name, 40)
+    if tied_count:
+        name += f", and {tied_count} that cannot be told from it"
+    if leader.skill is not None:
+        yield _tile("skill of the leader", text(leader.skill.mean), name)
+    value = float(value_of(leader, ranking))
+    yield _tile(f"leader by {ranking.quantity}", text(value), name)
+
+    if metrics[tab.ranking].direction is not Direction.LOWER:
+        return
+    baselines = []
+    for reference in tab.references:
+        baseline_value = float(value_of(reference, ranking))
+        if reference.counts and baseline_value > 0.0:
+            baselines.append((baseline_value, reference.name))
+    if baselines:
+        baseline_value, baseline = min(baselines)
+        ratio = f"{text(value / baseline_value, 2)}×"
+        yield _tile("leader beside the best naive baseline", ratio, baseline)
+
+
+def _speed_tiles(tab: Tab) -> Iterator[Markup]:
+    """Yield the tile of the fastest entry with skill: speed alone is no example."""
+    fastest = None
+    greatest = 0.0
+    for row in tab.rows:
+        cost = row.entry.cost
+        has_skill = row.skill is not None and row.skill.mean > 0.0
+        if row.rank is None or not has_skill or cost is None or not cost.speed_up:
+            continue
+        if cost.speed_up > greatest:
+            greatest = cost.speed_up
+            fastest = row
+    if fastest is None or fastest.entry.cost is None:
+        return
+    comparison = "faster than the solver"
+    if greatest < 1.0:
+        comparison = "slower than the solver"
+    name = clipped(fastest.entry.name, 40)
     yield _tile(
-        "entries", str(len(ranked)), f"and {rest} not ranked" if rest else "all ranked"
+        "speed of the fastest entry with skill, solver = 1×",
+        format_value(greatest, "factor"),
+        f"{comparison}: {name}, {fastest.entry.cost.device}; self-reported",
     )
 
 
 def _tile(what: str, big: str, more: str) -> Markup:
-    parts = {"what": what, "big": big, "more": more}
-    return tag("li", *(tag("span", part, class_=kind) for kind, part in parts.items()))
+    return tag(
+        "li",
+        tag("span", what, class_="what"),
+        tag("span", big, class_="big"),
+        tag("span", more, class_="more"),
+    )
 
 
-def _tools(tab: Tab, presets: Mapping[str, Sequence[str]]) -> Markup:
-    hidden = sum(not row.active for row in tab.rows)
-    buttons = [
-        tag("button", name, type="button", data_preset=name, data_keys=" ".join(keys))
-        for name, keys in presets.items()
-    ]
-    box = tag("input", type="checkbox")
-    old = "Withdrawn, superseded, or scored on old data"
-    inactive = tag("label", box, f"inactive ({hidden})", class_="check", title=old)
-    hint = "Filter methods, authors, hardware"
+def _tools(view: TableView) -> Markup:
+    """Return filter, presets, the switch for inactive entries, and the CSV button."""
+    buttons = []
+    for name in view.presets:
+        buttons.append(tag("button", name, type="button", data_preset=name))
+    inactive_count = sum(not row.active for row in view.tab.rows)
+    inactive = Markup("")
+    if inactive_count:
+        inactive = tag(
+            "label",
+            tag("input", type="checkbox"),
+            f"inactive ({inactive_count})",
+            class_="check",
+            title="Withdrawn, superseded, or scored on old data",
+        )
     return tag(
         "div",
         tag(
             "input",
             type="search",
-            placeholder=hint,
+            placeholder="Filter methods, authors, hardware",
             aria_label="Filter",
             spellcheck="false",
         ),
         tag("div", *buttons, class_="presets", role="group", aria_label="Columns"),
-        inactive if hidden else "",
+        inactive,
         tag("span", class_="count muted", role="status"),
         tag(
             "button",
@@ -423,36 +533,39 @@ def _tools(tab: Tab, presets: Mapping[str, Sequence[str]]) -> Markup:
 
 def _notes(tab: Tab) -> Iterator[Markup]:
     yield escaped(
-        "Click a row for curves, maps, a film, every number and the command that "
-        "makes it again."
-        " Ranks follow the ranking metric."
+        "Click a row for curves, maps, a film, every number and the command that makes "
+        "it again. Ranks follow the ranking metric."
     )
-    told = "There are too few test scenarios to tell entries apart: the intervals speak alone."
+    claim = (
+        "There are too few test scenarios to tell entries apart: the intervals speak "
+        "alone."
+    )
     if tab.decided:
-        told = (
-            "≈ cannot be told from the leader at 5 %: two-way bootstrap over "
-            "scenarios and seeds, with one"
-            " seed each the exact sign-flip test over scenarios; p-values corrected "
-            "by Holm's method."
+        claim = (
+            "≈ cannot be told from the leader at 5 %: two-way bootstrap over scenarios "
+            "and seeds, with one seed each the exact sign-flip test over scenarios; "
+            "p-values corrected by Holm's method."
         )
     yield escaped(
-        f"{told} Shaded rows are floors: what costs no learning, never ranked."
+        f"{claim} Shaded rows are reference predictors, never ranked: naive baselines, "
+        "which predict without learning and without equations, and classical solvers."
     )
     yield escaped(
         "Mean over test scenarios and seeds; below it the 95 % interval, of both "
-        "resampled together."
-        " ↓ lower, ↑ higher, ◎ closer to the perfect value is better;"
-        " bold is best, floors included, and the bluer a cell, the nearer to it."
-        " † some frames have no value. – not measured or undefined."
+        "resampled together. ↓ lower, ↑ higher, ◎ closer to the perfect value is "
+        "better; bold is best, reference predictors included, and the bluer a cell, "
+        "the nearer to it. † some frames have no value. – not measured or undefined."
     )
     yield escaped(
         "Times, speed-up, budget, parameters and hardware are self-reported: "
-        "submitters say them and nobody"
-        " computes them again. A speed-up below 1× means slower than the solver. "
-        "Scores are verified where"
-        " the maintainers scored the predictions again, else as submitted."
+        "submitters state them and nobody computes them again. A speed-up below 1× "
+        "means slower than the solver. Scores are verified where the maintainers "
+        "scored the predictions again, else as submitted."
     )
-    raised = {flag.name for row in tab.rows for flag in (*row.flags, *row.warnings)}
-    for name in sorted(raised & EXPLAINED.keys()):
-        label, meaning = EXPLAINED[name]
+    raised: set[str] = set()
+    for row in tab.rows:
+        for flag in (*row.flags, *row.warnings):
+            raised.add(flag.name)
+    for name in sorted(raised.intersection(LABELS)):
+        label, meaning = LABELS[name]
         yield join([tag("strong", label), ": ", meaning])

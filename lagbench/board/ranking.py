@@ -1,4 +1,4 @@
-"""From score files to one score per method, floors included.
+"""From score files to one score per method, reference predictors included.
 
 The mean over seeds is taken per scenario (and per frame) first, over the seeds that
 have a value there; intervals and tests resample scenarios and seeds together.
@@ -20,6 +20,7 @@ from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import (
     Score,
+    Tally,
     aggregate,
     bootstrap_interval,
     mean_over_seeds,
@@ -27,16 +28,19 @@ from lagbench.metrics.aggregate import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import REFERENCES as KNOWN
-from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
-from lagbench.scoring.score_file import StoredScores, write_statistics
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.card import SUBMISSION, Preview, ScoreCard, digits
+from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.score_file_checks import read_score_file
 
-from .entry import LONGEST_TEXT, OUTSIDE, DataSet, Flag, ScoredFile, Summary
+from .entry import OUTSIDE, DataSet, EntryFlag, ScoredFile, Summary
+from .fields import LONGEST_TEXT
 from .folder import REFERENCES, Folder
+
+NO_PREDICTIONS = "0" * 64  # hash in score files of reference predictors
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Combined:
+class CombinedScore:
     """A metric of all seeds of a method."""
 
     score: Score  # mean over seeds, per frame and per scenario
@@ -47,92 +51,107 @@ class Combined:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % interval of the mean: over scenarios and seeds together, one seed: over
-        scenarios.
-        """
+        """95 % interval of the mean, over scenarios and seeds together."""
         return bootstrap_interval(np.stack([seed.values for seed in self.seeds]))
 
 
-def combine(seeds: Sequence[StoredScores]) -> dict[str, Combined]:
-    """Return the scores of a method by metric: those of ours, not of packages, that all
-    seeds have.
+def combine(seeds: Sequence[Mapping[int, Tally]]) -> dict[str, CombinedScore]:
+    """Return the scores of a method by metric, from tallies by scenario of each seed.
+
+    Metrics of packages are left out, and so are metrics that a seed lacks.
     """
-    names = set.intersection(
-        *(set(next(iter(held.tallies.values())).names) for held in seeds)
-    )
-    metrics = [metric for metric in METRICS.values() if names.issuperset(metric.of)]
-    scores = [aggregate(metrics, held.tallies) for held in seeds]
-    common = [m.name for m in metrics if all(m.name in held for held in scores)]
-    return {name: _combined(tuple(held[name] for held in scores)) for name in common}
+    statistics = set(_statistics_of(seeds[0]))
+    for tallies in seeds[1:]:
+        statistics.intersection_update(_statistics_of(tallies))
+    metrics = [m for m in METRICS.values() if statistics.issuperset(m.of)]
+
+    scores = [aggregate(metrics, tallies) for tallies in seeds]
+    combined = {}
+    for metric in metrics:
+        name = metric.name
+        if all(name in seed_scores for seed_scores in scores):
+            combined[name] = _combine([seed_scores[name] for seed_scores in scores])
+    return combined
 
 
-def _combined(seeds: tuple[Score, ...]) -> Combined:
+def _statistics_of(tallies: Mapping[int, Tally]) -> Sequence[str]:
+    first_tally = next(iter(tallies.values()))
+    return first_tally.names
+
+
+def _combine(seeds: Sequence[Score]) -> CombinedScore:
     score = seeds[0]
-    means = tuple(held.mean for held in seeds)
     if len(seeds) > 1:
+        undefined = np.sum([seed.undefined for seed in seeds], axis=0)
         score = replace(
             score,
-            per_frame=mean_over_seeds([held.per_frame for held in seeds]),
-            values=mean_over_seeds([held.values for held in seeds]),
-            undefined=tuple(
-                map(sum, zip(*(held.undefined for held in seeds), strict=True))
-            ),
+            per_frame=mean_over_seeds([seed.per_frame for seed in seeds]),
+            values=mean_over_seeds([seed.values for seed in seeds]),
+            undefined=tuple(undefined.tolist()),
         )
-    defined = [value for value in means if not math.isnan(value)]
-    if len(defined) > 1:
-        std = float(np.std(defined, ddof=1))
-    else:
-        std = math.nan
-    return Combined(score=score, std=std, means=means, seeds=seeds)
+
+    means = tuple(seed.mean for seed in seeds)
+    defined_means = [value for value in means if not math.isnan(value)]
+    std = math.nan
+    if len(defined_means) > 1:
+        std = float(np.std(defined_means, ddof=1))
+    return CombinedScore(score=score, std=std, means=means, seeds=tuple(seeds))
 
 
-def summarise(scores: Mapping[str, Combined]) -> dict[str, Summary]:
-    """Return what the score block of an entry says of the metrics: nine digits, null
-    where undefined.
-    """
-    found = {}
-    for name, held in scores.items():
-        mean, std, low, high = map(digits, (held.score.mean, held.std, *held.interval))
-        found[name] = Summary(mean=mean, std=std, low=low, high=high)
-    return found
+def summarise(scores: Mapping[str, CombinedScore]) -> dict[str, Summary]:
+    """Return the metrics of a score block: nine digits, null where undefined."""
+    summaries = {}
+    for name, combined in scores.items():
+        low, high = combined.interval
+        summaries[name] = Summary(
+            mean=digits(combined.score.mean),
+            std=digits(combined.std),
+            low=digits(low),
+            high=digits(high),
+        )
+    return summaries
 
 
 def is_current(dataset: DataSet, size: Size) -> bool:
-    """Tell whether a data set is that of today: same MAJOR version, same hash where one
-    is recorded.
+    """Tell whether a data set is that of today.
+
+    It has the same MAJOR version, and the same hash where one is recorded.
     """
-    if size.measured:
-        recorded = size.measured.dataset_sha256
-    else:
-        recorded = dataset.sha256
-    return major_of(dataset.version) == size.major and dataset.sha256 == recorded
+    if major_of(dataset.version) != size.major:
+        return False
+    return size.measured is None or dataset.sha256 == size.measured.dataset_sha256
 
 
 def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
-    """Return the floors of a split and size, those of another data set left out.
+    """Return the reference predictors of a split and size.
 
-    What ours score, the package ships. Those of a split of somebody's own the scorer
-    measures beside a submission, and :func:`write_references` keeps them in the folder:
-    they are equal whoever submits.
+    The package ships their scores on our splits. On other splits the scorer measures
+    them beside a submission, and :func:`write_references` keeps them in the folder:
+    they are equal whoever submits. Scores on another data set are left out, and so are
+    scores of a predictor that is no longer in the table.
     """
-    if known := shipped(size):
-        return tuple(known.values())
-    found = []
+    shipped_scores = shipped(size)
+    if shipped_scores:
+        return tuple(r for r in shipped_scores.values() if r.name in KNOWN)
+
+    references = []
     for path in folder.reference_files(size.split, size.name):
-        scores = read_stored(folder.path / path).scores
-        if path.stem not in KNOWN or not is_current(dataset_of(scores.identity), size):
+        file = folder.path / path
+        stored = read_score_file(file).scores
+        dataset = dataset_of(stored.identity)
+        if path.stem not in KNOWN or not is_current(dataset, size):
             continue
-        read_stored(folder.path / path, size)
-        held = {name: made.score for name, made in combine([scores]).items()}
-        found.append(
+        read_score_file(file, size)  # refuses scores that do not fit the task
+        combined = combine([stored.tallies])
+        references.append(
             ReferenceScores(
                 name=path.stem,
-                scores=held,
+                scores={name: each.score for name, each in combined.items()},
                 seconds_per_frame=math.nan,
                 correlation=np.empty(0),
             )
         )
-    return tuple(found)
+    return tuple(references)
 
 
 def dataset_of(identity: Mapping[str, str]) -> DataSet:
@@ -143,70 +162,85 @@ def dataset_of(identity: Mapping[str, str]) -> DataSet:
 
 
 def write_references(card: ScoreCard, folder: Folder) -> tuple[Path, ...]:
-    """Write the floors of a card that the folder lacks, pictures of the truth alone;
-    return their paths.
+    """Write the reference predictors of a score card that the folder lacks.
+
+    Their pictures show the truth alone.
+
+    Returns:
+        Paths of the files that were written.
     """
-    written = []
     header = card.header
-    preview = card.preview
-    nothing = np.full_like(preview.vorticity[0], np.nan)
-    truth = replace(
-        preview,
-        vorticity=np.stack([preview.vorticity[0], nothing]),
-        histogram=np.stack(
-            [preview.histogram[0], np.full_like(preview.histogram[0], np.nan)]
-        ),
-        film=np.stack([preview.film[0], preview.film[0]]),
-    )
+    data_set_folder = folder.path / REFERENCES / header.split / header.size
+    preview = _truth_alone(card.preview)
+    written = []
     for name in card.tallies.keys() - {SUBMISSION}:
-        path = folder.path / REFERENCES / header.split / header.size / f"{name}.nc"
-        with suppress(UnreadableFileError):
-            if (
-                read_stored(path).scores.identity["dataset_sha256"]
-                == header.dataset_sha256
-            ):
-                continue
+        path = data_set_folder / f"{name}.nc"
+        if _is_scored_on(path, header.dataset_sha256):
+            continue
         path.parent.mkdir(parents=True, exist_ok=True)
-        tallies = {SUBMISSION: card.tallies[name]}
-        named = replace(header, method=name)
-        nobody = "0" * 64
-        floor = replace(
+        reference_card = replace(
             card,
-            header=named,
-            predictions_sha256=nobody,
-            tallies=tallies,
-            preview=truth,
+            header=replace(header, method=name),
+            predictions_sha256=NO_PREDICTIONS,
+            tallies={SUBMISSION: card.tallies[name]},
+            preview=preview,
         )
-        write_statistics(floor, path, option="--board")
+        write_statistics(reference_card, path, option="--board")
         written.append(path)
     return tuple(sorted(written))
 
 
+def _truth_alone(preview: Preview) -> Preview:
+    true_vorticity = preview.vorticity[0]
+    true_histogram = preview.histogram[0]
+    true_film = preview.film[0]
+    no_vorticity = np.full_like(true_vorticity, np.nan)
+    no_histogram = np.full_like(true_histogram, np.nan)
+    return replace(
+        preview,
+        vorticity=np.stack([true_vorticity, no_vorticity]),
+        histogram=np.stack([true_histogram, no_histogram]),
+        film=np.stack([true_film, true_film]),
+    )
+
+
+def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
+    with suppress(UnreadableFileError):
+        identity = read_score_file(path).scores.identity
+        return identity["dataset_sha256"] == dataset_sha256
+    return False
+
+
 def scored_file(
-    card: ScoreCard, path: Path, outside: float | None = None
+    card: ScoreCard, path: Path, outside_share: float | None = None
 ) -> ScoredFile:
-    """Return what an entry says of a card's score file; ``outside``: share of positions
-    beyond the box.
+    """Return the description of a card's score file in an entry.
+
+    Args:
+        card: scores of predictions.
+        path: the score file.
+        outside_share: share of positions beyond the box, where the validation warns.
     """
-
-    def flag(name: str, reasons: Sequence[str], share: float | None = None) -> Flag:
-        return Flag(
-            name=name,
-            reasons=tuple(said[:LONGEST_TEXT] for said in reasons),
-            share=share,
-        )
-
+    flags = []
+    for flag in card.flags:
+        if flag.raised:
+            flags.append(_entry_flag(flag.name, flag.reasons))
+    warnings = []
+    for issue in card.warnings:
+        share = outside_share if issue.check == OUTSIDE else None
+        reason = f"{issue.what}: {issue.got}"
+        warnings.append(_entry_flag(issue.check, [reason], share=share))
     return ScoredFile(
         sha256=file_sha256(path),
         predictions_sha256=card.predictions_sha256,
         diverged_at=dict(sorted(card.header.diverged_at.items())),
-        flags=tuple(flag(one.name, one.reasons) for one in card.flags if one.raised),
-        warnings=tuple(
-            flag(
-                one.check,
-                (f"{one.what}: {one.got}",),
-                outside if one.check == OUTSIDE else None,
-            )
-            for one in card.warnings
-        ),
+        flags=tuple(flags),
+        warnings=tuple(warnings),
     )
+
+
+def _entry_flag(
+    name: str, reasons: Sequence[str], *, share: float | None = None
+) -> EntryFlag:
+    short_reasons = tuple(reason[:LONGEST_TEXT] for reason in reasons)
+    return EntryFlag(name=name, reasons=short_reasons, share=share)

@@ -1,161 +1,223 @@
-"""Seeds of one method: files that come together, and an entry that gets more of
-them.
-"""
+"""Seeds of one method: files that come together, and an entry that gets more seeds."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.scoring.stored import read_stored
-from lagbench.submission.findings import quoted
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.format import Header
+from lagbench.submission.issues import quote
+from lagbench.submission.provenance import TrainingProvenance
 
-from .entry import LONGEST_TEXT, MOST_SEEDS, Entry, Meta, Status
-from .entry_file import is_there, read_entry
+from .entry import Entry, Meta, Status
+from .entry_file import is_unchanged, read_entry
+from .fields import MOST_SEEDS
 from .folder import Folder, Place, entry_path
 
-OWN = "submit each on its own"
+SUBMIT_APART = "submit each on its own"
+SUBMIT_ANEW = "or submit all seeds anew: --replace"
+
+SHARED_LABELS = ("split", "size", "dataset_sha256", "method", "parameters")
+"""Labels of predictions that all seeds of a method share."""
 
 
 def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
-    """Return the seeds of files that belong together; refuse those that do not."""
-    alike = ("split", "size", "dataset_sha256", "method", "parameters")
-    told = {name: [str(getattr(header, name)) for header in headers] for name in alike}
-    told["training"] = _alike([header.training or "" for header in headers])
-    for name, values in told.items():
-        if len(found := dict.fromkeys(values)) > 1:
-            rename = "; or write seeds of one method under one name: lagbench predict --method NAME"
-            fix = OWN + rename * (name == "method")
-            raise UsageError(
-                f"the files differ in {name}", got=", ".join(map(ascii, found)), fix=fix
-            )
+    """Return the seeds of files that belong together.
+
+    Raises:
+        UsageError: the files do not belong together, or their seeds do not differ.
+    """
+    for name in SHARED_LABELS:
+        _require_equal(name, [str(getattr(header, name)) for header in headers])
+    provenances = [header.provenance for header in headers]
+    _require_equal("training", _shared_trainings(provenances))
+
     seeds = tuple(header.seed for header in headers)
-    if any(seed is not None and not 0 <= seed < 2**63 for seed in seeds):
-        raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
+    for seed in seeds:
+        if seed is not None and not 0 <= seed < 2**63:
+            raise UsageError("a seed does not fit", expected="0 to 2^63 - 1", got=seeds)
     if len(seeds) > 1 and (None in seeds or len(set(seeds)) < len(seeds)):
-        fix = "write them with submission.write(..., seed=0), seed=1 and so on"
         raise UsageError(
-            "several files need seeds that differ", got=_spelled(seeds), fix=fix
+            "several files need seeds that differ",
+            got=_format_seeds(seeds),
+            fix="write them with submission.write(..., seed=0), seed=1 and so on",
         )
     return seeds
 
 
-def _alike(trainings: Sequence[str]) -> list[str]:
-    """Return trainings in words without what is each seed's own: its best step, and
-    what it started from.
+def _require_equal(name: str, values: Sequence[str]) -> None:
+    different = list(dict.fromkeys(values))
+    if len(different) < 2:
+        return
+    fix = SUBMIT_APART
+    if name == "method":
+        fix += (
+            "; or write seeds of one method under one name: "
+            "lagbench predict --method NAME"
+        )
+    raise UsageError(
+        f"the files differ in {name}", got=", ".join(map(ascii, different)), fix=fix
+    )
 
-    Nothing where no recipe is named: words of people are not compared.
+
+def _shared_trainings(
+    provenances: Sequence[TrainingProvenance | None],
+) -> list[str]:
+    """Return in words the part of each training that seeds of a method share.
+
+    Empty where no training is known as data: words of people are not compared.
     """
-    words = [re.sub(r"(, step |, weights )\w+", "", one) for one in trainings]
-    if any(", recipe " in one for one in words):
-        return words
-    return []
+    if not any(provenances):
+        return []
+    trainings = []
+    for provenance in provenances:
+        if provenance is None:
+            trainings.append("a training in words")
+        else:
+            trainings.append(provenance.shared_by_seeds().describe())
+    return trainings
 
 
-def extendable(
+def require_extendable(
     folder: Folder, place: Place, headers: Sequence[Header], meta: Meta
 ) -> Entry:
-    """Return the entry that gets more seeds, its predictions perhaps gone; refuse what
-    does not belong.
+    """Return the entry that gets more seeds; its predictions may be gone.
+
+    Raises:
+        UsageError: there is no such active entry, or the files do not belong to it.
+        ChecksFailedError: score files or weights of the entry have changed.
     """
     path = folder.path / entry_path(place)
-    first = headers[0]
-    anew = "or submit all seeds anew: --replace"
     if not path.exists():
-        fix = "submit it without --add; --method names the entry"
-        raise UsageError("there is no entry to add seeds to", where=str(path), fix=fix)
+        raise UsageError(
+            "there is no entry to add seeds to",
+            where=str(path),
+            fix="submit it without --add; --method names the entry",
+        )
     entry = read_entry(path)
     if entry.status is not Status.ACTIVE:
-        fix = "submit by another --method"
         raise UsageError(
             "seeds are added to active entries only",
             where=str(path),
             got=entry.status,
-            fix=fix,
+            fix="submit by another --method",
         )
-    own = [made.seed for made in entry.predictions]
-    seeds = [header.seed for header in headers]
-    if None in own or None in seeds:
+    _require_new_seeds(path, entry.seeds, [header.seed for header in headers])
+    _require_unchanged_files(folder, entry)
+    _require_same_method(folder, entry, headers[0], meta)
+    return entry
+
+
+def _require_new_seeds(
+    path: Path, entry_seeds: Sequence[int | None], new_seeds: Sequence[int | None]
+) -> None:
+    if None in entry_seeds or None in new_seeds:
         raise UsageError(
             "seeds that are added need numbers, those of the entry too",
             where=str(path),
-            got=f"the entry has {_spelled(own)}, the files {_spelled(seeds)}",
+            got=f"the entry has {_format_seeds(entry_seeds)}, "
+            f"the files {_format_seeds(new_seeds)}",
             fix="write every file with a seed, as submission.write(..., seed=0) does; "
             "submit all: --replace",
         )
-    if common := sorted({*own} & {*seeds}, key=str):
-        fix = f"leave out what is there, {anew}"
-        got = f"seed {_spelled(common)}; the entry has {_spelled(own)}"
+    common_seeds = sorted(set(entry_seeds) & set(new_seeds), key=str)
+    if common_seeds:
         raise UsageError(
-            "the entry has such a seed already", where=str(path), got=got, fix=fix
+            "the entry has such a seed already",
+            where=str(path),
+            got=f"seed {_format_seeds(common_seeds)}; "
+            f"the entry has {_format_seeds(entry_seeds)}",
+            fix=f"leave out what is there, {SUBMIT_ANEW}",
         )
-    if (count := len(own) + len(seeds)) > MOST_SEEDS:
+    count = len(entry_seeds) + len(new_seeds)
+    if count > MOST_SEEDS:
         raise UsageError(
             "too many seeds",
             where=str(path),
             expected=f"at most {MOST_SEEDS}",
             got=count,
         )
-    files = zip(entry.score_paths, entry.score.files, strict=True)
-    named = [
-        (path, said.sha256, "a score file of the entry is not the one")
-        for path, said in files
-    ]
-    weights = [made.weights for made in entry.predictions if made.weights]
-    named += [
-        (Path(its.path), its.sha256, "weights of the entry are not those")
-        for its in weights
-    ]
-    for inner, sha256, what in named:
-        if not is_there(folder, inner, sha256):
+
+
+def _require_unchanged_files(folder: Folder, entry: Entry) -> None:
+    for path, file in zip(entry.score_paths, entry.score.files, strict=True):
+        if not is_unchanged(folder, path, file.sha256):
             raise ChecksFailedError(
-                f"{what} that it names",
-                where=str(folder.path / inner),
-                expected=f"SHA-256 {sha256[:16]}",
-                fix=f"restore {'it' if inner.suffix == '.nc' else 'them'}, as `git "
-                f"checkout` does, {anew}",
+                "a score file of the entry is not the one that it names",
+                where=str(folder.path / path),
+                expected=f"SHA-256 {file.sha256[:16]}",
+                fix=f"restore it, as `git checkout` does, {SUBMIT_ANEW}",
             )
-    label = read_stored(folder.path / entry.score_paths[0]).scores.identity["method"]
-    told: dict[str, tuple[object, object]] = {
-        "method": (label, first.method),
-        "dataset_sha256": (entry.dataset.sha256, first.dataset_sha256),
-    }
-    if "parameters" not in meta.model_fields_set and first.parameters is not None:
-        told["parameters"] = (entry.parameters, first.parameters)
-    words = _alike([entry.training, (first.training or "")[:LONGEST_TEXT]])
-    if "training" not in meta.model_fields_set and words:
-        told["training"] = (words[0], words[1])
-    for name, (theirs, ours) in told.items():
-        if theirs != ours:
+    for prediction in entry.predictions:
+        weights = prediction.weights
+        if weights is None:
+            continue
+        if not is_unchanged(folder, Path(weights.path), weights.sha256):
+            raise ChecksFailedError(
+                "weights of the entry are not those that it names",
+                where=str(folder.path / weights.path),
+                expected=f"SHA-256 {weights.sha256[:16]}",
+                fix=f"restore them, as `git checkout` does, {SUBMIT_ANEW}",
+            )
+
+
+def _require_same_method(
+    folder: Folder, entry: Entry, header: Header, meta: Meta
+) -> None:
+    for name, expected, got in _labels_to_compare(folder, entry, header, meta):
+        if expected != got:
             raise UsageError(
                 f"the files differ from the entry in {name}",
-                where=str(path),
-                expected=quoted(theirs),
-                got=quoted(ours),
-                fix=f"{OWN}, by another --method; {anew}",
+                where=str(folder.path / entry.yaml_path),
+                expected=quote(expected),
+                got=quote(got),
+                fix=f"{SUBMIT_APART}, by another --method; {SUBMIT_ANEW}",
             )
-    return entry
 
 
-def _spelled(seeds: Sequence[int | None]) -> str:
+def _labels_to_compare(
+    folder: Folder, entry: Entry, header: Header, meta: Meta
+) -> Iterator[tuple[str, object, object]]:
+    """Yield labels with their values in the entry and in the files.
+
+    What the submitter states anew is not compared.
+    """
+    identity = read_score_file(folder.path / entry.score_paths[0]).scores.identity
+    yield "method", identity["method"], header.method
+    yield "dataset_sha256", entry.dataset.sha256, header.dataset_sha256
+    if "parameters" not in meta.model_fields_set and header.parameters is not None:
+        yield "parameters", entry.parameters, header.parameters
+    if "training" not in meta.model_fields_set:
+        trainings = _shared_trainings([entry.provenance, header.provenance])
+        if trainings:
+            yield "training", trainings[0], trainings[1]
+
+
+def _format_seeds(seeds: Iterable[int | None]) -> str:
     return ", ".join("none" if seed is None else str(seed) for seed in seeds)
 
 
 def require_new(
-    prints: Sequence[str], paths: Sequence[Path], known: Mapping[str, str]
+    identities: Sequence[str], paths: Sequence[Path], owners: Mapping[str, str]
 ) -> None:
-    """Refuse files that another entry or another seed has: `known` says whose a print
-    is.
+    """Refuse predictions that another entry or another seed has.
+
+    An identity is a content hash or a fingerprint; ``owners`` names the file or entry
+    that has it already.
+
+    Raises:
+        UsageError: the same predictions are there.
     """
-    found = dict(known)
-    for print_, path in zip(prints, paths, strict=True):
-        if print_ in found:
-            fix = "submit the file of each seed once; what goes by a new name supersedes its old entry"
-            got = f"those of {found[print_]}"
+    owner_of = dict(owners)
+    for identity, path in zip(identities, paths, strict=True):
+        if identity in owner_of:
             raise UsageError(
-                "the same predictions are there", where=str(path), got=got, fix=fix
+                "the same predictions are there",
+                where=str(path),
+                got=f"those of {owner_of[identity]}",
+                fix="submit the file of each seed once; what goes by a new name "
+                "supersedes its old entry",
             )
-        found[print_] = str(path)
+        owner_of[identity] = str(path)

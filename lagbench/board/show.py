@@ -3,164 +3,206 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
 from lagbench.scoring.card import digits
 
-from .columns import held
-from .model import Board, ReferenceRow, Row, Value
+from .columns import TableRow, metric_value
+from .entry import EntryCost
+from .model import Board, BoardRow, ReferenceRow, Tab, Value
+
+NOTHING = "-"
 
 
-def chosen_data_sets(
+def choose_data_sets(
     known: Collection[tuple[str, str]], split: str | None, size: str | None
 ) -> tuple[tuple[str, str], ...]:
-    """Return those of a split, of a size, or all of the (split, size) that have
-    entries; refuse none.
+    """Return the (split, size) with entries that are of a split, of a size, or all.
+
+    Raises:
+        UsageError: a split or size is given that has no entries.
     """
-    found = tuple(
-        one for one in known if split in (None, one[0]) and size in (None, one[1])
-    )
-    if found or (split is None and size is None):
-        return found
+    chosen = []
+    for known_split, known_size in known:
+        if split in (None, known_split) and size in (None, known_size):
+            chosen.append((known_split, known_size))
+    if chosen or (split is None and size is None):
+        return tuple(chosen)
+
     wanted = " ".join(name for name in (split, size) if name)
+    fix: str | None = "submit something: lagbench submit"
     if known:
-        fix = nearest(wanted, map(" ".join, known))
-    else:
-        fix = "submit something: lagbench submit"
+        fix = suggest_name(wanted, [" ".join(data_set) for data_set in known])
     raise UsageError("no entries there", where=f"leaderboard {wanted}", fix=fix)
 
 
 def tables(
     board: Board, metrics: Collection[str] = (), *, wide: bool = False
 ) -> Iterator[Table]:
-    """Yield a table per tab: ranked rows, floors, the rest; with ``wide`` the tab's
-    first metrics too.
+    """Yield a table per tab: ranked rows, reference predictors, other rows.
+
+    Args:
+        board: the board.
+        metrics: metrics to show beside the ranking one.
+        wide: whether to show the first metrics of each tab.
+
+    Raises:
+        UsageError: an unknown metric.
     """
     for name in metrics:
         if name not in board.metrics:
             raise UsageError(
                 f"no metric {name!r} here",
                 where="--metric",
-                fix=nearest(name, board.metrics),
+                fix=suggest_name(name, board.metrics),
             )
     for tab in board.tabs:
-        skill = ("skill",) if any(row.skill for row in tab.rows) else ()
-        names = list(
-            dict.fromkeys(
-                (*skill, tab.ranking, *metrics, *(tab.columns if wide else ()))
-            )
-        )
-        if tab.decided:
-            claim = ""
-        else:
-            claim = ", too few scenarios to tell entries apart"
-        if any(row.entry.cost for row in tab.rows):
-            cost = "; cost self-reported"
-        else:
-            cost = ""
-        title = f"{tab.size.split} {tab.size.name} {tab.size.version}, by {tab.ranking}{claim}{cost}"
-        ranked = [row for row in tab.rows if row.rank is not None]
-        rest = [row for row in tab.rows if row.rank is None]
-        shown: list[Row | ReferenceRow] = [*ranked, *tab.floors, *rest]
+        names = _columns_of(tab, metrics, wide=wide)
+        ranked_rows = [row for row in tab.rows if row.rank is not None]
+        other_rows = [row for row in tab.rows if row.rank is None]
+        rows: list[TableRow] = [*ranked_rows, *tab.references, *other_rows]
         yield Table(
-            title,
+            _title_of(tab),
             ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
-            tuple(_cells(row, names) for row in shown),
+            tuple(_format_row(row, names) for row in rows),
             keys=2,
         )
 
 
-def as_plain(board: Board) -> dict[str, Any]:
-    """Return a board as JSON may hold it; what is undefined is None."""
+def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
+    names = [tab.ranking, *metrics]
+    if any(row.skill for row in tab.rows):
+        names.insert(0, "skill")
+    if wide:
+        names += tab.columns
+    return list(dict.fromkeys(names))
+
+
+def _title_of(tab: Tab) -> str:
+    size = tab.size
+    title = f"{size.split} {size.name} {size.version}, by {tab.ranking}"
+    if not tab.decided:
+        title += ", too few scenarios to tell entries apart"
+    if any(row.entry.cost for row in tab.rows):
+        title += "; cost self-reported"
+    return title
+
+
+def to_plain(board: Board) -> dict[str, Any]:
+    """Return a board as values for JSON; undefined numbers are None."""
+    return {"tabs": [_plain_tab(tab) for tab in board.tabs]}
+
+
+def _plain_tab(tab: Tab) -> dict[str, Any]:
+    references = []
+    for reference in tab.references:
+        values = reference.values
+        metrics = {name: _plain_value(value) for name, value in values.items()}
+        references.append({"id": reference.name, "metrics": metrics})
     return {
-        "tabs": [
-            {
-                "split": tab.size.split,
-                "size": tab.size.name,
-                "dataset_version": tab.size.version,
-                "ranking_metric": tab.ranking,
-                "rows": [_plain_row(row) for row in tab.rows],
-                "floors": [
-                    {
-                        "id": floor.name,
-                        "metrics": {n: _plain(v) for n, v in floor.values.items()},
-                    }
-                    for floor in tab.floors
-                ],
-            }
-            for tab in board.tabs
-        ]
+        "split": tab.size.split,
+        "size": tab.size.name,
+        "dataset_version": tab.size.version,
+        "ranking_metric": tab.ranking,
+        "rows": [_plain_row(row) for row in tab.rows],
+        "floors": references,
     }
 
 
-def _plain_row(row: Row) -> dict[str, Any]:
+def _plain_row(row: BoardRow) -> dict[str, Any]:
     entry = row.entry
+    cost = None
+    if entry.cost is not None:
+        cost = {**entry.cost.model_dump(), "speed_up": entry.cost.speed_up}
+    budget = None
+    if entry.budget is not None:
+        budget = entry.budget.model_dump()
+    skill = None
+    if row.skill is not None:
+        skill = _plain_value(row.skill)
     return {
-        **{
-            name: getattr(row, name)
-            for name in ("id", "rank", "tied", "current", "diverged")
-        },
+        "id": row.id,
+        "rank": row.rank,
+        "tied": row.tied,
+        "current": row.current,
+        "diverged": row.diverged,
         "name": entry.name,
         "status": str(entry.status),
         "verified": row.verified is not None,
         "seeds": len(entry.predictions),
         "parameters": entry.parameters,
         "flags": [flag.name for flag in row.flags],
-        "cost": entry.cost
-        and {**entry.cost.model_dump(), "speed_up": entry.cost.speed_up},
-        "budget": entry.budget and entry.budget.model_dump(),
-        "skill": row.skill and _plain(row.skill),
-        "metrics": {name: _plain(value) for name, value in row.values.items()},
+        "cost": cost,
+        "budget": budget,
+        "skill": skill,
+        "metrics": {name: _plain_value(value) for name, value in row.values.items()},
     }
 
 
-def _plain(value: Value) -> dict[str, float | None]:
+def _plain_value(value: Value) -> dict[str, float | None]:
     return {
-        name: digits(getattr(value, name)) for name in ("mean", "std", "low", "high")
+        "mean": digits(value.mean),
+        "std": digits(value.std),
+        "low": digits(value.low),
+        "high": digits(value.high),
     }
 
 
-def _cells(row: Row | ReferenceRow, names: list[str]) -> tuple[str, ...]:
-    values = [
-        "-"
-        if (value := held(row, name)) is None or math.isnan(value.mean)
-        else f"{value.mean:.4g}"
-        + ("" if math.isnan(value.std) else f" ± {value.std:.2g}")
-        for name in names
-    ]
+def _format_row(row: TableRow, names: Sequence[str]) -> tuple[str, ...]:
+    values = [_format_value(metric_value(row, name)) for name in names]
     if isinstance(row, ReferenceRow):
-        cost = row.cost
-    else:
-        cost = row.entry.cost
-    if cost:
-        time = f"{cost.seconds_per_frame:.3g}"
-    else:
-        time = ""
-    if cost and cost.speed_up is not None:
-        speed_up = f"{cost.speed_up:.3g}"
-    else:
-        speed_up = ""
-    if isinstance(row, ReferenceRow):
-        return ("-", row.name, *values, time, speed_up, "floor")
+        times = _format_times(row.cost)
+        return (NOTHING, row.name, *values, *times, "reference")
+    return (
+        _format_rank(row),
+        row.id,
+        *values,
+        *_format_times(row.entry.cost),
+        ", ".join(_remarks_on(row)),
+    )
+
+
+def _format_value(value: Value | None) -> str:
+    if value is None or math.isnan(value.mean):
+        return NOTHING
+    if math.isnan(value.std):
+        return f"{value.mean:.4g}"
+    return f"{value.mean:.4g} ± {value.std:.2g}"
+
+
+def _format_times(cost: EntryCost | None) -> tuple[str, str]:
+    """Return time per frame and speed-up."""
+    if cost is None:
+        return "", ""
+    if cost.speed_up is None:
+        return f"{cost.seconds_per_frame:.3g}", ""
+    return f"{cost.seconds_per_frame:.3g}", f"{cost.speed_up:.3g}"
+
+
+def _format_rank(row: BoardRow) -> str:
     if row.rank is None:
-        rank = "-"
-    else:
-        rank = f"{row.rank}{'≈' if row.tied else ''}"
-    if row.entry.budget:
-        track = row.entry.budget.track
-    else:
-        track = None
+        return NOTHING
+    if row.tied:
+        return f"{row.rank}≈"
+    return str(row.rank)
+
+
+def _remarks_on(row: BoardRow) -> Iterator[str]:
     entry = row.entry
-    remarks = [
-        "verified" if row.verified else "",
-        "" if str(entry.status) == "active" else str(entry.status),
-        "" if row.current else f"data set {entry.dataset.version}",
-        track or "",
-        f"{len(entry.predictions)} seeds" if len(entry.predictions) > 1 else "",
-        f"{row.diverged} diverged" if row.diverged else "",
-        *(flag.name for flag in row.flags),
-    ]
-    return (rank, row.id, *values, time, speed_up, ", ".join(filter(None, remarks)))
+    if row.verified:
+        yield "verified"
+    if str(entry.status) != "active":
+        yield str(entry.status)
+    if not row.current:
+        yield f"data set {entry.dataset.version}"
+    if entry.budget is not None and entry.budget.track:
+        yield entry.budget.track
+    if len(entry.predictions) > 1:
+        yield f"{len(entry.predictions)} seeds"
+    if row.diverged:
+        yield f"{row.diverged} diverged"
+    for flag in row.flags:
+        yield flag.name

@@ -1,8 +1,9 @@
-"""Weights beside their entries: ``lagbench submit --weights`` copies them,
-``leaderboard check`` hashes them.
+"""Weights beside their entries.
 
-weights/<split>/<size>/<method>_<seed>.pt     parameters, as `lagbench predict` reads them
-weights/<split>/<size>/<method>_<seed>.json   what the training recorded, where it did
+``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them.
+
+weights/<split>/<size>/<method>_<seed>.pt     parameters, which `lagbench predict` reads
+weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
 """
 
 from __future__ import annotations
@@ -10,9 +11,8 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from operator import attrgetter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lagbench.data.checksums import file_sha256
 from lagbench.errors import (
@@ -21,43 +21,118 @@ from lagbench.errors import (
     check_installed,
     check_regular,
 )
-from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
+from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
-from .entry_file import is_there
-from .findings import finding
+from .entry_file import is_unchanged
 from .folder import Folder, Place, weights_path
-
-if TYPE_CHECKING:
-    from lagbench.baselines.checkpoint import Checkpoint
+from .issues import make_issue
 
 MOST_BYTES = 40_000_000
 """All weights of a leaderboard together [bytes]: git keeps every version of them for
 good.
 """
 
-# longest record of a training beside its weights [bytes]; those of ours take 3 kB
-MOST_RECORD = 256 << 10
+# longest log of a training beside its weights [bytes]; ours take 3 kB
+MOST_LOG_BYTES = 256 << 10
 
-RECORD = "training.json"
+TRAINING_LOG = "training.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeightsFile:
+    """A file of weights that a submitter gives."""
+
+    path: Path
+    sha256: str
+    is_state: bool  # a state to go on from, with an optimiser
+    baseline: str
+    data_set: tuple[str, str, str]  # split, size and SHA-256
+    seed: int
+    provenance: TrainingProvenance
+    parameters: int | None  # None where the weights are not rounded
+
+    def describe_data_set(self) -> str:
+        """Return split, size, data set and seed in words."""
+        return f"{_describe_data_set(self.data_set)}, seed {self.seed}"
+
+
+def _describe_data_set(data_set: tuple[str, str, str]) -> str:
+    split, size, sha256 = data_set
+    return f"{split} {size}, data set {sha256[:16]}"
+
+
+def inspect_weights(path: Path) -> WeightsFile:
+    """Read a file of weights; nothing in it is run.
+
+    Raises:
+        UnreadableFileError: the file is damaged or no weights.
+        UsageError: torch is not installed.
+    """
+    check_installed("torch", extra="baselines")
+    from lagbench.baselines.checkpoint import count_rounded_parameters, load
+    from lagbench.baselines.predict import provenance_of
+
+    checkpoint = load(path)
+    info = checkpoint.info
+    recipe = checkpoint.training.get("recipe", {})
+    return WeightsFile(
+        path=path,
+        sha256=file_sha256(path),
+        is_state=checkpoint.optimizer is not None,
+        baseline=checkpoint.baseline,
+        data_set=(info.split, info.size, info.dataset_sha256),
+        seed=recipe.get("training", {}).get("seed", 0),
+        provenance=provenance_of(checkpoint),
+        parameters=count_rounded_parameters(checkpoint) or None,
+    )
 
 
 def require_weights(
     weights: Sequence[str | Path],
     headers: Sequence[Header],
-    others: Mapping[Path, Entry],
+    rivals: Mapping[Path, Entry],
 ) -> tuple[Path | None, ...]:
-    """Return the file of weights of each of the predictions, found by its seed, None
-    where there is none.
+    """Return the weights of each of the predictions, by seed; None where it has none.
 
-    Refused are weights that cannot have made the predictions, that nothing says have,
-    and those of another entry: they lie on the board already.
+    Raises:
+        UsageError: the weights are too large, cannot have made the predictions, nothing
+            says that they have, or they lie beside another entry already.
+        UnreadableFileError: a file is no file of weights.
     """
-    found: list[Path | None] = [None] * len(headers)
-    if not weights:
-        return tuple(found)
-    length = sum(Path(path).stat().st_size for path in weights if Path(path).is_file())
+    paths = [Path(path) for path in weights]
+    _require_small(paths)
+
+    seeds = [header.seed or 0 for header in headers]
+    owners = _owners_of_weights(rivals)
+    chosen: list[Path | None] = [None] * len(headers)
+    for path in paths:
+        file = inspect_weights(path)
+        _require_fit(file, headers[0], seeds)
+        index = seeds.index(file.seed)
+        if chosen[index] is not None:
+            raise UsageError(
+                f"two files of weights of seed {file.seed}",
+                where=str(path),
+                fix="give one of each seed at most",
+            )
+        if file.sha256 in owners:
+            raise UsageError(
+                "these weights lie beside another entry",
+                where=str(path),
+                got=f"those of {owners[file.sha256]}",
+                fix="leave them out, and name them in --command; or give those of "
+                "this method",
+            )
+        _require_made_by(file, headers[index])
+        chosen[index] = path
+    return tuple(chosen)
+
+
+def _require_small(paths: Sequence[Path]) -> None:
+    length = sum(path.stat().st_size for path in paths if path.is_file())
     if length > MOST_BYTES:
         raise UsageError(
             "the weights are too large to lie beside entries",
@@ -67,237 +142,256 @@ def require_weights(
             fix="leave --weights out, and name a file of a release by `weights: "
             "https://...` in --from",
         )
-    check_installed("torch", extra="baselines")
-    from lagbench.baselines.checkpoint import load
-
-    seeds = [header.seed or 0 for header in headers]
-    lying = _holders(others)
-    for path in map(Path, weights):
-        held = load(path)
-        if held.optimizer is not None:
-            fix = "give weights.pt beside it, and predictions that were made with that"
-            raise UsageError(
-                "a state to go on from, not the weights of a model",
-                where=str(path),
-                fix=fix,
-            )
-        seed = held.training.get("recipe", {}).get("training", {}).get("seed", 0)
-        belong = attrgetter("split", "size", "dataset_sha256")
-        got = belong(held.info)
-        expected = belong(headers[0])
-        if got != expected or seed not in seeds:
-            raise UsageError(
-                "the weights do not belong to these predictions",
-                where=str(path),
-                expected=f"{expected[0]} {expected[1]}, data set {expected[2][:16]}, "
-                f"seeds {seeds}",
-                got=f"{got[0]} {got[1]}, data set {got[2][:16]}, seed {seed}",
-                fix="leave them out; those of another size are named in --command",
-            )
-        number = seeds.index(seed)
-        if found[number] is not None:
-            fix = "give one of each seed at most"
-            raise UsageError(
-                f"two files of weights of seed {seed}", where=str(path), fix=fix
-            )
-        if (holder := lying.get(file_sha256(path))) is not None:
-            fix = "leave them out, and name them in --command; or give those of this method"
-            what = "these weights lie beside another entry"
-            theirs = f"those of {holder}"
-            raise UsageError(what, where=str(path), got=theirs, fix=fix)
-        _require_made_by(path, held, headers[number])
-        found[number] = path
-    return tuple(found)
 
 
-def _require_made_by(path: Path, held: Checkpoint, header: Header) -> None:
-    """Refuse weights of which the predictions say nothing, or that others than these
-    made.
-    """
-    from lagbench.baselines.checkpoint import count_rounded_parameters
-    from lagbench.baselines.predict import fits, told_by_us, training_words
+def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> None:
+    """Refuse a training state, and weights of another data set or seed."""
+    if file.is_state:
+        raise UsageError(
+            "a state to go on from, not the weights of a model",
+            where=str(file.path),
+            fix="give weights.pt beside it, and predictions that were made with that",
+        )
+    data_set = (header.split, header.size, header.dataset_sha256)
+    if file.data_set != data_set or file.seed not in seeds:
+        raise UsageError(
+            "the weights do not belong to these predictions",
+            where=str(file.path),
+            expected=f"{_describe_data_set(data_set)}, seeds {seeds}",
+            got=file.describe_data_set(),
+            fix="leave them out; those of another size are named in --command",
+        )
 
-    words = header.training or ""
-    said = header.parameters
-    if said is None and not told_by_us(words):
+
+def _require_made_by(file: WeightsFile, header: Header) -> None:
+    """Refuse weights that did not make the predictions, or of which nothing says so."""
+    if header.parameters is None and header.provenance is None:
         raise UsageError(
             "nothing says that these weights made the predictions",
-            where=str(path),
+            where=str(file.path),
             expected="predictions that state their training, or how many parameters "
             "the model has",
             fix="predict with these weights: lagbench predict; or leave them out",
         )
-    count = count_rounded_parameters(held) or said
-    if not fits(words, held) or said not in (None, count):
+
+    is_same_training = (
+        header.provenance is None
+        or header.provenance.training_only() == file.provenance
+    )
+    is_same_count = (
+        header.parameters is None
+        or file.parameters is None
+        or header.parameters == file.parameters
+    )
+    if not is_same_training or not is_same_count:
+        parameters = file.parameters or header.parameters
         raise UsageError(
             "the weights did not make these predictions",
-            where=str(path),
-            expected=f"{words!a}, {said} parameters",
-            got=f"{training_words(held)!a}, {count} parameters of {held.baseline}",
+            where=str(file.path),
+            expected=f"{header.training or ''!a}, {header.parameters} parameters",
+            got=f"{file.provenance.describe()!a}, {parameters} parameters of "
+            f"{file.baseline}",
             fix="give the weights that `lagbench predict` was given, or predict "
             "with these",
         )
 
 
-def named_weights(
+def name_weights(
+    *,
     folder: Folder,
     place: Place,
-    made: Sequence[Prediction],
+    predictions: Sequence[Prediction],
     paths: Sequence[Path | None],
-    before: Entry | None,
-    others: Mapping[Path, Entry],
+    previous: Entry | None,
+    rivals: Mapping[Path, Entry],
 ) -> tuple[Weights | None, ...]:
-    """Return what an entry says of each seed's weights; those of before stay unless
-    something is wrong.
+    """Return the weights that an entry names for each of its predictions.
+
+    Predictions without new weights keep those of the previous entry, where these lie
+    unchanged in their place and are nobody else's.
     """
-    lying = _holders(others)
-    kept = {
-        (one.seed, one.sha256): one.weights
-        for one in (before.predictions if before else ())
-        if one.weights is not None
-        and one.weights.sha256 not in lying
-        and one.weights.path == weights_path(place, one.seed).as_posix()
-        and is_there(folder, weights_path(place, one.seed), one.weights.sha256)
-    }
-    return tuple(
-        kept.get((one.seed, one.sha256))
-        if path is None
-        else Weights(
-            path=weights_path(place, one.seed).as_posix(), sha256=file_sha256(path)
-        )
-        for one, path in zip(made, paths, strict=True)
-    )
+    previous_weights = _sound_weights(folder, place, previous, rivals)
+    named: list[Weights | None] = []
+    for prediction, path in zip(predictions, paths, strict=True):
+        if path is None:
+            key = (prediction.seed, prediction.sha256)
+            named.append(previous_weights.get(key))
+        else:
+            inner_path = weights_path(place, prediction.seed).as_posix()
+            named.append(Weights(path=inner_path, sha256=file_sha256(path)))
+    return tuple(named)
 
 
-def _holders(entries: Mapping[Path, Entry]) -> dict[str, str]:
+def _sound_weights(
+    folder: Folder,
+    place: Place,
+    previous: Entry | None,
+    rivals: Mapping[Path, Entry],
+) -> dict[tuple[int | None, str], Weights]:
+    """Return the weights of the previous entry that may stay, by seed and predictions.
+
+    The entry's own words about them are not believed.
+    """
+    if previous is None:
+        return {}
+    owners = _owners_of_weights(rivals)
+    sound = {}
+    for prediction in previous.predictions:
+        weights = prediction.weights
+        path = weights_path(place, prediction.seed)
+        if (
+            weights is not None
+            and weights.sha256 not in owners
+            and weights.path == path.as_posix()
+            and is_unchanged(folder, path, weights.sha256)
+        ):
+            sound[prediction.seed, prediction.sha256] = weights
+    return sound
+
+
+def _owners_of_weights(entries: Mapping[Path, Entry]) -> dict[str, str]:
     """Return the entries that have weights, by the SHA-256 of these."""
-    held = [
-        (made.weights, where)
-        for where, entry in entries.items()
-        for made in entry.predictions
-    ]
-    return {
-        weights.sha256: str(where) for weights, where in held if weights is not None
-    }
+    owners = {}
+    for path, entry in entries.items():
+        for prediction in entry.predictions:
+            if prediction.weights is not None:
+                owners[prediction.weights.sha256] = str(path)
+    return owners
 
 
-def stage_weights(
-    stage: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
-) -> Iterator[tuple[Path, Path]]:
-    """Copy weights, and what their trainings recorded, to a folder; yield each place
-    and its copy.
+def copy_weights(
+    staging: Path, named: Sequence[Weights | None], paths: Sequence[Path | None]
+) -> dict[Path, Path]:
+    """Copy weights and the logs of their trainings to the staging folder.
+
+    Returns:
+        Path of each copy, by its place in the leaderboard's folder.
     """
-    for number, (said, path) in enumerate(zip(named, paths, strict=True)):
-        if said is None or path is None:
+    copies = {}
+    for number, (weights, path) in enumerate(zip(named, paths, strict=True)):
+        if weights is None or path is None:
             continue
-        sources = {Path(said.path): path}
-        for record in (
-            path.with_suffix(".json"),
-            path.with_name(RECORD),
-        ):  # of weights on a board; of a run
-            # what predictions cost has no step
-            if (
-                record.is_file()
-                and not unfit_record(record)
-                and "step" in json.loads(record.read_bytes())
-            ):
-                sources[Path(said.path).with_suffix(".json")] = record
+        sources = {Path(weights.path): path}
+        log = _find_training_log(path)
+        if log is not None:
+            sources[Path(weights.path).with_suffix(".json")] = log
         for place, source in sources.items():
-            yield (
-                place,
-                Path(shutil.copyfile(source, stage / f"{number}{place.suffix}")),
-            )
+            copies[place] = staging / f"{number}{place.suffix}"
+            shutil.copyfile(source, copies[place])
+    return copies
 
 
-def unfit_record(path: Path) -> str | None:
-    """Return why a file cannot be the record of a training, None if it can."""
+def _find_training_log(path: Path) -> Path | None:
+    """Return the log beside weights on a board, else that beside weights of a run."""
+    training_log = None
+    for candidate in (path.with_suffix(".json"), path.with_name(TRAINING_LOG)):
+        if not candidate.is_file() or reason_unfit_log(candidate) is not None:
+            continue
+        # the JSON file that `lagbench predict` writes about costs has no step
+        if "step" in json.loads(candidate.read_bytes()):
+            training_log = candidate
+    return training_log
+
+
+def reason_unfit_log(path: Path) -> str | None:
+    """Return why a file cannot be the log of a training, None if it can."""
     try:
-        check_regular(path, longest=MOST_RECORD)
-        held = json.loads(path.read_bytes())
+        check_regular(path, longest=MOST_LOG_BYTES)
+        content = json.loads(path.read_bytes())
     except UnreadableFileError as error:
         return f"{error.what}: {error.got}"
     except (OSError, ValueError, RecursionError):
         return "no JSON"
-    if isinstance(held, dict):
+    if isinstance(content, dict):
         return None
     return "no JSON object"
 
 
-def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
-    """Yield weights that are missing, edited, out of place, without an entry, or too
-    many; unfit records.
+def check_weights(
+    folder: Folder, entries: Sequence[Entry]
+) -> Iterator[ValidationIssue]:
+    """Yield weights that are missing, edited, misplaced, without an entry or too many.
+
+    Unfit logs of trainings are reported, too; a log that is not there is no issue.
     """
-    known: set[Path] = set()
-    holders: dict[str, Path] = {}
+    known_paths: set[Path] = set()
+    active_paths: dict[str, Path] = {}  # by SHA-256
     for entry in entries:
-        for number, made in enumerate(entry.predictions):
-            if made.weights is None:
+        for number, prediction in enumerate(entry.predictions):
+            weights = prediction.weights
+            if weights is None:
                 continue
+            path = weights_path(entry.place, prediction.seed)
+            log = path.with_suffix(".json")
+            known_paths |= {path, log}
             where = f"{entry.yaml_path}, predictions.{number}.weights"
-            path = weights_path(entry.place, made.seed)
-            record = path.with_suffix(".json")  # its absence is no finding
-            known |= {path, record}
-            file = folder.path / path
-            kept = folder.path / record
-            if made.weights.path != path.as_posix():
-                yield finding(
-                    "weights", where, ascii(made.weights.path)[1:-1], expected=path
-                )
-            elif not file.is_file() or folder.link_in(path) is not None:
-                yield finding("weights", where, "no such file", expected=path)
-            elif (found := file_sha256(file)) != made.weights.sha256:
-                said = made.weights.sha256[:16]
-                yield finding(
-                    "weights",
-                    path,
-                    f"SHA-256 {found[:16]}",
-                    expected=f"{said} as the entry says",
-                )
-            elif (
-                entry.status is Status.ACTIVE
-                and (holder := holders.setdefault(found, path)) != path
-            ):
-                got = f"the same file as {holder}"
-                yield finding(
-                    "weights",
-                    path,
-                    got,
-                    what="the same weights twice",
-                    expected="one place",
-                )
-            linked = folder.link_in(record) is not None
-            if (
-                kept.exists()
-                and not linked
-                and (reason := unfit_record(kept)) is not None
-            ):
-                most = f"a JSON object of at most {MOST_RECORD} bytes, or no file"
-                yield finding(
-                    "weights",
-                    record,
-                    reason,
-                    what="no record of a training",
-                    expected=most,
-                )
-    held = folder.weight_files()
-    for path in held:
-        if path not in known:
-            yield finding(
+            yield from _check_weights_file(folder, path, weights, where=where)
+            yield from _check_log(folder, log)
+
+            is_active = entry.status is Status.ACTIVE
+            if is_active and is_unchanged(folder, path, weights.sha256):
+                first_path = active_paths.setdefault(weights.sha256, path)
+                if first_path != path:
+                    yield make_issue(
+                        "weights",
+                        path,
+                        f"the same file as {first_path}",
+                        what="the same weights twice",
+                        expected="one place",
+                    )
+
+    lying_paths = folder.weight_files()
+    for path in lying_paths:
+        if path not in known_paths:
+            yield make_issue(
                 "weights",
                 path,
                 "none",
                 what="weights that no entry has",
                 expected="an entry",
             )
-    total = sum((folder.path / path).stat().st_size for path in held)
+    total = sum((folder.path / path).stat().st_size for path in lying_paths)
     if total > MOST_BYTES:
-        fix = "keep larger ones as files of a release, and name them by `weights: https://...` in the entry"
-        most = f"at most {MOST_BYTES} bytes in all"
-        yield finding(
+        yield make_issue(
             "weights",
             "weights",
             f"{total} bytes",
-            what="too many",
-            expected=most,
-            fix=fix,
+            what="too many weights",
+            expected=f"at most {MOST_BYTES} bytes in all",
+            fix="keep larger ones as files of a release, and name them by `weights: "
+            "https://...` in the entry",
+        )
+
+
+def _check_weights_file(
+    folder: Folder, path: Path, weights: Weights, *, where: str
+) -> Iterator[ValidationIssue]:
+    file = folder.path / path
+    if weights.path != path.as_posix():
+        yield make_issue("weights", where, ascii(weights.path)[1:-1], expected=path)
+    elif not file.is_file() or folder.link_in(path) is not None:
+        yield make_issue("weights", where, "no such file", expected=path)
+    else:
+        sha256 = file_sha256(file)
+        if sha256 != weights.sha256:
+            yield make_issue(
+                "weights",
+                path,
+                f"SHA-256 {sha256[:16]}",
+                expected=f"{weights.sha256[:16]} as the entry says",
+            )
+
+
+def _check_log(folder: Folder, path: Path) -> Iterator[ValidationIssue]:
+    file = folder.path / path
+    if not file.exists() or folder.link_in(path) is not None:
+        return
+    reason = reason_unfit_log(file)
+    if reason is not None:
+        yield make_issue(
+            "weights",
+            path,
+            reason,
+            what="no log of a training",
+            expected=f"a JSON object of at most {MOST_LOG_BYTES} bytes, or no file",
         )

@@ -35,7 +35,7 @@ from .output import show as tell
 
 if TYPE_CHECKING:
     from lagbench.board.check import CheckResult
-    from lagbench.board.submit import SubmitResult
+    from lagbench.board.publish import SubmitResult
 
 BoardOption = Annotated[Path, option("--board FOLDER", "The leaderboard's folder.")]
 BOARD = Path("leaderboard")
@@ -330,17 +330,17 @@ def show(
     """Print the tables of the leaderboard."""
     from lagbench.board.build import collect
     from lagbench.board.folder import Folder
-    from lagbench.board.show import as_plain, chosen_data_sets, tables
+    from lagbench.board.show import choose_data_sets, tables, to_plain
 
     known = Folder(board).data_sets()
     held = collect(
         board,
-        only=chosen_data_sets(
+        only=choose_data_sets(
             known, chosen(name, split) if name or split else None, size
         ),
     )
     if as_json:
-        print_json(as_plain(held))
+        print_json(to_plain(held))
         return
     print_blocks(tables(held, metric or (), wide=wide))
     if known and not held.tabs:

@@ -102,7 +102,7 @@ def generate(
 
 def _generated(result: GenerationResult) -> list[str]:
     from lagbench.data.layout import url_of
-    from lagbench.data.registry import spell_ids
+    from lagbench.data.registry import format_ids
 
     to_do = len(result.simulated)
     if result.dry_run:
@@ -127,7 +127,7 @@ def _generated(result: GenerationResult) -> list[str]:
         )
     if result.missing:
         lines.append(
-            f"  missing {spell_ids(result.missing)}: the data set is incomplete"
+            f"  missing {format_ids(result.missing)}: the data set is incomplete"
         )
     if result.dataset_sha256:
         lines.append(f"  hash    {result.dataset_sha256}")
@@ -191,12 +191,12 @@ def _verified(result: VerificationResult) -> Iterator[str]:
 def list_splits(root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List the splits and sizes, what they cost, and what is generated here."""
     from lagbench.data.layout import url_of
-    from lagbench.data.local import resolve_root, rooted
+    from lagbench.data.local import load_rooted_registry, resolve_root
     from lagbench.data.registry import load
     from lagbench.make.inventory import overview
 
     folder = resolve_root(root)
-    registry = rooted(folder, load())
+    registry = load_rooted_registry(folder, load())
     found = [
         overview(registry.size(name, s), folder)
         for name, one in registry.splits.items()
@@ -266,11 +266,11 @@ def info(
     """Show a split: parameters with units, sizes in bytes, time to generate, local
     state.
     """
-    from lagbench.data.local import home
-    from lagbench.data.registry import spell_ids
+    from lagbench.data.local import locate_split
+    from lagbench.data.registry import format_ids
     from lagbench.make.inventory import overview
 
-    split_name, folder, registry = home(chosen(name, split), root=root)
+    split_name, folder, registry = locate_split(chosen(name, split), root=root)
     entry = registry.split(split_name)
     sizes = [
         registry.size(split_name, one) for one in ([size] if size else entry.sizes)
@@ -294,7 +294,7 @@ def info(
         print_table("Parameters", ("name", *entry.sizes, "[unit] meaning"), parameters)
         for one, tier in zip(found, sizes, strict=True):
             subsets = "; ".join(
-                f"{name} {spell_ids(ids)}" for name, ids in tier.subsets.items()
+                f"{name} {format_ids(ids)}" for name, ids in tier.subsets.items()
             )
             given = tier.task.input_frames
             horizon = tier.task.horizon
@@ -339,7 +339,7 @@ def cite(
     """Print how to cite a split: version, hashes of its sizes, and the works behind
     it.
     """
-    from lagbench.data.local import home
+    from lagbench.data.local import locate_split
 
     if bibtex and not (name or split):
         text = _bibtex(
@@ -347,7 +347,7 @@ def cite(
         )
         show({"bibtex": text}, [text], as_json=as_json)
         return
-    split_name, _, registry = home(chosen(name, split), root=root)
+    split_name, _, registry = locate_split(chosen(name, split), root=root)
     entry = registry.split(split_name)
     measured = registry.measured.get(split_name, {})
     hashes = {size: values.dataset_sha256 for size, values in measured.items()}

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.baselines.train import TrainingResult
     from lagbench.board.build import BuildResult
-    from lagbench.board.submit import SubmitResult
+    from lagbench.board.publish import SubmitResult
     from lagbench.data.registry import Registry
     from lagbench.make.generate import GenerationResult
     from lagbench.make.verify import VerificationResult

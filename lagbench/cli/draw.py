@@ -36,8 +36,8 @@ def _source(
     """Return the scenario file that a user means by its path or by split, size and
     id.
     """
-    from lagbench.data.local import locate, remedy
-    from lagbench.store.copy import bring
+    from lagbench.data.local import locate, suggest_repair
+    from lagbench.store.copy import update_working_copy
 
     if name is not None and name.endswith(".nc"):
         return Path(name)
@@ -47,7 +47,7 @@ def _source(
     else:
         wanted = scenario
     subset = tier.subset_of(wanted)
-    bring(tier, folder, [wanted])
+    update_working_copy(tier, folder, [wanted])
     path = tier.path(folder, wanted)
     if not path.is_file():
         if scenario is None:
@@ -57,7 +57,7 @@ def _source(
         raise DataError(
             f"scenario {wanted} is not there",
             where=str(path),
-            fix=remedy(tier, option, root=folder),
+            fix=suggest_repair(tier, option, root=folder),
         )
     return path
 

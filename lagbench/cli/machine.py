@@ -19,7 +19,7 @@ from lagbench.data.registry import load
 from lagbench.errors import LagbenchError, check_installed
 from lagbench.make.plan import free_bytes
 from lagbench.work.machine import available_cores
-from lagbench.work.pool import Pool, Report, Task
+from lagbench.work.pool import Pool, Report, WorkItem
 
 NEEDED = (
     *(
@@ -150,12 +150,12 @@ def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
     """
     tier = load().size(split, size)
     check_installed("taichi", extra="generate")
-    from lagbench.generators.batch import draw
+    from lagbench.generators.batch import draw_initial_state
     from lagbench.generators.constants import solver_constants
     from lagbench.generators.solver import build
 
     solver = build(solver_constants(tier))
-    solver.load([draw(tier, tier.subsets["test"][0])])
+    solver.load([draw_initial_state(tier, tier.subsets["test"][0])])
     solver.advance(WARM_UP * tier.substeps_per_frame)
     started = time.process_time()
     timed = 0
@@ -180,7 +180,7 @@ def bench_apart(split: str, size: str) -> SolverBench:
     check_installed("taichi", extra="generate")
     with Pool(1) as pool:
         pool.submit(
-            Task(
+            WorkItem(
                 name=f"bench of {split} {size}",
                 function=_bench,
                 arguments=(split, size),

@@ -20,7 +20,7 @@ from lagbench.figures.tables import Table
 from lagbench.work.progress import watched
 
 if TYPE_CHECKING:
-    from lagbench.submission.findings import ValidationResult
+    from lagbench.submission.issues import ValidationResult
     from lagbench.work.progress import Progress as State
 
 WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
@@ -204,9 +204,9 @@ def progress_bar(
     leaves none. ``counted`` is what the work is counted in.
     """
     if quiet:
-        from lagbench.store.copy import quietly
+        from lagbench.store.copy import silence_fetching
 
-        with quietly():
+        with silence_fetching():
             yield None
         return
     if not watched():

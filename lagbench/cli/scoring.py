@@ -35,7 +35,7 @@ from .output import (
 
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
-    from lagbench.submission.findings import ValidationResult
+    from lagbench.submission.issues import ValidationResult
 
 OwnSplitOption = Annotated[
     str | None,
@@ -250,9 +250,9 @@ def _wanted(
     """
     name = None
     if split is not None:
-        from lagbench.data.local import home
+        from lagbench.data.local import locate_split
 
-        name, root, _ = home(split, root=root)
+        name, root, _ = locate_split(split, root=root)
 
     def check(result: ValidationResult) -> None:
         if name is not None and result.split not in (None, name):

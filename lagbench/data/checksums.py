@@ -1,4 +1,4 @@
-"""Content hashes: what a data set says, not how a library packed it.
+"""Content hashes of the values of a data set, whatever library packed them.
 
 A file hash would change with the compression, the chunks or the version of HDF5. The
 content hash of a scenario is built from its values alone, in two levels::
@@ -8,8 +8,8 @@ content hash of a scenario is built from its values alone, in two levels::
                                           parameters, variables: {name: variable}})
 
 so that variables can be hashed side by side while frames arrive, and a damaged one can
-be named. Values are little-endian, in C order, with one zero and one NaN;
-docs/format.md has it all.
+be named. Values are little-endian, in C order, with one zero and one NaN. The full
+definition is in docs/format.md.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,10 +30,10 @@ HASHED_SUBSETS = ("train", "valid", "test")
 """Subsets that the data set hash covers."""
 
 BLOCK_BYTES = 1 << 18
-"""Values are made canonical in blocks that stay in the second-level cache [bytes]."""
+"""Values are made canonical in blocks that fit the second-level cache [bytes]."""
 
 
-def plain(value: object) -> object:
+def to_plain(value: object) -> object:
     """Return a JSON value equal to an attribute, whatever library read it.
 
     Booleans become 0 and 1, because netCDF has none; NumPy scalars and arrays of one
@@ -52,18 +53,20 @@ def plain(value: object) -> object:
     if isinstance(value, str) and "\0" not in value:
         return str(value)
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    expected = "a finite number or a string without NUL, or lists and mappings of them"
-    raise DataError("a value cannot be hashed", expected=expected, got=repr(value))
+        return [to_plain(item) for item in value]
+    raise DataError(
+        "a value cannot be hashed",
+        expected="a finite number, a string without NUL, or lists and mappings of them",
+        got=repr(value),
+    )
 
 
 def round_digits(value: float, digits: int = 9) -> float:
-    """Return a number rounded to significant digits, nine as in every published
-    statistic.
+    """Return a number rounded to significant digits.
 
-    What is not finite stays; -0.0 becomes 0.0.
+    Every published statistic has nine. Infinities and NaN stay; -0.0 becomes 0.0.
 
     >>> round_digits(2 / 3), round_digits(2 / 3, 4), round_digits(float("inf"))
     (0.666666667, 0.6667, inf)
@@ -84,7 +87,7 @@ def canonical_json(value: object) -> bytes:
     b'{"a":[0.0,1e-07],"b":1}'
     """
     text = json.dumps(
-        plain(value),
+        to_plain(value),
         sort_keys=True,
         separators=(",", ":"),
         ensure_ascii=False,
@@ -119,9 +122,9 @@ class VariableHasher:
     ) -> None:
         self.name = name  # name of the variable
         self.dtype = dtype_name(dtype)
-        self._missing = math.prod(shape)
+        self._missing_count = math.prod(shape)
         self._sha = hashlib.sha256()
-        self._joint = b""
+        self._separator = b""
         header = {
             "name": name,
             "dtype": self.dtype,
@@ -134,47 +137,55 @@ class VariableHasher:
         """Add the next values."""
         array = np.asarray(values)
         if dtype_name(array.dtype) != self.dtype:
-            raise self._wrong("values have another type", self.dtype, array.dtype)
-        if array.size > self._missing:
-            raise self._wrong(
-                "too many values", f"at most {self._missing} more", array.size
-            )
-        self._missing -= array.size
+            raise self._error("values have another type", self.dtype, array.dtype)
+        if array.size > self._missing_count:
+            most = f"at most {self._missing_count} more"
+            raise self._error("too many values", most, array.size)
+        self._missing_count -= array.size
         if self.dtype == "string":
-            for item in array.reshape(-1).tolist():
-                text = plain(item)
-                if not isinstance(text, str):
-                    raise self._wrong("a value is not a string", "a string", repr(item))
-                self._sha.update(self._joint + text.encode("utf-8"))
-                self._joint = b"\0"
-            return
-        little = array.astype(
-            array.dtype.newbyteorder("<"), order="C", copy=False
-        ).reshape(-1)
-        step = BLOCK_BYTES // little.itemsize
-        for start in range(0, little.size, step):
-            self._sha.update(_canonical(little[start : start + step]).data)
+            self._update_strings(array)
+        else:
+            self._update_numbers(array)
+
+    def _update_strings(self, array: NDArray[Any]) -> None:
+        """Add texts, joined by NUL."""
+        for item in array.reshape(-1).tolist():
+            text = to_plain(item)
+            if not isinstance(text, str):
+                raise self._error("a value is not a string", "a string", repr(item))
+            self._sha.update(self._separator + text.encode("utf-8"))
+            self._separator = b"\0"
+
+    def _update_numbers(self, array: NDArray[Any]) -> None:
+        little_endian = array.dtype.newbyteorder("<")
+        values = array.astype(little_endian, order="C", copy=False).reshape(-1)
+        step = BLOCK_BYTES // values.itemsize
+        for start in range(0, values.size, step):
+            block = _canonical_block(values[start : start + step])
+            self._sha.update(block.data)
 
     def hexdigest(self) -> str:
-        """Return the hash, 64 hex digits."""
-        if self._missing:
-            raise self._wrong(
+        """Return the hash, 64 hex digits.
+
+        Raises:
+            DataError: fewer values have arrived than the shape holds.
+        """
+        if self._missing_count:
+            raise self._error(
                 "values are missing",
                 "as many as the shape holds",
-                f"{self._missing} fewer",
+                f"{self._missing_count} fewer",
             )
         return self._sha.hexdigest()
 
-    def _wrong(self, what: str, expected: object, got: object) -> DataError:
+    def _error(self, what: str, expected: object, got: object) -> DataError:
         return DataError(
             what, where=f"variable {self.name!r}", expected=expected, got=got
         )
 
 
-def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Return a block with one zero and one NaN; the block itself where nothing
-    changes.
-    """
+def _canonical_block(block: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return a block with one zero and one NaN; the same block if nothing changes."""
     if block.dtype.kind != "f":
         return block
     bits = block.view(f"<i{block.itemsize}")
@@ -184,17 +195,18 @@ def _canonical(block: NDArray[np.generic]) -> NDArray[np.generic]:
     negative_zero = np.iinfo(bits.dtype).min
     if bits.min() > negative_zero and not np.isnan(block.min()):
         return block
-    clean = bits.copy()
-    clean[bits == negative_zero] = 0
-    clean[np.isnan(block)] = np.full(1, np.nan, block.dtype).view(bits.dtype)[0]
-    return clean
+    nan_bits = np.full(1, np.nan, block.dtype).view(bits.dtype)[0]
+    canonical_bits = bits.copy()
+    canonical_bits[bits == negative_zero] = 0
+    canonical_bits[np.isnan(block)] = nan_bits
+    return canonical_bits
 
 
 class ContentHasher:
     """Content hash of a scenario whose variables arrive side by side."""
 
     def __init__(self, identity: Mapping[str, object]) -> None:
-        self.identity = identity  # what enters beside the variables
+        self.identity = identity  # the hashed part beside the variables
         self._variables: dict[str, VariableHasher] = {}
 
     def declare(
@@ -209,9 +221,10 @@ class ContentHasher:
 
     def digests(self) -> dict[str, str]:
         """Return the hash of every variable, sorted by name."""
-        return {
-            name: self._variables[name].hexdigest() for name in sorted(self._variables)
-        }
+        digests = {}
+        for name in sorted(self._variables):
+            digests[name] = self._variables[name].hexdigest()
+        return digests
 
     def hexdigest(self) -> str:
         """Return the content hash, 64 hex digits."""
@@ -227,15 +240,16 @@ def file_sha256(path: Path) -> str:
 
 def subset_hash(hashes: Mapping[int, str]) -> str:
     """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id."""
-    lines = "".join(
-        f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes)
-    )
-    return hashlib.sha256(lines.encode("ascii")).hexdigest()
+    lines = [f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes)]
+    text = "".join(lines)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
 
 
 def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) -> str:
-    """Return the data set hash over train, valid and test; other subsets are left
-    out.
+    """Return the data set hash over train, valid and test, without other subsets.
+
+    Raises:
+        DataError: the hash of one of the three is missing.
     """
     missing = [subset for subset in HASHED_SUBSETS if subset not in subsets]
     if missing:

@@ -26,15 +26,17 @@ Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 COUNTED_SHARE = 0.35
-"""A node counts from this share of a full interior node's weight: walls (1/2) do,
-corners (1/4) not.
+"""Least share of a full interior node's weight from which a node counts.
+
+Nodes at walls (1/2) count, nodes at corners (1/4) do not.
 """
 
 EMPTY_SHARE = 1e-3
 """Below this share of a full node's weight a node is empty and its velocity is 0."""
 
-_LOW = 1
-_HIGH = 2  # rows that the stencil of a particle in the unit box can reach past the grid
+# Rows by which the stencil of a particle in the unit box can reach past the grid.
+_ROWS_BELOW = 1
+_ROWS_ABOVE = 2
 
 
 class Placement(enum.StrEnum):
@@ -125,24 +127,20 @@ class Fields:
 
     @cached_property
     def differentiable(self) -> Mask:
-        """Nodes at which vorticity and divergence stand, shape [..., x node, y
-        node].
-        """
+        """Nodes with vorticity and divergence, shape [..., x node, y node]."""
         return differentiable_nodes(self.counted)
 
     @cached_property
     def vorticity(self) -> Floats:
         """``dv/dx - du/dy`` [unit of u / length], NaN where not differentiable."""
-        return np.where(
-            self.differentiable, vorticity(self.velocity, self.grid.spacing), np.nan
-        )
+        slope = vorticity(self.velocity, self.grid.spacing)
+        return np.where(self.differentiable, slope, np.nan)
 
     @cached_property
     def divergence(self) -> Floats:
         """``du/dx + dv/dy`` [unit of u / length], NaN where not differentiable."""
-        return np.where(
-            self.differentiable, divergence(self.velocity, self.grid.spacing), np.nan
-        )
+        slope = divergence(self.velocity, self.grid.spacing)
+        return np.where(self.differentiable, slope, np.nan)
 
 
 def fields(
@@ -187,32 +185,76 @@ def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
     if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
-        expected = "two arrays of one shape [..., particle, 2]"
-        got = f"{x.shape} and {u.shape}"
         raise UsageError(
-            "positions and velocities do not fit", expected=expected, got=got
+            "positions and velocities do not fit",
+            expected="two arrays of one shape [..., particle, 2]",
+            got=f"{x.shape} and {u.shape}",
         )
+    # sum(w) and both components of sum(w u), shape [..., 3, x node, y node]
     sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
         _scatter(x[frame], u[frame], grid, sums[frame])
-    return Transfer(sums[..., 0, :, :], np.moveaxis(sums[..., 1:, :, :], -3, -1))
+    momentum = np.moveaxis(sums[..., 1:, :, :], -3, -1)
+    return Transfer(weight=sums[..., 0, :, :], momentum=momentum)
 
 
 def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
-    """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame to ``out``, [3,
-    x node, y node].
+    """Write ``sum(w)`` and both components of ``sum(w u)`` of one frame.
+
+    Args:
+        x: particle positions [length], shape [particle, 2].
+        u: particle velocities, shape [particle, 2].
+        grid: grid of the fields.
+        out: receives the sums, shape [3, x node, y node].
     """
-    if not (
-        x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
-    ):  # NaN is not inside either
+    # NaN is not inside either.
+    all_inside = x.min(initial=0.0) >= 0.0 and x.max(initial=1.0) <= 1.0
+    if not all_inside:
         inside = ((x >= 0.0) & (x <= 1.0)).all(axis=1)
         x = x[inside]
         u = u[inside]
+    base, weights = _spline_weights(x, grid)
+    along_x, along_y = np.ascontiguousarray(u.T)
+
+    # Number of the lowest of the 9 nodes around each particle, on a grid with margins.
+    side = grid.nodes + _ROWS_BELOW + _ROWS_ABOVE
+    base += _ROWS_BELOW
+    base[0] *= side
+    corner = (base[0] + base[1]).astype(np.intp)
+
+    # Node numbers stay those of the corner; the target is shifted to the node instead.
+    size = side * side
+    padded_size = size + 2 * side + 2
+    weight_sum = np.zeros(padded_size, np.float64)
+    # Both components go into one sum of complex numbers, which takes less time than two
+    # sums of real ones.
+    momentum_sum = np.zeros(padded_size, np.complex128)
+    weight = np.empty(len(corner))
+    product = np.empty(len(corner), np.complex128)
+    for i in range(3):
+        for k in range(3):
+            shift = i * side + k
+            np.multiply(weights[0, i], weights[1, k], out=weight)
+            np.add.at(weight_sum[shift:], corner, weight)
+            np.multiply(weight, along_x, out=product.real)
+            np.multiply(weight, along_y, out=product.imag)
+            np.add.at(momentum_sum[shift:], corner, product)
+
+    inner = slice(_ROWS_BELOW, -_ROWS_ABOVE)
+    padded_sums = (weight_sum, momentum_sum.real, momentum_sum.imag)
+    for field, padded_sum in zip(out, padded_sums, strict=True):
+        field[:] = padded_sum[:size].reshape(side, side)[inner, inner]
+
+
+def _spline_weights(x: Floats, grid: Grid) -> tuple[Floats, Floats]:
+    """Return the lowest of each particle's three nodes per axis, and their weights.
+
+    Shapes [axis, particle] and [axis, node, particle].
+    """
     s = x.T * grid.cells
     s -= grid.origin
     base = np.floor(s - 0.5)
     s -= base
-    # weights of the three nodes of each axis, shape [axis, node, particle]
     weights = np.empty((len(s), 3, s.shape[1]))
     for node, centre in enumerate((1.5, 1.0, 0.5)):
         weight = weights[:, node]
@@ -222,45 +264,16 @@ def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
             np.subtract(0.75, weight, out=weight)
         else:
             weight *= 0.5
-    side = grid.nodes + _LOW + _HIGH
-    base += _LOW
-    base[0] *= side
-    corner = (base[0] + base[1]).astype(np.intp)
-    along_x, along_y = np.ascontiguousarray(u.T)
-
-    # node numbers stay those of the corner; what is added to is shifted to the node
-    # instead
-    size = side * side
-    sums, momenta = (
-        np.zeros(size + 2 * side + 2, dtype) for dtype in (np.float64, np.complex128)
-    )
-    weight = np.empty(len(corner))
-    product = np.empty(len(corner), np.complex128)
-    for i in range(3):
-        for k in range(3):
-            shift = i * side + k
-            np.multiply(weights[0, i], weights[1, k], out=weight)
-            np.add.at(sums[shift:], corner, weight)
-            # both components go into one sum of complex numbers, which takes less than
-            # two of real ones
-            np.multiply(weight, along_x, out=product.real)
-            np.multiply(weight, along_y, out=product.imag)
-            np.add.at(momenta[shift:], corner, product)
-    for field, held in zip(out, (sums, momenta.real, momenta.imag), strict=True):
-        field[:] = held[:size].reshape(side, side)[_LOW:-_HIGH, _LOW:-_HIGH]
+    return base, weights
 
 
 def counted_nodes(weight: Floats, full: float) -> Mask:
-    """Return the nodes with at least :data:`COUNTED_SHARE` of a full interior node's
-    weight.
-    """
+    """Return the nodes with at least :data:`COUNTED_SHARE` of the full weight."""
     return weight >= COUNTED_SHARE * full
 
 
 def node_velocity(sums: Transfer, full: float) -> Floats:
-    """Return ``sum(w u) / sum(w)``, 0 where the weight is below :data:`EMPTY_SHARE` of
-    full.
-    """
+    """Return ``sum(w u) / sum(w)``; 0 below :data:`EMPTY_SHARE` of the full weight."""
     filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
     velocity = np.zeros_like(sums.momentum)
     np.divide(
@@ -282,10 +295,10 @@ def differentiable_nodes(counted: Mask) -> Mask:
 
 
 def vorticity(velocity: Floats, spacing: float) -> Floats:
-    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19); solid-body rotation Omega gives 2
-    Omega.
+    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19).
 
-    Central differences, 0 on the rim of the grid where there is none.
+    Solid-body rotation Omega gives 2 Omega. Central differences, 0 on the rim of the
+    grid where there is none.
 
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].
@@ -300,8 +313,9 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
 
 
 def divergence(velocity: Floats, spacing: float) -> Floats:
-    """Return ``du/dx + dv/dy``; an incompressible flow gives 0. Differences as of the
-    vorticity.
+    """Return ``du/dx + dv/dy``; an incompressible flow gives 0.
+
+    The differences are those of the vorticity.
 
     Args:
         velocity: node velocity, shape [..., x node, y node, 2].

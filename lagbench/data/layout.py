@@ -3,10 +3,10 @@
 ``<root>/<split>/<size>/v<MAJOR>/<subset>/<id:04d>.nc``, with ``manifest.json`` beside
 the subsets. Nothing here writes to the disk.
 
-A root folder in an object store has a local folder that stands for it: netCDF4 and HDF5
-read and write files, so a root given as a URL (``s3://bucket/prefix``) becomes a folder
-of the user's cache, named from the URL, that says in ``store.json`` what it is a copy
-of. Everything works on that folder; ``lagbench.store`` brings objects there and puts
+A root in an object store has a local working copy, because netCDF4 and HDF5 read and
+write files. A root given as a URL (``s3://bucket/prefix``) becomes a folder of the
+user's cache. The folder is named from the URL, and its file ``store.json`` holds the
+URL. All code works on that folder; ``lagbench.store`` fetches objects into it and puts
 them back.
 """
 
@@ -24,12 +24,10 @@ from pathlib import Path
 from lagbench.errors import UsageError
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
-"""Environment variable that names the folder of working copies and of what this machine
-measured.
-"""
+"""Environment variable for the folder of working copies and of measured speeds."""
 
-MARK = "store.json"
-"""Name of the file that says what a folder is a working copy of."""
+STORE_FILE = "store.json"
+"""Name of the file that holds the URL of a working copy."""
 
 _URL = re.compile(r"([a-z][a-z0-9+.-]+):/(.*)", re.DOTALL)
 
@@ -37,60 +35,55 @@ _URL = re.compile(r"([a-z][a-z0-9+.-]+):/(.*)", re.DOTALL)
 def as_url(root: str | Path) -> str | None:
     """Return a root as a URL without a slash at its end; None where it is a path.
 
-    A ``Path`` takes the second slash away; it is put back.
+    A ``Path`` drops the second slash of a URL; it is put back.
 
-    >>> as_url("s3://bucket/data/"), as_url(Path("s3://bucket/data")), as_url("data/cavity")
-    ('s3://bucket/data', 's3://bucket/data', None)
+    >>> as_url("s3://bucket/data/"), as_url(Path("s3://bucket/data"))
+    ('s3://bucket/data', 's3://bucket/data')
     """
     match = _URL.fullmatch(str(root))
     if match is None:
         return None
     scheme, rest = match.groups()
-    # What a local file system names by URL is absolute.
+    address = rest.strip("/")
+    # A path of a local file system is absolute.
     if scheme in {"file", "local"}:
-        lead = "/"
-    else:
-        lead = ""
-    return f"{scheme}://{lead}{rest.strip('/')}"
+        address = f"/{address}"
+    return f"{scheme}://{address}"
 
 
 def url_of(root: Path) -> str | None:
-    """Return the URL that a root folder is the working copy of; None for any other
-    folder.
+    """Return the URL of a working copy; None for any other folder.
 
-    A mark in any other place than the cache means nothing: a stranger may have put it
-    there.
+    The store file counts in the cache only: elsewhere a stranger may have put it.
     """
     try:
-        url = json.loads((root / MARK).read_text(encoding="utf-8"))["url"]
+        text = (root / STORE_FILE).read_text(encoding="utf-8")
+        url = json.loads(text)["url"]
     except (OSError, ValueError, TypeError, KeyError):
         return None
-    if isinstance(url, str) and as_url(url) == url and root == place_of(url):
+    if not isinstance(url, str):
+        return None
+    if as_url(url) == url and root == working_copy_of(url):
         return url
     return None
 
 
-def place_of(url: str) -> Path:
-    """Return the working copy of a root in a store, by a name that says the URL
-    readably, and no other's.
+def working_copy_of(url: str) -> Path:
+    """Return the working copy of a root in a store; its name is readable and unique.
 
-    >>> place_of("s3://bucket/data").name
+    >>> working_copy_of("s3://bucket/data").name
     's3-bucket-data-397b84d8'
     """
     words = re.sub(r"[^A-Za-z0-9._]+", "-", url).strip("-.")[:60]
-    return (
-        cache_folder("stores")
-        / f"{words}-{hashlib.sha256(url.encode()).hexdigest()[:8]}"
-    )
+    digest = hashlib.sha256(url.encode()).hexdigest()
+    return cache_folder("stores") / f"{words}-{digest[:8]}"
 
 
 def cache_folder(part: str) -> Path:
-    """Return a folder of the user's cache, or the one that ``LAGBENCH_CACHE`` names for
-    every part.
-    """
-    given = os.environ.get(CACHE_VARIABLE)
-    if given:
-        return expanded(given, CACHE_VARIABLE)
+    """Return a folder of the user's cache, or the folder of ``LAGBENCH_CACHE``."""
+    folder = os.environ.get(CACHE_VARIABLE)
+    if folder:
+        return expand_path(folder, CACHE_VARIABLE)
     import platformdirs
 
     return platformdirs.user_cache_path("lagbench", appauthor=False) / part
@@ -99,12 +92,12 @@ def cache_folder(part: str) -> Path:
 MANIFEST_NAME = "manifest.json"
 
 NOTES_NAME = ".verified.json"
-"""Where a machine notes which files it has hashed; it stands beside the manifest."""
+"""Name of the file beside the manifest with the hashes that this machine computed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioKey:
-    """What names one scenario."""
+    """The names of one scenario."""
 
     split: str  # name of the split
     size: str  # name of the size
@@ -120,7 +113,7 @@ class ScenarioKey:
     def identity(
         self, seed: str, parameters: Mapping[str, object]
     ) -> dict[str, object]:
-        """Return what enters the content hash beside the variables."""
+        """Return the part of the content hash beside the variables."""
         return {
             "split": self.split,
             "size": self.size,
@@ -141,16 +134,20 @@ def major_of(version: str) -> int:
     return int(version.split(".")[0])
 
 
-def expanded(path: str | Path, where: str) -> Path:
-    """Return a path made absolute, ~ replaced by the home folder; refuse the home of
-    nobody.
+def expand_path(path: str | Path, where: str) -> Path:
+    """Return a path made absolute, ~ replaced by the home folder.
+
+    Raises:
+        UsageError: the user of ``~user`` has no home folder.
     """
     try:
         return Path(path).expanduser().absolute()
     except RuntimeError as error:
-        got = ascii(str(path))
         raise UsageError(
-            "there is no such home folder", where=where, got=got, fix="write it out"
+            "there is no such home folder",
+            where=where,
+            got=ascii(str(path)),
+            fix="write it out",
         ) from error
 
 
@@ -165,29 +162,27 @@ def dataset_folder(root: Path, split: str, size: str, major: int) -> Path:
 
 def scenario_path(root: Path, key: ScenarioKey) -> Path:
     """Return the path of a scenario file."""
-    return (
-        dataset_folder(root, key.split, key.size, key.major)
-        / key.subset
-        / f"{key.scenario:04d}.nc"
-    )
+    folder = dataset_folder(root, key.split, key.size, key.major)
+    return folder / key.subset / f"{key.scenario:04d}.nc"
 
 
-def generation_of(path: Path) -> str | None:
-    """Return the command that makes a scenario file anew; None where its place says no
-    data set.
+def generation_command(path: Path) -> str | None:
+    """Return the command that makes a scenario file anew.
 
-    >>> generation_of(Path("/my data/cavity/tiny/v2/test/0003.nc"))
+    None where the path is not that of a data set.
+
+    >>> generation_command(Path("/my data/cavity/tiny/v2/test/0003.nc"))
     "lagbench generate --split cavity --size tiny --subset test --root '/my data'"
     """
-    subset, version, size, split, *_ = *reversed(path.parts[:-1]), *[""] * 4
-    if re.fullmatch(r"v\d+", version) is None:
+    folders = path.parts[:-1]
+    if len(folders) < 4 or re.fullmatch(r"v\d+", folders[-2]) is None:
         return None
-    root = path.parents[4]
-    return f"lagbench generate --split {split} --size {size} --subset {subset} --root {spelled(root)}"
+    split, size, _, subset = folders[-4:]
+    root = quote_root(path.parents[4])
+    names = f"--split {split} --size {size} --subset {subset}"
+    return f"lagbench generate {names} --root {root}"
 
 
-def spelled(root: Path) -> str:
-    """Return a root as an option's value for a shell: its URL, or the absolute path
-    without detours.
-    """
+def quote_root(root: Path) -> str:
+    """Return a root as an option's value for a shell: its URL, or its absolute path."""
     return shlex.quote(url_of(root) or os.path.abspath(root))

@@ -1,9 +1,9 @@
-"""Which parameters a size needs, and which values its numbers may have.
+"""Limits of the parameters, subsets and frames of a size, and scenario ids as text.
 
-Checked when a datasets.yaml is loaded, for every split alike; what the constants of a
-solver may be is told where it gets them (``lagbench.generators.constants``). Every
-mistake is a ``ValueError`` whose message names key, expected, got and, for names, the
-nearest known one.
+The limits are checked when a datasets.yaml is loaded, for every split alike. The limits
+of a solver's constants stand in ``lagbench.generators.constants``. Every refusal is a
+``ValueError`` whose message names key, expected, got and, for names, the nearest known
+one.
 
 Scenario ids as text: ``0,3-5`` means 0, 3, 4 and 5.
 """
@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 
 Value = int | float | bool | str
 
@@ -34,22 +34,17 @@ class Limit:
 
     def holds(self, value: object) -> bool:
         """Tell whether a value is a finite number within the limit."""
-        kinds = int if self.whole else (int, float)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, kinds)
-            or not math.isfinite(value)
-        ):
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
             return False
-        if self.open_low:
-            above = self.low < value
-        else:
-            above = self.low <= value
-        if self.open_high:
-            below = value < self.high
-        else:
-            below = value <= self.high
-        return above and below
+        if not math.isfinite(value):
+            return False
+        if self.whole and not isinstance(value, int):
+            return False
+        if value < self.low or value > self.high:
+            return False
+        is_on_open_low = self.open_low and value == self.low
+        is_on_open_high = self.open_high and value == self.high
+        return not is_on_open_low and not is_on_open_high
 
     def __str__(self) -> str:
         """Return the limit in words.
@@ -57,21 +52,16 @@ class Limit:
         >>> print(Limit(low=1, high=4096, whole=True))
         an integer, >= 1 and <= 4096
         """
+        bounds = []
         if self.low > -math.inf:
-            low = f"{'>' if self.open_low else '>='} {self.low:.10g}"
-        else:
-            low = ""
+            sign = ">" if self.open_low else ">="
+            bounds.append(f"{sign} {self.low:.10g}")
         if self.high < math.inf:
-            high = f"{'<' if self.open_high else '<='} {self.high:.10g}"
-        else:
-            high = ""
-        sides = " and ".join(side for side in (low, high) if side)
-        if self.whole:
-            kind = "an integer"
-        else:
-            kind = "a finite number"
-        if sides:
-            return f"{kind}, {sides}"
+            sign = "<" if self.open_high else "<="
+            bounds.append(f"{sign} {self.high:.10g}")
+        kind = "an integer" if self.whole else "a finite number"
+        if bounds:
+            return f"{kind}, {' and '.join(bounds)}"
         return kind
 
 
@@ -82,42 +72,51 @@ NEEDED = {
     "frame_rate": Limit(low=0, high=1e9, open_low=True),
     "density": Limit(low=0, open_low=True),
 }
-"""What every split must give: reading, estimating and writing rest on it."""
+"""Parameters of every split: reading, estimating and writing need them."""
 
 FRAMES = Limit(low=1, high=1_000_000, whole=True)
 """Frames of one scenario."""
 
 
 def check_parameters(
-    size: str, given: Mapping[str, Value], declared: Mapping[str, Value | None]
+    size: str, values: Mapping[str, Value], declared: Mapping[str, Value | None]
 ) -> None:
-    """Refuse unknown, missing and impossible parameters of a size."""
-    for name in given:
+    """Refuse unknown, missing and impossible parameters of a size.
+
+    Args:
+        size: name of the size.
+        values: values that the size gives.
+        declared: default value of each parameter of the split; None without one.
+
+    Raises:
+        ValueError: a parameter is unknown, missing or outside its limit.
+    """
+    for name in values:
         if name not in declared:
-            raise ValueError(
-                f"size {size}: undeclared parameter {name!r}: {nearest(name, declared)}"
-            )
-    missing = [n for n, value in declared.items() if value is None and n not in given]
+            hint = suggest_name(name, declared)
+            raise ValueError(f"size {size}: undeclared parameter {name!r}: {hint}")
+    missing = []
+    for name, default in declared.items():
+        if default is None and name not in values:
+            missing.append(name)
     if missing:
         raise ValueError(f"size {size}: no value for {', '.join(missing)}")
     for name in NEEDED:
         if name not in declared:
+            hint = suggest_name(name, declared)
             raise ValueError(
-                f"parameters: no {name!r}, which every split needs; "
-                f"{nearest(name, declared)}"
+                f"parameters: no {name!r}, which every split needs; {hint}"
             )
+
     for name, default in declared.items():
-        if name in given:
+        key = f"parameters.{name}.value"
+        if name in values:
             key = f"sizes.{size}.parameters.{name}"
-        else:
-            key = f"parameters.{name}.value"
-        value = given.get(name, default)
+        value = values.get(name, default)
+        # A split may have texts and switches of its own.
+        is_own_choice = isinstance(value, bool | str) and name not in NEEDED
         limit = NEEDED.get(name, Limit())
-        # Texts and switches are a split's own affair, unless the name is one that every
-        # split needs.
-        if not limit.holds(value) and (
-            name in NEEDED or not isinstance(value, bool | str)
-        ):
+        if not is_own_choice and not limit.holds(value):
             raise ValueError(f"{key}: expected {limit}; got {value!r}")
 
 
@@ -125,10 +124,10 @@ def check_subsets(size: str, subsets: Mapping[str, Sequence[int]]) -> None:
     """Refuse unknown subsets and ids that stand in two of them."""
     unknown = set(subsets) - set(SUBSETS)
     if unknown:
-        raise ValueError(
-            f"size {size}: no subset {min(unknown)!r}: {nearest(min(unknown), SUBSETS)}"
-        )
-    ids = [i for subset in subsets.values() for i in subset]
+        name = min(unknown)
+        hint = suggest_name(name, SUBSETS)
+        raise ValueError(f"size {size}: no subset {name!r}: {hint}")
+    ids = _all_ids(subsets)
     if len(ids) != len(set(ids)):
         raise ValueError(f"size {size}: a scenario stands in two subsets")
 
@@ -140,21 +139,44 @@ def check_frames(
     *,
     task_frames: int,
 ) -> None:
-    """Refuse impossible frame counts, and test scenarios shorter than their task."""
+    """Refuse impossible frame counts, and test scenarios shorter than their task.
+
+    Args:
+        size: name of the size.
+        frames: frames of every scenario, or the ids of scenarios by frame count.
+        subsets: scenario ids of each subset.
+        task_frames: frames that the task needs of a test scenario.
+
+    Raises:
+        ValueError: a count is impossible, or a scenario has none or several.
+    """
     key = f"sizes.{size}.frames"
-    ids = sorted(i for subset in subsets.values() for i in subset)
+    ids = _all_ids(subsets)
     if isinstance(frames, int):
-        pairs = [(i, frames) for i in ids]
+        frame_counts = [(scenario, frames) for scenario in ids]
     else:
-        pairs = sorted((i, count) for count, group in frames.items() for i in group)
-        if [i for i, _ in pairs] != ids:
+        frame_counts = []
+        for count, group in frames.items():
+            frame_counts += [(scenario, count) for scenario in group]
+        frame_counts.sort()
+        if [scenario for scenario, _ in frame_counts] != ids:
             raise ValueError(f"size {size}: frames must name every scenario once")
-    for scenario, count in pairs:
+    for scenario, count in frame_counts:
         if not FRAMES.holds(count):
             raise ValueError(f"{key}: expected {FRAMES}; got {count!r}")
         if scenario in subsets.get("test", ()) and count < task_frames:
-            least = f"at least input_frames + horizon = {task_frames} for test scenario {scenario}"
-            raise ValueError(f"{key}: expected {least}; got {count}")
+            least = f"at least input_frames + horizon = {task_frames}"
+            raise ValueError(
+                f"{key}: expected {least} for test scenario {scenario}; got {count}"
+            )
+
+
+def _all_ids(subsets: Mapping[str, Sequence[int]]) -> list[int]:
+    """Return the ids of all subsets, ascending."""
+    ids: list[int] = []
+    for subset in subsets.values():
+        ids += subset
+    return sorted(ids)
 
 
 MAX_ID = 9999
@@ -178,40 +200,47 @@ def parse_ids(
     >>> parse_ids("0,3-5")
     (0, 3, 4, 5)
     """
-
-    def bad(got: str) -> UsageError:
-        expected = f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5"
-        return UsageError(
-            f"bad list of {noun}s {text!r}", where=where, expected=expected, got=got
-        )
-
     ids: list[int] = []
+    issue = None
     for part in str(text).replace(" ", "").split(","):
         match = re.fullmatch(r"(\d{1,4})(?:-(\d{1,4}))?", part)
         if match is None:
-            raise bad(f"{part!r} is no {noun} and no range")
+            issue = f"{part!r} is no {noun} and no range"
+            break
         first = int(match[1])
         last = int(match[2] or match[1])
         if last < first:
-            raise bad(f"{part!r} runs backwards")
+            issue = f"{part!r} runs backwards"
+            break
         ids.extend(range(first, last + 1))
-    if len(set(ids)) != len(ids):
-        raise bad("a number stands twice")
+    if issue is None and len(set(ids)) != len(ids):
+        issue = "a number stands twice"
+    if issue is not None:
+        raise UsageError(
+            f"bad list of {noun}s {text!r}",
+            where=where,
+            expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
+            got=issue,
+        )
     return tuple(ids)
 
 
-def spell_ids(ids: Iterable[int]) -> str:
+def format_ids(ids: Iterable[int]) -> str:
     """Return the shortest text that :func:`parse_ids` reads as these ids.
 
-    >>> spell_ids([0, 3, 4, 5])
+    >>> format_ids([0, 3, 4, 5])
     '0,3-5'
     """
     runs: list[list[int]] = []
-    for i in ids:
-        if runs and i == runs[-1][-1] + 1:
-            runs[-1].append(i)
+    for scenario in ids:
+        if runs and scenario == runs[-1][-1] + 1:
+            runs[-1].append(scenario)
         else:
-            runs.append([i])
-    return ",".join(
-        f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs
-    )
+            runs.append([scenario])
+    texts = []
+    for run in runs:
+        if len(run) > 1:
+            texts.append(f"{run[0]}-{run[-1]}")
+        else:
+            texts.append(str(run[0]))
+    return ",".join(texts)

@@ -1,17 +1,14 @@
-"""Where a split is described and where its data live: by its name, or by the path of
-its folder.
+"""Find a split and its data, by the split's name or by the path of its folder.
 
-The *root folder* holds all data sets; one in an object store is a working copy on this
-machine.
+The *root folder* holds all data sets; a root in an object store has a working copy on
+this machine.
 
 A *local split* is a folder ``<root>/<name>/`` with its own description, ``split.yaml``
 (laid out as datasets.yaml), and its data in the same places as those of any other
 split. So ``--split path/to/own`` means the split ``own`` with the root folder
 ``path/to``; once the root is named (``--root path/to``), its name is enough. Files from
 strangers carry names only: a path is understood where the user gives one, in
-:func:`locate` and :func:`home`, and nowhere else.
-
-What makes a data set whole again, in words for the user.
+:func:`locate` and :func:`locate_split`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -20,43 +17,49 @@ import errno
 import json
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from lagbench.atomic import write_atomically
-from lagbench.errors import UnreadableFileError, UsageError, check_regular, nearest
+from lagbench.errors import UnreadableFileError, UsageError, check_regular, suggest_name
 
 from .layout import (
     CACHE_VARIABLE,
-    MARK,
+    STORE_FILE,
     as_url,
     dataset_folder,
-    expanded,
-    place_of,
-    spelled,
+    expand_path,
+    quote_root,
     url_of,
+    working_copy_of,
 )
 from .registry import NO_GENERATOR, Measured, Registry, Size, Split, load
 
 ROOT_VARIABLE = "LAGBENCH_ROOT"
 """Environment variable that names the root folder."""
 
-_ROOT = f"--root or {ROOT_VARIABLE}"
+_ROOT_OPTION = f"--root or {ROOT_VARIABLE}"
 
-_NO_REST = re.compile(r"[a-z][a-z0-9+.-]+:/*")
+_SCHEME_ALONE = re.compile(r"[a-z][a-z0-9+.-]+:/*")
 
 DESCRIPTION = "split.yaml"
 """Name of the file that describes a local split; it stands in the split's folder."""
 
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}")
+DEFAULT_NEW_SIZE = "mini"
+"""Size to generate or download by default: minutes and some hundred MB."""
+
+_SPLIT_NAME = re.compile(r"[a-z][a-z0-9_-]{0,63}")
+
+
+# --- root folders ---------------------------------------------------------------------
 
 
 def resolve_root(root: str | Path | None = None) -> Path:
     """Return the folder that holds all data sets.
 
     Args:
-        root: what the user gave; else ``LAGBENCH_ROOT``; else the platform's user data
+        root: root of the user; else ``LAGBENCH_ROOT``; else the platform's user data
             folder. A URL (``s3://bucket/prefix``) stands for its working copy, see
             :mod:`.layout`.
 
@@ -64,69 +67,81 @@ def resolve_root(root: str | Path | None = None) -> Path:
         UsageError: no file system can have a folder of that name.
         WorkFailedError: the working copy of a URL cannot be made.
     """
-    given = _given(root)
-    if given is None:
+    named_root = _named_root(root)
+    if named_root is None:
         import platformdirs
 
         return platformdirs.user_data_path("lagbench", appauthor=False)
-    if (url := as_url(given)) is not None:
-        copy = place_of(url)
-        if url_of(copy) != url:
-            text = json.dumps({"url": url}, indent=1) + "\n"
-            write_atomically(copy / MARK, text.encode(), option=CACHE_VARIABLE)
-        return copy
-    folder = expanded(given, _ROOT)
-    try:
-        folder.lstat()
-    except (OSError, ValueError) as error:
-        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-        if too_long or isinstance(error, ValueError):
-            raise UsageError(
-                "no folder can have that name",
-                where=_ROOT,
-                expected="a path",
-                got=f"{str(folder)[:60]!a}..., {len(str(folder))} characters",
-            ) from error
+    url = as_url(named_root)
+    if url is not None:
+        return _make_working_copy(url)
+    folder = expand_path(named_root, _ROOT_OPTION)
+    _check_folder_name(folder)
     return folder
 
 
+def _make_working_copy(url: str) -> Path:
+    folder = working_copy_of(url)
+    if url_of(folder) != url:
+        text = json.dumps({"url": url}, indent=1) + "\n"
+        write_atomically(folder / STORE_FILE, text.encode(), option=CACHE_VARIABLE)
+    return folder
+
+
+def _check_folder_name(folder: Path) -> None:
+    """Refuse a name that no file system can have; the folder may be missing."""
+    try:
+        folder.lstat()
+    except (OSError, ValueError) as error:
+        if isinstance(error, OSError) and error.errno != errno.ENAMETOOLONG:
+            return
+        name = str(folder)
+        raise UsageError(
+            "no folder can have that name",
+            where=_ROOT_OPTION,
+            expected="a path",
+            got=f"{name[:60]!a}..., {len(name)} characters",
+        ) from error
+
+
 def root_url(root: str | Path | None) -> str | None:
-    """Return the URL that the root of :func:`resolve_root` is; None for a folder. No
-    copy is made.
-    """
-    given = _given(root)
-    if given is None:
+    """Return the URL of a root, without making its copy; None for a folder."""
+    named_root = _named_root(root)
+    if named_root is None:
         return None
-    return as_url(given)
+    return as_url(named_root)
 
 
-def _given(root: str | Path | None) -> str | Path | None:
-    """Return the root that is given; refuse one that names nothing."""
-    given = os.environ.get(ROOT_VARIABLE) or None if root is None else root
-    if given is not None and (not str(given).strip() or _NO_REST.fullmatch(str(given))):
+def _named_root(root: str | Path | None) -> str | Path | None:
+    """Return the root of the user or of the environment; refuse an empty one."""
+    if root is None:
+        root = os.environ.get(ROOT_VARIABLE) or None
+    if root is None:
+        return None
+    text = str(root)
+    if not text.strip() or _SCHEME_ALONE.fullmatch(text):
         raise UsageError(
             "that names no root",
-            where=_ROOT,
+            where=_ROOT_OPTION,
             expected="a folder, or s3://bucket/prefix",
-            got=ascii(str(given)),
+            got=ascii(text),
         )
-    return given
+    return root
 
 
-class Home(NamedTuple):
-    """A split by name, the root folder of its data, and the registry that describes
-    it.
-    """
+# --- splits of a root folder ----------------------------------------------------------
+
+
+class SplitLocation(NamedTuple):
+    """A split by name, the root folder of its data, and the registry with the split."""
 
     name: str
     root: Path
     registry: Registry
 
 
-class Located(NamedTuple):
-    """One size of a split, the root folder of its data, and the registry that describes
-    it.
-    """
+class SizeLocation(NamedTuple):
+    """A size, the root folder of its data, and the registry with the split."""
 
     size: Size
     root: Path
@@ -150,44 +165,50 @@ class RootedRegistry(Registry):
         if name not in self.splits and name in self.local_names():
             self._add(name)
         if name not in self.splits:
-            known = (*self.splits, *self.local_names())
+            known_names = (*self.splits, *self.local_names())
             raise UsageError(
-                f"no split {name!r}", where="--split", fix=nearest(name, known)
+                f"no split {name!r}",
+                where="--split",
+                fix=suggest_name(name, known_names),
             )
         return self.splits[name]
 
     def local_names(self) -> tuple[str, ...]:
-        """Return the names of the root's local splits, sorted; those that others have
-        left out.
+        """Return the names of the root's local splits, sorted.
+
+        Names that other splits have are left out.
         """
         try:
-            found = [path.parent.name for path in self.root.glob(f"*/{DESCRIPTION}")]
+            descriptions = list(self.root.glob(f"*/{DESCRIPTION}"))
         except OSError:
             return ()
-        return tuple(
-            sorted(
-                name for name in found if is_name(name) and name not in self.base.splits
-            )
-        )
+        names = []
+        for path in descriptions:
+            name = path.parent.name
+            if is_split_name(name) and name not in self.base.splits:
+                names.append(name)
+        return tuple(sorted(names))
 
     def _add(self, name: str) -> None:
         path = self.root / name / DESCRIPTION
-        split, measured = _described(path, name)
+        split, measured = _read_description(path, name)
         self.splits[name] = split
         self.files[name] = path
         self.measured = {**self.measured, name: measured}
 
 
-def is_name(text: str) -> bool:
+def is_split_name(text: str) -> bool:
     """Tell whether a text can name a split: a path cannot.
 
-    >>> is_name("dam-break"), is_name("../dam-break")
+    >>> is_split_name("dam-break"), is_split_name("../dam-break")
     (True, False)
     """
-    return _NAME.fullmatch(text) is not None
+    return _SPLIT_NAME.fullmatch(text) is not None
 
 
-def rooted(root: Path, registry: Registry | None = None) -> RootedRegistry:
+def load_rooted_registry(
+    root: Path, registry: Registry | None = None
+) -> RootedRegistry:
     """Return a registry that also knows the local splits of a root folder, by name.
 
     Args:
@@ -195,21 +216,50 @@ def rooted(root: Path, registry: Registry | None = None) -> RootedRegistry:
         registry: the other splits; ours when None.
     """
     base = registry or load()
-    return RootedRegistry(base.base if isinstance(base, RootedRegistry) else base, root)
+    if isinstance(base, RootedRegistry):
+        base = base.base
+    return RootedRegistry(base, root)
 
 
-def home(
+def _read_description(path: Path, name: str) -> tuple[Split, Mapping[str, Measured]]:
+    """Return a local split and its measured values, from its description."""
+    check_regular(path)  # a device never ends
+    registry = load(path)
+    if list(registry.splits) != [name]:
+        raise UnreadableFileError(
+            "the folder is not named like its split",
+            where=str(path),
+            expected=f"one split, {name!r}",
+            got=", ".join(registry.splits) or "none",
+            fix="rename the folder back: the name is part of every hash",
+        )
+    split = registry.splits[name]
+    # A dotted path would be imported: a description must not choose code to run.
+    if split.generator != NO_GENERATOR:
+        raise UnreadableFileError(
+            "a local split cannot name a generator",
+            where=f"{path}, key splits.{name}.generator",
+            expected=NO_GENERATOR,
+            got=split.generator,
+            fix="an installed package adds splits that are simulated: see examples/",
+        )
+    return split, registry.measured.get(name, {})
+
+
+# --- what a user means ----------------------------------------------------------------
+
+
+def locate_split(
     split: str | Path,
     *,
     root: str | Path | None = None,
     registry: Registry | None = None,
-) -> Home:
-    """Return what a user means by ``--split``: a name, or the path of a local split's
-    folder.
+) -> SplitLocation:
+    """Return the split that a user means by ``--split``.
 
-    What has a separator (``path/to/own``, ``./own``, ``own/``) is a path; so is a name
-    that no split has while the current folder holds a local split of that name, and any
-    ``Path``.
+    The option is a name, or the path of a local split's folder. A text with a separator
+    (``path/to/own``, ``./own``, ``own/``) is a path, and so is any ``Path``. A name of
+    no split is a path where the current folder holds a local split of that name.
 
     Args:
         split: name or path.
@@ -221,109 +271,25 @@ def home(
             root.
         UnreadableFileError: the description of the local split is not right.
     """
-    named = isinstance(split, str)
-    split = os.fspath(split)
-    path = Path(os.path.abspath(expanded(split, "--split")))
-    if not named or "/" in split or os.sep in split or split in {".", "..", "~"}:
-        return _at(path, root, registry)
+    text = os.fspath(split)
+    path = Path(os.path.abspath(expand_path(text, "--split")))
+    has_separator = "/" in text or os.sep in text or text in {".", "..", "~"}
+    if has_separator or not isinstance(split, str):
+        return _locate_folder(path, root, registry)
     folder = resolve_root(root)
-    known = rooted(folder, registry)
+    rooted_registry = load_rooted_registry(folder, registry)
     try:
-        known.split(split)
+        rooted_registry.split(text)
     except UsageError:
         if root is None and (path / DESCRIPTION).is_file():
-            return _at(path, root, registry)
+            return _locate_folder(path, root, registry)
         raise
-    return Home(split, folder, known)
+    return SplitLocation(text, folder, rooted_registry)
 
 
-def locate(
-    split: str | Path,
-    size: str | None = None,
-    *,
-    root: str | Path | None = None,
-    registry: Registry | None = None,
-) -> Located:
-    """Return one size of the split that a user means, and where its data live; see
-    :func:`home`.
-
-    Args:
-        split: name or path.
-        size: name of the size; the only one that is there when None.
-        root: folder of all data sets.
-        registry: the other splits; ours when None.
-
-    Raises:
-        UsageError: see :func:`home`; the split has no such size, or of several or no
-            sizes that are there none is named.
-        UnreadableFileError: the description of the local split is not right.
-    """
-    name, folder, known = home(split, root=root, registry=registry)
-    return Located(
-        known.size(name, size or _only_size(name, folder, known)), folder, known
-    )
-
-
-SIZE_TO_MAKE = "mini"
-"""The size that is generated or downloaded where none is named: minutes and some
-hundred MB.
-"""
-
-
-def locate_new(
-    split: str | Path,
-    size: str | None = None,
-    *,
-    root: str | Path | None = None,
-    registry: Registry | None = None,
-) -> Located:
-    """Return what :func:`locate` does for what is yet to be made: mini, or the only
-    size, when None.
-    """
-    name, folder, known = home(split, root=root, registry=registry)
-    sizes = known.split(name).sizes
-    if SIZE_TO_MAKE in sizes:
-        default = SIZE_TO_MAKE
-    else:
-        default = next(iter(sizes))
-    return Located(known.size(name, size or default), folder, known)
-
-
-def _only_size(split: str, root: Path, known: Registry) -> str:
-    """Return the size that a split has, or of which there are data."""
-    sizes = [known.size(split, name) for name in known.split(split).sizes]
-    here = [
-        s
-        for s in sizes
-        if any(dataset_folder(root, split, s.name, s.major).glob("*/*.nc"))
-    ]
-    found = here or (sizes if len(sizes) == 1 else [])
-    if len(found) == 1:
-        return found[0].name
-    names = ", ".join(size.name for size in here) or f"no data of {split}"
-    if here:
-        option = f"--size {here[0].name}"
-    else:
-        option = remedy(sizes[-1], root=root)
-    if here:
-        wrong = "several sizes are there: name one"
-    else:
-        wrong = "no size is named, and none is there"
-    if (
-        url_of(root) is not None and not here
-    ):  # the store may hold it: only what was fetched is known
-        wrong = "no size is named, and none was fetched from the store"
-        option = "name it with --size"
-    raise UsageError(
-        wrong,
-        where="--size",
-        expected=", ".join(size.name for size in sizes),
-        got=f"{names} in {url_of(root) or root}",
-        fix=option,
-    )
-
-
-def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Home:
+def _locate_folder(
+    folder: Path, root: str | Path | None, registry: Registry | None
+) -> SplitLocation:
     """Return the local split of a folder."""
     name = folder.name
     parent = folder.parent
@@ -335,7 +301,7 @@ def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Hom
             got=root,
             fix="give the path alone, or the root and the split's name",
         )
-    if not (folder / DESCRIPTION).is_file() or not is_name(name):
+    if not (folder / DESCRIPTION).is_file() or not is_split_name(name):
         raise UsageError(
             "no local split there",
             where="--split",
@@ -345,63 +311,123 @@ def _at(folder: Path, root: str | Path | None, registry: Registry | None) -> Hom
             fix="lagbench list names the splits; lagbench import and lagbench adopt "
             "make local ones",
         )
-    known = rooted(parent, registry)
-    if name not in known.local_names():
+    rooted_registry = load_rooted_registry(parent, registry)
+    if name not in rooted_registry.local_names():
         raise UsageError(
             f"the name {name!r} is taken by another split",
             where=str(folder),
             fix="import or adopt the data again under another name",
         )
-    known.split(name)
-    return Home(name, parent, known)
+    rooted_registry.split(name)
+    return SplitLocation(name, parent, rooted_registry)
 
 
-def _described(path: Path, name: str) -> tuple[Split, Mapping[str, Measured]]:
-    """Return what a local split's description says of it."""
-    check_regular(path)  # a device never ends
-    file = load(path)
-    if list(file.splits) != [name]:
-        raise UnreadableFileError(
-            "the folder is not named like its split",
-            where=str(path),
-            expected=f"one split, {name!r}",
-            got=", ".join(file.splits) or "none",
-            fix="rename the folder back: the name is part of every hash",
-        )
-    split = file.splits[name]
-    # A dotted path would be imported: a description must not choose code to run.
-    if split.generator != NO_GENERATOR:
-        raise UnreadableFileError(
-            "a local split cannot name a generator",
-            where=f"{path}, key splits.{name}.generator",
-            expected=NO_GENERATOR,
-            got=split.generator,
-            fix="an installed package adds splits that are simulated: see examples/",
-        )
-    return split, file.measured.get(name, {})
+def locate(
+    split: str | Path,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> SizeLocation:
+    """Return one size of the split that a user means, and the place of its data.
+
+    Args:
+        split: name or path, see :func:`locate_split`.
+        size: name of the size; the only one with data when None.
+        root: folder of all data sets.
+        registry: the other splits; ours when None.
+
+    Raises:
+        UsageError: see :func:`locate_split`; the split has no such size, or none is
+            named where several sizes or no sizes have data.
+        UnreadableFileError: the description of the local split is not right.
+    """
+    location = locate_split(split, root=root, registry=registry)
+    if size is None:
+        size = _only_size(location)
+    tier = location.registry.size(location.name, size)
+    return SizeLocation(tier, location.root, location.registry)
 
 
-def remedy(size: Size, *options: str, root: Path | None = None) -> str:
-    """Return what makes a data set whole again.
+def locate_new(
+    split: str | Path,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> SizeLocation:
+    """Return a size whose data are yet to be made, and their place.
+
+    Arguments and errors are those of :func:`locate`, but for a size that is None: it
+    means mini, or the first size of a split without mini.
+    """
+    location = locate_split(split, root=root, registry=registry)
+    if size is None:
+        sizes = location.registry.split(location.name).sizes
+        size = DEFAULT_NEW_SIZE
+        if size not in sizes:
+            size = next(iter(sizes))
+    tier = location.registry.size(location.name, size)
+    return SizeLocation(tier, location.root, location.registry)
+
+
+def _only_size(location: SplitLocation) -> str:
+    """Return the only size of a split, or the only one with data."""
+    split, root, registry = location
+    sizes = [registry.size(split, name) for name in registry.split(split).sizes]
+    sizes_with_data = []
+    for size in sizes:
+        folder = dataset_folder(root, split, size.name, size.major)
+        if any(folder.glob("*/*.nc")):
+            sizes_with_data.append(size)
+    if len(sizes_with_data) == 1:
+        return sizes_with_data[0].name
+    if len(sizes) == 1 and not sizes_with_data:
+        return sizes[0].name
+    raise _size_error(location, sizes, sizes_with_data)
+
+
+def _size_error(
+    location: SplitLocation, sizes: Sequence[Size], sizes_with_data: Sequence[Size]
+) -> UsageError:
+    url = url_of(location.root)
+    if sizes_with_data:
+        what = "several sizes are there: name one"
+        data = ", ".join(size.name for size in sizes_with_data)
+        hint = f"--size {sizes_with_data[0].name}"
+    elif url is not None:
+        # The store may hold it: only what was fetched is known.
+        what = "no size is named, and none was fetched from the store"
+        data = f"no data of {location.name}"
+        hint = "name it with --size"
+    else:
+        what = "no size is named, and none is there"
+        data = f"no data of {location.name}"
+        hint = suggest_repair(sizes[-1], root=location.root)
+    return UsageError(
+        what,
+        where="--size",
+        expected=", ".join(size.name for size in sizes),
+        got=f"{data} in {url or location.root}",
+        fix=hint,
+    )
+
+
+def suggest_repair(size: Size, *options: str, root: Path | None = None) -> str:
+    """Return a hint how to make a data set whole again.
 
     >>> from lagbench.data.registry import load
-    >>> remedy(load().size("cavity", "tiny"), "--subset test")
+    >>> suggest_repair(load().size("cavity", "tiny"), "--subset test")
     'lagbench generate --split cavity --size tiny --subset test'
     """
-    if size.simulated:
-        if root is not None and (url_of(root) or "").startswith(
-            ("http://", "https://")
-        ):
-            return "nothing can be written over HTTP: tell whoever serves the address, or name another --root"
-        if root is None:
-            place = []
-        else:
-            place = [f"--root {spelled(root)}"]
-        return " ".join(
-            (
-                f"lagbench generate --split {size.split} --size {size.name}",
-                *options,
-                *place,
-            )
-        )
-    return "remove the folder and make the local split again: lagbench adopt, or lagbench import"
+    if not size.simulated:
+        commands = "lagbench adopt, or lagbench import"
+        return f"remove the folder and make the local split again: {commands}"
+    parts = [f"lagbench generate --split {size.split} --size {size.name}", *options]
+    if root is not None:
+        url = url_of(root) or ""
+        if url.startswith(("http://", "https://")):
+            advice = "tell whoever serves the address, or name another --root"
+            return f"nothing can be written over HTTP: {advice}"
+        parts.append(f"--root {quote_root(root)}")
+    return " ".join(parts)

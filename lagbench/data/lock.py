@@ -1,4 +1,4 @@
-"""One writer per data set version; the second waits, or says who holds the lock.
+"""One writer per data set version; a second one waits, or names the first.
 
 The operating system drops the lock when its process ends, however it ends, so that a
 killed generation blocks nobody. A small file beside the lock names the holder; it is
@@ -12,15 +12,19 @@ import json
 import os
 import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
 from lagbench.errors import WorkFailedError
 
 from .layout import dataset_folder
+
+if TYPE_CHECKING:
+    from filelock import BaseFileLock
 
 LOCK_NAME = ".lock"
 HOLDER_NAME = ".lock.holder.json"
@@ -28,7 +32,7 @@ HOLDER_NAME = ".lock.holder.json"
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a lock."""
+    """The process that holds a lock."""
 
     pid: int  # process id
     host: str  # name of its machine
@@ -49,41 +53,34 @@ def dataset_lock(
     timeout: float | None = None,
     on_wait: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
-    """Hold the lock of one data set version; where another has it, tell, wait, or say
-    who.
-    """
-    import filelock
+    """Hold the lock of one data set version.
 
+    Args:
+        root: root folder of all data sets.
+        split: name of the split.
+        size: name of the size.
+        major: MAJOR of the version.
+        timeout: longest wait for another process [s]; None without end.
+        on_wait: receives the description of the holder before a wait.
+
+    Raises:
+        WorkFailedError: another process holds the lock, or the folder is not writable.
+    """
     folder = dataset_folder(root, split, size, major)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock = filelock.FileLock(folder / LOCK_NAME)
-        try:
-            lock.acquire(timeout=0)
-        except filelock.Timeout:
-            last = read_holder(folder) or "another process"
-            if on_wait is not None and timeout != 0:
-                on_wait(str(last))
-            try:
-                lock.acquire(timeout=-1 if timeout is None else timeout)
-            except filelock.Timeout:
-                what = "another process writes this data set"
-                got = str(read_holder(folder) or last)
-                fix = "wait until it ends, or end it; files that are complete stay"
-                raise WorkFailedError(
-                    what, where=str(folder), got=got, fix=fix
-                ) from None
+        lock = _acquire(folder, timeout, on_wait)
     except OSError as error:
-        why = error.strerror or error
-        fix = "name a folder that you may write to: --root or LAGBENCH_ROOT"
         raise WorkFailedError(
-            "cannot lock the data set", where=str(folder), got=why, fix=fix
+            "cannot lock the data set",
+            where=str(folder),
+            got=error.strerror or error,
+            fix="name a folder that you may write to: --root or LAGBENCH_ROOT",
         ) from error
     try:
         holder = Holder(
-            os.getpid(),
-            socket.gethostname(),
-            datetime.now(UTC).isoformat(timespec="seconds"),
+            pid=os.getpid(),
+            host=socket.gethostname(),
+            since=datetime.now(UTC).isoformat(timespec="seconds"),
         )
         write_atomically(folder / HOLDER_NAME, json.dumps(asdict(holder)).encode())
         yield
@@ -92,11 +89,36 @@ def dataset_lock(
         lock.release()
 
 
-def read_holder(folder: Path) -> Holder | None:
-    """Return who last took the lock of a data set folder; None where it is not
-    written.
-    """
+def _acquire(
+    folder: Path, timeout: float | None, on_wait: Callable[[str], None] | None
+) -> BaseFileLock:
+    import filelock
+
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = filelock.FileLock(folder / LOCK_NAME)
+    with suppress(filelock.Timeout):
+        lock.acquire(timeout=0)
+        return lock
+
+    first_holder = read_holder(folder) or "another process"
+    if on_wait is not None and timeout != 0:
+        on_wait(str(first_holder))
     try:
-        return Holder(**json.loads((folder / HOLDER_NAME).read_text(encoding="utf-8")))
+        lock.acquire(timeout=-1 if timeout is None else timeout)
+    except filelock.Timeout:
+        raise WorkFailedError(
+            "another process writes this data set",
+            where=str(folder),
+            got=str(read_holder(folder) or first_holder),
+            fix="wait until it ends, or end it; files that are complete stay",
+        ) from None
+    return lock
+
+
+def read_holder(folder: Path) -> Holder | None:
+    """Return the last holder of a data set's lock; None where none is written."""
+    try:
+        text = (folder / HOLDER_NAME).read_text(encoding="utf-8")
+        return Holder(**json.loads(text))
     except (OSError, ValueError, TypeError):
         return None

@@ -1,8 +1,9 @@
-"""manifest.json: what a data set folder holds, and where it came from.
+"""manifest.json: the files of a data set folder, and where they came from.
 
 It stands beside the subsets, is written last, and is itself not hashed. A generation of
-some scenarios leaves ``complete: false``; a later one merges its files into what is
-there.
+some scenarios leaves ``complete: false``; a later one merges its files into it.
+
+``.verified.json`` beside it: the hashes that this machine computed.
 """
 
 from __future__ import annotations
@@ -49,17 +50,18 @@ from .layout import (
     scenario_path,
 )
 from .registry import Hash, Size
-from .scenario import read_scenario
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
 Row = Annotated[tuple[FiniteFloat, ...], Field(strict=False)]
 
 
-class _Strict(BaseModel):
+class _ManifestModel(BaseModel):
+    """Frozen model that refuses unknown keys."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
-class FileEntry(_Strict):
+class FileEntry(_ManifestModel):
     """One scenario file."""
 
     scenario: int  # id of the scenario
@@ -75,28 +77,26 @@ class FileEntry(_Strict):
     # further numbers by name, such as the energy of the last frame over the largest;
     # the file states them
     facts: dict[str, FiniteFloat] = Field(default_factory=dict)
-    # position RMSE of the nudged twin at each predicted frame [length]; test only
+    # position RMSE of a perturbed run at each predicted frame [length]; test only
     twin_floor: Row = ()
 
     @field_validator("path")
     @classmethod
-    def _follows(cls, path: str, info: ValidationInfo) -> str:
+    def _check_path(cls, path: str, info: ValidationInfo) -> str:
         """Refuse a path that leads elsewhere: files are opened and published by it."""
         if {"subset", "scenario"} <= info.data.keys():
-            wanted = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
-            if path != wanted:
-                raise ValueError(f"expected {wanted!r}")
+            expected = f"{info.data['subset']}/{info.data['scenario']:04d}.nc"
+            if path != expected:
+                raise ValueError(f"expected {expected!r}")
         return path
 
     def has_hash(self, recorded: str | None) -> bool:
-        """Return whether the content hash begins with the digits that datasets.yaml
-        has.
-        """
+        """Return whether the content hash begins with the digits of datasets.yaml."""
         return recorded is not None and self.content_sha256.startswith(recorded)
 
 
-class Manifest(_Strict):
-    """All that is recorded about a data set folder."""
+class Manifest(_ManifestModel):
+    """The files of a data set folder, their hashes and their machines."""
 
     format: Literal[1] = 1  # number of this layout
     split: str  # name of the split
@@ -119,8 +119,9 @@ class Manifest(_Strict):
     files: Annotated[tuple[FileEntry, ...], Field(strict=False)] = ()
 
     def is_of(self, split: str, size: str, major: int) -> bool:
-        """Return whether this is of a data set: files are read and written where these
-        names lead.
+        """Return whether this is the manifest of a data set.
+
+        Files are read and written where these names lead.
         """
         return (self.split, self.size, major_of(self.version)) == (split, size, major)
 
@@ -130,30 +131,30 @@ class Manifest(_Strict):
 
     def only(self, scenario: int) -> Manifest:
         """Return a manifest that names one file at the most."""
-        return self.model_copy(
-            update={"files": tuple(e for e in self.files if e.scenario == scenario)}
-        )
+        files = tuple(entry for entry in self.files if entry.scenario == scenario)
+        return self.model_copy(update={"files": files})
 
     def mean_twin_floor(self) -> tuple[float, ...]:
         """Return the mean twin floor over test at each frame that all have [length].
 
-        Nine digits; empty where a test scenario has no twin.
+        Nine digits; empty where a test scenario has no perturbed run.
         """
-        twins = [entry.twin_floor for entry in self.files if entry.subset == "test"]
-        if not all(twins):
+        errors = [entry.twin_floor for entry in self.files if entry.subset == "test"]
+        if not all(errors):
             return ()
-        return tuple(
-            round_digits(math.fsum(column) / len(column))
-            for column in zip(*twins, strict=False)
-        )
+        means = []
+        for column in zip(*errors, strict=False):
+            means.append(round_digits(math.fsum(column) / len(column)))
+        return tuple(means)
 
 
 def describe_file(
     root: Path, key: ScenarioKey, *, digest: str | None = None
 ) -> FileEntry:
-    """Return the manifest entry of a scenario file on disk; its content is not
-    re-hashed.
-    """
+    """Return the manifest entry of a scenario file, with the hash that it states."""
+    # h5py is loaded by those who read a file, not by those who read a manifest.
+    from .scenario import read_scenario
+
     path = scenario_path(root, key)
     with read_scenario(path) as file:
         header = file.header
@@ -171,7 +172,7 @@ def describe_file(
     )
 
 
-def merge(
+def build_manifest(
     old: Manifest | None,
     files: Iterable[FileEntry],
     *,
@@ -183,66 +184,97 @@ def merge(
     recorded: Mapping[int, str] | None = None,
     statistics: Mapping[str, Sequence[float]] | None = None,
 ) -> Manifest:
-    """Return a manifest with new files put in; new entries replace old ones of the same
-    id.
+    """Return a manifest with new entries; they replace old ones of the same id.
+
+    Args:
+        old: manifest before; None for an empty one.
+        files: new entries.
+        split: name of the split.
+        size: name of the size.
+        version: semantic version of the split.
+        subsets: scenario ids of each subset.
+        environment: machine and libraries that wrote the new files.
+        recorded: first digits of the content hashes of datasets.yaml, by id.
+        statistics: statistics over train; the old ones where train is unchanged.
     """
-    if old:
-        kept = [
-            entry
-            for entry in old.files
-            if entry.scenario in subsets.get(entry.subset, ())
-        ]
-    else:
-        kept = []
-    entries = {entry.scenario: entry for entry in (*kept, *files)}
-    hashes = {
-        name: subset_hash({i: entries[i].content_sha256 for i in ids})
-        for name, ids in subsets.items()
-        if all(i in entries for i in ids)
-    }
-    complete = all(name in hashes for name in HASHED_SUBSETS)
-    if old:
-        environments = list(old.environments)
-    else:
-        environments = []
+    entries = _collect_entries(old, files, subsets)
+    subset_hashes = _hash_complete_subsets(entries, subsets)
+    is_complete = all(name in subset_hashes for name in HASHED_SUBSETS)
+    whole_hash = None
+    if is_complete:
+        whole_hash = dataset_hash(split, size, major_of(version), subset_hashes)
+
+    environments: list[dict[str, str]] = []
+    if old is not None:
+        environments += old.environments
     if environment is not None and dict(environment) not in environments:
         environments.append(dict(environment))
-    if (
-        statistics is None
-        and old
-        and old.subset_sha256.get("train") == hashes.get("train")
-    ):
-        statistics = old.statistics
-    unproven = [
-        e for e in entries.values() if not e.has_hash((recorded or {}).get(e.scenario))
-    ]
-    differing = any(may_differ(entry.device, environments) for entry in unproven)
+
+    if statistics is None and old is not None:
+        has_same_train = old.subset_sha256.get("train") == subset_hashes.get("train")
+        if has_same_train:
+            statistics = old.statistics
+    rows = {}
+    if "train" in subset_hashes:
+        rows = {name: tuple(row) for name, row in (statistics or {}).items()}
+
+    identity: Literal["bitwise", "tolerance"] = "bitwise"
+    for entry in entries.values():
+        is_proven = entry.has_hash((recorded or {}).get(entry.scenario))
+        if not is_proven and may_differ(entry.device, environments):
+            identity = "tolerance"
     return Manifest(
         split=split,
         size=size,
         version=version,
-        complete=complete,
-        identity="tolerance" if differing else "bitwise",
-        dataset_sha256=dataset_hash(split, size, major_of(version), hashes)
-        if complete
-        else None,
-        subset_sha256=hashes,
-        statistics={n: tuple(row) for n, row in (statistics or {}).items()}
-        if "train" in hashes
-        else {},
+        complete=is_complete,
+        identity=identity,
+        dataset_sha256=whole_hash,
+        subset_sha256=subset_hashes,
+        statistics=rows,
         environments=tuple(environments),
         files=tuple(entries[scenario] for scenario in sorted(entries)),
     )
 
 
-def merged(
+def _collect_entries(
+    old: Manifest | None,
+    files: Iterable[FileEntry],
+    subsets: Mapping[str, Sequence[int]],
+) -> dict[int, FileEntry]:
+    """Return old and new entries by id; old ones count in their own subset only."""
+    entries = {}
+    if old is not None:
+        for entry in old.files:
+            if entry.scenario in subsets.get(entry.subset, ()):
+                entries[entry.scenario] = entry
+    for entry in files:
+        entries[entry.scenario] = entry
+    return entries
+
+
+def _hash_complete_subsets(
+    entries: Mapping[int, FileEntry], subsets: Mapping[str, Sequence[int]]
+) -> dict[str, str]:
+    subset_hashes = {}
+    for name, ids in subsets.items():
+        if all(scenario in entries for scenario in ids):
+            contents = {scenario: entries[scenario].content_sha256 for scenario in ids}
+            subset_hashes[name] = subset_hash(contents)
+    return subset_hashes
+
+
+def merge_entries(
     size: Size,
     base: Manifest | None,
     files: Iterable[FileEntry] = (),
     environment: Mapping[str, str] | None = None,
 ) -> Manifest:
-    """Return a manifest of a size with entries put in; an empty one without any."""
-    return merge(
+    """Return a manifest of a size with new entries; an empty one without any."""
+    recorded = None
+    if size.measured is not None:
+        recorded = size.measured.scenario_sha256
+    return build_manifest(
         base,
         files,
         split=size.split,
@@ -250,20 +282,25 @@ def merged(
         version=size.version,
         subsets=size.subsets,
         environment=environment,
-        recorded=size.measured.scenario_sha256 if size.measured else None,
+        recorded=recorded,
     )
 
 
-MANIFEST_LIMIT = 64 << 20  # longest manifest that is read [bytes]
-_ANEW = (
-    "remove it; lagbench generate checks the files and writes it anew; a local split "
-    "is made again by"
-    " lagbench adopt or import"
+MANIFEST_LIMIT = 64 << 20
+"""Longest manifest that is read [bytes]."""
+
+_MANIFEST_HINT = (
+    "remove it; lagbench generate checks the files and writes it anew; "
+    "a local split is made again by lagbench adopt or import"
 )
 
 
 def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | None:
-    """Return the manifest of a data set folder; None where there is none."""
+    """Return the manifest of a data set folder; None where there is none.
+
+    Raises:
+        DataError: the manifest is unreadable, damaged or of another data set.
+    """
     path = dataset_folder(root, split, size, major) / MANIFEST_NAME
     try:
         if not path.exists():
@@ -271,36 +308,38 @@ def read_manifest(root: Path, split: str, size: str, major: int) -> Manifest | N
         check_regular(path, longest=MANIFEST_LIMIT)
         text = path.read_bytes()
     except (OSError, UnreadableFileError) as error:
-        got = error.strerror if isinstance(error, OSError) else error.got
-        raise DataError("cannot read the manifest", where=str(path), got=got) from error
-    try:
-        found = Manifest.model_validate_json(text)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = f"{path}, key {'.'.join(map(str, first['loc'])) or '(whole file)'}"
+        reason = error.strerror if isinstance(error, OSError) else error.got
         raise DataError(
-            "the manifest is damaged", where=where, got=first["msg"], fix=_ANEW
+            "cannot read the manifest", where=str(path), got=reason
+        ) from error
+    try:
+        manifest = Manifest.model_validate_json(text)
+    except ValidationError as error:
+        first_error = error.errors()[0]
+        key = ".".join(str(part) for part in first_error["loc"])
+        raise DataError(
+            "the manifest is damaged",
+            where=f"{path}, key {key or '(whole file)'}",
+            got=first_error["msg"],
+            fix=_MANIFEST_HINT,
         ) from None
-    if not found.is_of(split, size, major):
+    if not manifest.is_of(split, size, major):
         raise DataError(
             "the manifest is of another data set",
             where=str(path),
             expected=f"{split} {size}, version {major}",
-            got=f"{found.split} {found.size}, version {found.version}",
-            fix=_ANEW,
+            got=f"{manifest.split} {manifest.size}, version {manifest.version}",
+            fix=_MANIFEST_HINT,
         )
-    return found
+    return manifest
 
 
 def read_or_empty(size: Size, root: Path) -> Manifest:
-    """Return the manifest of a folder, an empty one where there is none that can be
-    read.
-    """
-    try:
-        found = read_manifest(root, size.split, size.name, size.major)
-    except DataError:  # it is written anew from the files
-        found = None
-    return found or merged(size, None)
+    """Return the manifest of a folder, an empty one where none can be read."""
+    manifest = None
+    with suppress(DataError):  # it is written anew from the files
+        manifest = read_manifest(root, size.split, size.name, size.major)
+    return manifest or merge_entries(size, None)
 
 
 def write_manifest(root: Path, manifest: Manifest) -> Path:
@@ -313,16 +352,15 @@ def write_manifest(root: Path, manifest: Manifest) -> Path:
     return path
 
 
-# --- what this machine has hashed -----------------------------------------------------
+# --- hashes that this machine has computed --------------------------------------------
 
-# Hashing the values of a file takes seconds where it is large, and a manifest is a
-# claim of whoever wrote it. So files whose values were hashed here are noted beside it.
-# A note counts for that very file alone: nobody can set the time of its last change of
-# any kind (ctime), so notes that came with a copied or downloaded folder count for
-# nothing.
+# Hashing the values of a large file takes seconds, and a manifest is a claim of whoever
+# wrote it. So this machine notes the files whose values it has hashed. A note counts
+# for that very file alone: nobody can set the time of its last change of any kind
+# (ctime), so notes that came with a copied or downloaded folder count for nothing.
 
 
-class _Note(NamedTuple):
+class _HashNote(NamedTuple):
     """A file whose values were hashed."""
 
     bytes: int
@@ -331,81 +369,100 @@ class _Note(NamedTuple):
     file_sha256: str
     content_sha256: str
 
+    @property
+    def stamp(self) -> tuple[int, int, int]:
+        """Length and times of the file."""
+        return self.bytes, self.modified, self.changed
 
-_seen: dict[Path, _Note] = {}
-"""Files that this process has read whole: their bytes are not read again while their
-times stay.
+    def says(self, stamp: tuple[int, int, int], content_sha256: str) -> bool:
+        """Tell whether this is the note of a file with that stamp and content."""
+        return self.stamp == stamp and self.content_sha256 == content_sha256
+
+
+_read_in_process: dict[Path, _HashNote] = {}
+"""Files whose bytes this process has read.
+
+They are not read again while their times stay.
 """
 
 
-def note(
+def record_hashes(
     folder: Path,
     contents: Mapping[Path, str],
     digests: Mapping[Path, str] | None = None,
 ) -> None:
-    """Note the content hashes of files of a data set folder, just hashed or written by
-    this machine.
+    """Note content hashes of files that this machine has just hashed or written.
 
-    ``digests`` holds the SHA-256 of their bytes, from before their values were read,
-    where it is known; else the bytes are read. Where the folder cannot be written to,
-    nothing is noted.
+    Where the folder cannot be written to, nothing is noted.
+
+    Args:
+        folder: folder of the data set.
+        contents: content hashes by path.
+        digests: SHA-256 of the files' bytes, from before their values were read, where
+            it is known; else the bytes are read.
     """
     if not contents:
         return
-    old = _notes(folder)
-    found = {}
+    old_notes = _read_notes(folder)
+    new_notes = {}
     for path, content in contents.items():
-        stamp = _stamp(path)
-        known = old.get(_spelled(path, folder))
-        if known is None or (*known[:3], known.content_sha256) != (*stamp, content):
-            # The times are from before the bytes: a file that changes meanwhile does
-            # not fit its note.
-            digest = (digests or {}).get(path)
-            found[path] = _Note(*stamp, digest or file_sha256(path), content)
-            if digest is None:
-                _seen[path] = found[path]
-    if found:
-        notes = old | {_spelled(path, folder): held for path, held in found.items()}
+        stamp = _file_stamp(path)
+        name = _relative_name(path, folder)
+        old_note = old_notes.get(name)
+        if old_note is not None and old_note.says(stamp, content):
+            continue
+        # The times are from before the bytes: a file that changes meanwhile does not
+        # fit its note.
+        digest = (digests or {}).get(path)
+        note = _HashNote(*stamp, digest or file_sha256(path), content)
+        new_notes[name] = note
+        if digest is None:
+            _read_in_process[path] = note
+    if new_notes:
+        text = json.dumps(old_notes | new_notes, indent=1) + "\n"
         with suppress(WorkFailedError):
-            write_atomically(
-                folder / NOTES_NAME, (json.dumps(notes, indent=1) + "\n").encode()
-            )
+            write_atomically(folder / NOTES_NAME, text.encode())
 
 
-def note_entries(folder: Path, entries: Iterable[FileEntry]) -> None:
+def record_entry_hashes(folder: Path, entries: Iterable[FileEntry]) -> None:
     """Note files by their entries, which this machine has just made from them."""
-    files = {folder / entry.path: entry for entry in entries}
-    digests = {path: entry.file_sha256 for path, entry in files.items()}
-    note(folder, {path: entry.content_sha256 for path, entry in files.items()}, digests)
+    contents = {}
+    digests = {}
+    for entry in entries:
+        path = folder / entry.path
+        contents[path] = entry.content_sha256
+        digests[path] = entry.file_sha256
+    record_hashes(folder, contents, digests)
 
 
-def noted_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
-    """Return what tells content hash and SHA-256 of a file that was hashed here and is
-    still the same.
+def load_recorded_hashes(folder: Path) -> Callable[[Path], tuple[str, str] | None]:
+    """Return a function from a file to its noted content hash and SHA-256.
 
-    Its bytes are read to tell, once in a process; values are not unpacked.
+    The function returns None for a file that was not hashed here or has changed since.
+    It reads the bytes once in a process; values are not unpacked.
     """
-    notes = _notes(folder)
+    notes = _read_notes(folder)
 
-    def hashes(path: Path) -> tuple[str, str] | None:
-        held = notes.get(_spelled(path, folder))
-        if held is None or held[:3] != _stamp(path):
+    def find_hashes(path: Path) -> tuple[str, str] | None:
+        note = notes.get(_relative_name(path, folder))
+        if note is None or note.stamp != _file_stamp(path):
             return None
-        if _seen.get(path) != held and file_sha256(path) != held.file_sha256:
-            return None
-        _seen[path] = held
-        return held.content_sha256, held.file_sha256
+        if _read_in_process.get(path) != note:
+            if file_sha256(path) != note.file_sha256:
+                return None
+            _read_in_process[path] = note
+        return note.content_sha256, note.file_sha256
 
-    return hashes
+    return find_hashes
 
 
-def _notes(folder: Path) -> dict[str, _Note]:
+def _read_notes(folder: Path) -> dict[str, _HashNote]:
     path = folder / NOTES_NAME
+    notes = {}
     try:
         check_regular(path, longest=MANIFEST_LIMIT)
-        return {
-            name: _Note(*row) for name, row in json.loads(path.read_bytes()).items()
-        }
+        for name, row in json.loads(path.read_bytes()).items():
+            notes[name] = _HashNote(*row)
     except (
         UnreadableFileError,
         OSError,
@@ -415,12 +472,13 @@ def _notes(folder: Path) -> dict[str, _Note]:
         RecursionError,
     ):
         return {}
+    return notes
 
 
-def _stamp(path: Path) -> tuple[int, int, int]:
+def _file_stamp(path: Path) -> tuple[int, int, int]:
     status = path.stat()
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-def _spelled(path: Path, folder: Path) -> str:
+def _relative_name(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()

@@ -1,11 +1,11 @@
-"""The registry: what datasets.yaml says about every split and size.
+"""The registry: every split and size of datasets.yaml and of installed packages.
 
 A split is a family of simulated scenarios, a size one tier of it. Everything that
-decides bits (parameters, scenario ids, frame counts) is written by hand; everything
+decides bits (parameters, scenario ids, frame counts) is written by hand. Everything
 that follows from them (hashes, statistics, twin floor) stands under ``measured`` and is
 written by ``python -m lagbench.generators.record``.
 
-Splits that other installed packages add, none of which can harm ours.
+Other packages may add splits. None of them can harm ours.
 """
 
 from __future__ import annotations
@@ -29,57 +29,58 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
+from pydantic_core import ErrorDetails
 
 from lagbench.errors import (
     LagbenchError,
     UnreadableFileError,
     UsageError,
-    loaded,
-    nearest,
+    load_entry_point,
+    suggest_name,
 )
 
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
 from .limits import Value, check_frames, check_parameters, check_subsets
+from .limits import format_ids as format_ids
 from .limits import parse_ids as parse_ids
-from .limits import spell_ids as spell_ids
 
 GROUP = "lagbench.generators"
-"""Entry points of this group name a split and its module; ours register the same way.
-"""
+"""Entry points that name a split and its module; ours register the same way."""
 
 
 class PluginWarning(UserWarning):
-    """A package that wants to add a split cannot; all other splits are there."""
+    """A package cannot add its split; all other splits are there."""
 
 
-def installed(group: str) -> tuple[EntryPoint, ...]:
+def list_entry_points(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, of the packages that are installed now.
 
     Python reads the files of every package at each call. Here they are read again once
     a folder on the path has changed, as it does where a package is installed or
     removed.
     """
-    changed = []
-    for place in sys.path:
+    modification_times = []
+    for folder in sys.path:
         with suppress(OSError):
-            changed.append((place, os.stat(place or os.curdir).st_mtime_ns))
-    return _read_points(group, tuple(changed))
+            modified = os.stat(folder or os.curdir).st_mtime_ns
+            modification_times.append((folder, modified))
+    return _read_entry_points(group, tuple(modification_times))
 
 
 @functools.lru_cache(maxsize=8)
-def _read_points(group: str, _: Hashable) -> tuple[EntryPoint, ...]:
+def _read_entry_points(group: str, _: Hashable) -> tuple[EntryPoint, ...]:
     return tuple(entry_points(group=group))
 
 
-def _ids(value: str | int) -> tuple[int, ...]:
+def _parse_ids(value: str | int) -> tuple[int, ...]:
     try:
         return parse_ids(value)
     except UsageError as error:
         raise ValueError(f"{error.what}: {error.got}") from None
 
 
-Ids = Annotated[tuple[int, ...], BeforeValidator(_ids)]
+Ids = Annotated[tuple[int, ...], BeforeValidator(_parse_ids)]
 Interval = Annotated[tuple[FiniteFloat, FiniteFloat], Field(strict=False)]
 Hash = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 REGISTRY_VARIABLE = "LAGBENCH_REGISTRY"
@@ -89,23 +90,23 @@ NO_GENERATOR = "none"
 """Generator of splits that were not simulated here; see ``lagbench.data.local``."""
 
 
-class _Strict(BaseModel):
+class _RegistryModel(BaseModel):
     """Frozen model that names the nearest known key when it meets an unknown one."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:  # noqa: ANN401
-        for key in data if isinstance(data, Mapping) else ():
-            if key not in cls.model_fields:
-                raise ValueError(
-                    f"unknown key {key!r}: {nearest(str(key), cls.model_fields)}"
-                )
+    def _refuse_unknown_keys(cls, data: Any) -> Any:  # noqa: ANN401
+        if isinstance(data, Mapping):
+            for key in data:
+                if key not in cls.model_fields:
+                    hint = suggest_name(str(key), cls.model_fields)
+                    raise ValueError(f"unknown key {key!r}: {hint}")
         return data
 
 
-class Parameter(_Strict):
+class Parameter(_RegistryModel):
     """A physical or numerical parameter: value, unit and what it means."""
 
     value: Value | None = None
@@ -113,7 +114,7 @@ class Parameter(_Strict):
     description: str
 
 
-class ScoreGrid(_Strict):
+class ScoreGrid(_RegistryModel):
     """Grid on which the scorer forms fields."""
 
     cells: int = Field(gt=1)
@@ -121,8 +122,8 @@ class ScoreGrid(_Strict):
     placement: Literal["cell_centres", "nodes"]
 
 
-class Task(_Strict):
-    """What a model is given and what it must predict."""
+class Task(_RegistryModel):
+    """Given frames of a model, and frames that it must predict."""
 
     input_frames: int = Field(gt=1)  # frames given at the start of a test scenario
     horizon: int = Field(gt=0)  # frames to predict after them
@@ -131,10 +132,12 @@ class Task(_Strict):
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
+    # kinematic viscosity that models are told where scenarios state none [length^2/s]
+    effective_viscosity: float | None = Field(None, gt=0, allow_inf_nan=False)
 
 
-class Measured(_Strict):
-    """What follows from the parameters: hashes, statistics of train, twin floor."""
+class Measured(_RegistryModel):
+    """Hashes, statistics of train and twin floor; they follow from the parameters."""
 
     dataset_sha256: Hash  # data set hash over train, valid and test
     subset_sha256: dict[str, Hash]  # hash of each subset
@@ -142,12 +145,13 @@ class Measured(_Strict):
     scenario_sha256: dict[int, Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]]
     # mean and standard deviation per component over train
     statistics: dict[str, Annotated[tuple[float, ...], Field(strict=False)]]
-    # position RMSE of the perturbed twin per predicted frame, mean over test [length]
+    # position RMSE of a slightly perturbed run per predicted frame, mean over test
+    # [length]
     twin_floor: tuple[float, ...] = Field(strict=False)
 
 
-class _SizeEntry(_Strict):
-    """A size as written in datasets.yaml; :class:`Size` adds what the split says."""
+class _SizeEntry(_RegistryModel):
+    """A size as written in datasets.yaml; :class:`Size` adds the split's fields."""
 
     subsets: dict[str, Ids]
     frames: int | dict[int, Ids]
@@ -171,7 +175,7 @@ class Size(BaseModel):
     parameters: dict[str, Parameter]
     task: Task
     measured: Measured | None = None
-    file: Path = Path("datasets.yaml")  # what describes it
+    file: Path = Path("datasets.yaml")  # the file that describes it
 
     @property
     def major(self) -> int:
@@ -186,11 +190,10 @@ class Size(BaseModel):
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Return a parameter's value."""
         if name not in self.parameters:
-            where = f"datasets.yaml, {self.split} {self.name}"
             raise UsageError(
                 f"no parameter {name!r}",
-                where=where,
-                fix=nearest(name, self.parameters),
+                where=f"datasets.yaml, {self.split} {self.name}",
+                fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
 
@@ -222,26 +225,33 @@ class Size(BaseModel):
     @property
     def scenarios(self) -> tuple[int, ...]:
         """All scenario ids of the size, ascending."""
-        return tuple(sorted(i for ids in self.subsets.values() for i in ids))
+        scenarios: list[int] = []
+        for ids in self.subsets.values():
+            scenarios += ids
+        return tuple(sorted(scenarios))
 
     def subset_of(self, scenario: int) -> str:
         """Return the subset that a scenario belongs to."""
+        texts = []
         for subset, ids in self.subsets.items():
             if scenario in ids:
                 return subset
-        expected = ", ".join(
-            f"{subset} {spell_ids(ids)}" for subset, ids in self.subsets.items()
-        )
+            texts.append(f"{subset} {format_ids(ids)}")
         raise UsageError(
             f"no scenario {scenario}",
             where=f"{self.split} {self.name}",
-            expected=expected,
+            expected=", ".join(texts),
         )
 
     def key(self, scenario: int) -> ScenarioKey:
-        """Return what names a scenario."""
-        names = {"split": self.split, "size": self.name, "version": self.version}
-        return ScenarioKey(**names, scenario=scenario, subset=self.subset_of(scenario))
+        """Return the names of a scenario."""
+        return ScenarioKey(
+            split=self.split,
+            size=self.name,
+            version=self.version,
+            scenario=scenario,
+            subset=self.subset_of(scenario),
+        )
 
     def folder(self, root: Path) -> Path:
         """Return the folder of the data set below a root folder."""
@@ -255,34 +265,33 @@ class Size(BaseModel):
         """Return how many frames a scenario records."""
         if isinstance(self.frames, int):
             return self.frames
-        return next(count for count, ids in self.frames.items() if scenario in ids)
+        for count, ids in self.frames.items():
+            if scenario in ids:
+                return count
+        raise UsageError(
+            f"no scenario {scenario}", where=f"{self.split} {self.name}, frames"
+        )
 
     def file_bytes(self, scenario: int) -> int:
-        """Return the most bytes that a scenario's file takes, in sum over a data
-        set.
-        """
+        """Return the most bytes of a scenario's file, on average over a data set."""
         # Position and velocity are two float32 each; header, constants and chunk index
         # take 64 KiB at most.
-        return self.frame_count(scenario) * self.particles * 16 + 64 * 1024
+        value_bytes = self.frame_count(scenario) * self.particles * 16
+        return value_bytes + 64 * 1024
 
     def longest_file(self, scenario: int) -> int:
-        """Return the bytes beyond which no file of a scenario goes, whatever a store
-        says of it.
-        """
-        # What zlib cannot pack becomes longer.
+        """Return the most bytes of a scenario's file; a store may claim more."""
+        # zlib makes values longer that it cannot pack.
         return round(1.25 * self.file_bytes(scenario)) + (1 << 20)
 
     def frames_behind(self, scenario: int) -> int:
         """Return how many of a scenario's frames lie behind the horizon of the task."""
-        return max(
-            0, self.frame_count(scenario) - self.task.input_frames - self.task.horizon
-        )
+        task_frames = self.task.input_frames + self.task.horizon
+        return max(0, self.frame_count(scenario) - task_frames)
 
 
-class Split(_Strict):
-    """A named data set: version, provenance, parameters, sizes, and base URLs of its
-    mirrors.
-    """
+class Split(_RegistryModel):
+    """A named data set: version, provenance, parameters, sizes and mirrors' URLs."""
 
     version: str = Field(pattern=r"^[1-9]\d*\.\d+\.\d+$")
     title: str
@@ -299,14 +308,13 @@ class Split(_Strict):
     )
 
     @model_validator(mode="after")
-    def _consistent(self) -> Split:
+    def _check_sizes(self) -> Split:
+        declared = {name: entry.value for name, entry in self.parameters.items()}
         for name, size in self.sizes.items():
-            check_parameters(
-                name, size.parameters, {n: p.value for n, p in self.parameters.items()}
-            )
+            check_parameters(name, size.parameters, declared)
             check_subsets(name, size.subsets)
-            needed = size.task.input_frames + size.task.horizon
-            check_frames(name, size.frames, size.subsets, task_frames=needed)
+            task_frames = size.task.input_frames + size.task.horizon
+            check_frames(name, size.frames, size.subsets, task_frames=task_frames)
         return self
 
 
@@ -326,20 +334,24 @@ class Registry:
     def split(self, name: str) -> Split:
         """Return a split by name."""
         if name not in self.splits:
-            raise UsageError(
-                f"no split {name!r}", where="--split", fix=nearest(name, self.splits)
-            )
+            hint = suggest_name(name, self.splits)
+            raise UsageError(f"no split {name!r}", where="--split", fix=hint)
         return self.splits[name]
 
     def size(self, split: str, name: str) -> Size:
         """Return one size of a split with its merged parameters and measured values."""
         parent = self.split(split)
         if name not in parent.sizes:
-            fix = nearest(name, parent.sizes)
             raise UsageError(
-                f"split {split!r} has no size {name!r}", where="--size", fix=fix
+                f"split {split!r} has no size {name!r}",
+                where="--size",
+                fix=suggest_name(name, parent.sizes),
             )
         entry = parent.sizes[name]
+        parameters = {}
+        for key, parameter in parent.parameters.items():
+            value = entry.parameters.get(key, parameter.value)
+            parameters[key] = parameter.model_copy(update={"value": value})
         return Size(
             split=split,
             name=name,
@@ -348,17 +360,14 @@ class Registry:
             subsets=entry.subsets,
             frames=entry.frames,
             bounds=entry.bounds,
-            parameters={
-                key: p.model_copy(update={"value": entry.parameters.get(key, p.value)})
-                for key, p in parent.parameters.items()
-            },
+            parameters=parameters,
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),
             file=self.files.get(split, Path("datasets.yaml")),
         )
 
 
-class _File(_Strict):
+class _RegistryFile(_RegistryModel):
     """The whole of a datasets.yaml."""
 
     format: Literal[1]
@@ -375,92 +384,107 @@ def load(path: Path | None = None) -> Registry:
     """Return the validated registry, splits of other installed packages included.
 
     Args:
-        path: a datasets.yaml; else the one that ``LAGBENCH_REGISTRY`` names; else ours,
-            with the splits that entry points name; a package whose split cannot be
-            read, or has a name that is taken, is left out with a
-            :class:`~lagbench.data.registry.PluginWarning`.
+        path: a datasets.yaml; else that of ``LAGBENCH_REGISTRY``; else ours, with the
+            splits that entry points name. A package is left out with a
+            :class:`~lagbench.data.registry.PluginWarning` where its split cannot be
+            read, or has a name that is taken.
 
     Raises:
         UnreadableFileError: not YAML, an unknown key or a value of the wrong type.
     """
-    given = path or os.environ.get(REGISTRY_VARIABLE)
-    if given:
-        file = Path(given)
-    else:
-        file = default_path()
-    return _load(
-        Path(given) if given else None, file.stat().st_mtime_ns if file.exists() else 0
-    )
+    named_path = path or os.environ.get(REGISTRY_VARIABLE)
+    if named_path:
+        named_path = Path(named_path)
+    file = named_path or default_path()
+    modified = 0
+    if file.exists():
+        modified = file.stat().st_mtime_ns
+    return _load(named_path or None, modified)
 
 
 @functools.cache
 def _load(path: Path | None, modified: int) -> Registry:
     """Load a file once per modification time."""
-    own = _read(path or default_path())
-    splits = dict(own.splits)
-    measured = dict(own.measured)
-    files = dict.fromkeys(splits, path or default_path())
-    for point in dict.fromkeys(installed(GROUP)) if path is None else ():
-        name = point.name
-        if name in own.splits and own.splits[name].generator == point.value:
+    file = path or default_path()
+    our_file = _read(file)
+    registry = Registry(
+        our_file.splits, our_file.measured, dict.fromkeys(our_file.splits, file)
+    )
+    if path is not None:
+        return registry
+
+    for point in dict.fromkeys(list_entry_points(GROUP)):
+        our_split = our_file.splits.get(point.name)
+        if our_split is not None and our_split.generator == point.value:
             continue
         try:
-            if name in splits:
-                raise UsageError("its name is taken")
-            module = loaded(point)
-            if not hasattr(module, "REGISTRY"):
-                expected = "an attribute REGISTRY: the path of its datasets.yaml"
-                raise UsageError("its module has no registry", expected=expected)
-            place = Path(module.REGISTRY)
-            theirs = _read(place)
-            splits[name] = Registry(theirs.splits, {}).split(name)
-            measured[name] = theirs.measured.get(name, {})
-            files[name] = place
-        except (
-            Exception
-        ) as error:  # a stranger's module: importing it may raise anything
-            if point.dist:
-                package = point.dist.name
-            else:
-                package = point.value.partition(".")[0]
-            reason = (
-                error
-                if isinstance(error, LagbenchError)
-                else f"{type(error).__name__}: {error}"
-            )
-            message = (
-                f"package {package} adds no split {name!r} ({point.value}): {reason}"
-            )
+            registry = _add_split(registry, point)
+        except Exception as error:  # a stranger's module may raise anything
+            message = _describe_plugin_error(point, error)
             warnings.warn(message, PluginWarning, stacklevel=2)
-    return Registry(splits, measured, files)
+    return registry
 
 
-def _read(path: Path) -> _File:
+def _add_split(registry: Registry, point: EntryPoint) -> Registry:
+    """Return a registry with the split of an entry point of another package."""
+    name = point.name
+    if name in registry.splits:
+        raise UsageError("its name is taken")
+    module = load_entry_point(point)
+    if not hasattr(module, "REGISTRY"):
+        expected = "an attribute REGISTRY: the path of its datasets.yaml"
+        raise UsageError("its module has no registry", expected=expected)
+    path = Path(module.REGISTRY)
+    plugin_file = _read(path)
+    split = Registry(plugin_file.splits, {}).split(name)
+    measured = plugin_file.measured.get(name, {})
+    return Registry(
+        {**registry.splits, name: split},
+        {**registry.measured, name: measured},
+        {**registry.files, name: path},
+    )
+
+
+def _describe_plugin_error(point: EntryPoint, error: Exception) -> str:
+    package = point.value.partition(".")[0]
+    if point.dist:
+        package = point.dist.name
+    reason = str(error)
+    if not isinstance(error, LagbenchError):
+        reason = f"{type(error).__name__}: {error}"
+    return f"package {package} adds no split {point.name!r} ({point.value}): {reason}"
+
+
+def _read(path: Path) -> _RegistryFile:
     """Validate one datasets.yaml; say where and what is wrong with it."""
-    from .yamlfile import (
-        read_yaml,
-    )  # a child that validates is told of the sizes, and starts sooner without
+    # A child that validates predictions receives the sizes, and starts sooner without
+    # YAML.
+    from .yamlfile import read_yaml
 
+    content = read_yaml(path)
     try:
-        return _File.model_validate(read_yaml(path))
+        return _RegistryFile.model_validate(content)
     except ValidationError as error:
-        # for each mistake: key, what is expected there, and what was got if that is
-        # short
         lines = [""]
-        for item in error.errors()[:10]:
-            given = item["input"]
-            message = item["msg"].removeprefix("Value error, ")
-            if (
-                isinstance(given, int) and given.bit_length() > 256
-            ):  # Python prints no thousands of digits
-                given = f"an integer of {given.bit_length()} bits"
-            short = isinstance(given, str | int | float) and "; got " not in message
-            lines.append(
-                f"{'.'.join(map(str, item['loc']))}: "
-                f"{message}{f'; got {given!r}' if short else ''}"
-            )
-        what = f"{error.error_count()} mistake(s) in the registry"
-        fix = "mend the keys named above"
+        for detail in error.errors()[:10]:
+            lines.append(_describe_validation_error(detail))
         raise UnreadableFileError(
-            what, where=str(path), got="\n    ".join(lines), fix=fix
+            f"{error.error_count()} mistake(s) in the registry",
+            where=str(path),
+            got="\n    ".join(lines),
+            fix="mend the keys named above",
         ) from None
+
+
+def _describe_validation_error(detail: ErrorDetails) -> str:
+    """Return key, expected value and, where it is short, the value that is wrong."""
+    key = ".".join(str(part) for part in detail["loc"])
+    message = detail["msg"].removeprefix("Value error, ")
+    value = detail["input"]
+    # Python prints no thousands of digits.
+    if isinstance(value, int) and value.bit_length() > 256:
+        value = f"an integer of {value.bit_length()} bits"
+    is_short = isinstance(value, str | int | float)
+    if is_short and "; got " not in message:
+        return f"{key}: {message}; got {value!r}"
+    return f"{key}: {message}"

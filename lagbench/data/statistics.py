@@ -8,7 +8,7 @@ With x(f) the positions of frame f and the frame as time unit (Tables 5.1 and 5.
 per component, over all particles, frames and scenarios of a subset (population std, no
 n - 1).
 
-The nine digits that come out depend on the data alone. Positions are float32 in the
+The nine digits of a statistic depend on the data alone. Positions are float32 in the
 unit box, so their float64 sums over one frame and those of their differences are exact
 up to 2^13 particles away from 0; squares add in a fixed order within a frame; and
 frames and scenarios are joined by ``math.fsum``, which is correctly rounded whatever
@@ -18,7 +18,7 @@ the order or the chunks.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from lagbench.errors import DataError
 
 from .checksums import round_digits
-from .scenario import read_scenario
+from .scenario import ScenarioFile, read_scenario
 
 QUANTITIES = ("position", "velocity", "acceleration")
 """Order of the quantities: differences of order 0, 1 and 2 over frames."""
@@ -62,38 +62,48 @@ def scenario_moments(frames: Iterable[NDArray[np.float32]]) -> dict[str, Moments
             counts[name] += values.shape[1]
             totals[name].append(values.sum(axis=1))
             squares[name].append((values * values).sum(axis=1))
-    return {
-        name: Moments(counts[name], _fsum(totals[name]), _fsum(squares[name]))
-        for name in QUANTITIES
-    }
+    moments = {}
+    for name in QUANTITIES:
+        moments[name] = Moments(
+            count=counts[name],
+            total=_sum_columns(totals[name]),
+            squares=_sum_columns(squares[name]),
+        )
+    return moments
 
 
 def combine(scenarios: Iterable[dict[str, Moments]]) -> dict[str, Moments]:
     """Return the moments over several scenarios, in any order."""
-    held = list(scenarios)
-    return {
-        name: Moments(
-            sum(moments[name].count for moments in held),
-            _fsum([moments[name].total for moments in held if moments[name].count]),
-            _fsum([moments[name].squares for moments in held if moments[name].count]),
+    scenario_list = list(scenarios)
+    combined = {}
+    for name in QUANTITIES:
+        filled = []
+        for scenario in scenario_list:
+            if scenario[name].count:
+                filled.append(scenario[name])
+        combined[name] = Moments(
+            count=sum(moments.count for moments in filled),
+            total=_sum_columns([moments.total for moments in filled]),
+            squares=_sum_columns([moments.squares for moments in filled]),
         )
-        for name in QUANTITIES
-    }
+    return combined
 
 
 def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float, ...]]:
     """Return mean and std per component, to nine significant digits."""
     result: dict[str, tuple[float, ...]] = {}
     for name, moments in combine(scenarios).items():
-        if moments.count:
-            mean = [total / moments.count for total in moments.total]
-            pairs = zip(moments.squares, mean, strict=True)
-            std = [
-                math.sqrt(max(0.0, square / moments.count - m * m))
-                for square, m in pairs
-            ]
-            result[f"{name}_mean"] = tuple(map(round_digits, mean))
-            result[f"{name}_std"] = tuple(map(round_digits, std))
+        if not moments.count:
+            continue
+        means = []
+        deviations = []
+        for total, square in zip(moments.total, moments.squares, strict=True):
+            mean = total / moments.count
+            variance = square / moments.count - mean * mean
+            means.append(round_digits(mean))
+            deviations.append(round_digits(math.sqrt(max(0.0, variance))))
+        result[f"{name}_mean"] = tuple(means)
+        result[f"{name}_std"] = tuple(deviations)
     return result
 
 
@@ -111,13 +121,19 @@ def file_moments(
 ) -> dict[str, Moments]:
     """Return the moments of one scenario file, read one frame at a time."""
     with read_scenario(path) as file:
-        moments = scenario_moments(
-            frame for block in file.blocks("position") for frame in block
-        )
+        moments = scenario_moments(_read_frames(file))
     report(1)
     return moments
 
 
-def _fsum(rows: Sequence[Sequence[float] | NDArray[np.float64]]) -> tuple[float, ...]:
+def _read_frames(file: ScenarioFile) -> Iterator[NDArray[np.float32]]:
+    """Yield the positions of every frame, shape [particle, space]."""
+    for block in file.blocks("position"):
+        yield from block
+
+
+def _sum_columns(
+    rows: Sequence[Sequence[float] | NDArray[np.float64]],
+) -> tuple[float, ...]:
     """Return the column sums, correctly rounded."""
     return tuple(math.fsum(column) for column in zip(*rows, strict=True))

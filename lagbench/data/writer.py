@@ -1,4 +1,4 @@
-"""Scenario files: one netCDF4 file per trajectory that any netCDF or HDF5 reader opens.
+"""Write scenario files: one netCDF4 file per trajectory, for any netCDF or HDF5 reader.
 
 Dimensions are frame, particle, space and, in a closed box, wall; docs/format.md has
 every variable and attribute. Writing needs netCDF4 only, so that generation workers
@@ -22,39 +22,42 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
 from . import WALLS
-from .checksums import ContentHasher, plain
-from .layout import ScenarioKey as ScenarioKey
-from .layout import scenario_path as scenario_path
-from .scenario import AXES, MOST_IN_ROW, attributes_of
-from .scenario import ScenarioFile as ScenarioFile
-from .scenario import check_scenario as check_scenario
-from .scenario import read_scenario as read_scenario
-from .scenario import rehash as rehash
+from .checksums import ContentHasher, to_plain
+from .layout import ScenarioKey
+from .variables import AXES, MAX_VALUES_PER_FRAME, expected_attributes
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
 
 CHUNK_CACHE = 1 << 20
-"""Chunk cache of a variable while writing [bytes]; frames are written once, in order.
-"""
+"""Chunk cache of a variable [bytes]; frames are written once, in order."""
 
 PARTICLES_PER_CHUNK = 1 << 17
-"""Particles in a chunk at the most: 1 MiB, the default chunk cache of HDF5. Frames of
-more have several.
+"""Most particles in a chunk: 1 MiB, the default chunk cache of HDF5.
+
+Larger frames have several chunks.
 """
 
 _RESERVED = {
-    *(
-        "Conventions",
-        "title",
-        "source",
-        "license",
-        "lagbench_format",
-        "lagbench_version",
-    ),
-    *("split", "size", "version", "scenario", "subset", "seed", "generator", "device"),
-    *("hashed_parameters", "content_sha256", "facts"),
+    "Conventions",
+    "title",
+    "source",
+    "license",
+    "lagbench_format",
+    "lagbench_version",
+    "split",
+    "size",
+    "version",
+    "scenario",
+    "subset",
+    "seed",
+    "generator",
+    "device",
+    "hashed_parameters",
+    "content_sha256",
+    "facts",
 }
+"""Attributes of the file that no parameter may be named like."""
 
 
 class ScenarioWriter:
@@ -65,8 +68,8 @@ class ScenarioWriter:
     removed.
 
     Args:
-        path: target, see :func:`scenario_path`.
-        key: what names the scenario.
+        path: target, see :func:`lagbench.data.layout.scenario_path`.
+        key: names of the scenario.
         particles: particles in every frame.
         frames: frames that will be appended.
         frame_interval: time between frames [s].
@@ -74,7 +77,7 @@ class ScenarioWriter:
             [particle].
         particle_mass: mass of a particle, rho L^2 / n.
         wall_velocity: [length/s], shape [wall, 2] (constant) or [frame, wall, 2], entry
-            f being what acts from frame f-1 to f; walls left, right, bottom, top; None
+            f acting from frame f-1 to f; walls left, right, bottom, top; None
             where there are no moving walls (free surface).
         parameters: physical parameters by name: finite numbers and strings. Each
             becomes an attribute and enters the content hash. ``start_frame`` is one of
@@ -105,43 +108,58 @@ class ScenarioWriter:
         reynolds: float | None = None,
         licence: str = "CC-BY-4.0",
     ) -> None:
-        if particles * len(AXES) > MOST_IN_ROW:
-            expected = f"at most {MOST_IN_ROW // len(AXES)}"
+        most_particles = MAX_VALUES_PER_FRAME // len(AXES)
+        if particles > most_particles:
             raise DataError(
-                "too many particles", where=str(path), expected=expected, got=particles
+                "too many particles",
+                where=str(path),
+                expected=f"at most {most_particles}",
+                got=particles,
             )
         self.path = path
         self.key = key
         self.content_sha256 = ""  # content hash, set by the clean exit
-        if reynolds is None:
-            extra = {}
-        else:
-            extra = {"reynolds_number": reynolds}
-        self._parameters = _checked({**parameters, **extra}, path)
+        all_parameters = dict(parameters)
+        if reynolds is not None:
+            all_parameters["reynolds_number"] = reynolds
+        self._parameters = _check_parameters(all_parameters, path)
         self._labels = {
             "seed": seed,
             "device": device,
             "generator": generator,
             "license": licence,
         }
-        self._shape = {"frame": frames, "particle": particles, "space": len(AXES)}
-        self._constants: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {
-            "frame": (("frame",), np.arange(frames, dtype=np.int32)),
-            "time": (("frame",), np.arange(frames, dtype=np.float64) * frame_interval),
-            "particle": (("particle",), np.arange(particles, dtype=np.int32)),
-            "space": (("space",), np.array(AXES, dtype=object)),
-            "material": (("particle",), np.asarray(material, dtype=np.int8)),
-            "particle_mass": ((), np.asarray(particle_mass, dtype=np.float64)),
-        }
+
+        self._lengths = {"frame": frames, "particle": particles, "space": len(AXES)}
+        # dimensions and values by name of the variable
+        self._constants: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {}
+        self._add_constant("frame", ("frame",), np.arange(frames, dtype=np.int32))
+        times = np.arange(frames, dtype=np.float64) * frame_interval
+        self._add_constant("time", ("frame",), times)
+        numbers = np.arange(particles, dtype=np.int32)
+        self._add_constant("particle", ("particle",), numbers)
+        self._add_constant("space", ("space",), np.array(AXES, dtype=object))
+        materials = np.asarray(material, dtype=np.int8)
+        self._add_constant("material", ("particle",), materials)
+        mass = np.asarray(particle_mass, dtype=np.float64)
+        self._add_constant("particle_mass", (), mass)
         if wall_velocity is not None:
-            walls = np.broadcast_to(
-                np.asarray(wall_velocity, np.float32), (frames, len(WALLS), len(AXES))
-            )
-            self._shape["wall"] = len(WALLS)
-            self._constants["wall"] = (("wall",), np.array(WALLS, dtype=object))
-            self._constants["wall_velocity"] = (("frame", "wall", "space"), walls)
+            self._add_walls(np.asarray(wall_velocity, np.float32))
+
         self._hasher = ContentHasher(key.identity(seed, self._parameters))
-        self._written = 0
+        self._written_frames = 0
+
+    def _add_constant(
+        self, name: str, dims: tuple[str, ...], values: NDArray[Any]
+    ) -> None:
+        self._constants[name] = (dims, values)
+
+    def _add_walls(self, wall_velocity: NDArray[np.float32]) -> None:
+        self._lengths["wall"] = len(WALLS)
+        self._add_constant("wall", ("wall",), np.array(WALLS, dtype=object))
+        shape = (self._lengths["frame"], len(WALLS), len(AXES))
+        values = np.broadcast_to(wall_velocity, shape)
+        self._add_constant("wall_velocity", ("frame", "wall", "space"), values)
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the frames."""
@@ -154,32 +172,37 @@ class ScenarioWriter:
             temporary = stack.enter_context(atomic_path(self.path))
             self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
             stack.callback(self._file.close)
-            for name, length in self._shape.items():
-                self._file.createDimension(name, length)
-            for name, (dims, values) in self._constants.items():
-                self._create(name, values.dtype, dims)
-                self._hasher.update(name, values)
-                self._file[name][...] = values
+            self._write_constants()
             for name in ("position", "velocity"):
                 self._create(name, np.dtype(np.float32), ("frame", "particle", "space"))
-            key = self.key
-            program = version("lagbench")
-            attributes = {
-                "Conventions": "CF-1.11",
-                "title": f"lagbench {key.split} {key.size}, scenario {key.scenario}",
-                "source": f"lagbench {program}, {self._labels['generator']}",
-                "lagbench_format": FORMAT,
-                "lagbench_version": program,
-                "split": key.split,
-                "size": key.size,
-                "version": key.version,
-                "scenario": key.scenario,
-                "subset": key.subset,
-                **self._labels,
-            }
+            attributes = self._file_attributes(version("lagbench"))
             self._file.setncatts(attributes | self._parameter_attributes())
             self._stack = stack.pop_all()
         return self
+
+    def _write_constants(self) -> None:
+        for dimension, length in self._lengths.items():
+            self._file.createDimension(dimension, length)
+        for name, (dims, values) in self._constants.items():
+            self._create(name, values.dtype, dims)
+            self._hasher.update(name, values)
+            self._file[name][...] = values
+
+    def _file_attributes(self, program_version: str) -> dict[str, object]:
+        key = self.key
+        return {
+            "Conventions": "CF-1.11",
+            "title": f"lagbench {key.split} {key.size}, scenario {key.scenario}",
+            "source": f"lagbench {program_version}, {self._labels['generator']}",
+            "lagbench_format": FORMAT,
+            "lagbench_version": program_version,
+            "split": key.split,
+            "size": key.size,
+            "version": key.version,
+            "scenario": key.scenario,
+            "subset": key.subset,
+            **self._labels,
+        }
 
     def append(
         self, position: NDArray[np.float32], velocity: NDArray[np.float32]
@@ -195,42 +218,34 @@ class ScenarioWriter:
                 written.
             WorkFailedError: the disk is full or not writable.
         """
-        shape = (self._shape["particle"], len(AXES))
+        shape = (self._lengths["particle"], len(AXES))
         for name, values in (("position", position), ("velocity", velocity)):
             if values.shape != shape:
-                where = f"{self.path}, variable {name!r}"
                 raise DataError(
                     "a frame has the wrong shape",
-                    where=where,
+                    where=f"{self.path}, variable {name!r}",
                     expected=shape,
                     got=values.shape,
                 )
             self._hasher.update(name, values)
             with _write_errors(self.path):
-                self._file[name][self._written] = values
-        self._written += 1
+                self._file[name][self._written_frames] = values
+        self._written_frames += 1
 
     def state(self, **parameters: object) -> None:
-        """State further parameters, known only after the last frame; they are hashed
-        like the others.
-        """
-        self._parameters |= _checked(parameters, self.path)
-        self._hasher.identity = self.key.identity(
-            str(self._labels["seed"]), self._parameters
-        )
+        """State further parameters after the last frame; they are hashed too."""
+        self._parameters |= _check_parameters(parameters, self.path)
+        seed = self._labels["seed"]
+        self._hasher.identity = self.key.identity(seed, self._parameters)
         with _write_errors(self.path):
             self._file.setncatts(self._parameter_attributes())
 
     def _parameter_attributes(self) -> dict[str, object]:
-        return {
-            **self._parameters,
-            "hashed_parameters": " ".join(sorted(self._parameters)),
-        }
+        names = " ".join(sorted(self._parameters))
+        return {**self._parameters, "hashed_parameters": names}
 
     def state_facts(self, facts: Mapping[str, float]) -> None:
-        """State what the scenario went through: finite numbers by name, which no hash
-        covers.
-        """
+        """State simulation diagnostics: finite numbers by name, without a hash."""
         with _write_errors(self.path):
             self._file.facts = json.dumps(dict(facts), allow_nan=False)
 
@@ -252,16 +267,10 @@ class ScenarioWriter:
             self._file.content_sha256 = self.content_sha256
 
     def _create(self, name: str, dtype: np.dtype[Any], dims: tuple[str, ...]) -> None:
-        shape = tuple(self._shape[dim] for dim in dims)
+        shape = tuple(self._lengths[dimension] for dimension in dims)
         if dtype.kind == "O":
             variable = self._file.createVariable(name, str, dims)
         else:
-            moving = "particle" in dims and "frame" in dims
-            chunks = (
-                (1, min(shape[1], PARTICLES_PER_CHUNK), *shape[2:])
-                if moving
-                else shape or None
-            )
             variable = self._file.createVariable(
                 name,
                 dtype,
@@ -269,35 +278,46 @@ class ScenarioWriter:
                 compression="zlib" if dims else None,
                 complevel=1,
                 shuffle=True,
-                chunksizes=chunks,
+                chunksizes=_chunk_shape(dims, shape),
                 endian="little",
                 fill_value=False,
                 chunk_cache=CHUNK_CACHE,
             )
-        variable.setncatts(attributes_of(name, dims))
+        variable.setncatts(expected_attributes(name, dims))
         self._hasher.declare(name, dtype, dims, shape)
 
 
-def _checked(parameters: Mapping[str, object], path: Path) -> dict[str, object]:
+def _chunk_shape(
+    dims: tuple[str, ...], shape: tuple[int, ...]
+) -> tuple[int, ...] | None:
+    """Return the shape of a chunk; None for a single value."""
+    if "particle" in dims and "frame" in dims:
+        return (1, min(shape[1], PARTICLES_PER_CHUNK), *shape[2:])
+    return shape or None
+
+
+def _check_parameters(
+    parameters: Mapping[str, object], path: Path
+) -> dict[str, object]:
     """Return parameters as plain values; refuse names that the format needs itself."""
-    stored = {}
+    plain_values: dict[str, object] = {}
     for name, value in parameters.items():
         if name in _RESERVED or not name.isidentifier():
-            expected = f"an identifier other than {', '.join(sorted(_RESERVED))}"
             raise DataError(
                 f"a parameter cannot be named {name!r}",
                 where=str(path),
-                expected=expected,
+                expected=f"an identifier other than {', '.join(sorted(_RESERVED))}",
             )
-        stored[name] = plain(value)
-        if stored[name] == "" or not isinstance(stored[name], (int, float, str)):
+        plain_value = to_plain(value)
+        if plain_value == "" or not isinstance(plain_value, (int, float, str)):
             raise DataError(
                 f"the parameter {name!r} cannot be stored",
                 where=str(path),
                 expected="a finite number or a string that is not empty",
                 got=repr(value),
             )
-    return stored
+        plain_values[name] = plain_value
+    return plain_values
 
 
 @contextmanager
@@ -308,14 +328,13 @@ def _write_errors(path: Path) -> Iterator[None]:
     except LagbenchError:
         raise
     except (OSError, RuntimeError, UnicodeError) as error:  # a name that is no UTF-8
+        free_bytes = 0
         if path.parent.is_dir():
-            free = shutil.disk_usage(path.parent).free
-        else:
-            free = 0
+            free_bytes = shutil.disk_usage(path.parent).free
         raise WorkFailedError(
             "cannot write a scenario file",
             where=str(path),
-            got=f"{error}; {free:,} bytes free",
+            got=f"{error}; {free_bytes:,} bytes free",
             fix="free disk space, or name a folder that you may write to: --root or "
             "LAGBENCH_ROOT",
         ) from error

@@ -1,4 +1,4 @@
-"""Read YAML that strangers may have written: safe types only, bounded size, no aliases.
+"""Read YAML of strangers: safe types only, bounded size, no aliases.
 
 Aliases are refused because a few hundred bytes of them can expand to gigabytes;
 duplicate keys because the second would silently replace the first. Numbers are those of
@@ -35,11 +35,12 @@ NUMBERS = {
 }
 """Numbers of YAML 1.2's core schema, by tag; integers are asked first."""
 
+FIRST_CHARACTERS = list("-+.0123456789")
+"""First characters of a number."""
+
 
 class _StrictLoader(yaml.CSafeLoader):
-    """Safe loader that refuses duplicate keys and knows the numbers of YAML 1.2
-    only.
-    """
+    """Safe loader with the numbers of YAML 1.2; it refuses duplicate keys."""
 
     def construct_mapping(
         self, node: yaml.MappingNode, deep: bool = False
@@ -56,97 +57,106 @@ class _StrictLoader(yaml.CSafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-_StrictLoader.yaml_implicit_resolvers = {
-    first: [(tag, known) for tag, known in held if tag not in NUMBERS]
-    for first, held in yaml.CSafeLoader.yaml_implicit_resolvers.items()
-}
-for _tag, _pattern in NUMBERS.items():
-    _StrictLoader.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
-_StrictLoader.add_constructor(
-    INTEGER,
-    lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10),
-)
-_StrictLoader.add_constructor(
-    FLOAT,
-    lambda _, node: float(
-        node.value.replace(".", "", 1) if node.value[-1:].isalpha() else node.value
-    ),
-)
+def _construct_integer(_: _StrictLoader, node: yaml.ScalarNode) -> int:
+    if node.value.startswith(("0o", "0x")):
+        return int(node.value, base=0)
+    return int(node.value)
+
+
+def _construct_float(_: _StrictLoader, node: yaml.ScalarNode) -> float:
+    # YAML writes .inf and .nan, Python inf and nan.
+    if node.value[-1:].isalpha():
+        return float(node.value.replace(".", "", 1))
+    return float(node.value)
+
+
+def _register_number_types() -> None:
+    """Replace the numbers of YAML 1.1 by those of YAML 1.2."""
+    resolvers = {}
+    for first_character, pairs in yaml.CSafeLoader.yaml_implicit_resolvers.items():
+        resolvers[first_character] = [pair for pair in pairs if pair[0] not in NUMBERS]
+    _StrictLoader.yaml_implicit_resolvers = resolvers
+    for tag, pattern in NUMBERS.items():
+        _StrictLoader.add_implicit_resolver(tag, pattern, FIRST_CHARACTERS)
+    _StrictLoader.add_constructor(INTEGER, _construct_integer)
+    _StrictLoader.add_constructor(FLOAT, _construct_float)
+
+
+_register_number_types()
 
 
 def _check_structure(text: str) -> None:
     """Raise on the first alias or tag and on deep nesting, before anything is built."""
     depth = 0
     for event in yaml.parse(text, Loader=yaml.CSafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
-            event, yaml.CollectionEndEvent
-        )
-        what = None
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        if isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        issue = None
         if depth > MAX_DEPTH:
-            what = f"nested deeper than {MAX_DEPTH}"
+            issue = f"nested deeper than {MAX_DEPTH}"
         elif isinstance(event, yaml.AliasEvent):
-            what = "aliases are not allowed"
+            issue = "aliases are not allowed"
         elif getattr(event, "tag", None) is not None:
-            what = "tags are not allowed"
-        if what is not None:
-            raise yaml.YAMLError(f"{what} {event.start_mark}")
+            issue = "tags are not allowed"
+        if issue is not None:
+            raise yaml.YAMLError(f"{issue} {event.start_mark}")
 
 
 def read_yaml(path: Path) -> Any:  # noqa: ANN401
-    """Return the plain Python value of a YAML file."""
+    """Return the plain Python value of a YAML file.
+
+    Raises:
+        UnreadableFileError: the file is missing, too large, or not plain YAML.
+    """
     try:
-        size = path.stat().st_size
-        if size > MAX_BYTES:
-            what = "the YAML file is too large"
-            expected = f"at most {MAX_BYTES} bytes"
+        length = path.stat().st_size
+        if length > MAX_BYTES:
             raise UnreadableFileError(
-                what, where=str(path), expected=expected, got=f"{size} bytes"
+                "the YAML file is too large",
+                where=str(path),
+                expected=f"at most {MAX_BYTES} bytes",
+                got=f"{length} bytes",
             )
         text = path.read_text(encoding="utf-8")
         _check_structure(text)
         return yaml.load(text, Loader=_StrictLoader)
     except OSError as error:
-        got = error.strerror or error
         raise UnreadableFileError(
-            "cannot read the YAML file", where=str(path), got=got
+            "cannot read the YAML file",
+            where=str(path),
+            got=error.strerror or error,
         ) from error
-    except (
-        yaml.YAMLError,
-        ValueError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:  # as dates
-        got = " ".join(str(error).split())
-        fix = "use plain mappings, lists, numbers and strings, in UTF-8"
+    # PyYAML raises other types too, as for impossible dates.
+    except (yaml.YAMLError, ValueError, ArithmeticError, RecursionError) as error:
         raise UnreadableFileError(
-            "not a plain YAML file", where=str(path), got=got, fix=fix
+            "not a plain YAML file",
+            where=str(path),
+            got=" ".join(str(error).split()),
+            fix="use plain mappings, lists, numbers and strings, in UTF-8",
         ) from error
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes what our reader takes for a number, and writes no aliases, which it
-    refuses.
-    """
+    """Dumper for our reader: no aliases, and quotes around texts like numbers."""
 
     def ignore_aliases(self, data: object) -> bool:
         return True
 
 
 for _tag, _pattern in NUMBERS.items():
-    _Dumper.add_implicit_resolver(_tag, _pattern, list("-+.0123456789"))
+    _Dumper.add_implicit_resolver(_tag, _pattern, FIRST_CHARACTERS)
 
 
-def spell_yaml(value: object, *, default_flow_style: bool | None = False) -> str:
-    """Return plain values as the text of a YAML file, which :func:`read_yaml` reads as
-    the same values.
-    """
-    return str(
-        yaml.dump(
-            value,
-            Dumper=_Dumper,
-            sort_keys=False,
-            allow_unicode=True,
-            width=110,
-            default_flow_style=default_flow_style,
-        )
+def format_yaml(value: object, *, default_flow_style: bool | None = False) -> str:
+    """Return plain values as YAML that :func:`read_yaml` reads as the same values."""
+    text = yaml.dump(
+        value,
+        Dumper=_Dumper,
+        sort_keys=False,
+        allow_unicode=True,
+        width=110,
+        default_flow_style=default_flow_style,
     )
+    return str(text)

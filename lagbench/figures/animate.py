@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
-from lagbench.errors import UsageError, nearest
+from lagbench.errors import UsageError, suggest_name
 from lagbench.work.progress import watched
 
 from .canvas import DPI, figure, pixels_of
@@ -137,7 +137,7 @@ def check_ending(path: Path) -> None:
 
 def _check_kind(kind: Panel | str | None) -> None:
     if kind is not None and kind not in KINDS:
-        fix = nearest(str(kind), map(str, KINDS))
+        fix = suggest_name(str(kind), map(str, KINDS))
         raise UsageError(f"an animation cannot show {kind!r}", where="--kind", fix=fix)
 
 
@@ -181,10 +181,12 @@ class Film:
         self._limit = _common_limit(recordings, panel)
         self._painters = []
         self._lefts = []  # left side of each panel [pixel]
-        for column, recording in enumerate(recordings):
+        left = MARGIN
+        for recording in recordings:
             painter = Painter(recording, panel, side=SIDE, limit=self._limit)
             self._painters.append(painter)
-            self._lefts.append(MARGIN + column * (SIDE + GAP))
+            self._lefts.append(left)
+            left += SIDE + GAP
 
         width = self._lefts[-1] + SIDE + MARGIN
         height = TOP + SIDE + BOTTOM
@@ -198,14 +200,16 @@ class Film:
         for recording, painter, left in zip(
             self._recordings, self._painters, self._lefts, strict=True
         ):
-            panel = unpack(painter.paint(recording.scene(number)))
+            scene = recording.scene(number)
+            panel = unpack(painter.paint(scene))
             image[TOP : TOP + SIDE, left : left + SIDE] = panel
 
         # the counter stands at the bottom right
         text = self._counter_text(number)
-        counter = np.concatenate([self._letters[letter] for letter in text], axis=1)
+        letters = [self._letters[letter] for letter in text]
+        counter = np.concatenate(letters, axis=1)
         right = self.size[0] - MARGIN
-        left = right - LETTER_WIDTH * len(text)
+        left = right - counter.shape[1]
         top = TOP + SIDE + 12
         image[top : top + LETTER_HEIGHT, left:right] = counter
         return image

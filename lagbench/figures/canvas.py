@@ -83,8 +83,9 @@ def _cut_map(name: str, *, low: float, high: float, levels: int) -> ListedColorm
     """Return a stretch of a map of matplotlib in so many colours."""
     matplotlib = require("matplotlib", extra="plots")
     colors = require("matplotlib.colors", extra="plots")
+    whole_map = matplotlib.colormaps[name]
     shares = np.linspace(low, high, levels)
-    cut: ListedColormap = colors.ListedColormap(matplotlib.colormaps[name](shares))
+    cut: ListedColormap = colors.ListedColormap(whole_map(shares))
     return cut
 
 
@@ -92,21 +93,38 @@ def _cut_map(name: str, *, low: float, high: float, levels: int) -> ListedColorm
 def build_palette() -> NDArray[np.uint8]:
     """Return the 256 colours of every file, paper first, shape [256, 3]."""
     paper = parse_rgb(PAPER).astype(float)
-    speeds = np.asarray(build_speed_map().colors)[:, :3] * 255.0
-    vorticities = np.asarray(build_vorticity_map().colors)[:, :3] * 255.0
-
+    speeds = _exact_colours(build_speed_map())
+    vorticities = _exact_colours(build_vorticity_map())
     tables = [paper[None], speeds, vorticities]
-    # edges of dots by speed are smoothed too; fewer levels do there
-    tables.append(_blend(speeds[::3], paper, share=0.62))
-    tables.append(_blend(speeds[::5], paper, share=0.3))
-    for colour, blend_count in BLENDS:
-        pure = parse_rgb(colour)[None].astype(float)
-        for share in np.arange(1, blend_count + 1) / blend_count:
-            tables.append(_blend(pure, paper, share=share))
 
-    palette = np.concatenate(tables).round().astype(np.uint8)
-    filling = np.repeat(palette[:1], PALETTE_SIZE - len(palette), axis=0)
+    # edges of dots by speed are smoothed too; fewer levels do there
+    every_third = speeds[::3]
+    tables.append(_blend(every_third, paper, share=0.62))
+    every_fifth = speeds[::5]
+    tables.append(_blend(every_fifth, paper, share=0.3))
+
+    for colour, blend_count in BLENDS:
+        pure = parse_rgb(colour).astype(float)
+        for number in range(1, blend_count + 1):
+            share = number / blend_count
+            tables.append(_blend(pure[None], paper, share=share))
+
+    exact = np.concatenate(tables)
+    palette = exact.round().astype(np.uint8)
+    missing = PALETTE_SIZE - len(palette)
+    filling = np.repeat(palette[:1], missing, axis=0)
     return np.concatenate([palette, filling])
+
+
+def colour_bytes(colour_map: ListedColormap) -> NDArray[np.uint8]:
+    """Return the colours of a map as RGB bytes, shape [level, 3]."""
+    return _exact_colours(colour_map).round().astype(np.uint8)
+
+
+def _exact_colours(colour_map: ListedColormap) -> NDArray[np.float64]:
+    """Return the colours of a map from 0 to 255, shape [level, 3]."""
+    rgba = np.asarray(colour_map.colors)
+    return rgba[:, :3] * 255.0
 
 
 def _blend(

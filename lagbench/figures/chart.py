@@ -59,10 +59,11 @@ class AxisScale:
         if not self.log:
             return (x - self.low) / (self.high - self.low)
         is_positive = x > 0.0
-        logs = np.where(is_positive, np.log10(np.where(is_positive, x, 1.0)), np.nan)
+        logs = np.log10(np.where(is_positive, x, 1.0))
         low = math.log10(self.low)
         high = math.log10(self.high)
-        return np.asarray((logs - low) / (high - low), np.float64)
+        share = (logs - low) / (high - low)
+        return np.where(is_positive, share, np.nan)
 
     @property
     def factor(self) -> str:
@@ -99,8 +100,10 @@ def linear(
     if order < -2 or order > 4:
         exponent = order
     unit = 10.0**exponent
-    labels = format_multiples([value / unit for value in values], step / unit)
-    return AxisScale(low, high, False, exponent, tuple(map(Tick, values, labels)))
+    multiples = [value / unit for value in values]
+    labels = format_multiples(multiples, step / unit)
+    ticks = tuple(map(Tick, values, labels))
+    return AxisScale(low, high, False, exponent, ticks)
 
 
 def _round_up(rough: float) -> float:
@@ -120,13 +123,18 @@ def logarithmic(low: float, high: float) -> AxisScale:
     first = math.floor(math.log10(low) + 1e-9)
     last = math.ceil(math.log10(high) - 1e-9)
     last = max(last, first + 1)
-    every = 1 + (last - first) // 7
-    ticks = [Tick(10.0**k, format_power(k)) for k in range(first, last + 1, every)]
-    if last - first == 1:
+    decades = last - first
+    every = 1 + decades // 7
+    low = 10.0**first
+    high = 10.0**last
+    ticks = []
+    for exponent in range(first, last + 1, every):
+        ticks.append(Tick(10.0**exponent, format_power(exponent)))
+    if decades == 1:
         for factor in (2, 5):
             label = f"{factor}×{format_power(first)}"
-            ticks.append(Tick(factor * 10.0**first, label))
-    return AxisScale(10.0**first, 10.0**last, True, 0, tuple(ticks))
+            ticks.append(Tick(factor * low, label))
+    return AxisScale(low, high, True, 0, tuple(ticks))
 
 
 def close_logarithmic(low: float, high: float) -> AxisScale:
@@ -137,24 +145,25 @@ def close_logarithmic(low: float, high: float) -> AxisScale:
     first_decade = math.floor(math.log10(low)) - 1
     last_decade = math.ceil(math.log10(high)) + 1
     marks = []
-    for k in range(first_decade, last_decade):
-        marks += [(factor * 10.0**k, factor, k) for factor in (1, 2, 5)]
-    first = max(i for i, (value, *_) in enumerate(marks) if value <= 0.8 * low)
-    last = min(i for i, (value, *_) in enumerate(marks) if value >= 1.25 * high)
-    marks = marks[first : last + 1]
+    for exponent in range(first_decade, last_decade):
+        for factor in (1, 2, 5):
+            marks.append((factor * 10.0**exponent, factor, exponent))
+    start = max(value for value, _, _ in marks if value <= 0.8 * low)
+    end = min(value for value, _, _ in marks if value >= 1.25 * high)
+    marks = [mark for mark in marks if start <= mark[0] <= end]
 
     ticks = []
-    for value, factor, k in marks:
+    for value, factor, exponent in marks:
         if factor != 1 and len(marks) > MOST_LABELS:
             continue
-        if k in PLAIN_POWERS:
+        if exponent in PLAIN_POWERS:
             label = f"{value:g}"
         elif factor == 1:
-            label = format_power(k)
+            label = format_power(exponent)
         else:
-            label = f"{factor}×{format_power(k)}"
+            label = f"{factor}×{format_power(exponent)}"
         ticks.append(Tick(value, label))
-    return AxisScale(marks[0][0], marks[-1][0], True, 0, tuple(ticks))
+    return AxisScale(start, end, True, 0, tuple(ticks))
 
 
 def spanning(
@@ -169,7 +178,7 @@ def spanning(
     """
     parts = [np.asarray(values, np.float64).ravel() for values in series]
     values = np.concatenate([*parts, np.zeros(0)])
-    values = values[np.isfinite(values) & (np.abs(values) < HUGE)]
+    values = values[np.abs(values) < HUGE]  # NaN is not less
     if not values.size:
         return linear(0.0, 1.0)
     low = float(values.min())
@@ -244,18 +253,17 @@ class Plot:
 
     def line(self, x: ArrayLike, y: ArrayLike, kind: str, title: str = "") -> None:
         """Draw a line through points; NaN leaves a gap."""
-        points = zip(self._columns(x), self._rows(y), strict=True)
-        self._add_path(path_data(points), f"line {kind}", title)
+        data = path_data(self._points(x, y))
+        self._add_path(data, f"line {kind}", title)
 
     def band(self, x: ArrayLike, low: ArrayLike, high: ArrayLike, kind: str) -> None:
         """Fill between two lines where both are numbers."""
-        columns = self._columns(x)
-        below = self._rows(low)
-        above = self._rows(high)
-        for run in _runs(np.isfinite(below) & np.isfinite(above)):
-            forth = zip(columns[run], above[run], strict=True)
-            back = zip(columns[run][::-1], below[run][::-1], strict=True)
-            self._add_path(path_data([*forth, *back]) + "Z", f"band {kind}")
+        above = self._points(x, high)
+        below = self._points(x, low)
+        is_finite = np.isfinite(np.array([above, below])).all(axis=(0, 2))
+        for run in _runs(is_finite):
+            outline = above[run] + below[run][::-1]
+            self._add_path(path_data(outline) + "Z", f"band {kind}")
 
     def steps(
         self, edges: ArrayLike, heights: ArrayLike, kind: str, title: str = ""
@@ -267,19 +275,23 @@ class Plot:
 
     def dots(self, x: ArrayLike, y: ArrayLike, kind: str) -> None:
         """Draw a cloud of points."""
-        points = zip(self._columns(x), self._rows(y), strict=True)
-        self._add_path(_dot_data(points), f"dots {kind}")
+        data = _dot_data(self._points(x, y))
+        self._add_path(data, f"dots {kind}")
 
     def level(self, value: float, label: str) -> None:
         """Draw a horizontal line with a label at its right end."""
-        row = float(self._rows(np.array([value]))[0])
-        self._add_path(path_data([(0, row), (self._plot_width, row)]), "level")
-        self._marks.append(draw_text(label, self._plot_width, row - 5, "note end"))
+        row = float(self._rows(value))
+        right = self._plot_width
+        line = _draw_line((0, row), (right, row), "level")
+        note = draw_text(label, right, row - 5, "note end")
+        self._marks += [line, note]
 
     def upright(self, value: float, label: str) -> None:
         """Draw a vertical line with a label at its top."""
-        column = float(self._columns(np.array([value]))[0])
-        self._add_path(path_data([(column, 0), (column, self._plot_height)]), "level")
+        column = float(self._columns(value))
+        bottom = self._plot_height
+        line = _draw_line((column, 0), (column, bottom), "level")
+        self._marks.append(line)
         is_right = column > self._plot_width / 2
         if is_right:
             note = Label(label, column - 5, 11, 1.0)
@@ -294,16 +306,18 @@ class Plot:
         Spots that come first have the choice.
         """
         self._is_interactive = True
-        columns = self._columns([spot.x for spot in spots]).tolist()
-        rows = self._rows([spot.y for spot in spots]).tolist()
+        names = [clipped(spot.name, LABEL_ROOM) for spot in spots]
+        x = [spot.x for spot in spots]
+        y = [spot.y for spot in spots]
+        points = self._points(x, y)
         labels = place_labels(
-            [clipped(spot.name, LABEL_ROOM) for spot in spots],
-            list(zip(columns, rows, strict=True)),
+            names,
+            points,
             plot=LabelBox(0, 0, self._plot_width, self._plot_height),
             taken=self._notes,
         )
-        for spot, x, y, label in zip(spots, columns, rows, labels, strict=True):
-            self._marks.append(_draw_spot(spot, x, y, label))
+        for spot, point, label in zip(spots, points, labels, strict=True):
+            self._marks.append(_draw_spot(spot, point, label))
 
     def svg(self, title: str, description: str) -> Markup:
         """Return the chart."""
@@ -319,7 +333,12 @@ class Plot:
         role = "img"
         if self._is_interactive:
             role = "group"
-        parts = [*self._draw_axes(), area]
+        parts = [
+            *self._draw_y_axis(),
+            *self._draw_x_axis(),
+            *self._draw_axis_labels(),
+            area,
+        ]
         return _wrap_svg(self._height, title, description, parts, role=role)
 
     def _add_path(self, data: str, kind: str, title: str = "") -> None:
@@ -328,35 +347,60 @@ class Plot:
             children.append(tag("title", title))
         self._marks.append(tag("path", *children, d=data, class_=kind))
 
+    def _points(self, x: ArrayLike, y: ArrayLike) -> list[Point]:
+        """Return the places of values, across and down [pixel]."""
+        columns = self._columns(x).tolist()
+        rows = self._rows(y).tolist()
+        return list(zip(columns, rows, strict=True))
+
     def _columns(self, x: ArrayLike) -> Floats:
         return np.clip(self._x.share(x), -FAR, FAR) * self._plot_width
 
     def _rows(self, y: ArrayLike) -> Floats:
         return (1.0 - np.clip(self._y.share(y), -FAR, FAR)) * self._plot_height
 
-    def _draw_axes(self) -> list[Markup]:
-        bottom = TOP + self._plot_height
+    def _draw_y_axis(self) -> list[Markup]:
+        """Return a line across the plot for each tick, with its label."""
         right = WIDTH - RIGHT
+        label_right = LEFT - 7
         drawn = []
         for tick in self._y.ticks:
             row = TOP + float(self._rows(tick.value))
-            drawn.append(_draw_line((LEFT, row), (right, row), "grid"))
-            drawn.append(draw_text(tick.label, LEFT - 7, row + 4, "tick end"))
-        for tick in self._x.ticks:
-            column = LEFT + float(self._columns(tick.value))
-            drawn.append(_draw_line((column, bottom), (column, bottom + 4), "mark"))
-            drawn.append(draw_text(tick.label, column, bottom + 17, "tick middle"))
-        drawn.append(_draw_line((LEFT, bottom), (right, bottom), "axis"))
-
-        x_label = _with_factor(self._x_label, self._x)
-        drawn.append(draw_text(x_label, right, self._height - 5, "label end"))
-        y_label = _with_factor(self._y_label, self._y)
-        drawn.append(draw_text(y_label, 2, 14, "label"))
+            line = _draw_line((LEFT, row), (right, row), "grid")
+            label = draw_text(tick.label, label_right, row + 4, "tick end")
+            drawn += [line, label]
         return drawn
 
+    def _draw_x_axis(self) -> list[Markup]:
+        """Return the axis with a mark for each tick, with its label."""
+        right = WIDTH - RIGHT
+        bottom = TOP + self._plot_height
+        mark_bottom = bottom + 4
+        base_line = bottom + 17
+        drawn = []
+        for tick in self._x.ticks:
+            column = LEFT + float(self._columns(tick.value))
+            mark = _draw_line((column, bottom), (column, mark_bottom), "mark")
+            label = draw_text(tick.label, column, base_line, "tick middle")
+            drawn += [mark, label]
+        axis = _draw_line((LEFT, bottom), (right, bottom), "axis")
+        drawn.append(axis)
+        return drawn
 
-def _draw_spot(spot: Spot, x: float, y: float, label: Label | None) -> Markup:
+    def _draw_axis_labels(self) -> list[Markup]:
+        x_label = _with_factor(self._x_label, self._x)
+        y_label = _with_factor(self._y_label, self._y)
+        right = WIDTH - RIGHT
+        below = self._height - 5
+        return [
+            draw_text(x_label, right, below, "label end"),
+            draw_text(y_label, 2, 14, "label"),
+        ]
+
+
+def _draw_spot(spot: Spot, point: Point, label: Label | None) -> Markup:
     """Return a dot with its label; the element takes the keyboard's focus."""
+    x, y = point
     place = {"cx": f"{x:.1f}", "cy": f"{y:.1f}"}
     parts = [
         tag("title", spot.description),
@@ -398,38 +442,56 @@ def bar_chart(
     bars: Sequence[Bar], scale: AxisScale, *, label: str, title: str, description: str
 ) -> Markup:
     """Return horizontal bars with their names above them."""
-    across = WIDTH - BARS_LEFT - BARS_RIGHT
     bottom = ROW_HEIGHT * len(bars) + 6
-
-    def column_of(value: float) -> float:
-        share = float(np.nan_to_num(scale.share(value), nan=0.0))
-        return BARS_LEFT + across * min(max(share, 0.0), 1.0)
-
     drawn: list[Markup] = []
     for tick in scale.ticks:
-        column = column_of(tick.value)
-        drawn.append(_draw_line((column, 4), (column, bottom), "grid"))
-        drawn.append(draw_text(tick.label, column, bottom + 16, "tick middle"))
+        column = _bar_column(scale, tick.value)
+        line = _draw_line((column, 4), (column, bottom), "grid")
+        tick_label = draw_text(tick.label, column, bottom + 16, "tick middle")
+        drawn += [line, tick_label]
 
     start = float(BARS_LEFT)
     if not scale.log:
-        start = column_of(0.0)
+        start = _bar_column(scale, 0.0)
     for number, bar in enumerate(bars):
         top = number * ROW_HEIGHT + 19
         drawn.append(_draw_bar_name(bar, top))
         if np.isfinite(bar.value):
-            low, high = sorted((start, column_of(bar.value)))
-            box = {"x": f"{low:.1f}", "width": f"{max(high - low, 1.0):.1f}"}
-            kind = f"bar {bar.kind}"
-            drawn.append(tag("rect", **box, y=top, height=BAR_HEIGHT, class_=kind))
+            end = _bar_column(scale, bar.value)
+            drawn.append(_draw_bar(bar, start, end, top=top))
         middle = top + BAR_HEIGHT / 2
-        points = [(column_of(dot), middle) for dot in bar.dots if np.isfinite(dot)]
+        points = []
+        for dot in bar.dots:
+            if np.isfinite(dot):
+                points.append((_bar_column(scale, dot), middle))
         if points:
             drawn.append(tag("path", d=_dot_data(points), class_="dots on"))
-    drawn.append(_draw_line((start, 4), (start, bottom), "axis"))
+
+    axis = _draw_line((start, 4), (start, bottom), "axis")
+    right = WIDTH - BARS_RIGHT
     axis_label = _with_factor(label, scale)
-    drawn.append(draw_text(axis_label, WIDTH - BARS_RIGHT, bottom + 34, "label end"))
+    drawn.append(axis)
+    drawn.append(draw_text(axis_label, right, bottom + 34, "label end"))
     return _wrap_svg(bottom + 40, title, description, drawn, role="img")
+
+
+def _bar_column(scale: AxisScale, value: float) -> float:
+    """Return where a value stands along the bars [pixel]."""
+    across = WIDTH - BARS_LEFT - BARS_RIGHT
+    share = float(np.nan_to_num(scale.share(value), nan=0.0))
+    return BARS_LEFT + across * min(max(share, 0.0), 1.0)
+
+
+def _draw_bar(bar: Bar, start: float, end: float, *, top: float) -> Markup:
+    width = max(abs(end - start), 1.0)
+    return tag(
+        "rect",
+        x=f"{min(start, end):.1f}",
+        y=top,
+        width=f"{width:.1f}",
+        height=BAR_HEIGHT,
+        class_=f"bar {bar.kind}",
+    )
 
 
 def _draw_bar_name(bar: Bar, top: float) -> Markup:
@@ -487,6 +549,8 @@ def _runs(is_kept: NDArray[np.bool_]) -> list[slice]:
     >>> _runs(np.array([True, True, False, True]))
     [slice(0, 2, None), slice(3, 4, None)]
     """
-    padded = np.concatenate([[False], is_kept, [False]]).astype(np.int8)
-    changes = np.flatnonzero(np.diff(padded)).reshape(-1, 2)
-    return [slice(int(start), int(stop)) for start, stop in changes]
+    padded = np.concatenate([[False], is_kept, [False]])
+    changes = np.flatnonzero(np.diff(padded.astype(np.int8)))
+    starts = changes[0::2].tolist()
+    stops = changes[1::2].tolist()
+    return list(map(slice, starts, stops))

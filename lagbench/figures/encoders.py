@@ -103,8 +103,10 @@ def encode_gif(path: Path, *, rate: float) -> Iterator[WriteFrame]:
             image = reduce_colours(images.fromarray(frame))
             is_first = file.tell() == 0
             if is_first:
-                file.writelines(plugin.getheader(image, info={"loop": 0})[0])
-            file.writelines(plugin.getdata(image, duration=delay))
+                header, _ = plugin.getheader(image, info={"loop": 0})
+                file.writelines(header)
+            blocks = plugin.getdata(image, duration=delay)
+            file.writelines(blocks)
 
         yield write
         file.write(b";")

@@ -90,7 +90,7 @@ def tag(name: str, /, *children: object, **attributes: object) -> Markup:
     return Markup(f"<{name}{attribute_text}>{join(children)}</{name}>")
 
 
-def path_data(points: Iterable[tuple[float, float]]) -> str:
+def path_data(points: Iterable[Iterable[float]]) -> str:
     """Return SVG path data through points; a point that is no number leaves a gap.
 
     >>> nan = float("nan")
@@ -289,14 +289,31 @@ def draw_key(items: Sequence[tuple[str, str]], *, kind: str = "line") -> Markup:
     """
     drawn = []
     for mark, name in items:
-        if kind == "square":
-            box = {"x": 5, "y": 0, "width": 12, "height": 10, "rx": 2}
-            swatch = tag("rect", **box, class_=f"bar {mark}")
-        else:
-            swatch = tag("path", d="M1 5H21", class_=f"line {mark}")
-        frame = {"viewBox": "0 0 22 10", "class_": "swatch", "aria_hidden": "true"}
-        drawn.append(tag("li", tag("svg", swatch, **frame), tag("span", name)))
+        swatch = _draw_swatch(mark, kind)
+        drawn.append(tag("li", swatch, tag("span", name)))
     return tag("ul", *drawn, class_="key")
+
+
+def _draw_swatch(mark: str, kind: str) -> Markup:
+    if kind == "square":
+        shape = tag(
+            "rect",
+            x=5,
+            y=0,
+            width=12,
+            height=10,
+            rx=2,
+            class_=f"bar {mark}",
+        )
+    else:
+        shape = tag("path", d="M1 5H21", class_=f"line {mark}")
+    return tag(
+        "svg",
+        shape,
+        viewBox="0 0 22 10",
+        class_="swatch",
+        aria_hidden="true",
+    )
 
 
 def draw_table(
@@ -307,15 +324,19 @@ def draw_table(
     label: str = "",
 ) -> Markup:
     """Return a table in a box that scrolls when it is wider than the page."""
-    headings = [tag("th", cell, scope="col") for cell in head]
-    body = []
+    headings = []
+    for cell in head:
+        headings.append(tag("th", cell, scope="col"))
+    lines = []
     for first, *others in rows:
-        cells = [tag("td", cell) for cell in others]
-        body.append(tag("tr", tag("th", first, scope="row"), *cells))
+        cells = [tag("th", first, scope="row")]
+        for cell in others:
+            cells.append(tag("td", cell))
+        lines.append(tag("tr", *cells))
     drawn = tag(
         "table",
         tag("thead", tag("tr", *headings)),
-        tag("tbody", *body),
+        tag("tbody", *lines),
         class_=kind or None,
     )
     return tag(
@@ -373,7 +394,8 @@ def draw_image_panel(
     image_kind = None
     if smooth:
         image_kind = "smooth"
-    return tag("span", tag("img", src=source, alt=alt, class_=image_kind), class_=kind)
+    drawn = tag("img", src=source, alt=alt, class_=image_kind)
+    return tag("span", drawn, class_=kind)
 
 
 def draw_line_panel(drawn: Markup, kind: str, alt: str) -> Markup:
@@ -392,4 +414,5 @@ def draw_ramp(kind: str, limit: float, unit: str, *, signed: bool = False) -> Ma
         low = "0"
     bar = tag("span", class_=f"ramp {kind}")
     scale = join([low, bar, text(limit)], " ")
-    return tag("p", scale, tag("span", unit, class_="muted"), class_="scale")
+    unit_label = tag("span", unit, class_="muted")
+    return tag("p", scale, unit_label, class_="scale")

@@ -16,16 +16,19 @@ DESCENT = 3.0
 CAPITAL_WIDTH = 9.0
 LETTER_WIDTH = 6.4
 
-# shift of a label from the middle of its dot, and the share of it that lies to the left
+# Shift of a label from the middle of its dot, and the share of it that lies to the
+# left. Labels above and below clear the dots that stand in one row with theirs.
+ABOVE = -11.0
+BELOW = 19.0
 SHIFTS = (
     (9.0, 4.0, 0.0),
     (-9.0, 4.0, 1.0),
-    (4.0, -9.0, 0.0),
-    (4.0, 17.0, 0.0),
-    (-4.0, -9.0, 1.0),
-    (-4.0, 17.0, 1.0),
-    (0.0, -9.0, 0.5),
-    (0.0, 17.0, 0.5),
+    (0.0, ABOVE, 0.5),
+    (0.0, BELOW, 0.5),
+    (-6.0, ABOVE, 0.0),
+    (-6.0, BELOW, 0.0),
+    (6.0, ABOVE, 1.0),
+    (6.0, BELOW, 1.0),
 )
 
 ANCHORS = {0.0: "", 0.5: "middle", 1.0: "end"}

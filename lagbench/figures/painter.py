@@ -14,6 +14,7 @@ from .canvas import (
     DPI,
     build_speed_map,
     build_vorticity_map,
+    colour_bytes,
     figure,
     pixels_of,
 )
@@ -44,7 +45,8 @@ def pack(pixels: NDArray[np.uint8]) -> Packed:
 def unpack(packed: Packed) -> NDArray[np.uint8]:
     """Return packed pixels as RGB bytes, shape [..., 3]."""
     little_endian = np.ascontiguousarray(packed.astype("<u4"))
-    return little_endian.view(np.uint8).reshape(*packed.shape, 4)[..., :3]
+    channels = little_endian.view(np.uint8).reshape(*packed.shape, 4)
+    return channels[..., :3]
 
 
 def halve(packed: Packed) -> Packed:
@@ -52,15 +54,19 @@ def halve(packed: Packed) -> Packed:
 
     The mean is rounded down twice.
     """
-    rows = _average(packed[0::2], packed[1::2])
-    return _average(rows[:, 0::2], rows[:, 1::2])
+    even_rows = packed[0::2]
+    odd_rows = packed[1::2]
+    rows = _average(even_rows, odd_rows)
+    even_columns = rows[:, 0::2]
+    odd_columns = rows[:, 1::2]
+    return _average(even_columns, odd_columns)
 
 
 def _average(a: Packed, b: Packed) -> Packed:
     """Return the mean of packed pixels, colour by colour."""
     shared_bits = a & b
-    half_of_others = ((a ^ b) & _LOW_BITS_OFF) >> np.uint32(1)
-    return shared_bits + half_of_others
+    other_bits = (a ^ b) & _LOW_BITS_OFF
+    return shared_bits + (other_bits >> np.uint32(1))
 
 
 class Painter:
@@ -83,21 +89,19 @@ class Painter:
         self._diameter = DOT_DIAMETER * recording.spacing * self._side  # [pixel]
         self._walls_by_direction: dict[bytes, Packed] = {}
 
-        palette = pack(np.array([parse_rgb(colour) for colour in MATERIAL_COLOURS]))
+        material_colours = [parse_rgb(colour) for colour in MATERIAL_COLOURS]
+        palette = pack(np.array(material_colours))
         self._material_pixels = palette[recording.material]
         if panel is Panel.VORTICITY:
-            colours = np.asarray(build_vorticity_map().colors)
+            colour_map = build_vorticity_map()
         else:
-            colours = np.asarray(build_speed_map().colors)
-        self._scale = pack((colours[:, :3] * 255.0).round().astype(np.uint8))
+            colour_map = build_speed_map()
+        self._scale = pack(colour_bytes(colour_map))
 
-        # middles of the pixels along one side, and those within the walls
-        left, right, bottom, top = box_of(recording)
-        self._middle = (np.arange(self._side) + 0.5) / self._side
-        height = 1.0 - self._middle
-        is_row_inside = (height >= bottom) & (height <= top)
-        is_column_inside = (self._middle >= left) & (self._middle <= right)
-        self._is_inside: NDArray[np.bool_] = is_row_inside[:, None] & is_column_inside
+        # middles of the pixels along one side, and the pixels within the walls
+        number = np.arange(self._side)
+        self._middle = (number + 0.5) / self._side
+        self._is_inside = _find_inside(recording, self._middle)
 
     def paint(self, scene: Scene) -> Packed:
         """Return the panel of one frame, shape [row, column], first row at the top."""
@@ -111,14 +115,20 @@ class Painter:
     def _paint_vorticity(self, scene: Scene, walls: Packed) -> Packed:
         """Return a square around every node that has a vorticity, walls elsewhere."""
         grid = scene.fields.grid
-        node = self._middle * grid.cells - grid.origin + 0.5
-        index = np.clip(np.floor(node).astype(np.intp), 0, grid.nodes - 1)
-        # rows from the top, as pixels have them
+        last = grid.nodes - 1
+        node = self._middle * grid.cells - grid.origin
+        nearest = np.floor(node + 0.5).astype(np.intp)
+        column = np.clip(nearest, 0, last)
+        row = last - column[::-1]
+
+        # first row at the top, as pixels have it
         rows = scene.vorticity.T[::-1]
-        vorticity = rows[np.ix_(grid.nodes - 1 - index[::-1], index)]
+        vorticity = rows[np.ix_(row, column)]
         is_defined = np.isfinite(vorticity)
-        share = 0.5 + 0.5 * np.where(is_defined, vorticity, 0.0) / self.limit
-        return np.where(is_defined, self._look_up(share), walls)
+        finite_vorticity = np.where(is_defined, vorticity, 0.0)
+        share = 0.5 + 0.5 * finite_vorticity / self.limit
+        colours = self._look_up(share)
+        return np.where(is_defined, colours, walls)
 
     def _paint_particles(self, scene: Scene, walls: Packed) -> Packed:
         """Return a dot for every particle before the walls."""
@@ -127,22 +137,40 @@ class Painter:
         else:
             colours = self._material_pixels
         return paint_particles(
-            walls, scene.position, colours, view=UNIT_SQUARE, diameter=self._diameter
+            walls,
+            scene.position,
+            colours,
+            view=UNIT_SQUARE,
+            diameter=self._diameter,
         )
 
     def _paint_walls(self, scene: Scene) -> Packed:
         """Return the empty box; it changes only where a wall turns."""
         wall_velocity = scene.recording.wall_velocity[scene.frame]
         directions = np.sign(wall_velocity).tobytes()
-        if directions not in self._walls_by_direction:
-            with figure(self._side / DPI, self._side / DPI) as drawn:
+        walls = self._walls_by_direction.get(directions)
+        if walls is None:
+            side = self._side / DPI  # [inch]
+            with figure(side, side) as drawn:
                 axes = drawn.add_axes((0, 0, 1, 1))
                 draw_walls(axes, scene.recording, scene.frame)
-                self._walls_by_direction[directions] = pack(pixels_of(drawn))
-        return self._walls_by_direction[directions]
+                walls = pack(pixels_of(drawn))
+            self._walls_by_direction[directions] = walls
+        return walls
 
     def _look_up(self, share: NDArray[np.float64]) -> Packed:
         """Return the colours of values, which are shares of the colour scale."""
-        levels = len(self._scale)
-        level = np.clip(share * levels, 0, levels - 1).astype(np.intp)
-        return self._scale[level]
+        level_count = len(self._scale)
+        level = np.clip(share * level_count, 0, level_count - 1)
+        return self._scale[level.astype(np.intp)]
+
+
+def _find_inside(
+    recording: Recording, middle: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return the pixels within the walls, shape [row, column], first row at the top."""
+    left, right, bottom, top = box_of(recording)
+    height = 1.0 - middle
+    is_row_inside = (height >= bottom) & (height <= top)
+    is_column_inside = (middle >= left) & (middle <= right)
+    return is_row_inside[:, None] & is_column_inside

@@ -6,6 +6,7 @@ Needs matplotlib; :mod:`lagbench.figures.plot` composes them.
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, cast
 
@@ -93,7 +94,8 @@ def draw(
         colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
         _draw_dots(axes, scene, colours)
     elif panel is Panel.SPEED:
-        _draw_dots(axes, scene, scale.to_rgba(scene.speed))
+        colours = scale.to_rgba(scene.speed)
+        _draw_dots(axes, scene, colours)
     elif panel is Panel.VORTICITY:
         _draw_field(axes, scene, scene.vorticity, scale)
     else:
@@ -104,7 +106,9 @@ def draw(
 
 def box_of(recording: Recording) -> tuple[float, float, float, float]:
     """Return left, right, bottom and top wall of the box [length]."""
-    (left, right), (bottom, top) = recording.size.bounds
+    horizontal, vertical = recording.size.bounds
+    left, right = horizontal
+    bottom, top = vertical
     return left, right, bottom, top
 
 
@@ -126,14 +130,20 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
     """
     from matplotlib.patches import Rectangle
 
-    axes.set(xlim=(0, 1), ylim=(0, 1), xticks=[], yticks=[])
-    axes.set(aspect="equal", frame_on=False)
-    axes.add_patch(Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0))
-
+    axes.set(
+        xlim=(0, 1),
+        ylim=(0, 1),
+        xticks=[],
+        yticks=[],
+        aspect="equal",
+        frame_on=False,
+    )
     left, right, bottom, top = box_of(recording)
     width = right - left
     height = top - bottom
+    outside = Rectangle((0, 0), 1, 1, color=WALL, lw=0, zorder=0)
     inside = Rectangle((left, bottom), width, height, color=PAPER, lw=0, zorder=0.5)
+    axes.add_patch(outside)
     axes.add_patch(inside)
 
     # x, y, width and height of the walls left, right, bottom, top
@@ -154,19 +164,22 @@ def _draw_moving_wall(
     from matplotlib.patches import Polygon, Rectangle
 
     x, y, width, height = band
-    axes.add_patch(Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6))
+    wall = Rectangle((x, y), width, height, color=MOVING, lw=0, zorder=0.6)
+    axes.add_patch(wall)
 
     along = velocity / np.abs(velocity).max()
     across = np.array([-along[1], along[0]])
     centre = np.array([x + width / 2, y + height / 2])
     length = np.abs(along) * max(width, height)
     size = 0.3 * min(width, height)
+    half_base = size * across
     for share in _ARROWHEADS:
         middle = centre + share * length
         tip = middle + size * along
         tail = middle - 0.7 * size * along
-        corners = [tip, tail + size * across, tail - size * across]
-        axes.add_patch(Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7))
+        corners = [tip, tail + half_base, tail - half_base]
+        arrowhead = Polygon(corners, closed=True, color=PAPER, lw=0, zorder=0.7)
+        axes.add_patch(arrowhead)
 
 
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
@@ -174,13 +187,14 @@ def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
 
     Dots are cut off at the walls.
     """
-    step = -(-len(scene.position) // MOST_DOTS)
+    step = math.ceil(len(scene.position) / MOST_DOTS)
     x, y = scene.position[::step].T
     drawn = axes.get_figure()
     assert drawn is not None  # axes stand in a figure
     side = axes.get_position().width * drawn.get_figwidth()  # type: ignore[union-attr]
-    diameter = DOT_DIAMETER * scene.recording.spacing * POINTS_PER_INCH * side
-    area = step * float(diameter**2)  # of the marker [point^2]
+    length = DOT_DIAMETER * scene.recording.spacing
+    diameter = length * POINTS_PER_INCH * side  # [point]
+    area = step * float(diameter**2)  # [point^2]
     dots = axes.scatter(x, y, area, colours[::step], linewidths=0, zorder=2)
     dots.set_clip_path(_box_patch(axes, scene.recording))
 
@@ -201,8 +215,9 @@ def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) 
     NaN stays paper.
     """
     grid = scene.fields.grid
-    low = grid.axis[0] - grid.spacing / 2
-    high = grid.axis[-1] + grid.spacing / 2
+    half_spacing = grid.spacing / 2
+    low = grid.axis[0] - half_spacing
+    high = grid.axis[-1] + half_spacing
     image = axes.imshow(
         np.ma.masked_invalid(field.T),
         origin="lower",
@@ -221,8 +236,10 @@ def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
     fields = scene.fields
     if fields.differentiable.sum() < FEW_NODES:
         return
-    u = np.ma.masked_array(fields.velocity[..., 0], ~fields.counted)
-    v = np.ma.masked_array(fields.velocity[..., 1], ~fields.counted)
+    u, v = np.moveaxis(fields.velocity, -1, 0)
+    is_missing = ~fields.counted
+    u = np.ma.masked_array(u, is_missing)
+    v = np.ma.masked_array(v, is_missing)
     axes.streamplot(
         fields.grid.axis,
         fields.grid.axis,
@@ -288,7 +305,15 @@ def material_key(axes: Axes, materials: NDArray[np.int8]) -> None:
     for material in np.unique(materials):
         colour = MATERIAL_COLOURS[material]
         name = MATERIALS[material]
-        dot = Line2D([], [], ls="", marker="o", ms=6, color=colour, label=name)
+        dot = Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="o",
+            markersize=6,
+            color=colour,
+            label=name,
+        )
         handles.append(dot)
     axes.set_axis_off()
     axes.legend(

@@ -43,9 +43,13 @@ def paint_particles(
     height, width = background.shape
 
     x, y = position.T
-    is_inside = (x >= left) & (x <= right) & (y >= bottom) & (y <= top)
-    across = (x[is_inside] - left) / (right - left) * width
-    down = (top - y[is_inside]) / (top - bottom) * height
+    is_column_inside = (x >= left) & (x <= right)
+    is_row_inside = (y >= bottom) & (y <= top)
+    is_inside = is_column_inside & is_row_inside
+    x = x[is_inside]
+    y = y[is_inside]
+    across = (x - left) / (right - left) * width
+    down = (top - y) / (top - bottom) * height
     column = np.minimum(across.astype(np.intp), width - 1)
     row = np.minimum(down.astype(np.intp), height - 1)
 
@@ -58,7 +62,9 @@ def paint_particles(
     # one flat index per pixel of a disc, shape [particle, pixel]
     middle = (row + margin) * padded_width + column + margin
     stamp = disc_row * padded_width + disc_column
-    image.reshape(-1)[middle[:, None] + stamp] = values[is_inside][:, None]
+    index = middle[:, None] + stamp
+    pixels = image.reshape(-1)
+    pixels[index] = values[is_inside][:, None]
     return image[margin:-margin, margin:-margin]
 
 

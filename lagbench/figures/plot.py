@@ -7,6 +7,7 @@ kind over time; the others get a table of scenarios at one frame.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lagbench.data import WALLS
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UsageError, nearest
-from lagbench.store.copy import bring
+from lagbench.errors import DataError, UsageError, suggest_name
+from lagbench.store.copy import update_working_copy
 
 from .canvas import DPI, draw_header, figure, save
 from .colours import MUTED
@@ -92,7 +93,9 @@ def check_kind(kind: str) -> None:
     """
     if kind not in KINDS:
         raise UsageError(
-            f"no kind of picture {kind!r}", where="--kind", fix=nearest(kind, KINDS)
+            f"no kind of picture {kind!r}",
+            where="--kind",
+            fix=suggest_name(kind, KINDS),
         )
 
 
@@ -248,11 +251,13 @@ def contact_sheet(
         DataError: no scenario is there, or a file is damaged.
     """
     tier, folder, splits = locate(split, size, root=root, registry=registry)
-    bring(tier, folder, tier.scenarios)
+    update_working_copy(tier, folder, tier.scenarios)
     files = scenario_files(tier, folder)
     if not files:
         where = f"{tier.split} {size} under {folder}"
-        raise DataError("nothing to draw", where=where, fix=remedy(tier, root=folder))
+        raise DataError(
+            "nothing to draw", where=where, fix=suggest_repair(tier, root=folder)
+        )
     panel = None
     if kind is not None:
         panel = Panel(kind)
@@ -282,12 +287,17 @@ def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Pa
     paths: dict[str, Path] = {}
     for path in files:
         with open_recording(path, registry=splits) as recording:
-            for name in KIND_PARAMETERS:
-                kind = str(recording.parameters.get(name, ""))
-                if kind:
-                    paths.setdefault(kind, path)
-                    break
-    return dict(sorted(paths.items(), key=lambda item: item[1].name))
+            parameters = recording.parameters
+        for name in KIND_PARAMETERS:
+            kind = str(parameters.get(name, ""))
+            if kind:
+                paths.setdefault(kind, path)
+                break
+
+    def file_name(kind: str) -> str:
+        return paths[kind].name
+
+    return {kind: paths[kind] for kind in sorted(paths, key=file_name)}
 
 
 def _arrange_over_time(
@@ -295,26 +305,30 @@ def _arrange_over_time(
 ) -> ContactSheet:
     """Return one row per kind: the same moments of each, one colour scale."""
     rows = []
+    is_mixed = False
     for path in kinds.values():
+        row = []
         with open_recording(path, registry=splits) as recording:
+            is_mixed = is_mixed or recording.is_mixed
             last = recording.frames - 1
-            rows.append([recording.scene(round(share * last)) for share in TIMES])
-    if panel is None:
-        if any(row[0].recording.is_mixed for row in rows):
-            panel = Panel.MATERIAL
-        else:
-            panel = Panel.SPEED
+            for share in TIMES:
+                row.append(recording.scene(round(share * last)))
+        rows.append(row)
+    if panel is None and is_mixed:
+        panel = Panel.MATERIAL
+    elif panel is None:
+        panel = Panel.SPEED
 
-    limits = []
-    for row in rows:
-        limits += [limit_of(panel, scene) for scene in row]
-    limit = max(limits)
+    limit = 0.0
+    for scene in itertools.chain(*rows):
+        limit = max(limit, limit_of(panel, scene))
     cells = []
     for kind, row in zip(kinds, rows, strict=True):
-        labels = [f"{row[0].recording.scenario}  {kind}"]
-        labels += [f"frame {scene.frame}" for scene in row[1:]]
         line = []
-        for scene, label in zip(row, labels, strict=True):
+        for scene in row:
+            label = f"frame {scene.frame}"
+            if scene is row[0]:
+                label = f"{scene.recording.scenario}  {kind}"
             line.append(SheetCell(scene, label, limit))
         cells.append(line)
     return ContactSheet(
@@ -343,13 +357,17 @@ def _arrange_table(
         panel = panel or Panel.VORTICITY
 
     scenes = []
+    limits = []
     for path in shown_files:
         with open_recording(path, registry=splits) as recording:
-            scenes += [recording.scene(number) for number in frames]
+            for number in frames:
+                scene = recording.scene(number)
+                scenes.append(scene)
+                limits.append(limit_of(panel, scene))
+    common_limit = float(np.median(limits))
 
     # speeds of driven flows are compared with the speed of the wall
     is_wall_scaled = is_driven and panel in (Panel.STREAMLINES, Panel.SPEED)
-    common_limit = float(np.median([limit_of(panel, scene) for scene in scenes]))
     cells = []
     for number, scene in enumerate(scenes):
         is_first_of_scenario = number % len(frames) == 0
@@ -361,7 +379,8 @@ def _arrange_table(
             label = f"frame {scene.frame}"
         limit = common_limit
         if is_wall_scaled:
-            limit = WALL_SHARE * np.abs(scene.recording.wall_velocity).max()
+            wall_speed = np.abs(scene.recording.wall_velocity).max()
+            limit = WALL_SHARE * wall_speed
         cells.append(SheetCell(scene, label, limit))
 
     columns = COLUMNS
@@ -399,18 +418,21 @@ def _draw_sheet(
     sheet: ContactSheet, title: str, output: str | Path, *, dpi: int
 ) -> Path:
     """Draw a contact sheet; return the path of its file."""
-    columns = max(len(row) for row in sheet.rows)
+    columns = max(map(len, sheet.rows))
     width = max(2 * RIM + columns * (CELL + CELL_GAP) - CELL_GAP, NARROWEST)
     row_height = CELL + LABEL + CELL_GAP
     height = HEAD + len(sheet.rows) * row_height + FOOT
     with figure(width, height, dpi=dpi) as drawn:
         draw_header(drawn, title, sheet.subtitle, left=RIM)
+        cell_width = CELL / width
+        cell_height = CELL / height
         for row, cells in enumerate(sheet.rows):
             bottom = height - HEAD - (row + 1) * row_height + CELL_GAP
             for column, cell in enumerate(cells):
                 left = RIM + column * (CELL + CELL_GAP)
-                place = (left / width, bottom / height, CELL / width, CELL / height)
-                _draw_cell(drawn.add_axes(place), sheet.panel, cell)
+                place = (left / width, bottom / height, cell_width, cell_height)
+                axes = drawn.add_axes(place)
+                _draw_cell(axes, sheet.panel, cell)
         _draw_key(drawn, sheet, width=width, height=height)
         return save(drawn, output)
 
@@ -428,8 +450,8 @@ def _draw_key(
     below = drawn.add_axes(place)
     if sheet.panel is Panel.MATERIAL:
         materials = []
-        for row in sheet.rows:
-            materials += [cell.scene.recording.material for cell in row]
+        for cell in itertools.chain(*sheet.rows):
+            materials.append(cell.scene.recording.material)
         material_key(below, np.concatenate(materials))
     else:
         colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)

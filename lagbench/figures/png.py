@@ -24,15 +24,19 @@ def encode_indexed_png(index: Bytes, palette: Bytes) -> bytes:
     height, width = index.shape
     header = struct.pack(">IIBBBBB", width, height, 8, INDEXED, 0, 0, 0)
     # every row begins with the number of its filter: none
-    rows = np.concatenate([np.zeros((height, 1), np.uint8), index], axis=1)
+    filters = np.zeros((height, 1), np.uint8)
+    rows = np.concatenate([filters, index], axis=1)
+    colours = palette[:, :3]
+    opacities = palette[:, 3]
     chunks = [
+        SIGNATURE,
         _encode_chunk(b"IHDR", header),
-        _encode_chunk(b"PLTE", palette[:, :3].tobytes()),
-        _encode_chunk(b"tRNS", palette[:, 3].tobytes()),
+        _encode_chunk(b"PLTE", colours.tobytes()),
+        _encode_chunk(b"tRNS", opacities.tobytes()),
         _encode_chunk(b"IDAT", zlib.compress(rows.tobytes(), 9)),
         _encode_chunk(b"IEND", b""),
     ]
-    return SIGNATURE + b"".join(chunks)
+    return b"".join(chunks)
 
 
 def _encode_chunk(name: bytes, data: bytes) -> bytes:

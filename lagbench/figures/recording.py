@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import grid as gridding
-from lagbench.data.local import rooted
+from lagbench.data.local import load_rooted_registry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
@@ -216,7 +216,7 @@ def _registry_around(file: str | Path, registry: Registry | None) -> Registry:
     """Return a registry that also knows the local splits around a scenario file."""
     parents = Path(file).absolute().parents
     root = parents[min(DEPTH, len(parents) - 1)]
-    return rooted(root, registry)
+    return load_rooted_registry(root, registry)
 
 
 def _record_dataset(data: xr.Dataset, registry: Registry | None) -> Recording:

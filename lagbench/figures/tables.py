@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#&~$])")
@@ -35,18 +35,25 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     Columns of numbers are set flush right. Cells that start and end with a backtick
     are code and stay as they are.
     """
-    rules = []
-    for column in range(len(head)):
-        is_numeric = all(isinstance(row[column], int | float) for row in rows)
-        if is_numeric and rows:
-            rules.append("---:")
-        else:
-            rules.append("---")
-
-    lines = [[escape(name) for name in head], rules]
+    lines = [_format_line(map(escape, head))]
+    rules = [_format_rule(rows, column) for column in range(len(head))]
+    lines.append(_format_line(rules))
     for row in rows:
-        lines.append([_format_cell(value) for value in row])
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+        lines.append(_format_line(map(_format_cell, row)))
+    return "\n".join(lines)
+
+
+def _format_line(cells: Iterable[str]) -> str:
+    joined = " | ".join(cells)
+    return f"| {joined} |"
+
+
+def _format_rule(rows: Sequence[Sequence[object]], column: int) -> str:
+    """Return the rule below a heading, which says where the column is set flush."""
+    is_numeric = all(isinstance(row[column], int | float) for row in rows)
+    if rows and is_numeric:
+        return "---:"
+    return "---"
 
 
 def _format_cell(value: object) -> str:

@@ -1,10 +1,7 @@
 """Data set cards: README.md with pictures, and croissant.json, beside the manifest.
 
 Both follow from the registry and the manifest alone and hold no date, so the same data
-set gets the same bytes. Pictures are drawn where matplotlib is installed. The Croissant
-1.1 document, for search engines and loaders, names every file with its SHA-256, lists
-the scenarios as records and passes ``mlcroissant validate``. Specification:
-https://docs.mlcommons.org/croissant/docs/croissant-spec-1.1.html
+set gets the same bytes. Pictures are painted where matplotlib is installed.
 """
 
 from __future__ import annotations
@@ -15,141 +12,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
-from lagbench.data.manifest import Manifest
-from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.manifest import FileEntry, Manifest
+from lagbench.data.registry import Parameter, Size, Split, format_ids
 from lagbench.figures.tables import escape, markdown
 
-LICENCES = {"CC-BY-4.0": "https://creativecommons.org/licenses/by/4.0/"}
-KEYWORDS = (
-    "particle simulation",
-    "material point method",
-    "surrogate model",
-    "computational fluid dynamics",
-)
+from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
+from .croissant import KEYWORDS, croissant_json
 
-_TERMS = (
-    *(
-        "arrayShape",
-        "citeAs",
-        "column",
-        "containedIn",
-        "equivalentProperty",
-        "extract",
-        "field",
-    ),
-    *(
-        "fileObject",
-        "fileProperty",
-        "fileSet",
-        "format",
-        "includes",
-        "isArray",
-        "isLiveDataset",
-    ),
-    *(
-        "jsonPath",
-        "key",
-        "md5",
-        "parentField",
-        "path",
-        "recordSet",
-        "references",
-        "regex",
-        "repeated",
-    ),
-    *("replace", "samplingRate", "separator", "source", "subField", "transform"),
-)
-
-_CONTEXT: Mapping[str, object] = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "description": {"@container": "@language"},
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "name": {"@container": "@language"},
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "sc": "https://schema.org/",
-    **{term: f"cr:{term}" for term in _TERMS},
-}
-
-_FIELDS: Mapping[str, tuple[str, str]] = {
-    "scenario": ("sc:Integer", "id of the scenario"),
-    "subset": ("sc:Text", "subset that holds the scenario"),
-    "path": ("sc:Text", "file, relative to this document"),
-    "frames": ("sc:Integer", "recorded frames"),
-    "particles": ("sc:Integer", "particles in every frame"),
-    "content_sha256": ("sc:Text", "content hash, the same on every machine"),
-}
-
-
-def croissant_json(size: Size, split: Split, manifest: Manifest) -> str:
-    """Return the Croissant document of a data set folder."""
-    scenarios = {  # a table that holds its own data
-        "@type": "cr:RecordSet",
-        "@id": "scenarios",
-        "name": "scenarios",
-        "description": "One record per scenario file.",
-        "key": {"@id": "scenarios/scenario"},
-        "field": [
-            {
-                "@type": "cr:Field",
-                "@id": f"scenarios/{name}",
-                "name": name,
-                "description": description,
-                "dataType": kind,
-            }
-            for name, (kind, description) in _FIELDS.items()
-        ],
-        "data": [
-            {f"scenarios/{name}": getattr(entry, name) for name in _FIELDS}
-            for entry in manifest.files
-        ],
-    }
-    document = {
-        "@context": dict(_CONTEXT),
-        "@type": "sc:Dataset",
-        "name": f"lagbench-{size.split}-{size.name}",
-        "description": f"{split.title}, size {size.name}. {split.description}",
-        "conformsTo": "http://mlcommons.org/croissant/1.1",
-        "citeAs": split.citation,
-        "creator": {"@type": "sc:Organization", "name": "The lagbench authors"},
-        "isLiveDataset": False,
-        "keywords": list(KEYWORDS),
-        "license": LICENCES.get(split.licence, split.licence),
-        "version": manifest.version,
-        "distribution": [
-            {
-                "@type": "cr:FileObject",
-                "@id": entry.path,
-                "name": entry.path,
-                "description": f"scenario {entry.scenario} of {entry.subset}: "
-                f"{entry.frames} frames, netCDF4",
-                "contentUrl": entry.path,
-                "contentSize": f"{entry.bytes} B",
-                "encodingFormat": "application/x-netcdf",
-                "sha256": entry.file_sha256,
-            }
-            for entry in manifest.files
-        ],
-        "recordSet": [scenarios],
-    }
-    return json.dumps(document, indent=1, ensure_ascii=False) + "\n"
-
-
-CARD_NAME = "README.md"
-CROISSANT_NAME = "croissant.json"
-
-PICTURES: Mapping[str, str] = {  # path relative to the card, and what it shows
-    "pictures/scenarios.png": "scenarios of this data set",
-    "pictures/frame.png": "one frame of a test scenario",
-}
-NOTES: Mapping[
-    str, str
-] = {  # what a reader of one split's card must know beside its description
+# what a reader of one split's card must know beside its description
+NOTES: Mapping[str, str] = {
     "cavity": (
         "The wall velocities of all frames, those to be predicted included, are part "
         "of what is given: they "
@@ -174,7 +45,9 @@ NOTES: Mapping[
         "has: benchmarks/effective_viscosity.py fits it to the decay of each size."
     ),
 }
+
 _WALLS = "closed box: what acts towards each frame; walls left, right, bottom, top"
+# variables of a file: name, dimensions, type, unit, meaning
 VARIABLES = (
     (
         "`position`",
@@ -198,111 +71,161 @@ VARIABLES = (
 
 
 def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> list[Path]:
-    """Write README.md, croissant.json and, with matplotlib, the pictures; return their
-    paths.
+    """Write README.md, croissant.json and, with matplotlib, the pictures.
+
+    Nothing is painted or written where the texts are those of the manifest already.
+
+    Returns:
+        The paths of the files, README.md first.
     """
     folder = size.folder(root)
-    texts = {
-        folder / name: text for name, text in card_texts(size, split, manifest).items()
-    }
-    drawn = [folder / name for name in _pictures(manifest)]
-    there = all(path.is_file() for path in (*texts, *drawn))
-    # The card names every content hash: where its text stands already, the pictures are
-    # of the same data.
-    if not there or any(path.read_bytes() != text for path, text in texts.items()):
-        if drawn:
-            _draw(root, size, split, manifest)
+    texts: dict[Path, bytes] = {}
+    for name, text in card_texts(size, split, manifest).items():
+        texts[folder / name] = text
+    pictures = [folder / name for name in _picture_names(manifest)]
+
+    if not _is_current(texts, pictures):
+        if pictures:
+            # loads the drawing modules, so only where there is something to paint
+            from .painting import paint_pictures
+
+            paint_pictures(root, size, split, manifest)
         for path, text in texts.items():
             write_atomically(path, text)
-    return [*texts, *drawn]
+    return [*texts, *pictures]
+
+
+def _is_current(texts: Mapping[Path, bytes], pictures: list[Path]) -> bool:
+    """Return whether the files of a card are there and belong to the same data.
+
+    The card names every content hash. Where its text is right already, the pictures are
+    of the same data.
+    """
+    for path in (*texts, *pictures):
+        if not path.is_file():
+            return False
+    return all(path.read_bytes() == text for path, text in texts.items())
 
 
 def card_texts(size: Size, split: Split, manifest: Manifest) -> dict[str, bytes]:
     """Return the texts of a data set's card by name, README.md first."""
-    return {
-        CARD_NAME: dataset_card(
-            size, split, manifest, pictures=_pictures(manifest)
-        ).encode(),
-        CROISSANT_NAME: croissant_json(size, split, manifest).encode(),
-    }
+    pictures = _picture_names(manifest)
+    card = dataset_card(size, split, manifest, pictures=pictures)
+    document = croissant_json(size, split, manifest)
+    return {CARD_NAME: card.encode(), CROISSANT_NAME: document.encode()}
 
 
-def _pictures(manifest: Manifest) -> list[str]:
+def _picture_names(manifest: Manifest) -> list[str]:
     if manifest.files and importlib.util.find_spec("matplotlib"):
         return list(PICTURES)
     return []
-
-
-def _draw(root: Path, size: Size, split: Split, manifest: Manifest) -> None:
-    from lagbench.figures.plot import contact_sheet, plot_frame
-
-    splits = Registry({size.split: split}, {})
-    folder = size.folder(root)
-    sheet, single = PICTURES
-    contact_sheet(size.split, size.name, folder / sheet, root=root, registry=splits)
-    shown = next((e for e in manifest.files if e.subset == "test"), manifest.files[0])
-    frame = min(size.task.frames_of_interest[-1], shown.frames - 1)
-    plot_frame(folder / shown.path, frame, folder / single, registry=splits)
 
 
 def dataset_card(
     size: Size, split: Split, manifest: Manifest, *, pictures: list[str]
 ) -> str:
     """Return the card of a data set as Markdown with a YAML head."""
-    head = {  # JSON strings and lists are YAML
+    parts = [
+        _yaml_head(size, split, manifest),
+        f"# {escape(split.title)} · {size.split} {size.name}",
+        escape(split.description),
+    ]
+    if size.split in NOTES:
+        parts.append(escape(NOTES[size.split]))
+    for name in pictures:
+        parts.append(f"![{PICTURES[name]}]({name})")
+
+    parts += ["## In short", _summary_table(size, manifest)]
+    parts += ["## Subsets", _subset_table(size, manifest)]
+    parts += ["## Reading", *_reading_section(size)]
+    parts += ["## Task", _task_table(size, manifest)]
+    if manifest.statistics:
+        parts += _statistics_section(manifest)
+    parts += ["## Parameters", _parameter_table(size)]
+    parts += ["## Regenerate and verify", *_verification_section(size, manifest)]
+    parts += ["## Scenarios", _scenario_table(manifest)]
+
+    citation = f"{escape(split.licence)}. {escape(split.citation)}."
+    parts += ["## Licence and citation", citation]
+    return "\n\n".join(parts) + "\n"
+
+
+def _yaml_head(size: Size, split: Split, manifest: Manifest) -> str:
+    """Return what catalogues read of a card; JSON strings and lists are YAML."""
+    category = "1K<n<10K"
+    if len(manifest.files) < 1000:
+        category = "n<1K"
+    values = {
         "pretty_name": f"{split.title} ({size.split} {size.name})",
         "license": split.licence.lower(),
         "tags": list(KEYWORDS),
-        "size_categories": ["n<1K" if len(manifest.files) < 1000 else "1K<n<10K"],
+        "size_categories": [category],
         "version": manifest.version,
     }
-    moments = [
-        (name.replace("_", " "), *row) for name, row in manifest.statistics.items()
+    lines = ["---"]
+    for key, value in values.items():
+        lines.append(f"{key}: {json.dumps(value, ensure_ascii=False)}")
+    lines.append("---")
+    return "\n".join(lines)
+
+
+def _summary_table(size: Size, manifest: Manifest) -> str:
+    data_hash = "none before it is complete"
+    if manifest.dataset_sha256:
+        data_hash = f"`{manifest.dataset_sha256}`"
+
+    frame_counts = []
+    byte_count = 0
+    for entry in manifest.files:
+        frame_counts.append(entry.frames)
+        byte_count += entry.bytes
+    fewest = min(frame_counts, default=0)
+    most = max(frame_counts, default=0)
+    frame_range = str(fewest)
+    if most > fewest:
+        frame_range = f"{fewest} to {most}"
+
+    sides = [f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds]
+    rows = [
+        ("version", manifest.version),
+        ("complete", manifest.complete),
+        ("data set hash", data_hash),
+        ("identity", manifest.identity),
+        ("scenarios", len(manifest.files)),
+        ("frames per scenario", frame_range),
+        ("frames together", sum(frame_counts)),
+        ("particles", size.particles),
+        ("frame interval", f"{size.frame_interval:.6g} s"),
+        ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
+        ("box", " x ".join(sides)),
+        ("bytes", byte_count),
     ]
-    statistics = (
-        "## Statistics of train",
-        "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its "
-        "difference.",
-        markdown(("", "x", "y"), moments),
-    )
-    parameters = [
-        (
-            f"`{name}`",
-            f"{p.value:g}" if isinstance(p.value, float) else p.value,
-            p.unit,
-            p.description,
-        )
-        for name, p in size.parameters.items()
-    ]
-    subsets = []
+    return markdown(("", ""), rows)
+
+
+def _subset_table(size: Size, manifest: Manifest) -> str:
+    rows = []
     for name, ids in size.subsets.items():
-        there = [entry for entry in manifest.files if entry.subset == name]
-        sums = sum(entry.frames for entry in there), sum(entry.bytes for entry in there)
+        entry_count = 0
+        frame_count = 0
+        byte_count = 0
+        for entry in manifest.files:
+            if entry.subset == name:
+                entry_count += 1
+                frame_count += entry.frames
+                byte_count += entry.bytes
+        subset_hash = "incomplete"
         if name in manifest.subset_sha256:
-            digest = f"`{manifest.subset_sha256[name]}`"
-        else:
-            digest = "incomplete"
-        subsets.append(
-            (name, spell_ids(ids), f"{len(there)} of {len(ids)}", *sums, digest)
-        )
-    options = f"--split {size.split} --size {size.name}"
-    parts = [
-        "\n".join(
-            [
-                "---",
-                *(f"{k}: {json.dumps(v, ensure_ascii=False)}" for k, v in head.items()),
-                "---",
-            ]
-        ),
-        f"# {escape(split.title)} · {size.split} {size.name}",
-        escape(split.description),
-        *([escape(NOTES[size.split])] if size.split in NOTES else []),
-        *(f"![{PICTURES[name]}]({name})" for name in pictures),
-        "## In short",
-        _facts(size, manifest),
-        "## Subsets",
-        markdown(("subset", "ids", "scenarios", "frames", "bytes", "hash"), subsets),
-        "## Reading",
+            subset_hash = f"`{manifest.subset_sha256[name]}`"
+        present = f"{entry_count} of {len(ids)}"
+        row = (name, format_ids(ids), present, frame_count, byte_count, subset_hash)
+        rows.append(row)
+    head = ("subset", "ids", "scenarios", "frames", "bytes", "hash")
+    return markdown(head, rows)
+
+
+def _reading_section(size: Size) -> list[str]:
+    return [
         "One netCDF4 file per scenario, which `xarray.open_dataset` reads without "
         "lagbench. "
         "Lengths are in units of the unit box, time in seconds. Frame 0 is the state "
@@ -315,97 +238,98 @@ def dataset_card(
         "computed\n"
         "```",
         markdown(("variable", "dimensions", "type", "unit", "meaning"), VARIABLES),
-        "## Task",
-        _task(size, manifest),
-        *(statistics if manifest.statistics else ()),
-        "## Parameters",
-        markdown(("parameter", "value", "unit", "meaning"), parameters),
-        "## Regenerate and verify",
-        "The files hold the same bits on every x86-64 Linux machine, with any number "
-        "of workers."
-        if manifest.identity == "bitwise"
-        else "Some files come from a device that does not promise equal bits: they "
-        "agree to a tolerance.",
+    ]
+
+
+def _task_table(size: Size, manifest: Manifest) -> str:
+    task = size.task
+    grid = task.score_grid
+    placement = grid.placement.replace("_", " ")
+    rows = [
+        ("input frames", str(task.input_frames)),
+        ("frames to predict", str(task.horizon)),
+        ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
+        ("score grid", f"{grid.cells} cells a side, {placement}"),
+        ("radius for graph models", f"{task.radius:g}"),
+    ]
+    limits = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
+    if limits:
+        first = sum(limit[0] for limit in limits) / len(limits)
+        last = sum(limit[-1] for limit in limits) / len(limits)
+        at_first = f"{first:.3g} at the first predicted frame"
+        text = f"position RMSE {at_first}, {last:.3g} at the last"
+        rows.append(("twin that starts 2^-20 away", text))
+    return markdown(("", ""), rows)
+
+
+def _statistics_section(manifest: Manifest) -> list[str]:
+    rows = []
+    for name, row in manifest.statistics.items():
+        rows.append((name.replace("_", " "), *row))
+    return [
+        "## Statistics of train",
+        "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its "
+        "difference.",
+        markdown(("", "x", "y"), rows),
+    ]
+
+
+def _parameter_table(size: Size) -> str:
+    rows = []
+    for name, parameter in size.parameters.items():
+        value = _format_value(parameter)
+        rows.append((f"`{name}`", value, parameter.unit, parameter.description))
+    return markdown(("parameter", "value", "unit", "meaning"), rows)
+
+
+def _format_value(parameter: Parameter) -> object:
+    if isinstance(parameter.value, float):
+        return f"{parameter.value:g}"
+    return parameter.value
+
+
+def _verification_section(size: Size, manifest: Manifest) -> list[str]:
+    if manifest.identity == "bitwise":
+        promise = (
+            "The files hold the same bits on every x86-64 Linux machine, with any "
+            "number of workers."
+        )
+    else:
+        promise = (
+            "Some files come from a device that does not promise equal bits: they "
+            "agree to a tolerance."
+        )
+    options = f"--split {size.split} --size {size.name}"
+    commands = (
         "```sh\n"
         "pip install 'lagbench[generate]'\n"
         f"lagbench generate {options}\n"
         f"lagbench verify {options}                 # re-hash every file\n"
         f"lagbench verify {options} --regenerate 2  # simulate two scenarios again "
         f"and compare\n"
-        "```",
-        "## Scenarios",
-        _scenarios(manifest),
-        "## Licence and citation",
-        f"{escape(split.licence)}. {escape(split.citation)}.",
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def _facts(size: Size, manifest: Manifest) -> str:
-    frames = sorted({entry.frames for entry in manifest.files}) or [0]
-    digest = manifest.dataset_sha256
-    rows = [
-        ("version", manifest.version),
-        ("complete", manifest.complete),
-        ("data set hash", f"`{digest}`" if digest else "none before it is complete"),
-        ("identity", manifest.identity),
-        ("scenarios", len(manifest.files)),
-        (
-            "frames per scenario",
-            " to ".join(map(str, dict.fromkeys((frames[0], frames[-1])))),
-        ),
-        ("frames together", sum(entry.frames for entry in manifest.files)),
-        ("particles", size.particles),
-        ("frame interval", f"{size.frame_interval:.6g} s"),
-        ("substep", f"{size.dt:.6g} s, {size.substeps_per_frame} per frame"),
-        ("box", " x ".join(f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds)),
-        ("bytes", sum(entry.bytes for entry in manifest.files)),
-    ]
-    return markdown(("", ""), rows)
-
-
-def _task(size: Size, manifest: Manifest) -> str:
-    grid = size.task.score_grid
-    task = size.task
-    rows = [
-        ("input frames", str(task.input_frames)),
-        ("frames to predict", str(task.horizon)),
-        ("frames of interest", ", ".join(map(str, task.frames_of_interest))),
-        (
-            "score grid",
-            f"{grid.cells} cells a side, {grid.placement.replace('_', ' ')}",
-        ),
-        ("radius for graph models", f"{task.radius:g}"),
-    ]
-    floors = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
-    if floors:
-        first, last = (sum(floor[i] for floor in floors) / len(floors) for i in (0, -1))
-        text = f"position RMSE {first:.3g} at the first predicted frame, {last:.3g} at the last"
-        rows.append(("twin that starts 2^-20 away", text))
-    return markdown(("", ""), rows)
-
-
-def _scenarios(manifest: Manifest) -> str:
-    names = sorted({name for entry in manifest.files for name in entry.facts})
-    rows = [
-        (
-            entry.scenario,
-            f"`{entry.path}`",
-            entry.frames,
-            *(
-                f"{entry.facts[name]:.6g}" if name in entry.facts else ""
-                for name in names
-            ),
-            f"`{entry.content_sha256}`",
-        )
-        for entry in manifest.files
-    ]
-    head = (
-        "id",
-        "file",
-        "frames",
-        *(name.replace("_", " ") for name in names),
-        "content hash",
+        "```"
     )
-    listing = markdown(head, rows)
-    return f"<details><summary>{len(rows)} files</summary>\n\n{listing}\n\n</details>"
+    return [promise, commands]
+
+
+def _scenario_table(manifest: Manifest) -> str:
+    stated_names: set[str] = set()
+    for entry in manifest.files:
+        stated_names.update(entry.facts)
+    names = sorted(stated_names)
+    rows = [_scenario_row(entry, names) for entry in manifest.files]
+    titles = [name.replace("_", " ") for name in names]
+    table = markdown(("id", "file", "frames", *titles, "content hash"), rows)
+    return f"<details><summary>{len(rows)} files</summary>\n\n{table}\n\n</details>"
+
+
+def _scenario_row(entry: FileEntry, names: list[str]) -> tuple[object, ...]:
+    """Return a file's row; a number that it does not state is an empty cell."""
+    cells = []
+    for name in names:
+        cell = ""
+        if name in entry.facts:
+            cell = f"{entry.facts[name]:.6g}"
+        cells.append(cell)
+    path = f"`{entry.path}`"
+    return (entry.scenario, path, entry.frames, *cells, f"`{entry.content_sha256}`")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext, suppress
+from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,17 +11,13 @@ from lagbench.atomic import SUFFIX
 from lagbench.data.layout import MANIFEST_NAME, NOTES_NAME
 from lagbench.data.local import DESCRIPTION, locate
 from lagbench.data.lock import LOCK_NAME, dataset_lock
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import WorkFailedError
 
-from .cards import CARD_NAME, CROISSANT_NAME, PICTURES
+from .card_files import CARD_NAME, CROISSANT_NAME, PICTURES
 
-CARDS = (
-    MANIFEST_NAME,
-    CARD_NAME,
-    CROISSANT_NAME,
-    *PICTURES,
-)  # what lagbench writes beside the subsets
+# what lagbench writes beside the subsets
+CARDS = (MANIFEST_NAME, CARD_NAME, CROISSANT_NAME, *PICTURES)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,49 +58,69 @@ def clean(
     folder = tier.folder(home)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)
-    with (
-        nullcontext()
-        if dry_run
-        else dataset_lock(home, tier.split, tier.name, tier.major, timeout=0)
-    ):
-        found = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
+
+    lock: AbstractContextManager[object]
+    if dry_run:
+        lock = nullcontext()
+    else:
+        lock = dataset_lock(home, tier.split, tier.name, tier.major, timeout=0)
+    with lock:
+        paths = {path for path in folder.rglob(f".*{SUFFIX}") if path.is_file()}
         if not leftovers:
-            ours = {
-                folder / subset / f"{i:04d}.nc"
-                for subset, ids in tier.subsets.items()
-                for i in ids
-            }
-            if tier.simulated:
-                ours |= {folder / name for name in CARDS}
-            else:  # has no cards; its description says nothing without its data
-                ours |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}
-            found |= {path for path in ours if path.is_file()}
-        length = 0
-        for path in found:
-            with suppress(FileNotFoundError):  # a dry run may stand beside a writer
-                length += path.stat().st_size
-        for path in () if dry_run else found:
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:
-                raise WorkFailedError(
-                    "cannot remove a file", where=str(path), got=error.strerror
-                ) from error
-        if not dry_run and not leftovers:
-            for name in (
-                NOTES_NAME,
-                LOCK_NAME,
-            ):  # who waits for a lock that is gone takes a new one
-                (folder / name).unlink(missing_ok=True)
+            paths |= _data_set_files(tier, folder)
+        length = _total_length(paths)
+        if not dry_run:
+            _remove_files(paths)
+            if not leftovers:
+                # whoever waits for a lock that is gone takes a new one
+                for name in (NOTES_NAME, LOCK_NAME):
+                    (folder / name).unlink(missing_ok=True)
     if not dry_run and not leftovers:
-        # Folders that hold nothing any more go too, up to the root folder; links stay.
-        with suppress(OSError):  # somebody else was faster
-            for place in (
-                *(child for child in folder.iterdir() if child.is_dir()),
-                folder,
-                *folder.parents,
-            ):
-                if home in place.parents and not place.is_symlink():
-                    with suppress(OSError):  # it holds something
-                        place.rmdir()
-    return CleanResult(removed=tuple(sorted(found)), bytes=length, dry_run=dry_run)
+        _remove_empty_folders(folder, home)
+    return CleanResult(removed=tuple(sorted(paths)), bytes=length, dry_run=dry_run)
+
+
+def _data_set_files(size: Size, folder: Path) -> set[Path]:
+    """Return the files of a data set that lagbench wrote and that are there."""
+    paths = set()
+    for subset, ids in size.subsets.items():
+        for scenario in ids:
+            paths.add(folder / subset / f"{scenario:04d}.nc")
+    if size.simulated:
+        for name in CARDS:
+            paths.add(folder / name)
+    else:
+        # A local split has no cards; its description says nothing without its data.
+        paths |= {folder / MANIFEST_NAME, folder.parents[1] / DESCRIPTION}
+    return {path for path in paths if path.is_file()}
+
+
+def _total_length(paths: Iterable[Path]) -> int:
+    length = 0
+    for path in paths:
+        # a dry run may stand beside a writer
+        with suppress(FileNotFoundError):
+            length += path.stat().st_size
+    return length
+
+
+def _remove_files(paths: Iterable[Path]) -> None:
+    for path in paths:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise WorkFailedError(
+                "cannot remove a file", where=str(path), got=error.strerror
+            ) from error
+
+
+def _remove_empty_folders(folder: Path, home: Path) -> None:
+    """Remove folders that hold nothing any more, up to the root folder; links stay."""
+    # another process may have been faster
+    with suppress(OSError):
+        children = [child for child in folder.iterdir() if child.is_dir()]
+        for place in (*children, folder, *folder.parents):
+            if home in place.parents and not place.is_symlink():
+                # a folder that holds something stays
+                with suppress(OSError):
+                    place.rmdir()

@@ -5,8 +5,8 @@ after each, so that an interrupted generation goes on where it stopped and ends 
 same bytes as an uninterrupted one.
 
 The parent process plans, hands scenarios to workers and keeps the manifest; it never
-simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot take it
-along.
+draws or simulates, so that Ctrl-C reaches it at once and a crash of the solver cannot
+take it along.
 """
 
 from __future__ import annotations
@@ -20,40 +20,46 @@ from typing import Any, TypeVar
 
 from lagbench.atomic import remove_leftovers
 from lagbench.data.checksums import round_digits
-from lagbench.data.layout import MANIFEST_NAME, expanded
+from lagbench.data.layout import MANIFEST_NAME, expand_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     FileEntry,
     Manifest,
     describe_file,
-    merged,
-    note_entries,
+    merge_entries,
     read_or_empty,
+    record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Registry, Size, Split, spell_ids
+from lagbench.data.registry import Registry, Size, Split, format_ids
 from lagbench.data.statistics import file_moments, statistics
-from lagbench.errors import UsageError, check_installed, nearest
+from lagbench.errors import UsageError, check_installed, suggest_name
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import (
-    Pace,
-    Simulated,
+    SimulatedScenario,
+    SimulationPace,
+    measure_predictability,
+    perturbed_substep_count,
     simulate,
-    twin_floors,
-    twin_substeps,
 )
 from lagbench.generators.solver import Device
-from lagbench.store.copy import gather, gatherable
-from lagbench.store.publication import Publication, check_address, look_at, publication
+from lagbench.store.copy import gather as gather_files
+from lagbench.store.copy import list_gatherable
+from lagbench.store.publication import (
+    Publication,
+    check_address,
+    inspect_store,
+    publish,
+)
 from lagbench.work.cluster import Cluster, await_file
-from lagbench.work.machine import environment_of, promises_bits
-from lagbench.work.pool import Pool, Report, Task, worker_count
+from lagbench.work.machine import describe_machine, promises_bits
+from lagbench.work.pool import Event, Pool, Report, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import ONE_THREAD, read_many
 
 from .cards import card_texts, write_cards
-from .inventory import compare, examine, look
+from .inventory import compare_hashes, inspect_scenario, run_inspection
 from .plan import (
     Estimate,
     Scenarios,
@@ -70,283 +76,6 @@ Result = TypeVar("Result")
 
 # particles that a parallel device advances together at the most
 BATCH_PARTICLES = 1 << 19
-
-
-class Generation:
-    """Brings a data set folder to the state that its size describes."""
-
-    def __init__(
-        self,
-        size: Size,
-        root: Path,
-        device: Device,
-        workers: int,
-        meter: Meter,
-        *,
-        split: Split,
-        scheduler: str | None = None,
-        sources: Sequence[Path] = (),
-    ) -> None:
-        self.size = size
-        self.root = root
-        self.device = device
-        self.folder = size.folder(root)
-        self.workers = workers
-        self.scheduler = scheduler  # processes here, or a Dask scheduler's workers
-        self.sources = sources  # other root folders to take finished scenarios from
-        # which the root folder is a working copy of; None if plain
-        self.store: Publication | None = None
-        # what the folder holds, as far as is known
-        self.manifest = merged(self.size, None)
-        # files that were there and right, just hashed
-        self._hashed: list[FileEntry] = []
-        self.kept: list[int] = []  # ids whose files were there and right
-        self.to_do: Estimate = estimate(size, ())  # ids to simulate and what that takes
-        self.verdict = ""  # how the hashes compare with datasets.yaml, in words
-        self._meter = meter  # counts the work
-        self._split = split  # the split that the size belongs to
-        self._promised: list[int] = []
-        self._paces: list[Pace] = []  # how fast scenarios were simulated here
-
-    def survey(
-        self,
-        wanted: Sequence[int],
-        *,
-        force: bool = False,
-        gathered: Collection[int] | None = None,
-    ) -> None:
-        """Find out what is there and what is to do; with ``gathered``, what would be
-        there, it only tells.
-        """
-        old = read_or_empty(self.size, self.root)
-        if self.store:
-            held = self.store.held
-        else:
-            held = {}
-        local = [i for i in self.size.scenarios if i not in held]
-        # A file that came, went, or has another length than the manifest says is looked
-        # at too.
-        lengths = {
-            i: path.stat().st_size for i in local if (path := self._path(i)).exists()
-        }
-        stated = {entry.scenario: entry.bytes for entry in old.files}
-        suspects = [i for i in local if i in wanted or lengths.get(i) != stated.get(i)]
-        self._meter.begin("checking", total=len(suspects), scenarios=len(suspects))
-        quick = partial(
-            examine, self.root, self.size, quick=True, trusting=gathered is not None
-        )
-        looks = {
-            f"scenario {i}": partial(quick, i, manifest=old.only(i)) for i in suspects
-        }
-        findings = self._read(look, looks, map(self._path, suspects))
-        self._hashed = [finding.entry for finding in findings if finding.entry]
-        bad = set(suspects) - {entry.scenario for entry in self._hashed}
-        kept = tuple(e for e in old.files if e.scenario not in bad)
-        there = [*self._hashed, *held.values()]
-        self.manifest = merged(self.size, old.model_copy(update={"files": kept}), there)
-        self.kept = [
-            i for i in wanted if (i not in bad or i in (gathered or ())) and not force
-        ]
-        on_cores = self.device is Device.CPU and self.scheduler is None
-        self.to_do = estimate(
-            self.size, [i for i in wanted if i not in self.kept], on_cores=on_cores
-        )
-
-    def run(self, wanted: Sequence[int], *, force: bool = False) -> None:
-        """Simulate what is missing or wrong; write the manifest, compare, write
-        cards.
-        """
-        remove_leftovers(self.folder)
-        for source in self.sources:
-            self._keep(
-                gather(
-                    self.size, self.root, source, read_or_empty(self.size, self.root)
-                )
-            )
-        self.survey(wanted, force=force)
-        note_entries(self.folder, self._hashed)
-        check_disk(self.root, self.to_do.bytes)
-        self._keep(self.manifest)
-        try:
-            self._simulate()
-        finally:
-            # The workers are gone by now; what they had not finished goes too.
-            remove_leftovers(self.folder)
-        note_pace(self.size, self._paces)
-        manifest = self.manifest
-        train = self.size.subsets["train"]
-        measured = self.size.measured
-        # Statistics of other bits differ from datasets.yaml by right.
-        doubted = (
-            measured
-            and manifest.identity == "bitwise"
-            and manifest.statistics != measured.statistics
-        )
-        if "train" in manifest.subset_sha256 and (doubted or not manifest.statistics):
-            self._bring(train)
-            self._meter.begin("statistics", total=len(train), scenarios=len(train))
-            paths = {f"scenario {i}": self._path(i) for i in train}
-            moments = self._read(file_moments, paths, paths.values())
-            manifest = manifest.model_copy(update={"statistics": statistics(moments)})
-        self._keep(manifest)
-        self.verdict = compare(self.size, self.manifest, promised=self._promised)
-        self._meter.begin("cards", total=1, scenarios=len(self.manifest.files))
-        described = self.size, self._split, self.manifest
-        if self.store and self.store.is_settled(self.manifest, card_texts(*described)):
-            return
-        self._bring(self.size.scenarios)
-        cards = write_cards(self.root, *described)
-        if self.store:
-            self.store.finish(self.manifest, cards)
-
-    def _read(
-        self,
-        function: Callable[[Job, Report], Result],
-        jobs: Mapping[str, Job],
-        files: Iterable[Path],
-    ) -> list[Result]:
-        """Run a function that reads files, here or by the workers; the meter counts
-        files.
-        """
-
-        def count(done: int) -> None:
-            self._meter.count(done, scenarios=done)
-
-        return read_many(
-            function, jobs, files, count, workers=self.workers, scheduler=self.scheduler
-        )
-
-    def _path(self, scenario: int) -> Path:
-        return self.size.path(self.root, scenario)
-
-    def _simulate(self) -> None:
-        """Run everything that is to do in workers, and the twins of test scenarios."""
-        with_twin = {
-            entry.scenario for entry in self.manifest.files if entry.twin_floor
-        }
-        tested = self.size.subsets.get("test", ())
-        twins = [i for i in self.kept if i in tested and i not in with_twin]
-        self._bring(twins)
-        costs = dict(zip(self.to_do.scenarios, self.to_do.substeps, strict=True))
-        # Scenarios of similar length share a batch.
-        longest_first = sorted(costs, key=lambda i: (-costs[i], i))
-        if self.device is Device.CPU:
-            width = 1
-        else:
-            width = max(1, BATCH_PARTICLES // self.size.particles)
-        batches = [
-            tuple(longest_first[k : k + width])
-            for k in range(0, len(longest_first), width)
-        ]
-        tasks = [
-            self._task(
-                f"scenario {spell_ids(ids)}", simulate, ids, sum(costs[i] for i in ids)
-            )
-            for ids in batches
-        ]
-        tasks += map(self._twin, twins)
-        if not tasks:
-            return
-        total = round(sum(task.cost for task in tasks))
-        total += sum(
-            twin_substeps(self.size, i) for i in self.to_do.scenarios if i in tested
-        )
-        self._meter.begin(
-            "simulating", total=total, scenarios=len(self.to_do.scenarios)
-        )
-        if self.device is Device.CPU:
-            environment = ONE_THREAD
-        else:
-            environment = {}
-        here = Pool(min(self.workers, len(tasks)), environment)
-        with (
-            here
-            if self.scheduler is None
-            else Cluster(self.scheduler, folder=self.folder) as team
-        ):
-            for task in tasks:
-                team.submit(task)
-            for event in team.events():
-                if event.kind != "done":  # it went on, or is lost
-                    self._meter.count(
-                        event.value if event.kind == "progress" else -event.value
-                    )
-                elif event.task.function is simulate:
-                    self._take(
-                        event.value, team, event.machine or environment_of(self.device)
-                    )
-                else:
-                    floors = {
-                        i: tuple(map(round_digits, floor))
-                        for i, floor in event.value.items()
-                    }
-                    files = [
-                        entry
-                        for entry in self.manifest.files
-                        if entry.scenario in floors
-                    ]
-                    files = [
-                        e.model_copy(update={"twin_floor": floors[e.scenario]})
-                        for e in files
-                    ]
-                    self._keep(merged(self.size, self.manifest, files))
-
-    def _task(
-        self,
-        what: str,
-        function: Callable[..., Any],
-        scenarios: tuple[int, ...],
-        cost: float,
-    ) -> Task:
-        job = SimulationJob(
-            size=self.size, scenarios=scenarios, root=self.root, device=self.device
-        )
-        name = f"{self.size.split} {self.size.name}, {what}"
-        return Task(name=name, function=function, arguments=(job,), cost=cost)
-
-    def _twin(self, scenario: int) -> Task:
-        what = f"twin of scenario {scenario}"
-        cost = twin_substeps(self.size, scenario)
-        return self._task(what, twin_floors, (scenario,), cost)
-
-    def _take(
-        self,
-        outcomes: Sequence[Simulated],
-        team: Pool | Cluster,
-        machine: Mapping[str, str],
-    ) -> None:
-        """Note simulated scenarios whose files are there, and send the twins of those
-        of test after them.
-        """
-        environment = {**machine, "device": self.device.value}
-        if promises_bits(environment):
-            self._promised += [outcome.scenario for outcome in outcomes]
-        if self.device is Device.CPU and self.scheduler is None:
-            self._paces += [outcome.pace for outcome in outcomes if outcome.pace]
-        for outcome in outcomes:
-            await_file(self._path(outcome.scenario))
-        entries = [
-            describe_file(self.root, self.size.key(outcome.scenario))
-            for outcome in outcomes
-        ]
-        note_entries(self.folder, entries)
-        self._keep(merged(self.size, self.manifest, entries, environment))
-        self._meter.count(scenarios=len(entries))
-        for entry in entries:
-            if entry.subset == "test":
-                team.submit(self._twin(entry.scenario))
-
-    def _keep(self, manifest: Manifest) -> None:
-        self.manifest = manifest
-        if manifest.files or (self.folder / MANIFEST_NAME).exists():
-            write_manifest(self.root, manifest)
-            if self.store:
-                self.store.follow(manifest)
-
-    def _bring(self, scenarios: Iterable[int]) -> None:
-        """Have files of scenarios here that only the store holds."""
-        if self.store:
-            self.store.bring(scenarios)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -418,71 +147,456 @@ def generate(
         UsageError: unknown split, size, subset, scenario or device, fewer than one
             worker, or Taichi is not installed; or nothing can be gathered from a
             folder.
-        WorkFailedError: disk full or not writable, a scenario blew up, workers keep
-            dying, the cluster is lost or does not see the root folder; or the store
-            refuses or does not answer.
+        WorkFailedError: disk full or not writable, a scenario cannot be drawn or blew
+            up, workers keep dying, the cluster is lost or does not see the root folder;
+            or the store refuses or does not answer.
         DataError: the result has other hashes than datasets.yaml, or there is no such
             bucket.
     """
     started = time.monotonic()
     check_address(root)
     tier, folder, splits = locate_new(split, size, root=root, registry=registry)
-    wanted = select(tier, subset=subset, scenarios=scenarios)
-    devices = [known.value for known in Device]
-    if device not in devices:
-        raise UsageError(
-            f"no device {device!r}", where="--device", fix=nearest(device, devices)
-        )
-    target = Device(device)
-    cores = worker_count(workers, default=None if target.value == "cpu" else 1)
-    free = free_bytes(tier.folder(folder))
-    generation = Generation(
-        tier,
-        folder,
-        target,
-        cores,
-        Meter(progress),
+    wanted_ids = select(tier, subset=subset, scenarios=scenarios)
+    target = _find_device(device)
+    cores = worker_count(workers, default=None if target is Device.CPU else 1)
+    bytes_free = free_bytes(tier.folder(folder))
+    setup = _Setup(
+        size=tier,
         split=splits.split(tier.split),
+        root=folder,
+        device=target,
+        workers=cores,
         scheduler=scheduler,
-        sources=[expanded(source, "--gather") for source in gather],
+        meter=Meter(progress),
     )
+    sources = [expand_path(source, "--gather") for source in gather]
+
     if dry_run:
-        generation.store = look_at(tier, folder)
-        there = {
-            i for source in generation.sources for i in gatherable(tier, folder, source)
-        }
-        generation.survey(wanted, force=force, gathered=there)
+        scan = _plan_only(setup, wanted_ids, sources, force=force)
+        manifest = scan.manifest
+        verdict = ""
     else:
         if scheduler is None:
             check_installed("taichi", extra="generate")
         with (
             dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-            publication(tier, folder) as generation.store,
+            publish(tier, folder) as store,
         ):
-            generation.run(wanted, force=force)
-    manifest = generation.manifest
+            keeper = _ManifestKeeper(setup, store)
+            scan = _simulate_missing(setup, keeper, wanted_ids, sources, force=force)
+            _complete_statistics(setup, keeper)
+            manifest = keeper.manifest
+            verdict = compare_hashes(tier, manifest, promised=keeper.promised)
+            _describe(setup, store, manifest)
+
+    missing_ids = []
+    for scenario in tier.scenarios:
+        if not manifest.entry(scenario) and scenario not in scan.kept:
+            missing_ids.append(scenario)
     return GenerationResult(
         split=tier.split,
         size=tier.name,
         version=tier.version,
         root=folder,
-        folder=generation.folder,
+        folder=setup.folder,
         device=target.value,
         workers=cores,
-        simulated=generation.to_do.scenarios,
-        kept=tuple(generation.kept),
-        missing=tuple(
-            i
-            for i in tier.scenarios
-            if not manifest.entry(i) and i not in generation.kept
-        ),
-        bytes_needed=generation.to_do.bytes,
-        bytes_free=free,
-        seconds_expected=generation.to_do.seconds(cores),
-        measured=generation.to_do.measured,
+        simulated=scan.to_do.scenarios,
+        kept=scan.kept,
+        missing=tuple(missing_ids),
+        bytes_needed=scan.to_do.bytes,
+        bytes_free=bytes_free,
+        seconds_expected=scan.to_do.seconds(cores),
+        measured=scan.to_do.measured,
         seconds=time.monotonic() - started,
         complete=manifest.complete,
         dataset_sha256=manifest.dataset_sha256,
-        verdict=generation.verdict,
+        verdict=verdict,
         dry_run=dry_run,
     )
+
+
+def _find_device(name: str) -> Device:
+    names = list(map(str, Device))
+    if name not in names:
+        raise UsageError(
+            f"no device {name!r}", where="--device", fix=suggest_name(name, names)
+        )
+    return Device(name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Setup:
+    """What a generation makes, where, and with what."""
+
+    size: Size  # tier to generate
+    split: Split  # split that it belongs to
+    root: Path  # folder of all data sets
+    device: Device  # where the solver runs
+    workers: int  # worker processes
+    scheduler: str | None  # Dask scheduler whose workers simulate; None: here
+    meter: Meter  # counts the work
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the data set."""
+        return self.size.folder(self.root)
+
+    @property
+    def is_on_cores(self) -> bool:
+        """Whether cores of this machine simulate."""
+        return self.device is Device.CPU and self.scheduler is None
+
+    def path(self, scenario: int) -> Path:
+        """Return the file of a scenario."""
+        return self.size.path(self.root, scenario)
+
+    def read_files(
+        self,
+        function: Callable[[Job, Report], Result],
+        jobs: Mapping[str, Job],
+        files: Iterable[Path],
+    ) -> list[Result]:
+        """Run a function that reads files, here or by the workers; the meter counts
+        files.
+        """
+
+        def count(done: int) -> None:
+            self.meter.count(done, scenarios=done)
+
+        return read_many(
+            function, jobs, files, count, workers=self.workers, scheduler=self.scheduler
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Scan:
+    """What a data set folder holds, and what is left to do."""
+
+    manifest: Manifest  # of the files that are there and right
+    hashed: tuple[FileEntry, ...]  # files that were inspected and are right
+    kept: tuple[int, ...]  # chosen ids whose files are there and right
+    to_do: Estimate  # chosen ids to simulate, and what that takes
+
+
+class _ManifestKeeper:
+    """Writes the manifest of a folder whenever it changes; the store follows."""
+
+    def __init__(self, setup: _Setup, store: Publication | None) -> None:
+        self._setup = setup
+        # the store that the root folder is a working copy of; None if plain
+        self.store = store
+        self.manifest = read_or_empty(setup.size, setup.root)
+        # ids that were simulated on machines that promise equal bits
+        self.promised: list[int] = []
+
+    def keep(self, manifest: Manifest) -> None:
+        """Write a manifest, but no empty one where there is none yet."""
+        self.manifest = manifest
+        if manifest.files or (self._setup.folder / MANIFEST_NAME).exists():
+            write_manifest(self._setup.root, manifest)
+            if self.store:
+                self.store.put_files(manifest)
+
+    def add(
+        self,
+        entries: Iterable[FileEntry],
+        environment: Mapping[str, str] | None = None,
+    ) -> None:
+        """Put entries in, and the machine that wrote their files."""
+        self.keep(merge_entries(self._setup.size, self.manifest, entries, environment))
+
+    def fetch(self, scenarios: Iterable[int]) -> None:
+        """Have files of scenarios here that only the store holds."""
+        if self.store:
+            self.store.fetch(scenarios)
+
+
+def _plan_only(
+    setup: _Setup, wanted_ids: Sequence[int], sources: Sequence[Path], *, force: bool
+) -> _Scan:
+    """Scan a folder as if the sources were gathered; change nothing."""
+    gathered: set[int] = set()
+    for source in sources:
+        gathered.update(list_gatherable(setup.size, setup.root, source))
+    store = inspect_store(setup.size, setup.root)
+    return _scan_folder(setup, store, wanted_ids, force=force, gathered=gathered)
+
+
+def _simulate_missing(
+    setup: _Setup,
+    keeper: _ManifestKeeper,
+    wanted_ids: Sequence[int],
+    sources: Sequence[Path],
+    *,
+    force: bool,
+) -> _Scan:
+    """Gather, scan, and simulate what is missing or wrong; return the scan before."""
+    remove_leftovers(setup.folder)
+    for source in sources:
+        old = read_or_empty(setup.size, setup.root)
+        keeper.keep(gather_files(setup.size, setup.root, source, old))
+
+    scan = _scan_folder(setup, keeper.store, wanted_ids, force=force)
+    record_entry_hashes(setup.folder, scan.hashed)
+    check_disk(setup.root, scan.to_do.bytes)
+    keeper.keep(scan.manifest)
+    try:
+        paces = _simulate(setup, keeper, scan)
+    finally:
+        # The workers are gone by now; what they had not finished goes too.
+        remove_leftovers(setup.folder)
+    note_pace(setup.size, paces)
+    return scan
+
+
+def _scan_folder(
+    setup: _Setup,
+    store: Publication | None,
+    wanted_ids: Sequence[int],
+    *,
+    force: bool,
+    gathered: Collection[int] | None = None,
+) -> _Scan:
+    """Inspect the files of a folder.
+
+    With ``gathered``, the ids that would be there, nothing is written and the hashes of
+    the manifest are trusted.
+    """
+    size = setup.size
+    old = read_or_empty(size, setup.root)
+    stored: Mapping[int, FileEntry] = {}
+    if store:
+        stored = store.stored_entries
+    suspects = _suspects(setup, old, stored, wanted_ids)
+    setup.meter.begin("checking", total=len(suspects), scenarios=len(suspects))
+    inspections = {}
+    for scenario in suspects:
+        inspections[f"scenario {scenario}"] = partial(
+            inspect_scenario,
+            setup.root,
+            size,
+            scenario,
+            manifest=old.only(scenario),
+            quick=True,
+            trusting=gathered is not None,
+        )
+    paths = map(setup.path, suspects)
+    results = setup.read_files(run_inspection, inspections, paths)
+
+    hashed = []
+    bad_ids = set(suspects)
+    for result in results:
+        if result.entry:
+            hashed.append(result.entry)
+            bad_ids.discard(result.scenario)
+    old_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
+    base = old.model_copy(update={"files": tuple(old_entries)})
+
+    kept_ids = []
+    missing_ids = []
+    for scenario in wanted_ids:
+        is_there = scenario not in bad_ids or scenario in (gathered or ())
+        if is_there and not force:
+            kept_ids.append(scenario)
+        else:
+            missing_ids.append(scenario)
+    return _Scan(
+        manifest=merge_entries(size, base, [*hashed, *stored.values()]),
+        hashed=tuple(hashed),
+        kept=tuple(kept_ids),
+        to_do=estimate(size, missing_ids, on_cores=setup.is_on_cores),
+    )
+
+
+def _suspects(
+    setup: _Setup,
+    old: Manifest,
+    stored: Collection[int],
+    wanted_ids: Sequence[int],
+) -> list[int]:
+    """Return the ids to inspect: those chosen, and those whose file came, went, or has
+    another length than the manifest says; what the store holds is right.
+    """
+    stated_lengths = {entry.scenario: entry.bytes for entry in old.files}
+    suspects = []
+    for scenario in setup.size.scenarios:
+        if scenario in stored:
+            continue
+        length = None
+        path = setup.path(scenario)
+        if path.exists():
+            length = path.stat().st_size
+        if scenario in wanted_ids or length != stated_lengths.get(scenario):
+            suspects.append(scenario)
+    return suspects
+
+
+def _simulate(
+    setup: _Setup, keeper: _ManifestKeeper, scan: _Scan
+) -> list[SimulationPace]:
+    """Run everything that is to do in workers, and perturbed runs of test scenarios.
+
+    Returns:
+        How fast the cores of this machine were.
+    """
+    size = setup.size
+    test_ids = size.subsets.get("test", ())
+    # files that are right and have no predictability limit yet
+    unlimited_ids = []
+    for entry in keeper.manifest.files:
+        is_kept_test = entry.scenario in test_ids and entry.scenario in scan.kept
+        if is_kept_test and not entry.twin_floor:
+            unlimited_ids.append(entry.scenario)
+    keeper.fetch(unlimited_ids)
+
+    tasks = _simulation_tasks(setup, scan.to_do)
+    for scenario in unlimited_ids:
+        tasks.append(_perturbation_task(setup, scenario))
+    if not tasks:
+        return []
+
+    total = 0
+    for task in tasks:
+        total += round(task.cost)
+    for scenario in scan.to_do.scenarios:
+        if scenario in test_ids:
+            total += perturbed_substep_count(size, scenario)
+    scenario_count = len(scan.to_do.scenarios)
+    setup.meter.begin("simulating", total=total, scenarios=scenario_count)
+
+    paces: list[SimulationPace] = []
+    with _open_team(setup, len(tasks)) as team:
+        for task in tasks:
+            team.submit(task)
+        for event in team.events():
+            if event.kind == "progress":
+                setup.meter.count(event.value)
+            elif event.kind == "lost":
+                setup.meter.count(-event.value)
+            elif event.item.function is measure_predictability:
+                _add_limits(keeper, event.value)
+            else:
+                _add_simulated(setup, keeper, event)
+                for simulated in event.value:
+                    if setup.is_on_cores and simulated.pace:
+                        paces.append(simulated.pace)
+                    if simulated.scenario in test_ids:
+                        task = _perturbation_task(setup, simulated.scenario)
+                        team.submit(task)
+    return paces
+
+
+def _open_team(setup: _Setup, task_count: int) -> Pool | Cluster:
+    """Return the workers, here or of a Dask scheduler, to be used with ``with``."""
+    if setup.scheduler is not None:
+        return Cluster(setup.scheduler, folder=setup.folder)
+    environment: Mapping[str, str] = {}
+    if setup.device is Device.CPU:
+        environment = ONE_THREAD
+    return Pool(min(setup.workers, task_count), environment)
+
+
+def _simulation_tasks(setup: _Setup, to_do: Estimate) -> list[WorkItem]:
+    """Return a task per batch; scenarios of similar length share a batch."""
+    costs = dict(zip(to_do.scenarios, to_do.substeps, strict=True))
+    longest_first = sorted(costs, key=lambda scenario: (-costs[scenario], scenario))
+    width = 1
+    if setup.device is not Device.CPU:
+        width = max(1, BATCH_PARTICLES // setup.size.particles)
+
+    tasks = []
+    for start in range(0, len(longest_first), width):
+        ids = tuple(longest_first[start : start + width])
+        cost = sum(costs[scenario] for scenario in ids)
+        name = f"scenario {format_ids(ids)}"
+        tasks.append(_task(setup, name, function=simulate, ids=ids, cost=cost))
+    return tasks
+
+
+def _perturbation_task(setup: _Setup, scenario: int) -> WorkItem:
+    return _task(
+        setup,
+        f"perturbed run of scenario {scenario}",
+        function=measure_predictability,
+        ids=(scenario,),
+        cost=perturbed_substep_count(setup.size, scenario),
+    )
+
+
+def _task(
+    setup: _Setup,
+    name: str,
+    *,
+    function: Callable[..., Any],
+    ids: tuple[int, ...],
+    cost: float,
+) -> WorkItem:
+    size = setup.size
+    job = SimulationJob(size=size, scenarios=ids, root=setup.root, device=setup.device)
+    full_name = f"{size.split} {size.name}, {name}"
+    return WorkItem(name=full_name, function=function, arguments=(job,), cost=cost)
+
+
+def _add_simulated(setup: _Setup, keeper: _ManifestKeeper, event: Event) -> None:
+    """Put scenarios that a worker has simulated into the manifest."""
+    simulated: Sequence[SimulatedScenario] = event.value
+    machine = event.machine or describe_machine(setup.device)
+    environment = {**machine, "device": setup.device.value}
+    is_promised = promises_bits(environment)
+    for result in simulated:
+        if is_promised:
+            keeper.promised.append(result.scenario)
+        await_file(setup.path(result.scenario))
+    entries = []
+    for result in simulated:
+        entries.append(describe_file(setup.root, setup.size.key(result.scenario)))
+    record_entry_hashes(setup.folder, entries)
+    keeper.add(entries, environment)
+    setup.meter.count(scenarios=len(entries))
+
+
+def _add_limits(keeper: _ManifestKeeper, limits: Mapping[int, Sequence[float]]) -> None:
+    """Put predictability limits into the entries of their scenarios."""
+    entries = []
+    for entry in keeper.manifest.files:
+        if entry.scenario in limits:
+            rounded = tuple(map(round_digits, limits[entry.scenario]))
+            entries.append(entry.model_copy(update={"twin_floor": rounded}))
+    keeper.add(entries)
+
+
+def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
+    """Put the statistics of train into the manifest, once train is complete."""
+    manifest = keeper.manifest
+    measured = setup.size.measured
+    # Statistics of other bits differ from datasets.yaml by right.
+    is_doubted = (
+        measured is not None
+        and manifest.identity == "bitwise"
+        and manifest.statistics != measured.statistics
+    )
+    is_needed = is_doubted or not manifest.statistics
+    if "train" in manifest.subset_sha256 and is_needed:
+        train_ids = setup.size.subsets["train"]
+        keeper.fetch(train_ids)
+        setup.meter.begin("statistics", total=len(train_ids), scenarios=len(train_ids))
+        paths = {f"scenario {i}": setup.path(i) for i in train_ids}
+        moments = setup.read_files(file_moments, paths, paths.values())
+        manifest = manifest.model_copy(update={"statistics": statistics(moments)})
+    keeper.keep(manifest)
+
+
+def _describe(setup: _Setup, store: Publication | None, manifest: Manifest) -> None:
+    """Write the cards, and bring the store to the state of the folder."""
+    size = setup.size
+    setup.meter.begin("cards", total=1, scenarios=len(manifest.files))
+    if store is None:
+        write_cards(setup.root, size, setup.split, manifest)
+        return
+
+    if store.is_settled(manifest, card_texts(size, setup.split, manifest)):
+        return
+    store.fetch(size.scenarios)
+    cards = write_cards(setup.root, size, setup.split, manifest)
+    store.finish(manifest, cards)

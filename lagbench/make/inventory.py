@@ -14,23 +14,28 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from lagbench.data.checksums import file_sha256, plain
+from lagbench.data.checksums import file_sha256, to_plain
 from lagbench.data.layout import scenario_path, url_of
 from lagbench.data.local import DESCRIPTION
-from lagbench.data.manifest import FileEntry, Manifest, describe_file, noted_hashes
-from lagbench.data.registry import Size, spell_ids
+from lagbench.data.manifest import (
+    FileEntry,
+    Manifest,
+    describe_file,
+    load_recorded_hashes,
+)
+from lagbench.data.registry import Size, format_ids
 from lagbench.data.scenario import ScenarioHeader, check_scenario, read_scenario
 from lagbench.errors import DataError
-from lagbench.generators.batch import draw
+from lagbench.generators.batch import draw_initial_state
 from lagbench.generators.simulate import OUTCOMES, file_parameters
 from lagbench.work.machine import available_cores, may_differ
 
-from .cards import PICTURES
+from .card_files import PICTURES
 from .plan import estimate
 
 
-class State(enum.StrEnum):
-    """What became of a scenario's file."""
+class DataSetState(enum.StrEnum):
+    """What became of a scenario's file in a data set."""
 
     GOOD = "good"
     MISSING = "missing"
@@ -62,12 +67,12 @@ class Overview:
     @property
     def state(self) -> str:
         """Whether it is on this machine: "yes", "no" or how much of it."""
-        there = sum(self.present.values())
-        wanted = sum(self.scenarios.values())
-        if there == wanted:
+        present_count = sum(self.present.values())
+        total_count = sum(self.scenarios.values())
+        if present_count == total_count:
             return "yes"
-        if there:
-            return f"{there} of {wanted}"
+        if present_count:
+            return f"{present_count} of {total_count}"
         return "no"
 
 
@@ -77,46 +82,66 @@ def overview(size: Size, root: Path) -> Overview:
     """
     folder = size.folder(root)
     ids = size.scenarios
-    url = url_of(root)
-    # to draw all would take seconds
-    expected = estimate(size, ids, drawn=2) if size.simulated else None
-    if url is None:
-        there = {i for i in ids if size.path(root, i).is_file()}
-    else:
-        from lagbench.store.copy import (
-            remote_manifest,
-        )  # what a store takes is not loaded for a folder
 
-        found = remote_manifest(size, url)
-        if found:
-            there = {entry.scenario for entry in found.files}
-        else:
-            there = set()
+    seconds = 0.0
+    is_measured = False
+    if size.simulated:
+        expected = estimate(size, ids)
+        seconds = expected.seconds(available_cores())
+        is_measured = expected.measured
+
+    present_ids = _present_scenarios(size, root)
+    counts: dict[str, int] = {}
+    present: dict[str, int] = {}
+    for subset, members in size.subsets.items():
+        counts[subset] = len(members)
+        present[subset] = len(present_ids.intersection(members))
+
+    picture = None
+    for name in PICTURES:
+        if picture is None and (folder / name).is_file():
+            picture = folder / name
+    dataset_sha256 = None
+    if size.measured:
+        dataset_sha256 = size.measured.dataset_sha256
     return Overview(
         split=size.split,
         size=size.name,
         version=size.version,
-        scenarios={subset: len(ids) for subset, ids in size.subsets.items()},
+        scenarios=counts,
         particles=size.particles,
         frames=sum(map(size.frame_count, ids)),
         bytes=sum(map(size.file_bytes, ids)),
-        seconds=expected.seconds(available_cores()) if expected else 0.0,
-        measured=expected is not None and expected.measured,
-        present={subset: len(there & {*ids}) for subset, ids in size.subsets.items()},
+        seconds=seconds,
+        measured=is_measured,
+        present=present,
         folder=folder,
-        picture=next(
-            (folder / name for name in PICTURES if (folder / name).is_file()), None
-        ),
-        dataset_sha256=size.measured.dataset_sha256 if size.measured else None,
+        picture=picture,
+        dataset_sha256=dataset_sha256,
     )
 
 
+def _present_scenarios(size: Size, root: Path) -> set[int]:
+    """Return the ids whose files a folder has, or that its store's manifest names."""
+    url = url_of(root)
+    if url is None:
+        return {i for i in size.scenarios if size.path(root, i).is_file()}
+
+    # what a store takes is not loaded for a folder
+    from lagbench.store.copy import remote_manifest
+
+    manifest = remote_manifest(size, url)
+    if manifest is None:
+        return set()
+    return {entry.scenario for entry in manifest.files}
+
+
 @dataclass(frozen=True, kw_only=True)
-class Finding:
-    """What a look at one scenario's file showed."""
+class ScenarioInspection:
+    """What an inspection of one scenario's file showed."""
 
     scenario: int  # its id
-    state: State  # whether the file is there and right
+    state: DataSetState  # whether the file is there and right
     content_sha256: str | None = None  # content hash of a good file
     # what is wrong, naming file and, where it can be told, variable
     problem: str | None = None
@@ -132,7 +157,7 @@ def recorded_hash(size: Size, scenario: int) -> str | None:
     return None
 
 
-def examine(
+def inspect_scenario(
     root: Path,
     size: Size,
     scenario: int,
@@ -140,68 +165,26 @@ def examine(
     manifest: Manifest | None = None,
     quick: bool = False,
     trusting: bool = False,
-) -> Finding:
-    """Look at a file; ``quick`` asks for an entry and takes hashes of before,
-    ``trusting`` the manifest's.
+) -> ScenarioInspection:
+    """Inspect a scenario's file.
+
+    Args:
+        root: folder of all data sets.
+        size: size that the scenario belongs to.
+        scenario: its id.
+        manifest: what the folder's manifest says.
+        quick: ask for a manifest entry, and take the content hash that this machine
+            noted before instead of hashing the values again.
+        trusting: take the manifest's content hash too, where the bytes are those of
+            the manifest.
     """
-    key = size.key(scenario)
-    path = scenario_path(root, key)
+    path = scenario_path(root, size.key(scenario))
     if not path.exists():
-        return Finding(scenario=scenario, state=State.MISSING)
-    if manifest:
-        claim = manifest.entry(scenario)
-    else:
-        claim = None
-    recorded = recorded_hash(size, scenario)
+        return ScenarioInspection(scenario=scenario, state=DataSetState.MISSING)
     try:
-        # A manifest is the word of whoever wrote it: only what was hashed here is not
-        # hashed again.
-        if quick:
-            noted = noted_hashes(size.folder(root))(path)
-        else:
-            noted = None
-        # Before the values: a file that changes meanwhile then fits no note.
-        digest = noted[1] if noted else file_sha256(path) if quick else None
-        if trusting and claim is not None and digest == claim.file_sha256:
-            noted = claim.content_sha256, claim.file_sha256
-        with read_scenario(path) as file:
-            _check_header(path, file.header, size, scenario)
-            if noted:
-                file.check_attributes()
-        if noted:
-            content = noted[0]
-        else:
-            content = check_scenario(path)
-        unchanged = claim is not None and (digest, content) == (
-            claim.file_sha256,
-            claim.content_sha256,
+        return _inspect_file(
+            root, size, scenario, manifest=manifest, quick=quick, trusting=trusting
         )
-        expected = recorded or (claim.content_sha256 if claim else None)
-        differs = expected is not None and not content.startswith(expected)
-        if differs and not (
-            manifest is not None
-            and manifest.identity == "tolerance"
-            and claim is not None
-            and claim.content_sha256 == content
-            and may_differ(claim.device, manifest.environments)
-        ):
-            raise DataError(
-                "the file has another content hash",
-                where=str(path),
-                expected=f"{expected} of "
-                f"{record_of(size) if recorded else 'the manifest'}",
-                got=content,
-            )
-        entry = claim
-        if digest and not unchanged:
-            entry = describe_file(root, key, digest=digest)
-            if (
-                claim is not None and claim.content_sha256 == content
-            ):  # packed anew, or by an earlier version
-                facts = entry.facts or claim.facts
-                entry = entry.model_copy(
-                    update={"facts": facts, "twin_floor": claim.twin_floor}
-                )
     except DataError as error:
         # How to mend it depends on the split, and is said once for all files.
         problem = str(
@@ -209,36 +192,152 @@ def examine(
                 error.what, where=error.where, expected=error.expected, got=error.got
             )
         )
-        return Finding(scenario=scenario, state=State.WRONG, problem=problem)
     except OSError as error:
         problem = f"cannot read {path}: {error.strerror}"
-        return Finding(scenario=scenario, state=State.WRONG, problem=problem)
-    return Finding(
-        scenario=scenario,
-        state=State.GOOD,
-        content_sha256=content,
-        entry=entry if quick else None,
-        tolerated=differs,
+    return ScenarioInspection(
+        scenario=scenario, state=DataSetState.WRONG, problem=problem
     )
 
 
-def look(examined: Callable[[], Finding], report: Callable[[int], None]) -> Finding:
-    """Examine a file, as a worker does, and report it as one unit of work."""
-    finding = examined()
+def _inspect_file(
+    root: Path,
+    size: Size,
+    scenario: int,
+    *,
+    manifest: Manifest | None,
+    quick: bool,
+    trusting: bool,
+) -> ScenarioInspection:
+    """Inspect a file that is there; one that is not right is a DataError."""
+    path = size.path(root, scenario)
+    claim = None
+    if manifest:
+        claim = manifest.entry(scenario)
+
+    # A manifest is the word of whoever wrote it: only what was hashed here is not
+    # hashed again.
+    noted_content: str | None = None
+    digest: str | None = None
+    if quick:
+        noted = load_recorded_hashes(size.folder(root))(path)
+        if noted:
+            noted_content, digest = noted
+        else:
+            # Before the values: a file that changes meanwhile then fits no note.
+            digest = file_sha256(path)
+    if trusting and claim is not None and digest == claim.file_sha256:
+        noted_content = claim.content_sha256
+
+    with read_scenario(path) as file:
+        _check_header(path, file.header, size, scenario)
+        if noted_content:
+            file.check_attributes()
+    content = noted_content or check_scenario(path)
+
+    is_tolerated = _check_content(
+        size, scenario, content=content, manifest=manifest, path=path
+    )
+    entry = None
+    if quick and digest is not None:
+        entry = _entry_of(
+            root, size, scenario, claim=claim, content=content, digest=digest
+        )
+    return ScenarioInspection(
+        scenario=scenario,
+        state=DataSetState.GOOD,
+        content_sha256=content,
+        entry=entry,
+        tolerated=is_tolerated,
+    )
+
+
+def _check_content(
+    size: Size,
+    scenario: int,
+    *,
+    content: str,
+    manifest: Manifest | None,
+    path: Path,
+) -> bool:
+    """Refuse a content hash that is not the recorded one, else the manifest's.
+
+    Returns:
+        Whether it differs and is tolerated: a machine wrote the file that promises no
+        equal bits.
+    """
+    claim = None
+    if manifest:
+        claim = manifest.entry(scenario)
+    expected = recorded_hash(size, scenario)
+    source = record_name(size)
+    if expected is None and claim is not None:
+        expected = claim.content_sha256
+        source = "the manifest"
+    if expected is None or content.startswith(expected):
+        return False
+
+    is_tolerated = (
+        manifest is not None
+        and manifest.identity == "tolerance"
+        and claim is not None
+        and claim.content_sha256 == content
+        and may_differ(claim.device, manifest.environments)
+    )
+    if not is_tolerated:
+        raise DataError(
+            "the file has another content hash",
+            where=str(path),
+            expected=f"{expected} of {source}",
+            got=content,
+        )
+    return True
+
+
+def _entry_of(
+    root: Path,
+    size: Size,
+    scenario: int,
+    *,
+    claim: FileEntry | None,
+    content: str,
+    digest: str,
+) -> FileEntry:
+    """Return the manifest entry of a good file with these hashes."""
+    has_same_content = claim is not None and claim.content_sha256 == content
+    if claim is not None and has_same_content and claim.file_sha256 == digest:
+        return claim
+
+    entry = describe_file(root, size.key(scenario), digest=digest)
+    if claim is not None and has_same_content:
+        # packed anew, or by an earlier version
+        update = {"facts": entry.facts or claim.facts, "twin_floor": claim.twin_floor}
+        entry = entry.model_copy(update=update)
+    return entry
+
+
+def run_inspection(
+    inspection: Callable[[], ScenarioInspection], report: Callable[[int], None]
+) -> ScenarioInspection:
+    """Inspect a file, as a worker does, and report it as one unit of work."""
+    result = inspection()
     report(1)
-    return finding
+    return result
 
 
 def extra_files(root: Path, size: Size) -> dict[str, list[str]]:
     """Return, by subset folder, the names of files that no scenario of the size has."""
     folder = size.folder(root)
-    known = {
-        (subset, f"{i:04d}.nc") for subset, ids in size.subsets.items() for i in ids
-    }
+    scenario_names = set()
+    for subset, ids in size.subsets.items():
+        for scenario in ids:
+            scenario_names.add((subset, f"{scenario:04d}.nc"))
+
     extra: dict[str, list[str]] = {}
     for path in sorted(folder.glob("*/*.nc")):
-        if (path.parent.name, path.name) not in known and not path.name.startswith("."):
-            extra.setdefault(path.parent.name, []).append(path.name)
+        subset = path.parent.name
+        is_hidden = path.name.startswith(".")
+        if (subset, path.name) not in scenario_names and not is_hidden:
+            extra.setdefault(subset, []).append(path.name)
     return extra
 
 
@@ -247,93 +346,113 @@ def _check_header(
 ) -> None:
     """Refuse a file of another scenario or simulated with other parameters."""
     key = header.key
-    found = (key.split, key.size, key.major, key.scenario, key.subset)
-    wanted = (size.split, size.name, size.major, scenario, size.subset_of(scenario))
-    if found != wanted:
+    stated_key = (key.split, key.size, key.major, key.scenario, key.subset)
+    subset = size.subset_of(scenario)
+    expected_key = (size.split, size.name, size.major, scenario, subset)
+    if stated_key != expected_key:
         raise DataError(
-            "a file holds another scenario", where=str(path), expected=wanted, got=found
+            "a file holds another scenario",
+            where=str(path),
+            expected=expected_key,
+            got=stated_key,
         )
-    if not size.simulated:  # then the recorded content hash covers the parameters
+    # of a local split the recorded content hash covers the parameters
+    if not size.simulated:
         return
-    parameters = {
-        name: plain(value)
-        for name, value in file_parameters(size, draw(size, scenario)).items()
-    }
+
+    state = draw_initial_state(size, scenario)
+    expected = {}
+    for name, value in file_parameters(size, state).items():
+        expected[name] = to_plain(value)
     # What only the simulation tells is covered by the content hash.
-    stated = {
-        name: value for name, value in header.parameters.items() if name not in OUTCOMES
-    }
-    if parameters != stated:
-        names = sorted(
-            n
-            for n in parameters.keys() | stated.keys()
-            if parameters.get(n) != stated.get(n)
-        )
+    stated = {}
+    for name, value in header.parameters.items():
+        if name not in OUTCOMES:
+            stated[name] = value
+
+    if expected != stated:
+        names = expected.keys() | stated.keys()
+        different = [n for n in sorted(names) if expected.get(n) != stated.get(n)]
         raise DataError(
             "a file was simulated with other parameters",
-            where=f"{path}, attributes {', '.join(names)}",
+            where=f"{path}, attributes {', '.join(different)}",
             expected="those of datasets.yaml",
         )
 
 
-def record_of(size: Size) -> str:
+def record_name(size: Size) -> str:
     """Return the name of the file that records the hashes of a split."""
     if size.simulated:
         return "datasets.yaml"
     return DESCRIPTION
 
 
-def compare(size: Size, manifest: Manifest, *, promised: Collection[int] = ()) -> str:
-    """Return how the hashes of a manifest compare with datasets.yaml, in words."""
+def compare_hashes(
+    size: Size, manifest: Manifest, *, promised: Collection[int] = ()
+) -> str:
+    """Return how the hashes of a manifest compare with datasets.yaml, in words.
+
+    ``promised``: scenarios that this call simulated on a machine that promises equal
+    bits, whatever the manifest says of others.
+
+    Raises:
+        DataError: a hash is not the recorded one.
+    """
+    record = record_name(size)
     measured = size.measured
-    record = record_of(size)
     if measured is None:
         return f"{record} holds no hash of this size yet: nothing to compare with"
-    recorded = measured.scenario_sha256
-    differing = [
-        e.scenario for e in manifest.files if not e.has_hash(recorded.get(e.scenario))
-    ]
-    tolerated = {
-        e.scenario
-        for e in manifest.files
-        if may_differ(e.device, manifest.environments)
-    }
-    tolerated -= set(promised)
-    broken = [i for i in differing if i not in tolerated]
-    found = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
-    wanted = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
-    others = [
-        name
-        for name, digest in found.items()
-        if digest is not None and digest != wanted.get(name)
-    ]
+
+    differing = []
+    broken = []
+    for entry in manifest.files:
+        if entry.has_hash(measured.scenario_sha256.get(entry.scenario)):
+            continue
+        differing.append(entry.scenario)
+        is_tolerated = may_differ(entry.device, manifest.environments)
+        if entry.scenario in promised or not is_tolerated:
+            broken.append(entry.scenario)
+
+    computed = {**manifest.subset_sha256, "the data set": manifest.dataset_sha256}
+    recorded = {**measured.subset_sha256, "the data set": measured.dataset_sha256}
+    unequal = []
+    for name, digest in computed.items():
+        if digest is not None and digest != recorded.get(name):
+            unequal.append(name)
+
     if broken:
         what = f"{len(broken)} of {len(manifest.files)} scenarios have another hash"
-        others = [f"scenarios {spell_ids(broken)}"]
-    elif differing:
-        return f"scenarios {spell_ids(differing)} have {other_bits(size)}"
-    elif others:
-        what = "subsets or the data set have another hash though every scenario has its own"
-    else:
-        if manifest.complete:
-            return f"equal to {record}"
-        return f"what is there is equal to {record}"
-    raise DataError(
+        raise _hash_error(size, what, f"scenarios {format_ids(broken)}")
+    if differing:
+        return f"scenarios {format_ids(differing)} have {other_bits(size)}"
+    if unequal:
+        what = (
+            "subsets or the data set have another hash though every scenario has its "
+            "own"
+        )
+        raise _hash_error(size, what, ", ".join(unequal))
+    if manifest.complete:
+        return f"equal to {record}"
+    return f"what is there is equal to {record}"
+
+
+def _hash_error(size: Size, what: str, place: str) -> DataError:
+    return DataError(
         what,
-        where=f"{size.split} {size.name}, {', '.join(others)}",
-        expected=f"the hashes in {record}",
+        where=f"{size.split} {size.name}, {place}",
+        expected=f"the hashes in {record_name(size)}",
         fix="see docs/determinism.md; `lagbench doctor` prints what a report needs",
     )
 
 
 def unlike(size: Size) -> str:
     """Return the words for a hash that is not the recorded one."""
-    return f"NOT that of {record_of(size)}"
+    return f"NOT that of {record_name(size)}"
 
 
 def other_bits(size: Size) -> str:
     """Return the words for bits that may be others."""
-    return f"other bits than {record_of(size)} (identity: tolerance)"
+    return f"other bits than {record_name(size)} (identity: tolerance)"
 
 
 def hash_verdict(
@@ -342,16 +461,22 @@ def hash_verdict(
     """Return how the hash of a subset, else of the data set, compares with the recorded
     one, in words.
     """
-    known = size.measured
-    recorded = known and (
-        known.subset_sha256.get(subset) if subset else known.dataset_sha256
-    )
+    recorded = _recorded_digest(size, subset)
     if recorded is None:
-        return f"no hash in {record_of(size)} yet"
+        return f"no hash in {record_name(size)} yet"
     if computed is None:
         return "incomplete"
     if computed == recorded:
-        return f"equal to {record_of(size)}"
+        return f"equal to {record_name(size)}"
     if tolerated:
         return other_bits(size)
     return unlike(size)
+
+
+def _recorded_digest(size: Size, subset: str | None) -> str | None:
+    """Return the recorded hash of a subset, of the data set where it is None."""
+    if size.measured is None:
+        return None
+    if subset is None:
+        return size.measured.dataset_sha256
+    return size.measured.subset_sha256.get(subset)

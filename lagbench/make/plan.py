@@ -1,9 +1,9 @@
 """What a generation will simulate, and the bytes and time that it takes.
 
-Drawing the initial states tells how many substeps lie ahead. How fast this machine is,
-its own generations measured: ``rates.json`` in the user's cache holds it by kind of
-solver and number of particles. It enters estimates of time and nothing else: a file
-that is missing, damaged or another machine's counts for nothing.
+How fast this machine is, its own generations measured: ``rates.json`` in the user's
+cache holds it by kind of solver and number of particles. It enters estimates of time
+and nothing else. A file that is missing, damaged or another machine's counts for
+nothing.
 """
 
 from __future__ import annotations
@@ -14,22 +14,26 @@ import operator
 import os
 import platform
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lagbench.atomic import write_atomically
 from lagbench.data.layout import CACHE_VARIABLE, cache_folder
 from lagbench.data.limits import NEEDED, Limit
-from lagbench.data.registry import Size, parse_ids, spell_ids
-from lagbench.errors import UsageError, WorkFailedError, nearest
+from lagbench.data.registry import Size, format_ids, parse_ids
+from lagbench.errors import UsageError, WorkFailedError, suggest_name
+from lagbench.generators.batch import substep_count
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.split import ClosedBoxParameters
 
 if TYPE_CHECKING:
-    from lagbench.generators.simulate import Pace
+    from lagbench.generators.simulate import SimulationPace
 
-    Row = tuple[float, int, int]  # seconds, particle substeps and frames, as in Pace
+    # seconds, particle substeps and frames, as in SimulationPace
+    RateRow = tuple[float, int, int]
 
 
 MOST_BYTES = 1 << 16  # a longer file of rates is not ours [bytes]
@@ -55,37 +59,58 @@ Scenarios = str | Iterable[int] | None
 def select(
     size: Size, *, subset: Selection = None, scenarios: Scenarios = None
 ) -> tuple[int, ...]:
-    """Return the scenario ids that a user means, ascending."""
-    names = subset.replace(" ", "").split(",") if isinstance(subset, str) else subset
-    names = tuple(names or size.subsets)
+    """Return the scenario ids that a user means, ascending.
+
+    Raises:
+        UsageError: an unknown subset, an id outside the subsets, or no id at all.
+    """
+    names = _subset_names(size, subset)
+    selectable: set[int] = set()
+    for name in names:
+        selectable.update(size.subsets[name])
+    if scenarios is None:
+        return tuple(sorted(selectable))
+
+    ids = _scenario_ids(scenarios)
+    unknown = [scenario for scenario in ids if scenario not in selectable]
+    if unknown or not ids:
+        choices = [f"{name} {format_ids(size.subsets[name])}" for name in names]
+        missing = format_ids(unknown) or "at all"
+        raise UsageError(
+            f"no scenario {missing} in {', '.join(names)}",
+            where=f"--scenarios, {size.split} {size.name}",
+            expected="; ".join(choices),
+            got=format_ids(ids),
+        )
+    return tuple(sorted(set(ids)))
+
+
+def _subset_names(size: Size, subset: Selection) -> tuple[str, ...]:
+    if isinstance(subset, str):
+        subset = subset.replace(" ", "").split(",")
+    names = tuple(subset or size.subsets)
     for name in names:
         if name not in size.subsets:
-            what = f"{size.split} {size.name} has no subset {name!r}"
-            raise UsageError(what, where="--subset", fix=nearest(name, size.subsets))
-    held = {i for name in names for i in size.subsets[name]}
-    if scenarios is None:
-        return tuple(sorted(held))
+            raise UsageError(
+                f"{size.split} {size.name} has no subset {name!r}",
+                where="--subset",
+                fix=suggest_name(name, size.subsets),
+            )
+    return names
+
+
+def _scenario_ids(scenarios: str | Iterable[int]) -> tuple[int, ...]:
     try:
         if isinstance(scenarios, str):
-            wanted = parse_ids(scenarios)
-        else:
-            wanted = tuple(map(operator.index, scenarios))
+            return parse_ids(scenarios)
+        return tuple(map(operator.index, scenarios))
     except TypeError:
-        expected = "ids, as in (0, 3) or '0,3-5'"
         raise UsageError(
-            "no ids", where="--scenarios", expected=expected, got=repr(scenarios)[:80]
+            "no ids",
+            where="--scenarios",
+            expected="ids, as in (0, 3) or '0,3-5'",
+            got=repr(scenarios)[:80],
         ) from None
-    strangers = [i for i in wanted if i not in held]
-    if strangers or not wanted:
-        raise UsageError(
-            f"no scenario {spell_ids(strangers) or 'at all'} in {', '.join(names)}",
-            where=f"--scenarios, {size.split} {size.name}",
-            expected="; ".join(
-                f"{name} {spell_ids(size.subsets[name])}" for name in names
-            ),
-            got=spell_ids(wanted),
-        )
-    return tuple(sorted(set(wanted)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +122,7 @@ class Estimate:
     frames: int  # frames that they record together
     # disk space, before compression [bytes]; files come out a little smaller
     bytes: int
-    # time on one core, twins of test scenarios included [s], for orientation
+    # time on one core, perturbed runs of test scenarios included [s], for orientation
     core_seconds: float
     measured: bool  # whether at a rate that this machine has measured
 
@@ -112,17 +137,16 @@ class Estimate:
 
 
 def estimate(
-    size: Size,
-    scenarios: Sequence[int],
-    *,
-    drawn: int | None = None,
-    on_cores: bool = True,
+    size: Size, scenarios: Sequence[int], *, on_cores: bool = True
 ) -> Estimate:
-    """Return what simulating these scenarios takes; draw about so many, the others take
-    as much per frame.
+    """Return what simulating these scenarios takes; none of them is drawn.
 
     ``on_cores``: whether cores of this machine simulate, whose rate it may have
     measured.
+
+    Raises:
+        UsageError: the split is a local one.
+        UnreadableFileError: datasets.yaml has an impossible parameter.
     """
     if not size.simulated:
         raise UsageError(
@@ -131,38 +155,30 @@ def estimate(
             fix="lagbench import or lagbench adopt makes it again from the data that "
             "it came from",
         )
-    from lagbench.generators.batch import substeps_of
-    from lagbench.generators.constants import solver_constants
+    solver_constants(size)  # refuses parameters that the solver cannot use
 
-    solver_constants(size)
-    if drawn is None:
-        step = 1
-    else:
-        step = max(1, len(scenarios) // drawn)
-    known = {i: substeps_of(size, i) for i in scenarios[::step]}
-    per_frame = sum(known.values()) / max(1, sum(map(size.frame_count, known)))
-    substeps = tuple(
-        known.get(i) or round(per_frame * size.frame_count(i)) for i in scenarios
-    )
-    frames = sum(size.frame_count(i) for i in scenarios)
-    # twins of test scenarios are simulated too, but for the frames behind the horizon
-    behind = {
-        i: size.frames_behind(i) for i in scenarios if size.subset_of(i) == "test"
-    }
-    twins = sum(n for i, n in zip(scenarios, substeps, strict=True) if i in behind)
-    twins -= sum(behind.values()) * size.substeps_per_frame
-    both = frames + sum(map(size.frame_count, behind)) - sum(behind.values())
+    substeps = tuple(substep_count(size, scenario) for scenario in scenarios)
+    frames = sum(map(size.frame_count, scenarios))
+
+    # Test scenarios are simulated a second time, perturbed, up to the horizon.
+    total_substeps = sum(substeps)
+    total_frames = frames
+    for scenario, count in zip(scenarios, substeps, strict=True):
+        if size.subset_of(scenario) == "test":
+            omitted_frames = size.frames_behind(scenario)
+            total_substeps += count - omitted_frames * size.substeps_per_frame
+            total_frames += size.frame_count(scenario) - omitted_frames
+
+    ratio = None
     if on_cores:
         ratio = measured_ratio(size)
-    else:
-        ratio = None
+    seconds = reference_seconds(total_substeps * size.particles, total_frames)
     return Estimate(
         scenarios=tuple(scenarios),
         substeps=substeps,
         frames=frames,
         bytes=sum(map(size.file_bytes, scenarios)),
-        core_seconds=(ratio or 1.0)
-        * reference_seconds((sum(substeps) + twins) * size.particles, both),
+        core_seconds=(ratio or 1.0) * seconds,
         measured=ratio is not None,
     )
 
@@ -170,21 +186,28 @@ def estimate(
 def free_bytes(folder: Path) -> int:
     """Return the free space of the file system that holds, or would hold, a folder to
     write to [bytes].
+
+    Raises:
+        WorkFailedError: nothing can be written there.
     """
     existing = next(place for place in (folder, *folder.parents) if place.exists())
-    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-        raise WorkFailedError(
-            "no data set can be written here",
-            where=str(folder),
-            expected="a folder that you may write to",
-            got=f"{existing} is {'write-protected' if existing.is_dir() else 'a file'}",
-            fix="name another folder: --root or LAGBENCH_ROOT",
-        )
-    return shutil.disk_usage(existing).free
+    if existing.is_dir() and os.access(existing, os.W_OK | os.X_OK):
+        return shutil.disk_usage(existing).free
+
+    obstacle = "a file"
+    if existing.is_dir():
+        obstacle = "write-protected"
+    raise WorkFailedError(
+        "no data set can be written here",
+        where=str(folder),
+        expected="a folder that you may write to",
+        got=f"{existing} is {obstacle}",
+        fix="name another folder: --root or LAGBENCH_ROOT",
+    )
 
 
 def check_disk(root: Path, needed: int) -> None:
-    """Refuse to start what cannot fit."""
+    """Refuse to start a generation whose files, of so many bytes, cannot fit."""
     free = free_bytes(root)
     if free < needed:
         raise WorkFailedError(
@@ -206,73 +229,91 @@ def measured_ratio(size: Size) -> float | None:
     """Return what this machine took over the reference machine; None where it never
     timed that solver.
     """
-    rows = _read().get(_kind(size))
+    rows = _read_rates().get(_solver_kind(size))
     if not rows:
         return None
+
     # The nearest number of particles counts: the reference tells small work from large.
-    seconds, *work = rows[
-        min(rows, key=lambda particles: abs(math.log(particles / size.particles)))
-    ]
-    return seconds / reference_seconds(*work)
+    def distance(particles: int) -> float:
+        return abs(math.log(particles / size.particles))
+
+    seconds, particle_substeps, frames = rows[min(rows, key=distance)]
+    return seconds / reference_seconds(particle_substeps, frames)
 
 
-def note_pace(size: Size, paces: Sequence[Pace]) -> None:
+def note_pace(size: Size, paces: Sequence[SimulationPace]) -> None:
     """Note how fast a generation was; nothing where none was timed or the cache cannot
     be written.
     """
     if not paces:
         return
-    row = tuple(sum(column) for column in zip(*map(astuple, paces), strict=True))
-    held = _read()
-    kind = _kind(size)
-    rows = {n: old for n, old in held.get(kind, {}).items() if n != size.particles} | {
-        size.particles: row
-    }
-    held[kind] = dict(list(rows.items())[-MOST_ROWS:])
-    text = json.dumps({"machine": platform.node(), **held}, indent=1) + "\n"
-    with suppress(
-        WorkFailedError, RuntimeError
-    ):  # a home that is not known is a RuntimeError
-        write_atomically(_path(), text.encode(), option=CACHE_VARIABLE)
+    seconds = 0.0
+    particle_substeps = 0
+    frames = 0
+    for pace in paces:
+        seconds += pace.seconds
+        particle_substeps += pace.particle_substeps
+        frames += pace.frames
+
+    rates = _read_rates()
+    kind = _solver_kind(size)
+    rows = dict(rates.get(kind, {}))
+    rows.pop(size.particles, None)  # the latest row comes last
+    rows[size.particles] = (seconds, particle_substeps, frames)
+    rates[kind] = dict(list(rows.items())[-MOST_ROWS:])
+
+    text = json.dumps({"machine": platform.node(), **rates}, indent=1) + "\n"
+    # a home that is not known is a RuntimeError
+    with suppress(WorkFailedError, RuntimeError):
+        write_atomically(_rates_path(), text.encode(), option=CACHE_VARIABLE)
 
 
-def _path() -> Path:
+def _rates_path() -> Path:
     return cache_folder("rates") / "rates.json"
 
 
-def _kind(size: Size) -> str:
+def _solver_kind(size: Size) -> str:
     """Return which of the solvers a size is simulated with."""
-    from lagbench.generators.constants import solver_constants
-    from lagbench.generators.split import ClosedBoxParameters
-
     if isinstance(solver_constants(size), ClosedBoxParameters):
         return "closed_box"
     return "free_surface"
 
 
-def _read() -> dict[str, dict[int, Row]]:
-    """Return what this machine noted: by kind and number of particles; nothing of what
-    is damaged.
+def _read_rates() -> dict[str, dict[int, RateRow]]:
+    """Return what this machine noted, by kind and number of particles.
+
+    The result is empty where the file is damaged or another machine's.
     """
     try:
-        with _path().open("rb") as stream:
+        with _rates_path().open("rb") as stream:
             data = stream.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             return {}
-        held = json.loads(data)
-        if held["machine"] != platform.node():
+        document = json.loads(data)
+        if document["machine"] != platform.node():
             return {}
-        rates: dict[str, dict[int, Row]] = {"closed_box": {}, "free_surface": {}}
-        for kind, rows in rates.items():
-            for particles, (seconds, substeps, frames) in held.get(kind, {}).items():
-                counts = NEEDED["particles"].holds(int(particles)) and COUNT.holds(
-                    substeps
-                )
-                if not (counts and COUNT.holds(frames) and SECONDS.holds(seconds)):
-                    return {}
-                if not RATIO.holds(seconds / reference_seconds(substeps, frames)):
-                    return {}
-                rows[int(particles)] = (seconds, substeps, frames)
-        return rates
+        closed_box = _parse_rows(document.get("closed_box", {}))
+        free_surface = _parse_rows(document.get("free_surface", {}))
+        return {"closed_box": closed_box, "free_surface": free_surface}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
+
+
+def _parse_rows(rows: Mapping[str, Any]) -> dict[int, RateRow]:
+    """Return the rows of one kind of solver; a rate that no machine has is a
+    ValueError.
+    """
+    parsed: dict[int, RateRow] = {}
+    for particles, (seconds, particle_substeps, frames) in rows.items():
+        is_possible = (
+            NEEDED["particles"].holds(int(particles))
+            and COUNT.holds(particle_substeps)
+            and COUNT.holds(frames)
+            and SECONDS.holds(seconds)
+            and RATIO.holds(seconds / reference_seconds(particle_substeps, frames))
+        )
+        if not is_possible:
+            msg = f"no possible rate: {seconds} s, {particle_substeps}, {frames}"
+            raise ValueError(msg)
+        parsed[int(particles)] = (seconds, particle_substeps, frames)
+    return parsed

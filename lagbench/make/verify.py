@@ -2,7 +2,7 @@
 anew.
 
 The manifest is a claim of whoever wrote it; datasets.yaml comes with lagbench. So files
-are held against datasets.yaml, and against the manifest only where datasets.yaml has no
+are compared with datasets.yaml, and with the manifest only where datasets.yaml has no
 hash yet, or where a machine wrote files that promises no equal bits.
 """
 
@@ -20,34 +20,37 @@ from lagbench.data.checksums import (
     file_sha256,
     subset_hash,
 )
-from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import Manifest, note, read_manifest
-from lagbench.data.registry import Registry, Size, spell_ids
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import Manifest, read_manifest, record_hashes
+from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, check_installed
 from lagbench.generators.batch import SimulationJob
 from lagbench.generators.simulate import simulate
 from lagbench.generators.solver import Device
-from lagbench.store.copy import bring, unstored
-from lagbench.work.pool import Pool, Task, worker_count
+from lagbench.store.copy import list_unstored, update_working_copy
+from lagbench.work.pool import Pool, WorkItem, worker_count
 from lagbench.work.progress import Meter, Progress
 
 from .inventory import (
-    Finding,
-    State,
-    examine,
+    DataSetState,
+    ScenarioInspection,
     extra_files,
     hash_verdict,
+    inspect_scenario,
     other_bits,
-    record_of,
+    record_name,
     recorded_hash,
     unlike,
 )
 from .plan import Scenarios, Selection, estimate, select
 
+Inspections = Mapping[int, ScenarioInspection]
+"""What the inspection of each scenario's file showed, by id."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class SubsetReport:
-    """What was found of one subset."""
+    """What the files of one subset are."""
 
     name: str  # name of the subset
     present: int  # scenarios that are there and right
@@ -59,7 +62,7 @@ class SubsetReport:
 
 @dataclass(frozen=True, kw_only=True)
 class VerificationResult:
-    """What a verification found."""
+    """What a verification showed."""
 
     split: str  # name of the split
     size: str  # name of the size
@@ -85,23 +88,28 @@ class VerificationResult:
         return not any(report.missing for report in self.subsets)
 
     def check(self) -> None:
-        """Raise unless everything that has to hold does."""
+        """Raise a DataError unless everything that has to hold does."""
         where = str(self.folder)
         if self.problems:
-            count = (
-                f"{len(self.problems)} problem{'s' if len(self.problems) > 1 else ''}"
-            )
+            count = f"{len(self.problems)} problems"
+            if len(self.problems) == 1:
+                count = "1 problem"
             what = "\n  ".join([count, *self.problems])
             raise DataError(what, where=where, fix=self.fix)
+
         if not any(report.present for report in self.subsets):
             raise DataError("nothing is generated", where=where, fix=self.fix)
+
         if self.must_be_complete and not self.complete:
-            missing = ", ".join(
-                f"{r.name} {spell_ids(r.missing)}" for r in self.subsets if r.missing
-            )
-            got = f"missing: {missing}"
+            gaps = []
+            for report in self.subsets:
+                if report.missing:
+                    gaps.append(f"{report.name} {format_ids(report.missing)}")
             raise DataError(
-                "the data set is incomplete", where=where, got=got, fix=self.fix
+                "the data set is incomplete",
+                where=where,
+                got=f"missing: {', '.join(gaps)}",
+                fix=self.fix,
             )
 
 
@@ -150,100 +158,102 @@ def verify(
         )
     if regenerate:
         check_installed("taichi", extra="generate")
-    bring(tier, folder, ids, thoroughly=True)
-    manifest: Manifest | None = None
-    warnings: list[str] = []
-    try:
-        manifest = read_manifest(folder, tier.split, tier.name, tier.major)
-        if manifest is None:
-            warnings.append(f"there is no manifest: {remedy(tier, root=folder)}")
-        elif manifest.identity == "tolerance":
-            warnings.append(
-                "identity: tolerance - a device wrote these files that does not "
-                "promise equal bits"
-            )
-    except DataError as error:
-        warnings.append(str(error))
-    meter.begin("hashing", total=len(ids), scenarios=len(ids))
-    findings = {}
-    digests_of = {}
-    for scenario in ids:
-        path = tier.path(folder, scenario)
-        with suppress(
-            OSError
-        ):  # before the values, so that a file that changes meanwhile fits no note
-            digests_of[path] = file_sha256(path)
-        findings[scenario] = examine(folder, tier, scenario, manifest=manifest)
-        meter.count(1, scenarios=1)
-    # Which files are right is noted, so that scorer and generator need not hash their
-    # values again.
-    right = {i: f.content_sha256 for i, f in findings.items() if f.content_sha256}
-    note(
-        tier.folder(folder),
-        {tier.path(folder, i): content for i, content in right.items()},
-        digests_of,
-    )
-    anew = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
-    regenerated = {
-        i: _likeness(tier, findings[i], content) for i, content in anew.items()
-    }
-    problems = [f.problem for f in findings.values() if f.problem]
-    problems += [
-        f"scenario {i} differs when simulated anew"
-        for i in anew
-        if regenerated[i] == "different"
-    ]
+
+    update_working_copy(tier, folder, ids, thoroughly=True)
+    manifest, warnings = _read_manifest(tier, folder)
+    inspections = _inspect_files(tier, folder, ids, manifest=manifest, meter=meter)
+    # content hashes of the files that are there and right
+    hashes: dict[int, str] = {}
+    for scenario, inspection in inspections.items():
+        if inspection.content_sha256:
+            hashes[scenario] = inspection.content_sha256
+
+    new_hashes = _regenerate(tier, evenly_spaced(ids, regenerate), cores, meter)
+    regenerated: dict[int, str] = {}
+    for scenario, content in new_hashes.items():
+        regenerated[scenario] = _compare_regenerated(
+            tier, inspections[scenario], content
+        )
+
+    subset_digests = _subset_digests(tier, hashes)
+    data_set_digest = _data_set_digest(tier, subset_digests)
+    reports = _subset_reports(folder, tier, inspections, subset_digests)
+    tolerated = [i for i, inspection in inspections.items() if inspection.tolerated]
+    verdict = hash_verdict(tier, data_set_digest, tolerated=bool(tolerated))
+
+    problems = [*_file_problems(inspections), *_regeneration_problems(regenerated)]
     # A killed writer leaves files here that the store never got.
-    alone = unstored(tier, folder, [*right])
-    problems += [
-        f"scenario {i} is in the working copy alone, not in the store" for i in alone
-    ]
-    full = {
-        name: members
-        for name, members in tier.subsets.items()
-        if right.keys() >= {*members}
-    }
-    digests = {
-        name: subset_hash({i: right[i] for i in members})
-        for name, members in full.items()
-    }
-    reports = _reports(folder, tier, findings, digests)
-    hashed = {name: digests.get(name, "") for name in HASHED_SUBSETS}
-    if all(hashed.values()):
-        whole = dataset_hash(tier.split, tier.name, tier.major, hashed)
-    else:
-        whole = None
-    tolerated = [i for i, finding in findings.items() if finding.tolerated]
-    verdict = hash_verdict(tier, whole, tolerated=bool(tolerated))
-    wrong = unlike(tier)
-    problems += [
-        f"{r.name}: its hash is {wrong}" for r in reports if r.verdict == wrong
-    ]
-    problems += [f"the data set hash is {wrong}"] if verdict == wrong else []
-    if tolerated:
-        gaps = [f"scenarios {spell_ids(tolerated)} have {other_bits(tier)}"]
-    else:
-        gaps = []
-    gaps += [f"{r.name} lacks {spell_ids(r.missing)}" for r in reports if r.missing]
-    gaps += [
-        f"{r.name} has files of no scenario: {', '.join(r.extra)}"
-        for r in reports
-        if r.extra
-    ]
+    for scenario in list_unstored(tier, folder, [*hashes]):
+        problem = f"scenario {scenario} is in the working copy alone, not in the store"
+        problems.append(problem)
+    problems += _hash_problems(tier, reports, verdict)
+
+    warnings += _gaps(tier, reports, tolerated)
+    warnings += _manifest_differences(tier, manifest, inspections)
+    identity = "unknown"
+    if manifest:
+        identity = manifest.identity
     return VerificationResult(
         split=tier.split,
         size=tier.name,
         folder=tier.folder(folder),
         subsets=reports,
-        identity=manifest.identity if manifest else "unknown",
-        dataset_sha256=whole,
+        identity=identity,
+        dataset_sha256=data_set_digest,
         regenerated=regenerated,
         problems=tuple(problems),
-        warnings=(*warnings, *gaps, *_notes(tier, manifest, findings)),
+        warnings=tuple(warnings),
         must_be_complete=complete,
         verdict=verdict,
-        fix=remedy(tier, root=folder),
+        fix=suggest_repair(tier, root=folder),
     )
+
+
+def _read_manifest(size: Size, root: Path) -> tuple[Manifest | None, list[str]]:
+    """Return the manifest of a data set, and what a reader should know of it."""
+    try:
+        manifest = read_manifest(root, size.split, size.name, size.major)
+    except DataError as error:
+        return None, [str(error)]
+    if manifest is None:
+        return None, [f"there is no manifest: {suggest_repair(size, root=root)}"]
+
+    warnings = []
+    if manifest.identity == "tolerance":
+        warnings.append(
+            "identity: tolerance - a device wrote these files that does not "
+            "promise equal bits"
+        )
+    return manifest, warnings
+
+
+def _inspect_files(
+    size: Size,
+    root: Path,
+    ids: Sequence[int],
+    *,
+    manifest: Manifest | None,
+    meter: Meter,
+) -> dict[int, ScenarioInspection]:
+    """Hash every file; note which are right, so that scorer and generator need not hash
+    their values again.
+    """
+    meter.begin("hashing", total=len(ids), scenarios=len(ids))
+    inspections: dict[int, ScenarioInspection] = {}
+    file_digests: dict[Path, str] = {}
+    contents: dict[Path, str] = {}
+    for scenario in ids:
+        path = size.path(root, scenario)
+        # Before the values, so that a file that changes meanwhile fits no note.
+        with suppress(OSError):
+            file_digests[path] = file_sha256(path)
+        inspection = inspect_scenario(root, size, scenario, manifest=manifest)
+        inspections[scenario] = inspection
+        if inspection.content_sha256:
+            contents[path] = inspection.content_sha256
+        meter.count(1, scenarios=1)
+    record_hashes(size.folder(root), contents, file_digests)
+    return inspections
 
 
 def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
@@ -255,10 +265,14 @@ def evenly_spaced(ids: Sequence[int], count: int) -> tuple[int, ...]:
     count = min(count, len(ids))
     if count < 2:
         return tuple(ids[:count])
+
     last = len(ids) - 1
-    return tuple(
-        ids[(2 * k * last + count - 1) // (2 * (count - 1))] for k in range(count)
-    )
+    chosen = []
+    for k in range(count):
+        # k last / (count - 1), rounded to the nearest, halves up
+        position = (2 * k * last + count - 1) // (2 * (count - 1))
+        chosen.append(ids[position])
+    return tuple(chosen)
 
 
 def _regenerate(
@@ -279,90 +293,177 @@ def _regenerate(
                 size=size, scenarios=(scenario,), root=Path(folder), device=Device.CPU
             )
             name = f"{size.split} {size.name}, scenario {scenario}"
-            pool.submit(Task(name=name, function=simulate, arguments=(job,), cost=cost))
+            pool.submit(
+                WorkItem(name=name, function=simulate, arguments=(job,), cost=cost)
+            )
         for event in pool.events():
             if event.kind == "done":
-                hashes |= {
-                    outcome.scenario: outcome.content_sha256 for outcome in event.value
-                }
+                for simulated in event.value:
+                    hashes[simulated.scenario] = simulated.content_sha256
                 meter.count(scenarios=1)
+            elif event.kind == "progress":
+                meter.count(event.value)
             else:
-                meter.count(event.value if event.kind == "progress" else -event.value)
+                # lost with its worker: done in vain
+                meter.count(-event.value)
     return {scenario: hashes[scenario] for scenario in ids}
 
 
-def _likeness(size: Size, finding: Finding, content: str) -> str:
+def _compare_regenerated(
+    size: Size, inspection: ScenarioInspection, content: str
+) -> str:
     """Compare a scenario simulated anew with its file, else with datasets.yaml."""
-    if finding.content_sha256:
-        known = [finding.content_sha256]
-    else:
-        known = []
-    if finding.tolerated or not known:
-        known += filter(None, [recorded_hash(size, finding.scenario)])
-    if not known:
+    references = []
+    if inspection.content_sha256:
+        references.append(inspection.content_sha256)
+    if inspection.tolerated or not references:
+        recorded = recorded_hash(size, inspection.scenario)
+        if recorded:
+            references.append(recorded)
+    if not references:
         return "nothing to compare with"
-    if any(map(content.startswith, known)):
-        return "identical"
+    for reference in references:
+        if content.startswith(reference):
+            return "identical"
     return "different"
 
 
-def _reports(
-    root: Path, size: Size, findings: Mapping[int, Finding], digests: Mapping[str, str]
+def _subset_digests(size: Size, hashes: Mapping[int, str]) -> dict[str, str]:
+    """Return the hash of every subset whose files are all there and right."""
+    digests = {}
+    for name, members in size.subsets.items():
+        if hashes.keys() >= set(members):
+            digests[name] = subset_hash({i: hashes[i] for i in members})
+    return digests
+
+
+def _data_set_digest(size: Size, subset_digests: Mapping[str, str]) -> str | None:
+    """Return the hash of a data set; None while a subset that it covers has none."""
+    covered = {}
+    for name in HASHED_SUBSETS:
+        if name not in subset_digests:
+            return None
+        covered[name] = subset_digests[name]
+    return dataset_hash(size.split, size.name, size.major, covered)
+
+
+def _subset_reports(
+    root: Path, size: Size, inspections: Inspections, digests: Mapping[str, str]
 ) -> tuple[SubsetReport, ...]:
     extra = extra_files(root, size)
     reports = []
     for name, members in size.subsets.items():
-        held = {i: findings[i] for i in members if i in findings}
-        if held:
-            by_state = {
-                state: tuple(i for i, f in held.items() if f.state is state)
-                for state in State
-            }
-            reports.append(
-                SubsetReport(
-                    name=name,
-                    present=len(by_state[State.GOOD]),
-                    missing=by_state[State.MISSING],
-                    wrong=by_state[State.WRONG],
-                    extra=tuple(extra.get(name, ())),
-                    verdict=hash_verdict(
-                        size,
-                        digests.get(name),
-                        name,
-                        tolerated=any(f.tolerated for f in held.values()),
-                    ),
-                )
-            )
+        subset_inspections = [inspections[i] for i in members if i in inspections]
+        if not subset_inspections:
+            continue
+        is_tolerated = any(inspection.tolerated for inspection in subset_inspections)
+        verdict = hash_verdict(size, digests.get(name), name, tolerated=is_tolerated)
+        report = SubsetReport(
+            name=name,
+            present=len(_ids_in_state(subset_inspections, DataSetState.GOOD)),
+            missing=_ids_in_state(subset_inspections, DataSetState.MISSING),
+            wrong=_ids_in_state(subset_inspections, DataSetState.WRONG),
+            extra=tuple(extra.get(name, ())),
+            verdict=verdict,
+        )
+        reports.append(report)
     return tuple(reports)
 
 
-def _notes(
-    size: Size, manifest: Manifest | None, findings: Mapping[int, Finding]
+def _ids_in_state(
+    inspections: Sequence[ScenarioInspection], state: DataSetState
+) -> tuple[int, ...]:
+    return tuple(i.scenario for i in inspections if i.state is state)
+
+
+def _file_problems(inspections: Inspections) -> list[str]:
+    problems = []
+    for inspection in inspections.values():
+        if inspection.problem:
+            problems.append(inspection.problem)
+    return problems
+
+
+def _regeneration_problems(regenerated: Mapping[int, str]) -> list[str]:
+    problems = []
+    for scenario, verdict in regenerated.items():
+        if verdict == "different":
+            problems.append(f"scenario {scenario} differs when simulated anew")
+    return problems
+
+
+def _hash_problems(
+    size: Size, reports: Sequence[SubsetReport], verdict: str
+) -> list[str]:
+    """Return which hashes are not the recorded ones."""
+    wrong = unlike(size)
+    problems = []
+    for report in reports:
+        if report.verdict == wrong:
+            problems.append(f"{report.name}: its hash is {wrong}")
+    if verdict == wrong:
+        problems.append(f"the data set hash is {wrong}")
+    return problems
+
+
+def _gaps(
+    size: Size, reports: Sequence[SubsetReport], tolerated: Sequence[int]
+) -> list[str]:
+    """Return what is tolerated, missing, or there without a scenario."""
+    gaps = []
+    if tolerated:
+        gaps.append(f"scenarios {format_ids(tolerated)} have {other_bits(size)}")
+    for report in reports:
+        if report.missing:
+            gaps.append(f"{report.name} lacks {format_ids(report.missing)}")
+    for report in reports:
+        if report.extra:
+            names = ", ".join(report.extra)
+            gaps.append(f"{report.name} has files of no scenario: {names}")
+    return gaps
+
+
+def _manifest_differences(
+    size: Size, manifest: Manifest | None, inspections: Inspections
 ) -> list[str]:
     """Return how the manifest differs from files that are right, and from
     datasets.yaml.
     """
     if manifest is None:
         return []
-    entries = {entry.scenario: entry.content_sha256 for entry in manifest.files}
-    others = [
-        i
-        for i, f in findings.items()
-        if i in entries and f.content_sha256 not in (None, entries[i])
-    ]
-    if others:
-        notes = [f"the manifest has other hashes of {spell_ids(others)}"]
-    else:
-        notes = []
-    # What follows from the bits must be as recorded where all of them are.
-    if size.measured and manifest.complete and manifest.identity == "bitwise":
-        found = {**manifest.statistics, "twin floor": manifest.mean_twin_floor()}
-        known = {**size.measured.statistics, "twin floor": size.measured.twin_floor}
-        names = [*sorted((known.keys() | found.keys()) - {"twin floor"}), "twin floor"]
-        names = [name for name in names if found.get(name) != known.get(name)]
-        notes += (
-            [f"the manifest has another {', '.join(names)} than {record_of(size)}"]
-            if names
-            else []
-        )
-    return notes
+    differences = []
+    different_ids = []
+    for scenario, inspection in inspections.items():
+        entry = manifest.entry(scenario)
+        content = inspection.content_sha256
+        if entry and content and content != entry.content_sha256:
+            different_ids.append(scenario)
+    if different_ids:
+        listing = format_ids(different_ids)
+        differences.append(f"the manifest has other hashes of {listing}")
+
+    names = _different_statistics(size, manifest)
+    if names:
+        listing = ", ".join(names)
+        record = record_name(size)
+        differences.append(f"the manifest has another {listing} than {record}")
+    return differences
+
+
+def _different_statistics(size: Size, manifest: Manifest) -> list[str]:
+    """Return the names of recorded numbers of which the manifest has others.
+
+    They follow from the bits. So they must be as recorded where all bits are.
+    """
+    is_bitwise = manifest.complete and manifest.identity == "bitwise"
+    if size.measured is None or not is_bitwise:
+        return []
+    stated = manifest.statistics
+    recorded = size.measured.statistics
+    names = []
+    for name in sorted(stated.keys() | recorded.keys()):
+        if stated.get(name) != recorded.get(name):
+            names.append(name)
+    if manifest.mean_twin_floor() != size.measured.twin_floor:
+        names.append("twin_floor")
+    return names

@@ -39,9 +39,6 @@ Field = Callable[[Floats], Floats]
 MIRRORED_LAYER = 4.0
 """Depth of the layer that is mirrored at the walls, in spacings of the points."""
 
-EFFECTIVE_VISCOSITY = "effective_viscosity"
-"""Parameter of a size whose scenarios have no viscosity of their own [length^2/s]."""
-
 
 class Kind(enum.StrEnum):
     """How a prediction comes about."""
@@ -95,9 +92,9 @@ class Given:
         Where neither states one the fluid is inviscid: 0.
         """
         stated = self.parameters.get("viscosity")
-        if stated is None and EFFECTIVE_VISCOSITY in self.size.parameters:
-            stated = self.size.value(EFFECTIVE_VISCOSITY)
-        return float(str(stated or 0.0))
+        if stated is None:
+            return self.size.task.effective_viscosity or 0.0
+        return float(str(stated))
 
     @property
     def predicted_frames(self) -> range:

@@ -1,9 +1,8 @@
-"""Data sets in a store, which is any root that is a URL: ``s3://``, ``https://``,
-``file://`` and others.
+"""Data sets in a store: a root that is a URL, as ``s3://``, ``https://``, ``file://``.
 
 ``--root s3://bucket/prefix`` means a folder of the user's cache that holds copies of
 the store's objects, see :mod:`lagbench.data.layout`. *Fetching* moves bytes over a line
-(:mod:`.fetch`), *bringing* puts what is fetched and right into the working copy
-(:mod:`.copy`), a *publication* puts it back (:mod:`.publication`); :mod:`.objects`
-opens, lists and puts. docs/scaling.md has the rules.
+(:mod:`.fetch`) into the working copy (:mod:`.copy`), a *publication* puts them back
+(:mod:`.publication`); :mod:`.objects` opens, lists and puts. docs/scaling.md has the
+rules.
 """

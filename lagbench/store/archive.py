@@ -1,11 +1,10 @@
-"""A data set as one archive, named by its hash, as releases hold it: write one, and
-read it from a store.
+"""A data set as one archive of a release, named by its hash: write it, and fetch it.
 
     python -m lagbench.store.archive --split cavity --size mini --output dist
 
 writes ``dist/cavity-mini-<first 16 digits of the data set hash>.tar``: the manifest,
 then the scenario files in the order of their names, not compressed (they are already).
-The same files give the same bytes. What is read is checked as if it came file by file;
+The same files give the same bytes. Files from an archive are checked like single ones;
 a member that should not be there is an error.
 """
 
@@ -23,14 +22,28 @@ from pathlib import Path
 
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import MANIFEST_NAME
-from lagbench.data.local import locate, remedy
-from lagbench.data.manifest import MANIFEST_LIMIT, FileEntry, read_manifest
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import (
+    MANIFEST_LIMIT,
+    FileEntry,
+    Manifest,
+    read_manifest,
+)
 from lagbench.data.registry import Size
 from lagbench.data.scenario import check_scenario
 from lagbench.errors import DataError, LagbenchError
 
-from .copy import bring, parse_manifest, refuse_strangers
-from .fetch import BLOCK, Pace, Wanted, accept, insist, partial_name, received, saving
+from .copy import parse_manifest, refuse_foreign_hashes, update_working_copy
+from .fetch import (
+    BLOCK,
+    FetchRequest,
+    TransferRate,
+    accept,
+    partial_file_errors,
+    partial_name,
+    receive,
+    retry,
+)
 from .objects import (
     Answer,
     BrokenError,
@@ -42,19 +55,20 @@ from .objects import (
 )
 
 RELEASES = "https://lagbench.invalid/releases"
-"""Folder of the released archives; a placeholder as long as its host is .invalid (RFC
-2606).
+"""Folder of the released archives.
+
+It is a placeholder as long as its host is .invalid (RFC 2606).
 """
 
-# environment variable that names another such folder
 RELEASES_VARIABLE = "LAGBENCH_RELEASES"
-PATH = attrgetter("path")  # the order of scenario files in an archive
+"""Environment variable that names another such folder."""
+
+ARCHIVE_ORDER = attrgetter("path")
+"""Key of the order of scenario files in an archive."""
 
 
-def releases(size: Size) -> tuple[str, ...]:
-    """Return where a data set is released: one address, or none for local splits and
-    placeholders.
-    """
+def list_releases(size: Size) -> tuple[str, ...]:
+    """Return the addresses of releases: one; none for local splits and placeholders."""
     url = os.environ.get(RELEASES_VARIABLE) or RELEASES
     if size.simulated and ".invalid/" not in url:
         return (url,)
@@ -64,9 +78,9 @@ def releases(size: Size) -> tuple[str, ...]:
 def archive_name(size: Size) -> str:
     """Return the name of the archive of a data set whose hash is recorded."""
     if size.measured is None:
-        where = f"{size.split} {size.name}"
         raise DataError(
-            "a data set without a recorded hash has no archive", where=where
+            "a data set without a recorded hash has no archive",
+            where=f"{size.split} {size.name}",
         )
     return f"{size.split}-{size.name}-{size.measured.dataset_sha256[:16]}.tar"
 
@@ -78,242 +92,285 @@ def write_archive(
     output: str | Path,
     root: str | Path | None = None,
 ) -> Path:
-    """Write the archive of a complete data set into a folder, every file checked;
-    return its path.
+    """Write the archive of a complete data set, every file checked; return its path.
+
+    Args:
+        split: name of the split, or path of a local split's folder.
+        size: name of the size; the only one with data when None.
+        output: folder for the archive.
+        root: folder of all data sets.
+
+    Raises:
+        DataError: the data set is incomplete, damaged, or of another hash.
     """
-    tier, home, _ = locate(split, size, root=root)
+    tier, root_folder, _ = locate(split, size, root=root)
     target = Path(output) / archive_name(tier)
-    bring(tier, home, tier.scenarios)
-    folder = tier.folder(home)
-    manifest = read_manifest(home, tier.split, tier.name, tier.major)
-    if tier.measured:
-        recorded = tier.measured.dataset_sha256
-    else:
-        recorded = None
-    whole = manifest is not None and [
-        entry.scenario for entry in manifest.files
-    ] == list(tier.scenarios)
-    if manifest is None or not whole or manifest.dataset_sha256 != recorded:
-        raise DataError(
-            "the data set is not complete, or of another hash",
-            where=str(folder),
-            expected=f"data set hash {recorded}",
-            got=manifest.dataset_sha256 if manifest else "no manifest",
-            fix=remedy(tier),
-        )
-    files = sorted(manifest.files, key=PATH)
-    for entry in files:
+    update_working_copy(tier, root_folder, tier.scenarios)
+    manifest = _read_complete_manifest(tier, root_folder)
+
+    folder = tier.folder(root_folder)
+    names = [MANIFEST_NAME]
+    for entry in sorted(manifest.files, key=ARCHIVE_ORDER):
         check_scenario(folder / entry.path, entry.content_sha256)
+        names.append(entry.path)
     with (
-        atomic_path(target, option="--output") as beside,
-        tarfile.open(beside, "w", format=tarfile.USTAR_FORMAT) as tar,
+        atomic_path(target, option="--output") as temporary,
+        tarfile.open(temporary, "w", format=tarfile.USTAR_FORMAT) as archive,
     ):
-        for name in (MANIFEST_NAME, *(entry.path for entry in files)):
-            # A bare TarInfo has no owner, no time, and mode 644 whatever the file has.
+        for name in names:
+            # A bare TarInfo has no owner, no time, and mode 644 for any file.
             member = tarfile.TarInfo(name)
             with (folder / name).open("rb") as stream:
                 member.size = os.fstat(stream.fileno()).st_size
-                tar.addfile(member, stream)
+                archive.addfile(member, stream)
     return target
+
+
+def _read_complete_manifest(size: Size, root: Path) -> Manifest:
+    """Return the manifest of a data set with all scenarios and the recorded hash."""
+    manifest = read_manifest(root, size.split, size.name, size.major)
+    recorded_hash = None
+    if size.measured is not None:
+        recorded_hash = size.measured.dataset_sha256
+    dataset_hash = "no manifest"
+    if manifest is not None:
+        dataset_hash = str(manifest.dataset_sha256)
+        scenarios = [entry.scenario for entry in manifest.files]
+        is_complete = scenarios == list(size.scenarios)
+        if is_complete and manifest.dataset_sha256 == recorded_hash:
+            return manifest
+    raise DataError(
+        "the data set is not complete, or of another hash",
+        where=str(size.folder(root)),
+        expected=f"data set hash {recorded_hash}",
+        got=dataset_hash,
+        fix=suggest_repair(size),
+    )
 
 
 def fetch_archive(
     size: Size,
     url: str,
-    wanted: Mapping[int, Wanted],
+    requests: Mapping[int, FetchRequest],
     report: Callable[[int], None],
     *,
     limit: int,
-    remedy: str,
+    hint: str,
 ) -> Generator[FileEntry, None, None]:
-    """Fetch scenarios from the archive in a store; yield what its manifest says of each
-    as it is right.
+    """Fetch scenarios from the archive in a store; yield the entry of each right file.
 
-    Hold the lock of the data set. ``report`` is told the bytes that arrive. What is not
-    wanted is not asked for; no archive is longer than ``limit``. Files that were right
-    stay, whatever comes after.
+    Hold the lock of the data set. Other members are skipped. Right files stay, whatever
+    comes after.
+
+    Args:
+        size: the data set.
+        url: folder of the archive.
+        requests: files to fetch, by scenario id.
+        report: receives the number of bytes that arrived.
+        limit: most bytes of an archive.
+        hint: how the user mends a store with wrong data.
     """
     address = f"{url}/{archive_name(size)}"
-    missing = set(wanted)
-    with closing(_Stream(address, report, limit=limit, remedy=remedy)) as stream:
-        length = stream.member(MANIFEST_NAME)
-        if length > MANIFEST_LIMIT:
-            raise stream.refused(
-                WrongLengthError, "the manifest is too long", f"{MANIFEST_LIMIT} bytes"
-            )
-        manifest = parse_manifest(
-            size, stream.read(length), where=address, remedy=remedy
-        )
-        stream.skip(-length % tarfile.BLOCKSIZE)
-        ids = [entry.scenario for entry in manifest.files]
-        if sorted(ids) != list(size.scenarios):
-            other = ids
-        else:
-            other = []
-        if size.measured:
-            known = size.measured.scenario_sha256
-        else:
-            known = {}
-        other = other or [
-            e.scenario for e in manifest.files if not e.has_hash(known.get(e.scenario))
-        ]
-        refuse_strangers(manifest, other, where=address, remedy=remedy)
-        for entry in sorted(manifest.files, key=PATH):
+    missing = set(requests)
+    with closing(_Stream(address, report, limit=limit, hint=hint)) as stream:
+        manifest = _fetch_manifest(size, stream, address, hint)
+        for entry in sorted(manifest.files, key=ARCHIVE_ORDER):
             if not missing:
                 return
             padding = -entry.bytes % tarfile.BLOCKSIZE
             if entry.scenario not in missing:
                 stream.skip(tarfile.BLOCKSIZE + entry.bytes + padding)
                 continue
-            one = replace(
-                wanted[entry.scenario], url=address, file_sha256=entry.file_sha256
+            request = replace(
+                requests[entry.scenario], url=address, file_sha256=entry.file_sha256
             )
-            length = stream.member(entry.path)
-            if length != entry.bytes or length > one.limit:
-                what = f"{entry.path} has another length"
-                raise stream.refused(
-                    WrongLengthError, what, f"{min(entry.bytes, one.limit)} bytes"
-                )
-            partial = partial_name(one.target)
-            with saving(partial):
-                with partial.open("wb") as out:
-                    stream.copy(length, out.write)
-                accept(one)
+            _fetch_member(stream, entry, request)
             missing.remove(entry.scenario)
             yield entry
             stream.skip(padding)
         stream.end()
 
 
-class _Stream:
-    """The bytes of an archive in order, taken up where the line breaks.
+def _fetch_manifest(size: Size, stream: _Stream, address: str, hint: str) -> Manifest:
+    """Return the manifest, the first member; refuse one of another data set."""
+    length = stream.member(MANIFEST_NAME)
+    if length > MANIFEST_LIMIT:
+        raise stream.error(
+            WrongLengthError, "the manifest is too long", f"{MANIFEST_LIMIT} bytes"
+        )
+    manifest = parse_manifest(size, stream.read(length), where=address, hint=hint)
+    stream.skip(-length % tarfile.BLOCKSIZE)
 
-    What is skipped is not sent where the store knows ranges.
+    recorded_hashes: Mapping[int, str] = {}
+    if size.measured is not None:
+        recorded_hashes = size.measured.scenario_sha256
+    scenarios = []
+    foreign_scenarios = []
+    for entry in manifest.files:
+        scenarios.append(entry.scenario)
+        if not entry.has_hash(recorded_hashes.get(entry.scenario)):
+            foreign_scenarios.append(entry.scenario)
+    if sorted(scenarios) != list(size.scenarios):
+        foreign_scenarios = scenarios
+    refuse_foreign_hashes(manifest, foreign_scenarios, where=address, hint=hint)
+    return manifest
+
+
+def _fetch_member(stream: _Stream, entry: FileEntry, request: FetchRequest) -> None:
+    length = stream.member(entry.path)
+    if length != entry.bytes or length > request.limit:
+        raise stream.error(
+            WrongLengthError,
+            f"{entry.path} has another length",
+            f"{min(entry.bytes, request.limit)} bytes",
+        )
+    partial = partial_name(request.target)
+    with partial_file_errors(partial):
+        with partial.open("wb") as file:
+            stream.copy(length, file.write)
+        accept(request)
+
+
+class _Stream:
+    """The bytes of an archive in order; a broken connection is opened again.
+
+    Skipped bytes are not sent where the store knows ranges.
     """
 
     def __init__(
-        self, url: str, report: Callable[[int], None], *, limit: int, remedy: str
+        self, url: str, report: Callable[[int], None], *, limit: int, hint: str
     ) -> None:
         self._url = url
         self._report = report
         self._limit = limit
-        self._remedy = remedy
-        self._pace = Pace(url)
-        self._place = 0
-        self._ranges = True
+        self._hint = hint
+        self._rate = TransferRate(url)
+        self._position = 0
+        self._knows_ranges = True
         self._answer: Answer | None = None
         self._blocks: Iterator[bytes] = iter(())
-        self._rest = b""
+        self._unread = b""  # bytes that have arrived, from the present position on
 
-    def refused(
+    def error(
         self, kind: type[DataError], what: str, expected: object, got: object = None
     ) -> DataError:
-        """Return the error of a lie."""
-        return kind(what, where=self._url, expected=expected, got=got, fix=self._remedy)
+        """Return the error that the archive is wrong."""
+        return kind(what, where=self._url, expected=expected, got=got, fix=self._hint)
 
     def member(self, name: str) -> int:
-        """Read the header of the next member, which must be this file; return its
-        length.
+        """Read the header of the next member; return its length.
+
+        Raises:
+            DataError: the next member is not this file.
         """
         header = self.read(tarfile.BLOCKSIZE)
         try:
-            found = tarfile.TarInfo.frombuf(header, "ascii", "strict")
+            member = tarfile.TarInfo.frombuf(header, "ascii", "strict")
         except (tarfile.HeaderError, ValueError) as error:
-            raise self.refused(
+            raise self.error(
                 NotDataError, "a member has no header", name, error
             ) from None
-        if found.name != name or not found.isreg() or found.size < 0:
-            got = f"{found.name!a}, type {found.type!a}"
-            raise self.refused(
-                WrongContentError, "the archive holds another member", name, got
+        if member.name != name or not member.isreg() or member.size < 0:
+            raise self.error(
+                WrongContentError,
+                "the archive holds another member",
+                name,
+                f"{member.name!a}, type {member.type!a}",
             )
-        return found.size
+        return member.size
 
     def read(self, count: int) -> bytes:
-        """Return the next bytes, just so many."""
+        """Return the next bytes."""
         parts: list[bytes] = []
         self.copy(count, parts.append)
         return b"".join(parts)
 
     def copy(self, count: int, write: Callable[[bytes], object]) -> None:
-        """Give the next bytes, just so many, to a function."""
-        end = self._place + count
+        """Give the next bytes to a function."""
+        end = self._position + count
 
         def attempt() -> None:
-            while self._place < end:
-                block = self._next()
+            while self._position < end:
+                block = self._next_block()
                 if not block:
-                    got = f"{self._place} bytes"
-                    raise self.refused(
+                    raise self.error(
                         TruncatedError,
                         "an archive ends too early",
                         f"over {end - 1}",
-                        got,
+                        f"{self._position} bytes",
                     )
-                used = block[: end - self._place]
-                self._rest = block[end - self._place :]
-                self._place += len(used)
-                write(used)
+                needed_bytes = end - self._position
+                part = block[:needed_bytes]
+                self._unread = block[needed_bytes:]
+                self._position += len(part)
+                write(part)
 
-        insist(attempt, self._url, place=lambda: self._place)
+        retry(attempt, self._url, place=lambda: self._position)
 
     def skip(self, count: int) -> None:
         """Pass over bytes."""
-        if self._ranges and count > BLOCK:
+        if self._knows_ranges and count > BLOCK:
             self.close()
-            self._place += count
+            self._position += count
         else:
             self.copy(count, len)
 
     def end(self) -> None:
-        """See that nothing but zeros follows."""
-        while block := insist(self._next, self._url):
-            self._rest = b""
+        """Read to the end; refuse anything but zeros."""
+        block = retry(self._next_block, self._url)
+        while block:
+            self._unread = b""
             if any(block):
-                raise self.refused(
+                raise self.error(
                     WrongContentError, "the archive holds another member", "its end"
                 )
-            self._place += len(block)
+            self._position += len(block)
+            block = retry(self._next_block, self._url)
 
     def close(self) -> None:
-        """Let go of the line."""
+        """Close the connection."""
         if self._answer is not None:
             self._answer.close()
         self._answer = None
-        self._rest = b""
+        self._unread = b""
 
-    def _next(self) -> bytes:
-        """Return a block from the present place on, none at the end; the line may have
-        to be opened.
+    def _next_block(self) -> bytes:
+        """Return a block from the present position on; an empty one at the end.
+
+        The connection is opened where it is not open.
         """
-        if self._rest:
-            return self._rest
+        if self._unread:
+            return self._unread
         try:
             if self._answer is None:
-                self._answer = open_object(self._url, self._place, remedy=self._remedy)
-                behind = self._place - self._answer.start
-                self._ranges = behind == 0
-                self._blocks = received(
-                    self._answer,
-                    self._pace,
-                    limit=self._limit,
-                    begins=MANIFEST_NAME.encode() + b"\0",
-                    remedy=self._remedy,
-                )
-                while behind > 0:
-                    block = self._arrive()
-                    if not block:
-                        return b""
-                    self._rest = block[behind:]
-                    behind = behind - len(block)
-            return self._rest or self._arrive()
+                self._open()
+            return self._unread or self._receive_block()
         except BrokenError as broken:
             self.close()
             if broken.stale:
                 raise broken.error from None
             raise
 
-    def _arrive(self) -> bytes:
+    def _open(self) -> None:
+        """Open the connection and pass over bytes before the present position."""
+        self._answer = open_object(self._url, self._position, hint=self._hint)
+        bytes_before = self._position - self._answer.start
+        self._knows_ranges = bytes_before == 0
+        self._blocks = receive(
+            self._answer,
+            self._rate,
+            limit=self._limit,
+            begins=MANIFEST_NAME.encode() + b"\0",
+            hint=self._hint,
+        )
+        while bytes_before > 0:
+            block = self._receive_block()
+            if not block:
+                return
+            self._unread = block[bytes_before:]
+            bytes_before -= len(block)
+
+    def _receive_block(self) -> bytes:
         block = next(self._blocks, b"")
         self._report(len(block))
         return block
@@ -326,7 +383,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description=(__doc__ or "").partition("\n")[0],
     )
     parser.add_argument("--split", required=True, help="name of the split")
-    parser.add_argument("--size", help="name of the size; the only one that is there")
+    parser.add_argument("--size", help="name of the size; the only one with data")
     parser.add_argument("--root", help="folder of all data sets")
     parser.add_argument(
         "--output", type=Path, default=Path(), help="folder for the archive"

@@ -1,9 +1,8 @@
-"""Bring scenarios from elsewhere: from a store into its working copy, from other root
-folders into one.
+"""Fetch scenarios into a working copy from its store, or gather them from other roots.
 
-The store's manifest says what is there; each object is fetched and gets its name once
-its content hash is that of datasets.yaml, or of the manifest where datasets.yaml has
-none. What is in the working copy and is what the manifest says is not fetched again.
+The store's manifest names its objects. A fetched object gets its name once its content
+hash is that of datasets.yaml, or of the manifest where datasets.yaml has none.
+Files of the working copy that match the manifest are not fetched again.
 """
 
 from __future__ import annotations
@@ -22,25 +21,25 @@ from pydantic import ValidationError
 from lagbench.atomic import atomic_path
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, url_of
-from lagbench.data.local import remedy as remedy_of
+from lagbench.data.local import suggest_repair
 from lagbench.data.lock import dataset_lock
 from lagbench.data.manifest import (
     MANIFEST_LIMIT,
     FileEntry,
     Manifest,
-    merged,
-    note_entries,
+    merge_entries,
     read_manifest,
     read_or_empty,
+    record_entry_hashes,
     write_manifest,
 )
-from lagbench.data.registry import Size, spell_ids
+from lagbench.data.registry import Size, format_ids
 from lagbench.data.scenario import check_scenario
-from lagbench.errors import DataError, UsageError, nearest
+from lagbench.errors import DataError, UsageError, suggest_name
 from lagbench.work.machine import may_differ
 from lagbench.work.progress import watched
 
-from .fetch import Wanted, fetch_scenarios, fetch_text
+from .fetch import FetchRequest, fetch_scenarios, fetch_text
 from .objects import (
     HTTP,
     NotDataError,
@@ -51,143 +50,208 @@ from .objects import (
     check_bucket,
 )
 
-FRESH = 30.0  # how long a store's manifest is not asked for again by this process [s]
+FRESH_SECONDS = 30.0
+"""How long a store's manifest is not asked for again by this process [s]."""
 
-_asked: dict[str, tuple[float, Manifest | None]] = {}
-_written: set[Path] = set()
-_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+_manifests: dict[str, tuple[float, Manifest | None]] = {}
+"""Time of the last answer and manifest, by address."""
+
+_copies_of_writers: set[Path] = set()
+"""Working copies from which this process writes to a store."""
+
+_is_silent: ContextVar[bool] = ContextVar("is_silent", default=False)
 
 
-def address_of(size: Size, url: str, name: str) -> str:
+def object_address(size: Size, url: str, name: str) -> str:
     """Return the address of an object of a data set in a store."""
-    return f"{url}/{folder_of(size)}/{name}"
+    return f"{url}/{store_folder(size)}/{name}"
 
 
-def folder_of(size: Size) -> str:
+def store_folder(size: Size) -> str:
     """Return the folder of a data set below the root of a store."""
     return size.folder(Path()).as_posix()
 
 
-def _remedy(size: Size, url: str) -> str:
+def _store_hint(size: Size, url: str) -> str:
     if url.startswith(HTTP):
         return "tell whoever serves the address, or name another --root"
-    return f"lagbench generate --split {size.split} --size {size.name} --root {url} writes it anew"
+    command = f"lagbench generate --split {size.split} --size {size.name} --root {url}"
+    return f"{command} writes it anew"
 
 
-def parse_manifest(size: Size, text: bytes, *, where: str, remedy: str) -> Manifest:
-    """Return a store's manifest; what is none, or another data set's, is a
-    NotDataError.
+def parse_manifest(size: Size, text: bytes, *, where: str, hint: str) -> Manifest:
+    """Return a store's manifest.
+
+    Raises:
+        NotDataError: the text is no manifest, or that of another data set.
     """
     try:
-        found = Manifest.model_validate_json(text)
+        manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
-        what = "the store's manifest is none"
-        expected = "a manifest.json as lagbench generate writes it"
-        got = ascii(text[:80].decode("utf-8", "replace"))
         raise NotDataError(
-            what, where=where, expected=expected, got=got, fix=remedy
+            "the store's manifest is none",
+            where=where,
+            expected="a manifest.json as lagbench generate writes it",
+            got=ascii(text[:80].decode("utf-8", "replace")),
+            fix=hint,
         ) from error
-    if not found.is_of(size.split, size.name, size.major):
+    if not manifest.is_of(size.split, size.name, size.major):
+        names = f"{manifest.split} {manifest.size}, version {manifest.version}"
         raise NotDataError(
             "the store's manifest is of another data set",
             where=where,
             expected=f"{size.split} {size.name}, version {size.major}",
-            got=ascii(f"{found.split} {found.size}, version {found.version}"[:200]),
-            fix=remedy,
+            got=ascii(names[:200]),
+            fix=hint,
         )
-    return found
+    return manifest
 
 
-def refuse_strangers(
-    found: Manifest, strangers: Collection[int], *, where: str, remedy: str
+def refuse_foreign_hashes(
+    manifest: Manifest, foreign_scenarios: Collection[int], *, where: str, hint: str
 ) -> None:
     """Refuse a store whose manifest has other content hashes than datasets.yaml."""
-    if strangers:
+    if foreign_scenarios:
         raise WrongContentError(
             "the store holds another data set",
-            where=f"{where}, scenarios {spell_ids(strangers)}",
+            where=f"{where}, scenarios {format_ids(foreign_scenarios)}",
             expected="the content hashes of datasets.yaml",
-            got=f"version {found.version}, data set hash {found.dataset_sha256}",
-            fix=remedy,
+            got=f"version {manifest.version}, data set hash {manifest.dataset_sha256}",
+            fix=hint,
         )
 
 
 def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, Path]:
-    """Return the files of subsets by id, brought from the store that a root is a copy
-    of; all are there.
+    """Return the files of subsets by id, fetched where the root is a working copy.
+
+    Raises:
+        UsageError: unknown subset.
+        DataError: scenarios are missing.
     """
+    paths = {}
     for subset in subsets:
         if not isinstance(subset, str) or subset not in size.subsets:
-            where = f"{size.split} {size.name}"
             raise UsageError(
                 f"no subset {subset!r}",
-                where=where,
-                fix=nearest(str(subset), size.subsets),
+                where=f"{size.split} {size.name}",
+                fix=suggest_name(str(subset), size.subsets),
             )
-    paths = {i: size.path(root, i) for subset in subsets for i in size.subsets[subset]}
-    bring(size, root, paths)
-    missing = [i for i, path in paths.items() if not path.is_file()]
+        for scenario in size.subsets[subset]:
+            paths[scenario] = size.path(root, scenario)
+    update_working_copy(size, root, paths)
+
+    missing = [scenario for scenario, path in paths.items() if not path.is_file()]
     if missing:
-        lacking = ",".join(
-            subset
-            for subset in subsets
-            if not set(missing).isdisjoint(size.subsets[subset])
+        incomplete_subsets = []
+        for subset in subsets:
+            if not set(missing).isdisjoint(size.subsets[subset]):
+                incomplete_subsets.append(subset)
+        names = ",".join(incomplete_subsets)
+        raise DataError(
+            f"{len(missing)} of {len(paths)} scenarios are not there",
+            where=str(size.folder(root)),
+            got=f"missing: {format_ids(missing)} of {names}",
+            fix=suggest_repair(size, f"--subset {names}", root=root),
         )
-        what = f"{len(missing)} of {len(paths)} scenarios are not there"
-        got = spell_ids(missing)
-        where = str(size.folder(root))
-        fix = remedy_of(size, f"--subset {lacking}", root=root)
-        raise DataError(what, where=where, got=f"missing: {got} of {lacking}", fix=fix)
     return paths
 
 
-def bring(
+# --- the working copy of a store ------------------------------------------------------
+
+
+def update_working_copy(
     size: Size, root: Path, scenarios: Iterable[int] = (), *, thoroughly: bool = False
 ) -> bool:
-    """Bring manifest and some scenarios where the root is a store's working copy; say
-    whether any came.
+    """Fetch the manifest and some scenarios, where the root is a working copy.
 
-    A scenario that the store does not have is left to the caller, who misses its file.
-    ``thoroughly`` hashes files that are there, and does not only look at their lengths,
-    and looks whether the store has all that its manifest names. Lies of the store are
-    DataErrors, its silence is a WorkFailedError.
+    The caller has to miss the file of a scenario that the store does not have.
+
+    Args:
+        size: the data set.
+        root: root folder; for a plain folder nothing happens.
+        scenarios: scenarios to fetch.
+        thoroughly: hash files of the copy, and do not only compare their lengths; check
+            that the store has all objects of its manifest.
+
+    Returns:
+        Whether the copy has changed.
+
+    Raises:
+        DataError: the store holds wrong data.
+        WorkFailedError: the store does not answer.
     """
     url = url_of(root)
     scenarios = tuple(scenarios)
-    if url is None or root in _written:
+    if url is None or root in _copies_of_writers:
         return False
-    found = remote_manifest(size, url)
-    if found is None or any(found.entry(i) is None for i in scenarios):
-        found = remote_manifest(size, url, fresh=0.0)  # it may have come just now
-    if found is None:
+    manifest = _remote_manifest_with(size, url, scenarios)
+    if manifest is None:
         return False
-    where = address_of(size, url, MANIFEST_NAME)
-    if thoroughly and not url.startswith(HTTP):  # which lists nothing
-        there = Objects(url, folder_of(size)).sizes()
-        wrong = [
-            entry.scenario
-            for entry in found.files
-            if there.get(entry.path) != entry.bytes
-        ]
-        if wrong:
-            what = "the store's manifest names objects that are not there, or of another length"
-            where = f"{where}, scenarios {spell_ids(wrong)}"
-            raise DataError(what, where=where, fix=_remedy(size, url))
-    named = [e for i in scenarios if (e := found.entry(i))]
-    strangers = [e.scenario for e in named if not is_right(e, size, found)]
-    refuse_strangers(found, strangers, where=where, remedy=_remedy(size, url))
-    old = read_or_empty(size, root)
-    lacking = [
-        e for e in named if not is_here(e, size, root, None if thoroughly else old)
-    ]
-    if not lacking and with_local(size, root, found) == old:
+    # A store that answers HTTP lists nothing.
+    if thoroughly and not url.startswith(HTTP):
+        _check_objects(size, url, manifest)
+
+    entries = []
+    foreign_scenarios = []
+    for scenario in scenarios:
+        entry = manifest.entry(scenario)
+        if entry is not None:
+            entries.append(entry)
+            if not matches_registry(entry, size, manifest):
+                foreign_scenarios.append(scenario)
+    refuse_foreign_hashes(
+        manifest,
+        foreign_scenarios,
+        where=object_address(size, url, MANIFEST_NAME),
+        hint=_store_hint(size, url),
+    )
+
+    local_manifest = read_or_empty(size, root)
+    trusted = None if thoroughly else local_manifest
+    lacking = _list_lacking(entries, size, root, trusted)
+    if not lacking and add_local_entries(size, root, manifest) == local_manifest:
         return False
     with dataset_lock(root, size.split, size.name, size.major):
-        fetch_entries(
-            size, root, url, [e for e in lacking if not is_here(e, size, root)]
-        )
-        write_manifest(root, with_local(size, root, found))
+        # Another process may have fetched some meanwhile.
+        fetch_entries(size, root, url, _list_lacking(lacking, size, root))
+        write_manifest(root, add_local_entries(size, root, manifest))
     return True
+
+
+def _remote_manifest_with(
+    size: Size, url: str, scenarios: Collection[int]
+) -> Manifest | None:
+    """Return a store's manifest, asked for again where it lacks a scenario."""
+    manifest = remote_manifest(size, url)
+    if manifest is not None and not _list_missing(manifest, scenarios):
+        return manifest
+    # A writer may have put it just now.
+    return remote_manifest(size, url, fresh=0.0)
+
+
+def _check_objects(size: Size, url: str, manifest: Manifest) -> None:
+    """Refuse a store that lacks an object of its manifest."""
+    lengths = Objects(url, store_folder(size)).sizes()
+    wrong_scenarios = []
+    for entry in manifest.files:
+        if lengths.get(entry.path) != entry.bytes:
+            wrong_scenarios.append(entry.scenario)
+    if wrong_scenarios:
+        address = object_address(size, url, MANIFEST_NAME)
+        raise DataError(
+            "the store's manifest names objects that it lacks, or of another length",
+            where=f"{address}, scenarios {format_ids(wrong_scenarios)}",
+            fix=_store_hint(size, url),
+        )
+
+
+def _list_lacking(
+    entries: Iterable[FileEntry],
+    size: Size,
+    root: Path,
+    trusted: Manifest | None = None,
+) -> list[FileEntry]:
+    return [entry for entry in entries if not is_in_copy(entry, size, root, trusted)]
 
 
 def remote_manifest(
@@ -195,258 +259,318 @@ def remote_manifest(
 ) -> Manifest | None:
     """Return the manifest of a data set in a store; None where there is none.
 
-    An earlier answer of this process counts while it is no older than ``fresh`` [s].
+    Args:
+        size: the data set.
+        url: root of the store.
+        fresh: age up to which an earlier answer counts [s]; FRESH_SECONDS by default.
     """
-    place = address_of(size, url, MANIFEST_NAME)
-    remedy = _remedy(size, url)
-    when, known = _asked.get(place, (-1e9, None))
-    if time.monotonic() - when < (FRESH if fresh is None else fresh):
-        return known
+    if fresh is None:
+        fresh = FRESH_SECONDS
+    address = object_address(size, url, MANIFEST_NAME)
+    if address in _manifests:
+        answered, manifest = _manifests[address]
+        if time.monotonic() - answered < fresh:
+            return manifest
+    hint = _store_hint(size, url)
+    manifest = None
     try:
-        text = fetch_text(place, limit=MANIFEST_LIMIT, remedy=remedy)
+        text = fetch_text(address, limit=MANIFEST_LIMIT, hint=hint)
     except NotInStoreError:
         check_bucket(url)
-        found = None
     else:
-        found = parse_manifest(size, text, where=place, remedy=remedy)
-    _asked[place] = (time.monotonic(), found)
-    return found
+        manifest = parse_manifest(size, text, where=address, hint=hint)
+    _manifests[address] = (time.monotonic(), manifest)
+    return manifest
 
 
-def unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
-    """Return scenarios that the manifest of a working copy's store lacks; a plain
-    folder has no store.
-    """
+def list_unstored(size: Size, root: Path, scenarios: Iterable[int]) -> tuple[int, ...]:
+    """Return the scenarios that a working copy's store lacks; none for a folder."""
     url = url_of(root)
     if url is None:
         return ()
-    found = remote_manifest(size, url)
-    return tuple(i for i in scenarios if found is None or found.entry(i) is None)
+    manifest = remote_manifest(size, url)
+    if manifest is None:
+        return tuple(scenarios)
+    return _list_missing(manifest, scenarios)
 
 
-def is_right(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
-    """Return whether an entry of a manifest is what datasets.yaml means.
+def _list_missing(manifest: Manifest, scenarios: Iterable[int]) -> tuple[int, ...]:
+    """Return the scenarios without an entry in a manifest."""
+    return tuple(scenario for scenario in scenarios if manifest.entry(scenario) is None)
+
+
+def matches_registry(entry: FileEntry, size: Size, manifest: Manifest) -> bool:
+    """Return whether an entry of a manifest has the hash of datasets.yaml.
 
     A file of a machine that promises no equal bits may differ, as it may in a local
     folder.
     """
-    if size.measured is None or entry.scenario not in size.scenarios:
-        return entry.scenario in size.scenarios
-    return entry.has_hash(size.measured.scenario_sha256.get(entry.scenario)) or (
-        manifest.identity == "tolerance"
-        and may_differ(entry.device, manifest.environments)
-    )
+    if entry.scenario not in size.scenarios:
+        return False
+    if size.measured is None:
+        return True
+    if entry.has_hash(size.measured.scenario_sha256.get(entry.scenario)):
+        return True
+    is_tolerant = manifest.identity == "tolerance"
+    return is_tolerant and may_differ(entry.device, manifest.environments)
 
 
-def with_local(size: Size, root: Path, found: Manifest) -> Manifest:
-    """Return the store's manifest with what only the working copy holds."""
+def add_local_entries(size: Size, root: Path, manifest: Manifest) -> Manifest:
+    """Return the store's manifest with the entries that only the working copy has."""
     folder = size.folder(root)
-    local = read_or_empty(size, root)
-    ours = [
-        e
-        for e in local.files
-        if found.entry(e.scenario) is None and is_right(e, size, local)
-    ]
-    return join(
-        size, found, local, [entry for entry in ours if (folder / entry.path).is_file()]
-    )
+    local_manifest = read_or_empty(size, root)
+    local_entries = []
+    for entry in local_manifest.files:
+        if manifest.entry(entry.scenario) is not None:
+            continue
+        is_right = matches_registry(entry, size, local_manifest)
+        if is_right and (folder / entry.path).is_file():
+            local_entries.append(entry)
+    return join_manifests(size, manifest, local_manifest, local_entries)
 
 
-def join(
+def join_manifests(
     size: Size, base: Manifest, other: Manifest, files: Collection[FileEntry]
 ) -> Manifest:
-    """Return a manifest with entries of another, and its machines and statistics as far
-    as they hold.
+    """Return a manifest with entries, machines and statistics of another.
+
+    Args:
+        size: the data set.
+        base: the manifest.
+        other: the other one; its statistics count where both have the same train.
+        files: entries to take from the other one; none leaves the base as it is.
     """
     if not files:
         return base
-    machines = [
-        *base.environments,
-        *(e for e in other.environments if e not in base.environments),
-    ]
-    joined = merged(
-        size, base.model_copy(update={"environments": tuple(machines)}), files
-    )
-    if joined.statistics or joined.subset_sha256.get(
+    environments = list(base.environments)
+    for environment in other.environments:
+        if environment not in base.environments:
+            environments.append(environment)
+    widened = base.model_copy(update={"environments": tuple(environments)})
+    joined = merge_entries(size, widened, files)
+    has_same_train = joined.subset_sha256.get("train") == other.subset_sha256.get(
         "train"
-    ) != other.subset_sha256.get("train"):
+    )
+    if joined.statistics or not has_same_train:
         return joined
     return joined.model_copy(update={"statistics": other.statistics})
 
 
-def is_here(
+def is_in_copy(
     entry: FileEntry, size: Size, root: Path, trusted: Manifest | None = None
 ) -> bool:
-    """Return whether the working copy holds what an entry describes; what is trusted is
-    not hashed.
+    """Return whether the working copy holds the file of an entry.
+
+    The bytes are hashed, unless the trusted manifest has the same entry.
     """
     path = size.folder(root) / entry.path
     if not path.is_file() or path.stat().st_size != entry.bytes:
         return False
-    if trusted:
-        known = trusted.entry(entry.scenario)
-    else:
-        known = None
-    return (known is not None and known.file_sha256 == entry.file_sha256) or (
-        file_sha256(path) == entry.file_sha256
-    )
+    if trusted is not None:
+        trusted_entry = trusted.entry(entry.scenario)
+        if trusted_entry is not None and trusted_entry.file_sha256 == entry.file_sha256:
+            return True
+    return file_sha256(path) == entry.file_sha256
 
 
 def fetch_entries(
     size: Size, root: Path, url: str, entries: Collection[FileEntry]
 ) -> None:
-    """Fetch objects into the working copy, whose lock is held; each appears whole and
-    right.
+    """Fetch objects into the working copy; each appears whole and right.
+
+    Hold the lock of the working copy.
+
+    Raises:
+        DataError: the store holds wrong data.
+        WorkFailedError: the store does not answer, or the disk is full.
     """
     if not entries:
         return
+    _check_entry_lengths(size, url, entries)
     folder = size.folder(root)
-    too_long = [e.scenario for e in entries if e.bytes > size.longest_file(e.scenario)]
-    if too_long:
-        raise WrongLengthError(
-            "the store's manifest names longer files than there can be",
-            where=f"{address_of(size, url, MANIFEST_NAME)}, scenarios "
-            f"{spell_ids(too_long)}",
-            expected=f"at most {size.longest_file(too_long[0])} bytes",
-            got=next(entry.bytes for entry in entries if entry.scenario == too_long[0]),
-            fix=_remedy(size, url),
-        )
-    wanted = {
-        entry.scenario: Wanted(
-            url=address_of(size, url, entry.path),
+    requests = {}
+    for entry in entries:
+        requests[entry.scenario] = FetchRequest(
+            url=object_address(size, url, entry.path),
             target=folder / entry.path,
             limit=entry.bytes,
             length=entry.bytes,
             file_sha256=entry.file_sha256,
             content_sha256=entry.content_sha256,
-            remedy=_remedy(size, url),
+            hint=_store_hint(size, url),
         )
-        for entry in entries
-    }
+    total_bytes = sum(entry.bytes for entry in entries)
     with (
-        _Ticker(url, len(entries), sum(entry.bytes for entry in entries)) as told,
-        contextlib.closing(fetch_scenarios(wanted, told.count)) as arrivals,
+        _TransferDisplay(url, len(entries), total_bytes) as display,
+        contextlib.closing(fetch_scenarios(requests, display.count)) as arrivals,
     ):
-        for _, absent in arrivals:
-            if absent is not None:
-                raise absent
-            told.finished += 1
+        for _, error in arrivals:
+            if error is not None:
+                raise error
+            display.finished_objects += 1
+
+
+def _check_entry_lengths(size: Size, url: str, entries: Iterable[FileEntry]) -> None:
+    """Refuse a manifest that names longer files than there can be."""
+    too_long = []
+    for entry in entries:
+        if entry.bytes > size.longest_file(entry.scenario):
+            too_long.append(entry)
+    if too_long:
+        ids = format_ids(entry.scenario for entry in too_long)
+        raise WrongLengthError(
+            "the store's manifest names longer files than there can be",
+            where=f"{object_address(size, url, MANIFEST_NAME)}, scenarios {ids}",
+            expected=f"at most {size.longest_file(too_long[0].scenario)} bytes",
+            got=too_long[0].bytes,
+            fix=_store_hint(size, url),
+        )
+
+
+# --- other root folders ---------------------------------------------------------------
 
 
 def gather(size: Size, root: Path, source: Path, manifest: Manifest) -> Manifest:
-    """Take over what another root folder has finished and this one's manifest does not
-    hold; return both's.
+    """Take over finished scenarios of another root folder; return the joint manifest.
 
     Each job of an array generates some scenarios into a root folder of its own. The
-    whole is then what one call would have left.
+    result is what one call would have left.
+
+    Args:
+        size: the data set.
+        root: root folder to take them to.
+        source: the other root folder.
+        manifest: manifest of the data set in the root folder.
+
+    Raises:
+        UsageError: the source has no such data set, or is the root folder.
+        DataError: a file of the source is damaged.
     """
-    there = size.folder(source)
-    here = size.folder(root)
-    found = _gathered(size, root, source)
-    taken = []
-    new = []
-    for entry in found.files:
-        old = manifest.entry(entry.scenario)
-        if old is None or (
-            not old.twin_floor and old.content_sha256 == entry.content_sha256
-        ):
-            taken.append(entry)
-            if (here / entry.path).exists():
-                continue
-            check_scenario(there / entry.path, entry.content_sha256)
-            new.append(entry)
-            with atomic_path(here / entry.path) as temporary:
-                try:  # files are only ever replaced, so a shared one cannot change
-                    os.link((there / entry.path).resolve(), temporary)
-                except OSError:
-                    shutil.copyfile(there / entry.path, temporary)
-    note_entries(here, new)
-    for environment in found.environments:
-        manifest = merged(size, manifest, environment=environment)
-    return merged(size, manifest, taken)
+    source_folder = size.folder(source)
+    target_folder = size.folder(root)
+    source_manifest = _read_source_manifest(size, root, source)
+    taken_entries = []
+    new_entries = []
+    for entry in source_manifest.files:
+        if not _adds_to(manifest.entry(entry.scenario), entry):
+            continue
+        taken_entries.append(entry)
+        target = target_folder / entry.path
+        if not target.exists():
+            check_scenario(source_folder / entry.path, entry.content_sha256)
+            new_entries.append(entry)
+            _link_or_copy(source_folder / entry.path, target)
+    record_entry_hashes(target_folder, new_entries)
+    for environment in source_manifest.environments:
+        manifest = merge_entries(size, manifest, environment=environment)
+    return merge_entries(size, manifest, taken_entries)
 
 
-def gatherable(size: Size, root: Path, source: Path) -> tuple[int, ...]:
-    """Return the scenarios that :func:`gather` would bring: finished there, and not
-    here at all.
-    """
-    found = _gathered(size, root, source)
-    known = read_or_empty(size, root)
-    there = size.folder(source)
-    here = size.folder(root)
-    return tuple(
-        entry.scenario
-        for entry in found.files
-        if known.entry(entry.scenario) is None
-        and (there / entry.path).is_file()
-        and not (here / entry.path).exists()
+def _adds_to(old_entry: FileEntry | None, entry: FileEntry) -> bool:
+    """Tell whether an entry is new, or may add a predictability limit to an old one."""
+    if old_entry is None:
+        return True
+    is_same_content = old_entry.content_sha256 == entry.content_sha256
+    return is_same_content and not old_entry.twin_floor
+
+
+def _link_or_copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        # Files are only ever replaced, so a shared one cannot change.
+        try:
+            os.link(source.resolve(), temporary)
+        except OSError:
+            shutil.copyfile(source, temporary)
+
+
+def list_gatherable(size: Size, root: Path, source: Path) -> tuple[int, ...]:
+    """Return the scenarios that :func:`gather` would add and copy."""
+    source_manifest = _read_source_manifest(size, root, source)
+    manifest = read_or_empty(size, root)
+    source_folder = size.folder(source)
+    target_folder = size.folder(root)
+    gatherable = []
+    for entry in source_manifest.files:
+        is_new = manifest.entry(entry.scenario) is None
+        has_source = (source_folder / entry.path).is_file()
+        if is_new and has_source and not (target_folder / entry.path).exists():
+            gatherable.append(entry.scenario)
+    return tuple(gatherable)
+
+
+def _read_source_manifest(size: Size, root: Path, source: Path) -> Manifest:
+    manifest = read_manifest(source, size.split, size.name, size.major)
+    is_root = size.folder(source).resolve() == size.folder(root).resolve()
+    if manifest is not None and not is_root:
+        return manifest
+    got = "no manifest of that data set"
+    if manifest is not None:
+        got = "the folder to write to"
+    raise UsageError(
+        "nothing can be gathered from a folder",
+        where=str(source),
+        expected=f"a root folder with {size.split} {size.name} of another call of "
+        f"lagbench generate",
+        got=got,
     )
 
 
-def _gathered(size: Size, root: Path, source: Path) -> Manifest:
-    found = read_manifest(source, size.split, size.name, size.major)
-    if found is None or size.folder(source).resolve() == size.folder(root).resolve():
-        raise UsageError(
-            "nothing can be gathered from a folder",
-            where=str(source),
-            expected=f"a root folder with {size.split} {size.name} of another call of "
-            f"lagbench generate",
-            got="the folder to write to" if found else "no manifest of that data set",
-        )
-    return found
+# --- fetching, as others see it -------------------------------------------------------
 
 
 @contextlib.contextmanager
-def writing(root: Path) -> Iterator[None]:
-    """Bring nothing into a working copy from which this process writes to the store."""
-    _written.add(root)
+def suspend_fetching(root: Path) -> Iterator[None]:
+    """Fetch nothing into a working copy from which this process writes to the store."""
+    _copies_of_writers.add(root)
     try:
         yield
     finally:
-        _written.discard(root)
-        _asked.clear()
+        _copies_of_writers.discard(root)
+        _manifests.clear()
 
 
 @contextlib.contextmanager
-def quietly() -> Iterator[None]:
-    """Say nothing on stderr about what is fetched."""
-    token = _quiet.set(True)
+def silence_fetching() -> Iterator[None]:
+    """Print nothing on stderr about transfers."""
+    token = _is_silent.set(True)
     try:
         yield
     finally:
-        _quiet.reset(token)
+        _is_silent.reset(token)
 
 
-class _Ticker:
-    """Tells on stderr how much has been fetched, where a person watches."""
+class _TransferDisplay:
+    """Prints on a terminal how much has been fetched."""
 
-    def __init__(self, url: str, objects: int, length: int) -> None:
+    def __init__(self, url: str, object_count: int, total_bytes: int) -> None:
         self._url = url
-        self._objects = objects
-        self._length = length
-        self.finished = self._arrived = 0
-        self._last = 0.0
-        self._watched = watched() and not _quiet.get()
+        self._object_count = object_count
+        self._total_bytes = total_bytes
+        self.finished_objects = 0
+        self._arrived_bytes = 0
+        self._last_print = 0.0
+        self._is_visible = watched() and not _is_silent.get()
 
-    def __enter__(self) -> _Ticker:
-        self._tell()
+    def __enter__(self) -> _TransferDisplay:
+        self._print()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._tell(end="\n")
+        self._print(end="\n")
 
-    def count(self, arrived: int) -> None:
+    def count(self, byte_count: int) -> None:
         """Count bytes."""
-        self._arrived += arrived
-        if time.monotonic() - self._last > 0.2:
-            self._tell()
+        self._arrived_bytes += byte_count
+        if time.monotonic() - self._last_print > 0.2:
+            self._print()
 
-    def _tell(self, end: str = "") -> None:
-        self._last = time.monotonic()
-        if self._watched:
-            files = f"{self.finished} of {self._objects} files"
-            share = f"{self._arrived / 1e6:.1f} of {self._length / 1e6:.1f} MB"
-            sys.stderr.write(
-                f"\rlagbench: fetching from {self._url}: {files}, {share} {end}"
-            )
-            sys.stderr.flush()
+    def _print(self, end: str = "") -> None:
+        self._last_print = time.monotonic()
+        if not self._is_visible:
+            return
+        files = f"{self.finished_objects} of {self._object_count} files"
+        arrived = f"{self._arrived_bytes / 1e6:.1f}"
+        megabytes = f"{arrived} of {self._total_bytes / 1e6:.1f} MB"
+        text = f"lagbench: fetching from {self._url}: {files}, {megabytes}"
+        sys.stderr.write(f"\r{text} {end}")
+        sys.stderr.flush()

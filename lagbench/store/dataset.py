@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lagbench.data import registry
-from lagbench.data.local import locate, remedy
-from lagbench.data.scenario import damaged
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.scenario import damage_error
 from lagbench.errors import DataError
 
 if TYPE_CHECKING:
@@ -19,9 +19,11 @@ if TYPE_CHECKING:
     from lagbench.data.manifest import Manifest
 
 
-# Dask reads position and velocity in chunks of about this size [bytes]
 CHUNK_BYTES = 4 << 20
-PADDING = -1  # material of particles that a scenario does not have
+"""Dask reads position and velocity in chunks of about this size [bytes]."""
+
+PADDING = -1
+"""Material of particles that a scenario does not have."""
 
 
 def list_splits() -> tuple[str, ...]:
@@ -36,24 +38,27 @@ def load_manifest(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Raises:
         UsageError: unknown split or size.
         DataError: nothing is generated, or the manifest is damaged.
     """
+    # Listing the splits needs neither h5py nor the stores.
     from lagbench.data.manifest import read_manifest
 
-    from .copy import bring
+    from .copy import update_working_copy
 
-    entry, folder, _ = locate(split, size, root=root)
-    bring(entry, folder)
-    manifest = read_manifest(folder, entry.split, entry.name, entry.major)
+    tier, root_folder, _ = locate(split, size, root=root)
+    update_working_copy(tier, root_folder)
+    manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
     if manifest is None:
-        where = str(entry.folder(folder))
-        fix = remedy(entry, root=folder)
-        raise DataError("the data set has no manifest", where=where, fix=fix)
+        raise DataError(
+            "the data set has no manifest",
+            where=str(tier.folder(root_folder)),
+            fix=suggest_repair(tier, root=root_folder),
+        )
     return manifest
 
 
@@ -69,7 +74,7 @@ def open_split(
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:
@@ -86,40 +91,42 @@ def open_split(
     """
     from .copy import scenario_files
 
-    entry, folder, _ = locate(split, size, root=root)
-    paths = scenario_files(entry, folder, (subset,))
-    fix = remedy(entry, root=folder)
-    # What stays open after an error is closed by whichever thread collects garbage.
-    with ExitStack() as opened:
-        scenarios = [
-            opened.enter_context(_open_scenario(path, entry.key(i), fix))
-            for i, path in paths.items()
-        ]
-        joined = _joined(scenarios, list(paths))
-        # local splits are found by it
-        joined.encoding["source"] = str(next(iter(paths.values())).absolute())
-        joined.set_close(opened.pop_all().close)
+    tier, root_folder, _ = locate(split, size, root=root)
+    paths = scenario_files(tier, root_folder, (subset,))
+    hint = suggest_repair(tier, root=root_folder)
+    # Files left open after an error would be closed by the garbage collector, in any
+    # thread.
+    with ExitStack() as open_files:
+        scenarios = []
+        for scenario, path in paths.items():
+            file = _open_scenario(path, tier.key(scenario), hint)
+            scenarios.append(open_files.enter_context(file))
+        joined = _join_scenarios(scenarios, list(paths))
+        # Local splits are recognised by it.
+        first_path = next(iter(paths.values()))
+        joined.encoding["source"] = str(first_path.absolute())
+        joined.set_close(open_files.pop_all().close)
     return joined
 
 
-def _joined(scenarios: Sequence[xr.Dataset], numbers: Sequence[int]) -> xr.Dataset:
-    """Return scenarios along a new first dimension; those of unequal lengths are
-    padded.
-    """
+def _join_scenarios(
+    scenarios: Sequence[xr.Dataset], numbers: Sequence[int]
+) -> xr.Dataset:
+    """Return scenarios along a new first dimension, padded to equal lengths."""
     import xarray as xr
 
     ids = xr.Variable(
         "scenario", list(numbers), {"long_name": "scenario id", "units": "1"}
     )
-    frames = [scenario.sizes["frame"] for scenario in scenarios]
-    particles = [scenario.sizes["particle"] for scenario in scenarios]
-    longest = scenarios[frames.index(max(frames))]
-    fullest = scenarios[particles.index(max(particles))]
-    labels = {"frame": longest["frame"], "particle": fullest["particle"]}
-    padded = [
-        scenario.drop_vars("time").reindex(labels, fill_value={"material": PADDING})
-        for scenario in scenarios
-    ]
+    frame_counts = [scenario.sizes["frame"] for scenario in scenarios]
+    particle_counts = [scenario.sizes["particle"] for scenario in scenarios]
+    longest = scenarios[frame_counts.index(max(frame_counts))]
+    largest = scenarios[particle_counts.index(max(particle_counts))]
+    labels = {"frame": longest["frame"], "particle": largest["particle"]}
+    padded = []
+    for scenario in scenarios:
+        timeless = scenario.drop_vars("time")
+        padded.append(timeless.reindex(labels, fill_value={"material": PADDING}))
     joined = xr.concat(
         padded,
         dim=ids,
@@ -131,12 +138,12 @@ def _joined(scenarios: Sequence[xr.Dataset], numbers: Sequence[int]) -> xr.Datas
     joined = joined.assign_coords(scenario=ids, time=longest["time"].compute())
     joined["frame_count"] = (
         "scenario",
-        frames,
+        frame_counts,
         {"long_name": "recorded frames", "units": "1"},
     )
     joined["particle_count"] = (
         "scenario",
-        particles,
+        particle_counts,
         {"long_name": "particles", "units": "1"},
     )
     for variable in joined.variables.values():
@@ -148,33 +155,38 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
     """Open one file lazily and check that it is the scenario that its path says."""
     import xarray as xr
 
-    with ExitStack() as opened:
+    with ExitStack() as stack:
         try:
-            stored = opened.enter_context(
+            file = stack.enter_context(
                 xr.open_dataset(path, engine="netcdf4", cache=False)
             )
-            frame_bytes = (
-                stored["position"].dtype.itemsize
-                * stored.sizes["particle"]
-                * stored.sizes["space"]
-            )
-            scenario = stored.chunk(
-                frame=max(1, CHUNK_BYTES // frame_bytes), particle=-1, space=-1
-            )
-            found = {
+            value_bytes = file["position"].dtype.itemsize
+            frame_bytes = value_bytes * file.sizes["particle"] * file.sizes["space"]
+            frames_per_chunk = max(1, CHUNK_BYTES // frame_bytes)
+            scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
+            attributes = {
                 name: scenario.attrs[name]
                 for name in ("split", "size", "scenario", "version")
             }
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
-            raise damaged(path, f"{type(error).__name__}: {error}", fix=fix) from error
-        same_major = str(found["version"]).split(".")[0] == str(key.major)
-        named = (found["split"], found["size"], int(found["scenario"]))
-        if not same_major or named != (key.split, key.size, key.scenario):
+            reason = f"{type(error).__name__}: {error}"
+            raise damage_error(path, reason, fix=fix) from error
+        if not _is_of(key, attributes):
             raise DataError(
                 "a scenario file is another scenario",
                 where=str(path),
                 expected=key,
-                got=found,
+                got=attributes,
             )
-        scenario.set_close(opened.pop_all().close)
+        scenario.set_close(stack.pop_all().close)
     return scenario
+
+
+def _is_of(key: ScenarioKey, attributes: Mapping[str, Any]) -> bool:
+    """Tell whether attributes name a scenario; MINOR and PATCH may differ."""
+    return (
+        attributes["split"] == key.split
+        and attributes["size"] == key.size
+        and int(attributes["scenario"]) == key.scenario
+        and str(attributes["version"]).split(".")[0] == str(key.major)
+    )

@@ -1,8 +1,8 @@
-"""Fetch objects of a store: resumed by range, bounded in length and time, checked
-before they get their name.
+"""Fetch objects of a store: resumed by range, bounded in length and time, checked.
 
-Whatever a store does wrong has an error of its own, see :mod:`.objects`. A broken line
-is tried again from where it broke; a lie leaves nothing of that object.
+An object gets its name once it is checked. Every fault of a store has an error of its
+own, see :mod:`.objects`. After a broken connection the next attempt goes on where it
+broke; after wrong data nothing of that object stays.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from typing import TypeVar
 
 from lagbench.atomic import SUFFIX
 from lagbench.data.checksums import file_sha256
-from lagbench.data.hdf5 import SIGNATURE, Structure, check_structure, opened
+from lagbench.data.hdf5 import SIGNATURE, open_hdf5
 from lagbench.data.scenario import check_scenario
+from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, UnreadableFileError, WorkFailedError
 
 from .objects import (
@@ -38,88 +39,94 @@ from .objects import (
 
 CONNECTIONS = 4  # objects that are fetched side by side
 BLOCK = 1 << 18  # bytes read at a time
-# bytes per second below which a store is refused, each object by itself
-LEAST_RATE = 4096.0
-PATIENCE = 60.0  # seconds of waiting over which the rate is measured
+LEAST_RATE = 4096.0  # bytes per second below which an object is given up
+RATE_SECONDS = 60.0  # seconds of waiting over which the rate is measured
 ATTEMPTS = 5  # attempts in a row that bring nothing before we give up
 MOST_ATTEMPTS = 100  # attempts at one object at all, however little each brings
 PAUSE = 0.5  # pause after the first failed attempt [s]; it doubles
-FIX_LINE = "the same command goes on where it stopped"
+RESUME_HINT = "the same command goes on where it stopped"
 
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class FetchRequest:
     """A scenario's file in a store, and what is known of it."""
 
     url: str
-    target: Path  # where it shall be; its temporary name is beside that
-    limit: int  # bytes beyond which no file of this kind goes
+    target: Path  # path of the file; its temporary name is beside that
+    limit: int  # most bytes of a file of this kind
     content_sha256: str  # content hash that it must have, whole or its first digits
     length: int | None = None  # bytes that it has, where the store's manifest says so
     file_sha256: str | None = None  # SHA-256 of its bytes, likewise
-    remedy: str  # what helps where the store lies
+    hint: str  # how the user mends a store with wrong data
 
 
 def partial_name(target: Path) -> Path:
-    """Return the temporary name of a file that is fetched; a later attempt goes on from
-    it.
-    """
+    """Return the temporary name of a file that is being fetched."""
     return target.with_name(f".{target.name}.download{SUFFIX}")
 
 
-def fetch_text(url: str, *, limit: int, remedy: str) -> bytes:
-    """Return a small object, tried again from its start where the line breaks."""
-    pace = Pace(url)
+def fetch_text(url: str, *, limit: int, hint: str) -> bytes:
+    """Return a small object; after a broken connection it is fetched from its start."""
+    rate = TransferRate(url)
 
     def attempt() -> bytes:
-        with closing(open_object(url, 0, remedy=remedy)) as answer:
-            return b"".join(received(answer, pace, limit=limit, remedy=remedy))
+        with closing(open_object(url, 0, hint=hint)) as answer:
+            return b"".join(receive(answer, rate, limit=limit, hint=hint))
 
-    return insist(attempt, url)
+    return retry(attempt, url)
 
 
 def fetch_scenarios(
-    wanted: Mapping[int, Wanted],
+    requests: Mapping[int, FetchRequest],
     report: Callable[[int], None],
     *,
     connections: int = CONNECTIONS,
 ) -> Generator[tuple[int, NotInStoreError | None], None, None]:
-    """Fetch scenarios side by side; yield each as its file has its name, or why the
-    store has none.
+    """Fetch scenarios side by side; yield each when its file has its name.
 
-    Hold the lock of the data set, and close the iterator: that stops what is under way.
-    ``report`` is told the bytes that arrive. After a broken line temporary files stay,
-    to go on from; after a lie none.
+    Hold the lock of the data set, and close the iterator: that stops the transfers.
+    After a broken connection temporary files stay, to go on from; after wrong data none
+    does.
+
+    Args:
+        requests: files to fetch, by scenario id.
+        report: receives the number of bytes that arrived.
+        connections: objects that are fetched side by side.
+
+    Yields:
+        Scenario id, and the error where the store does not have the object.
     """
     stop = threading.Event()
     lock = threading.Lock()
 
-    def count(arrived: int) -> None:
+    def count(byte_count: int) -> None:
         if stop.is_set():
             raise _StoppedError
         with lock:
-            report(arrived)
+            report(byte_count)
 
     with ThreadPoolExecutor(max_workers=connections) as pool:
-        pending = {pool.submit(_fetch, one, count): i for i, one in wanted.items()}
+        pending = {}
+        for scenario, request in requests.items():
+            pending[pool.submit(_fetch, request, count)] = scenario
         try:
-            for arrival in as_completed(pending):
-                scenario = pending[arrival]
+            for transfer in as_completed(pending):
+                scenario = pending[transfer]
                 try:
-                    arrival.result()
+                    transfer.result()
                 except NotInStoreError as error:
                     yield scenario, error
                 else:
-                    # Here and not in the threads: netCDF4 stands one at a time.
-                    accept(wanted[scenario])
+                    # Here and not in the threads: HDF5 is not safe in several threads.
+                    accept(requests[scenario])
                     yield scenario, None
         except DataError:
             stop.set()
             pool.shutdown(cancel_futures=True)
-            for one in wanted.values():
-                partial_name(one.target).unlink(missing_ok=True)
+            for request in requests.values():
+                partial_name(request.target).unlink(missing_ok=True)
             raise
         finally:
             stop.set()
@@ -127,44 +134,43 @@ def fetch_scenarios(
 
 
 class _StoppedError(Exception):
-    """Another object has failed."""
+    """The transfer of another object has failed."""
 
 
-def _fetch(wanted: Wanted, report: Callable[[int], None]) -> None:
-    """Fetch one object under its temporary name, going on where an earlier attempt
-    stopped.
-    """
-    partial = partial_name(wanted.target)
-    pace = Pace(wanted.url)
+def _fetch(request: FetchRequest, report: Callable[[int], None]) -> None:
+    """Fetch one object under its temporary name, going on after an earlier attempt."""
+    partial = partial_name(request.target)
+    rate = TransferRate(request.url)
 
     def attempt() -> None:
         report(0)
-        with partial.open("ab") as out:
-            have = out.tell()
-            if have and have == wanted.length:
+        with partial.open("ab") as file:
+            offset = file.tell()
+            if offset and offset == request.length:
                 return
-            with closing(open_object(wanted.url, have, remedy=wanted.remedy)) as answer:
-                if answer.start < have:
-                    out.seek(answer.start)
-                    out.truncate()
-                for block in received(
+            with closing(open_object(request.url, offset, hint=request.hint)) as answer:
+                if answer.start < offset:
+                    file.seek(answer.start)
+                    file.truncate()
+                blocks = receive(
                     answer,
-                    pace,
-                    limit=wanted.limit,
-                    length=wanted.length,
+                    rate,
+                    limit=request.limit,
+                    length=request.length,
                     begins=SIGNATURE,
-                    remedy=wanted.remedy,
-                ):
-                    out.write(block)
+                    hint=request.hint,
+                )
+                for block in blocks:
+                    file.write(block)
                     report(len(block))
 
-    with saving(partial):
-        insist(attempt, wanted.url, partial)
+    with partial_file_errors(partial):
+        retry(attempt, request.url, partial)
 
 
 @contextmanager
-def saving(partial: Path) -> Iterator[None]:
-    """Write a temporary file: after a lie it goes, after a broken line it stays."""
+def partial_file_errors(partial: Path) -> Iterator[None]:
+    """Remove a temporary file after wrong data; keep it after a broken connection."""
     try:
         partial.parent.mkdir(parents=True, exist_ok=True)
         yield
@@ -172,181 +178,225 @@ def saving(partial: Path) -> Iterator[None]:
         partial.unlink(missing_ok=True)
         raise
     except OSError as error:
-        got = error.strerror or error
-        fix = "--root names another folder"
         raise WorkFailedError(
-            "cannot write there", where=str(partial), got=got, fix=fix
+            "cannot write there",
+            where=str(partial),
+            got=error.strerror or error,
+            fix="--root names another folder",
         ) from error
 
 
-def insist(
-    attempt: Callable[[], T],
+def retry(
+    attempt: Callable[[], Result],
     url: str,
     partial: Path | None = None,
     place: Callable[[], int] = lambda: 0,
-) -> T:
-    """Attempt until it succeeds, or attempts bring a partial file, or a place, no
-    further.
+) -> Result:
+    """Repeat an attempt until it succeeds, or several in a row bring nothing.
+
+    Args:
+        attempt: raises BrokenError where another attempt may succeed.
+        url: address of the object, for the message.
+        partial: file whose length tells how far the attempts are.
+        place: tells how far the attempts are, where there is no such file [bytes].
+
+    Raises:
+        ConnectionLostError: too many attempts.
     """
 
-    def held() -> int:
-        if partial and partial.exists():
+    def arrived_bytes() -> int:
+        if partial is not None and partial.exists():
             return partial.stat().st_size
         return place()
 
     failures = 0
-    restarted = False
+    has_restarted = False
     for _ in range(MOST_ATTEMPTS):
-        before = held()
+        bytes_before = arrived_bytes()
         try:
             return attempt()
         except BrokenError as broken:
-            if held() > before:
+            failures += 1
+            if arrived_bytes() > bytes_before:
                 failures = 0
-            else:
-                failures = failures + 1
-            if failures >= ATTEMPTS or (broken.stale and restarted):
+            if failures >= ATTEMPTS or (broken.stale and has_restarted):
                 raise broken.error from None
-            if broken.stale and partial:
+            if broken.stale and partial is not None:
                 partial.unlink(missing_ok=True)
-                restarted = True
+                has_restarted = True
             time.sleep(PAUSE * 2**failures)
-    what = "the connection to the store broke too often"
-    got = f"{held()} bytes after {MOST_ATTEMPTS} attempts"
-    raise ConnectionLostError(what, where=url, got=got, fix=FIX_LINE)
+    raise ConnectionLostError(
+        "the connection to the store broke too often",
+        where=url,
+        got=f"{arrived_bytes()} bytes after {MOST_ATTEMPTS} attempts",
+        fix=RESUME_HINT,
+    )
 
 
-class Pace:
+class TransferRate:
     """How fast an object arrives, over all attempts at it."""
 
     def __init__(self, url: str) -> None:
         self.url = url
-        self._arrived = 0
-        self._waited = 0.0
+        self._byte_count = 0
+        self._seconds = 0.0
 
-    def count(self, arrived: int, seconds: float) -> None:
-        """Count bytes and the time that they took; refuse a store that sends too
-        little.
+    def count(self, byte_count: int, seconds: float) -> None:
+        """Count bytes and the time that they took.
+
+        Raises:
+            TooSlowError: too few bytes have arrived within the last minute.
         """
-        self._arrived += arrived
-        self._waited += seconds
-        if self._waited < PATIENCE:
+        self._byte_count += byte_count
+        self._seconds += seconds
+        if self._seconds < RATE_SECONDS:
             return
-        if self._arrived < LEAST_RATE * self._waited:
+        if self._byte_count < LEAST_RATE * self._seconds:
             raise TooSlowError(
                 "the store sends too slowly",
                 where=self.url,
                 expected=f"at least {LEAST_RATE:g} bytes a second",
-                got=f"{self._arrived} bytes in {self._waited:.0f} s",
-                fix=FIX_LINE,
+                got=f"{self._byte_count} bytes in {self._seconds:.0f} s",
+                fix=RESUME_HINT,
             )
-        self._arrived = 0
-        self._waited = 0.0
+        self._byte_count = 0
+        self._seconds = 0.0
 
 
-def received(
+def receive(
     answer: Answer,
-    pace: Pace,
+    rate: TransferRate,
     *,
     limit: int,
     length: int | None = None,
     begins: bytes = b"",
-    remedy: str,
+    hint: str,
 ) -> Iterator[bytes]:
-    """Yield what a store sends; refuse a page, another length than is known, and more
-    than can be.
+    """Yield what a store sends; refuse a page, a wrong length, and more than can be.
+
+    Args:
+        answer: the object that the store has begun to send.
+        rate: counts bytes and time.
+        limit: most bytes that such an object can have.
+        length: its length, where it is known [bytes].
+        begins: its first bytes.
+        hint: how the user mends a store with wrong data.
+
+    Raises:
+        NotDataError: another kind of object, such as a page.
+        WrongLengthError: the store announces or sends another length.
+        TruncatedError: the object ends too early.
+        BrokenError: the connection broke.
     """
 
-    def refused(
+    def refusal(
         kind: type[DataError], what: str, expected: str, got: str | None = None
     ) -> DataError:
-        return kind(what, where=pace.url, expected=expected, got=got, fix=remedy)
+        return kind(what, where=rate.url, expected=expected, got=got, fix=hint)
 
-    place = answer.start
-    blocks = _blocks(answer, pace)
+    position = answer.start
+    blocks = _read_blocks(answer, rate)
     block = next(blocks, b"")
-    if answer.page or (place == 0 and not block.startswith(begins[: len(block)])):
-        text = " ".join(block[:200].decode("utf-8", "replace").split())
-        expected = "a netCDF4 file or a manifest; a page may ask to log in"
-        raise refused(
+    is_other_format = position == 0 and not block.startswith(begins[: len(block)])
+    if answer.page or is_other_format:
+        words = block[:200].decode("utf-8", "replace").split()
+        raise refusal(
             NotDataError,
             "the store sent something else than data",
-            expected,
-            ascii(text[:80]),
+            "a netCDF4 file or a manifest; a page may ask to log in",
+            ascii(" ".join(words)[:80]),
         )
+    most_bytes = limit
+    expected_length = f"at most {limit} bytes"
+    if length is not None:
+        most_bytes = length
+        expected_length = f"{length} bytes"
     total = answer.total
-    if total is not None and (total > limit or total != (length or total)):
-        expected = f"{length or f'at most {limit}'} bytes"
-        raise refused(
-            WrongLengthError,
-            "the store announces another length",
-            expected,
-            f"{total} bytes",
-        )
-    if length is None:
-        most = limit
-    else:
-        most = length
+    if total is not None:
+        is_too_long = total > limit
+        is_other_length = length is not None and total != length
+        if is_too_long or is_other_length:
+            raise refusal(
+                WrongLengthError,
+                "the store announces another length",
+                expected_length,
+                f"{total} bytes",
+            )
+
     while block:
-        place += len(block)
-        if place > most:
+        position += len(block)
+        if position > most_bytes:
             what = "the store sends more than the object holds"
-            raise refused(WrongLengthError, what, f"at most {most} bytes")
+            raise refusal(WrongLengthError, what, f"at most {most_bytes} bytes")
         yield block
         block = next(blocks, b"")
-    if total is not None and place < total:
-        what = "an object ends before the length that the store announces"
-        raise BrokenError(
-            refused(TruncatedError, what, f"{total} bytes", f"{place} bytes")
+
+    if total is not None and position < total:
+        truncated = refusal(
+            TruncatedError,
+            "an object ends before the length that the store announces",
+            f"{total} bytes",
+            f"{position} bytes",
         )
-    if length is not None and place != length:
-        raise refused(
+        raise BrokenError(truncated)
+    if length is not None and position != length:
+        raise refusal(
             TruncatedError,
             "an object ends too early",
             f"{length} bytes",
-            f"{place} bytes",
+            f"{position} bytes",
         )
 
 
-def _blocks(answer: Answer, pace: Pace) -> Iterator[bytes]:
-    """Yield what arrives until the end; whatever a library raises is a broken line."""
+def _read_blocks(answer: Answer, rate: TransferRate) -> Iterator[bytes]:
+    """Yield what arrives, at last an empty block; any exception is a broken line."""
     block = b"more"
     while block:
         started = time.monotonic()
         try:
             block = answer.read(BLOCK)
         except Exception as error:
-            pace.count(0, time.monotonic() - started)
-            what = "the connection to the store broke"
-            got = f"{type(error).__name__}: {error}"
-            raise BrokenError(
-                ConnectionLostError(what, where=pace.url, got=got, fix=FIX_LINE)
-            ) from error
-        pace.count(len(block), time.monotonic() - started)
+            rate.count(0, time.monotonic() - started)
+            lost = ConnectionLostError(
+                "the connection to the store broke",
+                where=rate.url,
+                got=f"{type(error).__name__}: {error}",
+                fix=RESUME_HINT,
+            )
+            raise BrokenError(lost) from error
+        rate.count(len(block), time.monotonic() - started)
         yield block
 
 
-def accept(wanted: Wanted) -> None:
-    """Give a file its name once its content is right."""
-    partial = partial_name(wanted.target)
+def accept(request: FetchRequest) -> None:
+    """Give a fetched file its name once its content is right.
+
+    Raises:
+        WrongContentError: the file is damaged, or its hash is another.
+    """
+    partial = partial_name(request.target)
     try:
-        # The bytes first: HDF5 is best not given what a bad line has garbled.
-        if (
-            wanted.file_sha256 is not None
-            and file_sha256(partial) != wanted.file_sha256
-        ):
-            raise DataError("its bytes are not those of the store's manifest")
-        with opened(partial) as file:
-            check_structure(file, partial, Structure(texts=True))
-        check_scenario(partial, wanted.content_sha256)
+        _check_content(partial, request)
     except (DataError, UnreadableFileError) as error:
+        reason = error.what
+        if error.got is not None:
+            reason = f"{error.what}: {error.got}"
         raise WrongContentError(
             "an object has other content",
-            where=wanted.url,
-            expected=f"content hash {wanted.content_sha256}",
-            got=error.what if error.got is None else f"{error.what}: {error.got}",
-            fix=wanted.remedy,
+            where=request.url,
+            expected=f"content hash {request.content_sha256}",
+            got=reason,
+            fix=request.hint,
         ) from error
     with partial.open("rb") as stream:
         os.fsync(stream.fileno())
-    partial.replace(wanted.target)
+    partial.replace(request.target)
+
+
+def _check_content(partial: Path, request: FetchRequest) -> None:
+    # The bytes first: HDF5 should not read what a bad line has garbled.
+    if request.file_sha256 is not None and file_sha256(partial) != request.file_sha256:
+        raise DataError("its bytes are not those of the store's manifest")
+    with open_hdf5(partial) as file:
+        check_structure(file, partial, Structure(texts=True))
+    check_scenario(partial, request.content_sha256)

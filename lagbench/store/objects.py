@@ -1,9 +1,8 @@
 """Objects by URL: open one from an offset on, list, read and put whole ones.
 
-HTTP comes from the standard library, because resuming is what no downloader at hand
-does (pooch and fsspec start over); ``s3://``, ``file://`` and the rest are file systems
-of fsspec. What is the store's lie is a DataError, what is the line's fault a
-WorkFailedError.
+HTTP comes from the standard library, because no downloader at hand resumes (pooch and
+fsspec start over); ``s3://``, ``file://`` and the rest are file systems of fsspec. A
+wrong answer of the store is a DataError, a fault of the connection a WorkFailedError.
 """
 
 from __future__ import annotations
@@ -36,10 +35,13 @@ HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")
 
-FIX_LINE = "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: it goes on"
+ADDRESS_HINT = (
+    "see that the address and AWS_ENDPOINT_URL are right, then repeat the command: "
+    "it goes on"
+)
 
-_BUSY = {408, 425, 429, 500, 502, 503, 504}
-# no object has more bytes, and Python reads no endless number
+_BUSY_STATUSES = {408, 425, 429, 500, 502, 503, 504}
+# No object has more bytes, and Python refuses to read an endless number.
 _LENGTH = re.compile(r"\d{1,18}")
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
 
@@ -63,7 +65,7 @@ class ConnectionLostError(WorkFailedError):
 
 
 class NotDataError(DataError):
-    """The store sent something else than data: an error page, a login form."""
+    """The store sent no data but an error page or a login form."""
 
 
 class TruncatedError(DataError):
@@ -75,7 +77,7 @@ class WrongLengthError(DataError):
 
 
 class WrongContentError(DataError):
-    """An object has other content than datasets.yaml means."""
+    """An object has another content hash than datasets.yaml."""
 
 
 class BrokenError(Exception):
@@ -86,7 +88,7 @@ class BrokenError(Exception):
     ) -> None:
         super().__init__(str(error))
         self.error = error  # what to raise when no other attempt is made
-        self.stale = stale  # whether what is there already has to go first
+        self.stale = stale  # whether the bytes that have arrived must be removed first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,74 +102,101 @@ class Answer:
     page: bool = False  # whether the store says itself that it is a page to look at
 
 
-def open_object(url: str, offset: int, *, remedy: str) -> Answer:
+def open_object(url: str, offset: int, *, hint: str) -> Answer:
     """Ask for an object from an offset on; the answer may start over at 0.
 
-    The remedy is what helps where the store has not what it should have.
+    Args:
+        url: address of the object.
+        offset: first byte that is asked for.
+        hint: how the user mends a store without the object.
+
+    Raises:
+        NotInStoreError: there is no such object.
+        BrokenError: another attempt may succeed.
+        StoreUnreachableError: the store refuses.
+        UsageError: the address is none.
     """
-    return (_open_http if url.startswith(HTTP) else _open_fsspec)(url, offset, remedy)
+    if url.startswith(HTTP):
+        return _open_http(url, offset, hint)
+    return _open_fsspec(url, offset, hint)
 
 
-def _open_http(url: str, offset: int, remedy: str) -> Answer:
+def _open_http(url: str, offset: int, hint: str) -> Answer:
     headers = {"User-Agent": "lagbench", "Accept-Encoding": "identity"}
     if offset:
         headers["Range"] = f"bytes={offset}-"
     try:
-        parts = urllib.parse.urlsplit(url)
-        if not parts.hostname:
-            raise ValueError("it names no host")
-        # Percent-encoded, but for what is encoded already.
-        path, query = (
-            urllib.parse.quote(p, safe=string.punctuation)
-            for p in (parts.path, parts.query)
-        )
-        address = parts._replace(path=path, query=query).geturl()
-        response = _OPENER.open(
-            urllib.request.Request(address, headers=headers), timeout=TIMEOUT
-        )
+        request = urllib.request.Request(_percent_encode(url), headers=headers)
+        response = _OPENER.open(request, timeout=TIMEOUT)
     except urllib.error.HTTPError as error:
         with closing(error):
-            raise _refusal_of_status(error, url, offset, remedy) from None
+            raise _status_error(error, url, offset, hint) from None
     except (ValueError, http.client.InvalidURL) as error:  # time would not mend it
-        what = "not the address of a store"
-        expected = "http://host/path"
-        raise UsageError(what, where=url, expected=expected, got=str(error)) from error
+        raise UsageError(
+            "not the address of a store",
+            where=url,
+            expected="http://host/path",
+            got=str(error),
+        ) from error
     except (OSError, http.client.HTTPException) as error:
-        got = f"{type(error).__name__}: {getattr(error, 'reason', error)}"
-        fix = "repeat the command later: it goes on where it stopped"
-        silent = StoreUnreachableError(
-            "the store does not answer", where=url, got=got, fix=fix
+        unreachable = StoreUnreachableError(
+            "the store does not answer",
+            where=url,
+            got=f"{type(error).__name__}: {getattr(error, 'reason', error)}",
+            fix="repeat the command later: it goes on where it stopped",
         )
-        raise BrokenError(silent) from error
+        raise BrokenError(unreachable) from error
+
     start = 0
     total = response.headers.get("Content-Length")
     if response.status == http.client.PARTIAL_CONTENT:
+        total = None
         match = _RANGE.fullmatch(response.headers.get("Content-Range", ""))
         if offset and (match is None or int(match[1]) != offset):
             response.close()
-            return _open_http(url, 0, remedy)
-        start, total = (offset, match[3]) if match else (0, None)
+            return _open_http(url, 0, hint)
+        if match is not None:
+            start = offset
+            total = match[3]
+    content_type = response.headers.get_content_type()
     return Answer(
         # read() would wait for a whole block, and so for ever where a byte comes now
         # and then.
         read=response.read1,
         close=response.close,
         start=start,
-        total=int(total) if total is not None and _LENGTH.fullmatch(total) else None,
-        page=response.headers.get_content_type()
-        in ("text/html", "application/xhtml+xml"),
+        total=_parse_length(total),
+        page=content_type in ("text/html", "application/xhtml+xml"),
     )
 
 
-def _refusal_of_status(
-    error: urllib.error.HTTPError, url: str, offset: int, remedy: str
+def _percent_encode(url: str) -> str:
+    """Return an address with unusual characters encoded, but for encoded ones."""
+    parts = urllib.parse.urlsplit(url)
+    if not parts.hostname:
+        raise ValueError("it names no host")
+    path = urllib.parse.quote(parts.path, safe=string.punctuation)
+    query = urllib.parse.quote(parts.query, safe=string.punctuation)
+    return parts._replace(path=path, query=query).geturl()
+
+
+def _parse_length(text: str | None) -> int | None:
+    if text is not None and _LENGTH.fullmatch(text):
+        return int(text)
+    return None
+
+
+def _status_error(
+    error: urllib.error.HTTPError, url: str, offset: int, hint: str
 ) -> Exception:
     """Return the error that an HTTP status means."""
     code = error.code
     if code in (404, 410):
-        got = f"HTTP status {code}"
         return NotInStoreError(
-            "the store does not have the object", where=url, got=got, fix=remedy
+            "the store does not have the object",
+            where=url,
+            got=f"HTTP status {code}",
+            fix=hint,
         )
     if code == http.client.REQUESTED_RANGE_NOT_SATISFIABLE and offset:
         truncated = TruncatedError(
@@ -175,18 +204,22 @@ def _refusal_of_status(
             where=url,
             expected=f"more than {offset} bytes",
             got=f"HTTP status {code}",
-            fix=remedy,
+            fix=hint,
         )
         return BrokenError(truncated, stale=True)
-    got = f"HTTP status {code}: {str(error.reason)[:200]!a}"
-    refused = StoreUnreachableError("the store refuses", where=url, got=got, fix=remedy)
-    if code in _BUSY:
+    refused = StoreUnreachableError(
+        "the store refuses",
+        where=url,
+        got=f"HTTP status {code}: {str(error.reason)[:200]!a}",
+        fix=hint,
+    )
+    if code in _BUSY_STATUSES:
         return BrokenError(refused)
     return refused
 
 
 class _Redirections(urllib.request.HTTPRedirectHandler):
-    """Tells a store that leads to no address from an address that the user mistyped."""
+    """Refuses a redirection to no address, as a fault of the store."""
 
     def http_error_302(
         self,
@@ -220,38 +253,39 @@ for _handler in (
     _OPENER.add_handler(_handler())
 
 
-def _open_fsspec(url: str, offset: int, remedy: str) -> Answer:
+def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
     try:
         system, path = _file_system(url)
         total = system.info(path)["size"]
         stream = system.open(path, "rb")
+        start = 0
         if offset <= total:
             start = offset
-        else:
-            start = 0
         stream.seek(start)
     except LagbenchError:
         raise
     except FileNotFoundError:
         raise NotInStoreError(
-            "the store does not have the object", where=url, fix=remedy
+            "the store does not have the object", where=url, fix=hint
         ) from None
     except Exception as error:  # file systems raise what their libraries raise
-        refused = _refusal(error, url)
-        # botocore has tried its own errors again by itself, and no right comes with
-        # time.
-        again = isinstance(error, OSError) and not isinstance(error, PermissionError)
-        if again and isinstance(refused, WorkFailedError):
-            raise BrokenError(refused) from error
-        raise refused from error
+        store_error = _translate_error(error, url)
+        # botocore has tried its own errors again by itself, and no permission comes
+        # with time.
+        may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
+        if may_pass and isinstance(store_error, WorkFailedError):
+            raise BrokenError(store_error) from error
+        raise store_error from error
     return Answer(read=stream.read, close=stream.close, start=start, total=total)
 
 
 class Objects:
-    """The folder of one data set version in a store of fsspec; names are relative to
-    it.
+    """The folder of one data set version in a store of fsspec.
 
-    A root that is no such store is a UsageError.
+    Names of objects are relative to the folder.
+
+    Raises:
+        UsageError: the root is no such store.
     """
 
     def __init__(self, root: str, folder: str) -> None:
@@ -263,77 +297,79 @@ class Objects:
                 where=root,
                 fix="name another --root",
             )
-        with _refusals(self.url):
+        with _store_errors(self.url):
             self._system, self._path = _file_system(self.url)
 
     def sizes(self) -> dict[str, int]:
-        """Return the length of every object by name [bytes]; a missing bucket is a
-        DataError.
+        """Return the length of every object by name [bytes].
+
+        Raises:
+            DataError: there is no such bucket.
         """
-        with _refusals(self.url):
+        with _store_errors(self.url):
             try:
-                found = self._system.find(self._path, detail=True)
+                objects = self._system.find(self._path, detail=True)
             except FileNotFoundError:
                 check_bucket(self.root)
                 return {}
         prefix = self._path.rstrip("/") + "/"
-        return {
-            p.removeprefix(prefix): int(i["size"])
-            for p, i in found.items()
-            if p.startswith(prefix)
-        }
+        lengths = {}
+        for path, details in objects.items():
+            if path.startswith(prefix):
+                lengths[path.removeprefix(prefix)] = int(details["size"])
+        return lengths
 
     def read(self, name: str) -> bytes | None:
         """Return a small object; None where it is not there."""
-        with _refusals(self.url):
+        with _store_errors(self.url):
             try:
-                return bytes(self._system.cat_file(self._at(name)))
+                return bytes(self._system.cat_file(self._path_of(name)))
             except FileNotFoundError:
                 return None
 
     def write(self, name: str, data: bytes) -> None:
         """Put a small object, whole or not at all."""
-        with _refusals(self.url):
+        with _store_errors(self.url):
             if self.url.startswith(LOCAL):
-                write_atomically(Path(self._at(name)), data)
+                write_atomically(Path(self._path_of(name)), data)
             else:
-                self._system.pipe_file(self._at(name), data)
+                self._system.pipe_file(self._path_of(name), data)
 
     def put(self, name: str, source: Path) -> None:
-        """Put a file as an object, whole or not at all: after a fault the old one is
-        there, or none.
+        """Put a file as an object, whole or not at all.
+
+        After a fault the old object is there, or none.
         """
-        with _refusals(self.url):
+        with _store_errors(self.url):
             if self.url.startswith(LOCAL):
                 # On a file system a put is not atomic by itself.
-                with atomic_path(Path(self._at(name))) as beside:
+                with atomic_path(Path(self._path_of(name))) as beside:
                     shutil.copyfile(source, beside)
             else:
-                self._system.put_file(str(source), self._at(name))
+                self._system.put_file(str(source), self._path_of(name))
 
-    def _at(self, name: str) -> str:
+    def _path_of(self, name: str) -> str:
         return f"{self._path.rstrip('/')}/{name}"
 
 
 def check_bucket(url: str) -> None:
-    """Tell a missing bucket, which is a DataError, from one that holds nothing here."""
+    """Raise a DataError where the bucket is missing, not where it is empty."""
     if not url.startswith(S3):
         return
-    with _refusals(url):
+    with _store_errors(url):
         system, _ = _file_system(url)
-        if not system.exists(_bucket(url)):
+        if not system.exists(_bucket_of(url)):
             raise FileNotFoundError
 
 
-def _bucket(url: str) -> str:
+def _bucket_of(url: str) -> str:
     return url.split("//", 1)[1].split("/")[0]
 
 
 def _file_system(url: str) -> tuple[Any, str]:
-    """Return the file system of fsspec that an address belongs to, and the address
-    within it.
+    """Return the file system of an address, and the address within it.
 
-    Nothing is remembered of what it holds: what other machines do must be seen at once.
+    No listing is cached: changes by other machines must be seen at once.
     """
     if url.startswith(S3):
         require("s3fs", extra="s3")
@@ -341,61 +377,77 @@ def _file_system(url: str) -> tuple[Any, str]:
 
     scheme = url.split("://", 1)[0]
     if scheme not in fsspec.available_protocols():
-        expected = "s3://bucket/prefix, or another that fsspec knows; file:///path for a folder"
         raise UsageError(
-            "no such kind of address", where=url, expected=expected, got=scheme
+            "no such kind of address",
+            where=url,
+            expected="s3://bucket/prefix, or another that fsspec knows; "
+            "file:///path for a folder",
+            got=scheme,
         )
     # Another endpoint or other credentials are another system, also within one process.
-    key = (
-        scheme,
-        *sorted(item for item in os.environ.items() if item[0].startswith("AWS_")),
-    )
+    settings = sorted(item for item in os.environ.items() if item[0].startswith("AWS_"))
+    key = (scheme, *settings)
     if key not in _systems:
-        _systems[key], _ = fsspec.core.url_to_fs(
+        system, _ = fsspec.core.url_to_fs(
             url, use_listings_cache=False, skip_instance_cache=True
         )
+        _systems[key] = system
     system = _systems[key]
     return system, system._strip_protocol(url)
 
 
 @contextmanager
-def _refusals(url: str) -> Iterator[None]:
+def _store_errors(url: str) -> Iterator[None]:
     """Turn what a file system of fsspec raises into errors that say what to do."""
     try:
         yield
     except LagbenchError:
         raise
     except Exception as error:  # file systems raise what their libraries raise
-        raise _refusal(error, url) from error
+        raise _translate_error(error, url) from error
 
 
-def _refusal(error: Exception, url: str) -> LagbenchError:
+def _translate_error(error: Exception, url: str) -> LagbenchError:
     """Return the error of ours that an exception of a file system means."""
-    got = f"{type(error).__name__}: {str(error)[:300]}"
+    message = f"{type(error).__name__}: {str(error)[:300]}"
     if isinstance(error, ImportError):
         return UsageError(
             "this kind of address needs another package",
             where=url,
-            got=got,
+            got=message,
             fix=str(error),
         )
     if isinstance(error, FileNotFoundError):
-        fix = "create the bucket, or correct the address: --root or LAGBENCH_ROOT"
         return DataError(
-            "there is no such bucket", where=url, got=_bucket(url), fix=fix
+            "there is no such bucket",
+            where=url,
+            got=_bucket_of(url),
+            fix="create the bucket, or correct the address: --root or LAGBENCH_ROOT",
         )
-    refused = isinstance(error, PermissionError)
-    if url.startswith(S3):
-        from botocore import exceptions as boto  # type: ignore[import-untyped]
-
-        refused |= isinstance(
-            error, (boto.NoCredentialsError, boto.PartialCredentialsError)
-        )
-        refused |= isinstance(error, (boto.ProfileNotFound, boto.TokenRetrievalError))
-    if refused:
+    if _is_permission_error(error, url):
         keys = "AWS_PROFILE or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
-        fix = f"see that {keys} may read it, and write to it"
-        return StoreUnreachableError("the store refuses", where=url, got=got, fix=fix)
+        return StoreUnreachableError(
+            "the store refuses",
+            where=url,
+            got=message,
+            fix=f"see that {keys} may read it, and write to it",
+        )
     return StoreUnreachableError(
-        "the store does not answer or fails", where=url, got=got, fix=FIX_LINE
+        "the store does not answer or fails", where=url, got=message, fix=ADDRESS_HINT
     )
+
+
+def _is_permission_error(error: Exception, url: str) -> bool:
+    if isinstance(error, PermissionError):
+        return True
+    if not url.startswith(S3):
+        return False
+    from botocore import exceptions  # type: ignore[import-untyped]
+
+    credential_errors = (
+        exceptions.NoCredentialsError,
+        exceptions.PartialCredentialsError,
+        exceptions.ProfileNotFound,
+        exceptions.TokenRetrievalError,
+    )
+    return isinstance(error, credential_errors)

@@ -1,10 +1,10 @@
 """Write a data set to a store: whole objects first, the manifest that names them last.
 
-What the store holds and is right is neither simulated nor fetched. Objects are put as
-they are finished; now and then, after them, and at the end, after the cards, comes the
-manifest, so that a machine that is lost costs little and the manifest never names an
-object that is not there. There is no lock: whoever writes a scenario writes the same
-bits, and a manifest that is put keeps what another writer's names.
+Right objects of the store are neither simulated nor fetched. A finished file is put at
+once. The manifest follows now and then, and at the end after the cards. So a lost
+machine costs little, and the manifest never names an object that is not there. There is
+no lock: every writer of a scenario writes the same bits, and each new manifest keeps
+the entries of other writers.
 """
 
 from __future__ import annotations
@@ -17,23 +17,24 @@ from pathlib import Path
 from lagbench.data.checksums import file_sha256
 from lagbench.data.layout import MANIFEST_NAME, url_of
 from lagbench.data.local import root_url
-from lagbench.data.manifest import FileEntry, Manifest, merged, write_manifest
+from lagbench.data.manifest import FileEntry, Manifest, merge_entries, write_manifest
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError
 
 from .copy import (
+    add_local_entries,
     fetch_entries,
-    folder_of,
-    is_here,
-    is_right,
-    join,
+    is_in_copy,
+    join_manifests,
+    matches_registry,
     remote_manifest,
-    with_local,
-    writing,
+    store_folder,
+    suspend_fetching,
 )
 from .objects import NotDataError, Objects
 
-EVERY = 10.0  # least time between two manifests while scenarios are being finished [s]
+MANIFEST_SECONDS = 10.0
+"""Least time between two manifests while scenarios are being finished [s]."""
 
 
 class Publication:
@@ -43,140 +44,149 @@ class Publication:
         self._size = size
         self._root = root
         self._folder = size.folder(root)
-        self._objects = Objects(url, folder_of(size))
+        self._objects = Objects(url, store_folder(size))
         lengths = self._objects.sizes()
-        self._named = self._latest = self._read_manifest()
-        # Entries of the scenarios that the store holds and that are right, by id.
-        right = [
-            e
-            for e in self._right(self._named)
-            if e.bytes <= size.longest_file(e.scenario)
-        ]
-        self.held = {e.scenario: e for e in right if lengths.get(e.path) == e.bytes}
-        self._there = {e.path: e.file_sha256 for e in self.held.values()}
-        self._when = time.monotonic()
+        self._published = self._read_manifest()  # the manifest that is in the store
+        self._latest = self._published  # the manifest of the working copy
+        # entries of the right scenarios in the store, by id
+        self.stored_entries: dict[int, FileEntry] = {}
+        # SHA-256 of the objects in the store, by path
+        self._object_hashes: dict[str, str] = {}
+        for entry in self._list_right_entries(self._published):
+            has_possible_length = entry.bytes <= size.longest_file(entry.scenario)
+            if has_possible_length and lengths.get(entry.path) == entry.bytes:
+                self.stored_entries[entry.scenario] = entry
+                self._object_hashes[entry.path] = entry.file_sha256
+        self._last_manifest = time.monotonic()
 
     def prepare(self) -> None:
-        """Write the manifest of the working copy: what the store holds, and what only
-        the copy does.
-        """
-        known = with_local(self._size, self._root, self._restricted(self._named))
-        if known.files:
-            write_manifest(self._root, known)
+        """Write the manifest of the working copy, with the entries of the store."""
+        stored_manifest = self._without_lacking(self._published)
+        manifest = add_local_entries(self._size, self._root, stored_manifest)
+        if manifest.files:
+            write_manifest(self._root, manifest)
 
-    def bring(self, scenarios: Iterable[int]) -> None:
-        """Fetch what the store holds of some scenarios and the working copy does
-        not.
-        """
-        entries = [self.held[i] for i in scenarios if i in self.held]
-        lacking = [e for e in entries if not is_here(e, self._size, self._root)]
+    def fetch(self, scenarios: Iterable[int]) -> None:
+        """Fetch the scenarios of the store that the working copy lacks."""
+        lacking = []
+        for scenario in scenarios:
+            entry = self.stored_entries.get(scenario)
+            if entry is not None and not is_in_copy(entry, self._size, self._root):
+                lacking.append(entry)
         fetch_entries(self._size, self._root, self._objects.root, lacking)
 
     def is_settled(self, manifest: Manifest, cards: Mapping[str, bytes]) -> bool:
-        """Return whether the store has this manifest, all that it names, and the
-        cards.
-        """
-        if manifest != self._named or self._lacking(manifest):
+        """Return whether the store has this manifest, its objects, and the cards."""
+        if manifest != self._published or self._list_lacking(manifest):
             return False
         return all(self._objects.read(name) == text for name, text in cards.items())
 
-    def follow(self, manifest: Manifest, *, at_once: bool = False) -> None:
-        """Put what the manifest names and the store lacks; then, if it is time, the
-        manifest.
+    def put_files(self, manifest: Manifest, *, at_once: bool = False) -> None:
+        """Put the files that the store lacks; then, if it is time, the manifest.
 
-        A file that is another than the manifest says is a DataError.
+        Args:
+            manifest: manifest of the working copy.
+            at_once: whether to put the manifest now.
+
+        Raises:
+            DataError: a file has another hash than its entry.
         """
         self._latest = manifest
-        for entry in self._lacking(manifest):
-            self._put(entry)
-        if at_once or time.monotonic() - self._when >= EVERY:
+        for entry in self._list_lacking(manifest):
+            self._put_file(entry)
+        waited_seconds = time.monotonic() - self._last_manifest
+        if at_once or waited_seconds >= MANIFEST_SECONDS:
             self._put_manifest(manifest)
 
     def finish(self, manifest: Manifest, cards: Iterable[Path]) -> None:
         """Put the cards, and the manifest last."""
-        self.follow(manifest)
-        # The text comes after the pictures that it shows: where it is right, so are
-        # they.
+        self.put_files(manifest)
+        # The text comes after its pictures: where it is right, so are they.
         for path in reversed([*cards]):
             self._objects.put(path.relative_to(self._folder).as_posix(), path)
         self._put_manifest(manifest, anew=True)
 
     def save(self) -> None:
-        """Put a manifest of what is there, after an interruption."""
-        self._put_manifest(self._restricted(self._latest))
+        """Put a manifest of the objects in the store, after an interruption."""
+        self._put_manifest(self._without_lacking(self._latest))
 
-    def _put(self, entry: FileEntry) -> None:
+    def _put_file(self, entry: FileEntry) -> None:
         path = self._folder / entry.path
         if file_sha256(path) != entry.file_sha256:
-            what = "a file of the working copy is another than its manifest says"
-            fix = f"remove it, then lagbench generate with --root {self._objects.root}"
-            raise DataError(what, where=str(path), fix=fix)
-        if self._named.entry(entry.scenario) is not None:
-            # An object that is about to change must not be named meanwhile.
-            self._there.pop(entry.path, None)
-            self._put_manifest(self._restricted(self._named))
+            root = self._objects.root
+            raise DataError(
+                "a file of the working copy is another than its manifest says",
+                where=str(path),
+                fix=f"remove it, then lagbench generate with --root {root}",
+            )
+        if self._published.entry(entry.scenario) is not None:
+            # The manifest must not name an object that is about to change.
+            self._object_hashes.pop(entry.path, None)
+            self._put_manifest(self._without_lacking(self._published))
         self._objects.put(entry.path, path)
-        self._there[entry.path] = entry.file_sha256
-        self.held.pop(entry.scenario, None)  # it is here, and the store has ours
+        self._object_hashes[entry.path] = entry.file_sha256
+        # The working copy has this file: it need not be fetched.
+        self.stored_entries.pop(entry.scenario, None)
 
     def _put_manifest(self, manifest: Manifest, *, anew: bool = False) -> None:
-        """Put a manifest with what another writer has named since we last did."""
-        if manifest == self._named and not anew:
+        """Put a manifest with the entries that another writer has added meanwhile."""
+        if manifest == self._published and not anew:
             return
-        found = self._read_manifest()
-        known = {
-            e.scenario
-            for e in (*self._named.files, *self._latest.files, *manifest.files)
-        }
-        others = [e for e in self._right(found) if e.scenario not in known]
-        manifest = join(self._size, manifest, found, others)
-        self._objects.write(
-            MANIFEST_NAME, (manifest.model_dump_json(indent=1) + "\n").encode()
-        )
-        self._named = manifest
-        self._when = time.monotonic()
+        known_scenarios = set()
+        for source in (self._published, self._latest, manifest):
+            known_scenarios |= {entry.scenario for entry in source.files}
+        stored_manifest = self._read_manifest()
+        added_entries = []
+        for entry in self._list_right_entries(stored_manifest):
+            if entry.scenario not in known_scenarios:
+                added_entries.append(entry)
+        joined = join_manifests(self._size, manifest, stored_manifest, added_entries)
+        text = joined.model_dump_json(indent=1) + "\n"
+        self._objects.write(MANIFEST_NAME, text.encode())
+        self._published = joined
+        self._last_manifest = time.monotonic()
 
-    def _lacking(self, manifest: Manifest) -> list[FileEntry]:
-        return [
-            entry
-            for entry in manifest.files
-            if self._there.get(entry.path) != entry.file_sha256
-        ]
+    def _list_lacking(self, manifest: Manifest) -> list[FileEntry]:
+        """Return the entries whose files the store lacks."""
+        lacking = []
+        for entry in manifest.files:
+            if self._object_hashes.get(entry.path) != entry.file_sha256:
+                lacking.append(entry)
+        return lacking
 
-    def _restricted(self, manifest: Manifest) -> Manifest:
-        """Return a manifest without what the store lacks."""
-        lacking = self._lacking(manifest)
+    def _without_lacking(self, manifest: Manifest) -> Manifest:
+        """Return a manifest without the files that the store lacks."""
+        lacking = self._list_lacking(manifest)
+        if not lacking:
+            return manifest
         files = tuple(entry for entry in manifest.files if entry not in lacking)
-        if lacking:
-            return merged(self._size, manifest.model_copy(update={"files": files}))
-        return manifest
+        reduced = manifest.model_copy(update={"files": files})
+        return merge_entries(self._size, reduced)
 
-    def _right(self, manifest: Manifest) -> list[FileEntry]:
-        return [
-            entry for entry in manifest.files if is_right(entry, self._size, manifest)
-        ]
+    def _list_right_entries(self, manifest: Manifest) -> list[FileEntry]:
+        right_entries = []
+        for entry in manifest.files:
+            if matches_registry(entry, self._size, manifest):
+                right_entries.append(entry)
+        return right_entries
 
     def _read_manifest(self) -> Manifest:
-        try:
-            found = remote_manifest(self._size, self._objects.root, fresh=0.0)
-        except NotDataError:  # it is written anew from the files
-            found = None
-        return found or merged(self._size, None)
+        """Return the store's manifest; an empty one where none can be read."""
+        manifest = None
+        with suppress(NotDataError):  # it is written anew from the files
+            manifest = remote_manifest(self._size, self._objects.root, fresh=0.0)
+        return manifest or merge_entries(self._size, None)
 
 
 def check_address(root: str | Path | None) -> None:
-    """Refuse a root that is an address where nothing can be written, before a copy of
-    it is made.
-    """
+    """Refuse an address where nothing can be written, before its copy is made."""
     url = root_url(root)
     if url is not None:
         Objects(url, "")
 
 
-def look_at(size: Size, root: Path) -> Publication | None:
-    """Return what a store holds of a data set, to look only; None for a root that is a
-    plain folder.
-    """
+def inspect_store(size: Size, root: Path) -> Publication | None:
+    """Return the state of a data set in its store; None for a plain folder."""
     url = url_of(root)
     if url is None:
         return None
@@ -184,23 +194,26 @@ def look_at(size: Size, root: Path) -> Publication | None:
 
 
 @contextmanager
-def publication(size: Size, root: Path) -> Iterator[Publication | None]:
+def publish(size: Size, root: Path) -> Iterator[Publication | None]:
     """Write a data set to a store; yield None for a root that is a plain folder.
 
-    Hold the lock of the working copy. Until the end nothing is brought into it. Raises
-    a DataError where the bucket does not exist, a WorkFailedError where the store
-    refuses or does not answer, a UsageError where what reads this kind of address is
-    not installed.
+    Hold the lock of the working copy. Until the end nothing is fetched into it
+    unasked.
+
+    Raises:
+        DataError: the bucket does not exist.
+        WorkFailedError: the store refuses or does not answer.
+        UsageError: the package for this kind of address is not installed.
     """
-    held = look_at(size, root)
-    if held is None:
+    state = inspect_store(size, root)
+    if state is None:
         yield None
         return
-    with writing(root):
+    with suspend_fetching(root):
         try:
-            held.prepare()
-            yield held
+            state.prepare()
+            yield state
         except BaseException:
-            with suppress(LagbenchError):  # what is wrong is on its way to the user
-                held.save()
+            with suppress(LagbenchError):  # the first error is on its way to the user
+                state.save()
             raise

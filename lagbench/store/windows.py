@@ -1,6 +1,4 @@
-"""Windows of scenarios as NumPy arrays: consecutive frames, in memory that the split's
-size leaves alone.
-"""
+"""Windows of consecutive frames as NumPy arrays, in memory of bounded size."""
 
 from __future__ import annotations
 
@@ -11,33 +9,34 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import accumulate, groupby
+from itertools import accumulate
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
-from lagbench.data.local import locate, remedy
+from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import damaged
+from lagbench.data.scenario import damage_error
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
 from .copy import scenario_files
 
-if TYPE_CHECKING:
-    import h5py
-
 Floats = NDArray[np.float32]
 
-CACHE_BYTES = 256 << 20  # frames kept decompressed, by default [bytes]
-# files that a store keeps open, about 0.6 MB each; our splits train on up to 63
+CACHE_BYTES = 256 << 20
+"""Frames kept decompressed, by default [bytes]."""
+
 OPEN_FILES = 128
+"""Files that a store keeps open, about 0.6 MB each; our splits train on up to 63."""
 
 
-class _Open(NamedTuple):
-    """An open file with what is the same in all its windows."""
+class _OpenScenario(NamedTuple):
+    """An open file, with the arrays that all its windows share."""
 
     file: h5py.File
     position: h5py.Dataset
@@ -45,12 +44,26 @@ class _Open(NamedTuple):
     wall_velocity: Floats | None
 
 
+class _Identity(NamedTuple):
+    """Names and length of a scenario."""
+
+    split: str
+    size: str
+    major: int
+    scenario: int
+    frames: int
+
+
 class FrameStore:
-    """Read frames of scenario files; those used last stay in memory, up to a fixed
-    number of bytes.
+    """Read frames of scenario files; the last used frames stay in memory.
 
     Files are opened by the process that reads them and never written, so a store may be
     sent to worker processes: each has a cache of its own.
+
+    Args:
+        size: the data set.
+        paths: files by scenario id.
+        cache_bytes: most memory for decompressed frames [bytes].
     """
 
     def __init__(
@@ -59,12 +72,13 @@ class FrameStore:
         self._size = size
         self._paths = dict(paths)
         self.cache_bytes = cache_bytes
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._process = os.getpid()
-        self._open: OrderedDict[int, _Open] = OrderedDict()
-        self._frames: OrderedDict[tuple[int, int], Floats] = OrderedDict()
+        # least recently used first
+        self._open_scenarios: OrderedDict[int, _OpenScenario] = OrderedDict()
+        self._cached_frames: OrderedDict[tuple[int, int], Floats] = OrderedDict()
         self.cached_bytes = 0
 
     def __getstate__(self) -> dict[str, Any]:
@@ -84,153 +98,172 @@ class FrameStore:
 
         The arrays are those of the cache: copy them, never write to them.
         """
-        self._own()
-        found = {
-            frame: self._frames.get((scenario, frame)) for frame in range(start, stop)
-        }
-        lacking = [frame for frame, values in found.items() if values is None]
-        # Consecutive frames, which are equally far from their places in the list, are
-        # read at once.
-        for _, run in groupby(enumerate(lacking), lambda item: item[1] - item[0]):
-            numbers = [frame for _, frame in run]
-            found.update(self._read(scenario, numbers[0], numbers[-1] + 1))
-        held = {frame: values for frame, values in found.items() if values is not None}
-        for frame, values in held.items():
-            if (scenario, frame) not in self._frames:
-                self._frames[scenario, frame] = values
-                self.cached_bytes += values.nbytes
-            self._frames.move_to_end((scenario, frame))
+        self._reset_after_fork()
+        values = {}
+        missing = []
+        for frame in range(start, stop):
+            cached = self._cached_frames.get((scenario, frame))
+            if cached is None:
+                missing.append(frame)
+            else:
+                values[frame] = cached
+        for first, last in _consecutive_runs(missing):
+            values.update(self._read(scenario, first, last))
+
+        frames = [values[frame] for frame in range(start, stop) if frame in values]
+        for frame, positions in sorted(values.items()):
+            self._cache(scenario, frame, positions)
         while self.cached_bytes > self.cache_bytes:
-            self.cached_bytes -= self._frames.popitem(last=False)[1].nbytes
-        return list(held.values())
+            _, oldest = self._cached_frames.popitem(last=False)
+            self.cached_bytes -= oldest.nbytes
+        return frames
+
+    def _cache(self, scenario: int, frame: int, positions: Floats) -> None:
+        """Keep a frame as the last used one."""
+        key = (scenario, frame)
+        if key not in self._cached_frames:
+            self._cached_frames[key] = positions
+            self.cached_bytes += positions.nbytes
+        self._cached_frames.move_to_end(key)
 
     def constants(self, scenario: int) -> tuple[NDArray[np.int8], Floats | None]:
-        """Return material, shape [particle], and wall velocity [length/s], [frame,
-        wall, 2].
+        """Return material, shape [particle], and wall velocity [length/s].
 
-        Material is 0, liquid, in files without it; wall velocity is None where no wall
-        moves.
+        Material is 0, liquid, in files without it. Wall velocity has the shape [frame,
+        wall, 2]; it is None where no wall moves.
         """
-        self._own()
-        return self._opened(scenario)[2:]
+        self._reset_after_fork()
+        opened = self._open(scenario)
+        return opened.material, opened.wall_velocity
 
-    def _own(self) -> None:
+    def _reset_after_fork(self) -> None:
         """Reopen files after a fork: HDF5 handles do not survive one."""
         if os.getpid() != self._process:
-            self._forget()
+            self._reset()
 
     def _read(
         self, scenario: int, first: int, last: int
     ) -> Iterator[tuple[int, Floats]]:
-        with self._naming(scenario):
-            values = self._opened(scenario).position[first:last]
-        # Copies, so that each frame's memory is free when it leaves the cache.
-        return ((first + i, frame.copy()) for i, frame in enumerate(values))
+        """Yield numbers and positions of the frames from the first to the last."""
+        with self._damage_errors(scenario):
+            values = self._open(scenario).position[first : last + 1]
+        for frame, positions in enumerate(values, start=first):
+            # A copy, so that each frame's memory is free when it leaves the cache.
+            yield frame, positions.copy()
 
-    def _opened(self, scenario: int) -> _Open:
-        """Return an open file that is what the registry says; of too many the longest
-        unused is closed.
-        """
-        if scenario not in self._open:
-            with self._naming(scenario):
-                self._open[scenario] = self._checked(scenario)
-            if len(self._open) > OPEN_FILES:
-                self._open.popitem(last=False)[1].file.close()
-        self._open.move_to_end(scenario)
-        return self._open[scenario]
+    def _open(self, scenario: int) -> _OpenScenario:
+        """Return an open file; of too many the least recently used is closed."""
+        if scenario not in self._open_scenarios:
+            with self._damage_errors(scenario):
+                self._open_scenarios[scenario] = self._open_checked(scenario)
+            if len(self._open_scenarios) > OPEN_FILES:
+                _, oldest = self._open_scenarios.popitem(last=False)
+                oldest.file.close()
+        self._open_scenarios.move_to_end(scenario)
+        return self._open_scenarios[scenario]
 
-    def _checked(self, scenario: int) -> _Open:
+    def _open_checked(self, scenario: int) -> _OpenScenario:
         """Open a file; refuse one of another scenario, version or content."""
-        import h5py
-
-        from lagbench.data.scenario import variables
-
-        size = self._size
         path = self._paths[scenario]
         if not path.is_file():
             raise DataError(
                 "a scenario file is missing",
                 where=str(path),
-                fix=self._remedy(scenario),
+                fix=self._repair_hint(scenario),
             )
         # Frames are cached here: HDF5 need not keep chunks too.
         file = h5py.File(path, "r", rdcc_nbytes=0)
-        values = variables(file)
-        held = file.attrs
-        position = values["position"]
-        # netCDF4 stores ASCII text as bytes.
-        split, tier, version, content = (
-            text.decode() if isinstance(text := held[name], bytes) else str(text)
-            for name in ("split", "size", "version", "content_sha256")
-        )
-        found = (
-            split,
-            tier,
-            major_of(version),
-            int(np.asarray(held["scenario"]).item()),
-            len(position),
-        )
-        expected = (
-            size.split,
-            size.name,
-            size.major,
-            scenario,
-            size.frame_count(scenario),
-        )
-        if size.measured:
-            digest = size.measured.scenario_sha256.get(scenario, "")
-        else:
-            digest = ""
-        if found != expected or not content.startswith(digest):
+        variables = list_variables(file)
+        position = variables["position"]
+        try:
+            self._check_identity(file, scenario, frames=len(position))
+        except DataError:
             file.close()
+            raise
+        material = np.zeros(position.shape[1], np.int8)
+        if "material" in variables:
+            material = variables["material"][...]
+        wall_velocity = None
+        if "wall_velocity" in variables:
+            wall_velocity = variables["wall_velocity"][...]
+        return _OpenScenario(file, position, material, wall_velocity)
+
+    def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:
+        """Refuse a file of another scenario, version or content."""
+        size = self._size
+        stated = _Identity(
+            split=_read_text(file, "split"),
+            size=_read_text(file, "size"),
+            major=major_of(_read_text(file, "version")),
+            scenario=int(np.asarray(file.attrs["scenario"]).item()),
+            frames=frames,
+        )
+        expected = _Identity(
+            split=size.split,
+            size=size.name,
+            major=size.major,
+            scenario=scenario,
+            frames=size.frame_count(scenario),
+        )
+        content_hash = _read_text(file, "content_sha256")
+        recorded_hash = ""
+        if size.measured is not None:
+            recorded_hash = size.measured.scenario_sha256.get(scenario, "")
+        if stated != expected or not content_hash.startswith(recorded_hash):
             raise DataError(
                 "a scenario file is not that of the registry",
-                where=str(path),
-                expected=f"(split, size, version, id, frames) = {expected}, content "
-                f"hash {digest or 'any'}",
-                got=f"{found}, content hash {content[:16]}",
-                fix=self._remedy(scenario),
+                where=str(self._paths[scenario]),
+                expected=f"(split, size, version, id, frames) = {tuple(expected)}, "
+                f"content hash {recorded_hash or 'any'}",
+                got=f"{tuple(stated)}, content hash {content_hash[:16]}",
+                fix=self._repair_hint(scenario),
             )
-        material = values.get("material")
-        walls = values.get("wall_velocity")
-        if material is None:
-            kinds = np.zeros(position.shape[1], np.int8)
-        else:
-            kinds = material[...]
-        return _Open(file, position, kinds, None if walls is None else walls[...])
 
     @contextmanager
-    def _naming(self, scenario: int) -> Iterator[None]:
-        """Turn whatever HDF5 raises on damaged bytes into a DataError naming the
-        file.
-        """
+    def _damage_errors(self, scenario: int) -> Iterator[None]:
+        """Turn whatever HDF5 raises on damaged bytes into a DataError with the path."""
+        path = self._paths[scenario]
         try:
             yield
         except LagbenchError:
             raise
-        except (
-            Exception
-        ) as error:  # no list of types holds: damage surfaces as nearly any of them
-            if isinstance(error, OSError) and error.errno in (
-                errno.EMFILE,
-                errno.ENFILE,
-            ):
+        except Exception as error:  # damage surfaces as nearly any type
+            limits = (errno.EMFILE, errno.ENFILE)
+            if isinstance(error, OSError) and error.errno in limits:
                 raise WorkFailedError(
                     "the system opens no more files",
-                    where=str(self._paths[scenario]),
-                    got=f"{len(self._open)} scenario files are open",
+                    where=str(path),
+                    got=f"{len(self._open_scenarios)} scenario files are open",
                     fix="allow more, as by `ulimit -n 4096`, or open fewer data sets "
                     "at a time",
                 ) from error
-            got = f"{type(error).__name__}: {error}"
-            fix = self._remedy(scenario)
-            raise damaged(self._paths[scenario], got, fix=fix) from error
+            reason = f"{type(error).__name__}: {error}"
+            hint = self._repair_hint(scenario)
+            raise damage_error(path, reason, fix=hint) from error
 
-    def _remedy(self, scenario: int) -> str:
+    def _repair_hint(self, scenario: int) -> str:
         root = self._paths[scenario].parents[4]
-        return remedy(
-            self._size, f"--subset {self._size.subset_of(scenario)}", root=root
-        )
+        subset = self._size.subset_of(scenario)
+        return suggest_repair(self._size, f"--subset {subset}", root=root)
+
+
+def _consecutive_runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
+    """Return first and last number of each run of consecutive ascending numbers."""
+    runs: list[tuple[int, int]] = []
+    for number in numbers:
+        if runs and runs[-1][1] == number - 1:
+            runs[-1] = (runs[-1][0], number)
+        else:
+            runs.append((number, number))
+    return runs
+
+
+def _read_text(file: h5py.File, name: str) -> str:
+    """Return an attribute as text; netCDF4 stores ASCII text as bytes."""
+    value = file.attrs[name]
+    if isinstance(value, bytes):
+        return value.decode()
+    return str(value)
 
 
 class Window(NamedTuple):
@@ -239,8 +272,8 @@ class Window(NamedTuple):
     # particle positions [length], shape [particle, frame, 2]
     position: NDArray[np.float32]
     material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
-    # velocity of the walls [length/s], shape [frame, wall, 2]: what acts on the way to
-    # each frame, those to predict included; None in a split without moving walls
+    # velocity of the walls [length/s], shape [frame, wall, 2]: the forcing on the way
+    # to each frame, those to predict included; None in a split without moving walls
     wall_velocity: NDArray[np.float32] | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
@@ -250,12 +283,11 @@ class Window(NamedTuple):
 
 
 class WindowReader:
-    """All windows of ``history + future`` consecutive frames of a data set's subsets,
-    by number.
+    """All windows of ``history + future`` consecutive frames, by number.
 
     Files are opened by the process that reads from them, at most 128 at a time;
     decompressed frames are kept up to `cache_bytes` in each process. Stored data are
-    never changed: every window is a copy. `windows` says what the arguments are.
+    never changed: every window is a copy. See `windows` for the arguments.
     """
 
     def __init__(
@@ -271,45 +303,49 @@ class WindowReader:
         cache_bytes: int = CACHE_BYTES,
         origin: bool = False,
     ) -> None:
-        entry, folder, _ = locate(split, size, root=root, registry=registry)
-        names = (subset,) if isinstance(subset, str) else tuple(subset)
-        paths = scenario_files(entry, folder, names)
+        tier, root_folder, _ = locate(split, size, root=root, registry=registry)
+        subsets = (subset,) if isinstance(subset, str) else tuple(subset)
+        paths = scenario_files(tier, root_folder, subsets)
         # what the registry publishes: bounds, task, parameters, statistics of train
-        self.size = entry
-        # frames that a model is given
-        self.history = entry.task.input_frames if history is None else history
+        self.size = tier
+        if history is None:
+            history = tier.task.input_frames
+        self.history = history  # given frames of a model
         self.future = future  # frames after them
-        self.length = self.history + future  # frames in a window
+        self.length = history + future  # frames in a window
         self.origin = origin  # whether windows hold the scenario's first frame too
         self.scenarios = tuple(paths)
-        self.frame_bytes = 8 * entry.particles
-        frames = [entry.frame_count(i) for i in paths]
-        counts = [max(0, count - self.length + 1) for count in frames]
+        self.frame_bytes = 8 * tier.particles
+        frame_counts = [tier.frame_count(scenario) for scenario in paths]
+        window_counts = [max(0, count - self.length + 1) for count in frame_counts]
         # number of the first window of each scenario, and the number of all windows
-        self.starts = (0, *accumulate(counts))
-        where = f"{split} {entry.name}, {', '.join(names)}"
+        self.starts = (0, *accumulate(window_counts))
+
+        where = f"{split} {tier.name}, {', '.join(subsets)}"
         if self.history < 1 or future < 0:
             raise UsageError(
                 "a window has at least one given frame",
                 where=where,
                 expected="history >= 1, future >= 0",
                 got=f"history {self.history}, future {future}",
-                fix=f"leave history out for the task's {entry.task.input_frames}",
+                fix=f"leave history out for the task's {tier.task.input_frames}",
             )
-        if not frames or cache_bytes < 0:
-            what = "no windows can be read like that"
-            expected = "a subset at least, and cache_bytes >= 0"
-            got = f"{len(frames)} scenarios, cache_bytes {cache_bytes}"
-            raise UsageError(what, where=where, expected=expected, got=got)
+        if not frame_counts or cache_bytes < 0:
+            raise UsageError(
+                "no windows can be read like that",
+                where=where,
+                expected="a subset at least, and cache_bytes >= 0",
+                got=f"{len(frame_counts)} scenarios, cache_bytes {cache_bytes}",
+            )
         if not len(self):
             raise UsageError(
                 "no scenario is as long as a window",
                 where=where,
-                expected=f"at most {max(frames)} frames",
+                expected=f"at most {max(frame_counts)} frames",
                 got=f"{self.length}: history {self.history}, future {future}",
                 fix="ask for fewer frames",
             )
-        self.store = FrameStore(entry, paths, cache_bytes=cache_bytes)
+        self.store = FrameStore(tier, paths, cache_bytes=cache_bytes)
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -318,20 +354,21 @@ class WindowReader:
     @property
     def gravity(self) -> float:
         """Downward acceleration [length/s^2]; 0 in a split that states none."""
-        stated = self.size.parameters.get("gravity")
-        if stated:
-            return float(stated.value or 0.0)
-        return 0.0
+        gravity = self.size.parameters.get("gravity")
+        if gravity is None:
+            return 0.0
+        return float(gravity.value or 0.0)
 
     @property
     def viscosity(self) -> float | None:
-        """Kinematic viscosity of the liquid [length^2/s]; None where scenarios differ:
-        it is not given.
+        """Kinematic viscosity of the liquid [length^2/s].
+
+        None where scenarios differ: it is not given.
         """
-        stated = self.size.parameters.get("liquid_viscosity")
-        if stated is None or stated.value is None:
+        viscosity = self.size.parameters.get("liquid_viscosity")
+        if viscosity is None or viscosity.value is None:
             return None
-        return float(stated.value)
+        return float(viscosity.value)
 
     def place(self, index: int) -> tuple[int, int]:
         """Return scenario id and first frame of a window."""
@@ -347,14 +384,13 @@ class WindowReader:
         scenario, frame = self.place(index)
         frames = self.store.frames(scenario, frame, frame + self.length)
         material, walls = self.store.constants(scenario)
-        if walls is None:
-            part = None
-        else:
-            part = walls[frame : frame + self.length]
-        window = window_of(frames, material, part, scenario, frame)
+        if walls is not None:
+            walls = walls[frame : frame + self.length]
+        window = copy_window(frames, material, walls, scenario, frame)
         if not self.origin:
             return window
-        return window._replace(origin=self.store.frames(scenario, 0, 1)[0].copy())
+        first_frame = self.store.frames(scenario, 0, 1)[0]
+        return window._replace(origin=first_frame.copy())
 
 
 class Windows(WindowReader):
@@ -381,18 +417,18 @@ def windows(
 
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, 2];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
-    [frame, wall, 2], or None; the ids ``scenario`` and ``frame``. ``data.size`` holds
-    what is published of the data set. `lagbench.torch.WindowDataset` gives the same
+    [frame, wall, 2], or None; the ids ``scenario`` and ``frame``. ``data.size`` is the
+    description of the data set. `lagbench.torch.WindowDataset` gives the same
     windows as tensors.
 
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        history: frames that a model is given; those of the task by default.
+        history: given frames of the model; those of the task by default.
         future: frames after them.
-        registry: what describes the data set; ours by default.
+        registry: description of the data sets; ours by default.
         cache_bytes: frames kept decompressed [bytes]; with less, reading is slower,
             never different.
         origin: whether windows hold the positions in the scenario's first frame too, as
@@ -415,7 +451,7 @@ def windows(
     )
 
 
-def window_of(
+def copy_window(
     frames: Sequence[NDArray[np.float32]],
     material: NDArray[np.int8],
     walls: NDArray[np.float32] | None,
@@ -424,11 +460,14 @@ def window_of(
 ) -> Window:
     """Copy frames, each of shape [particle, 2], to a window."""
     # x and y of a particle travel as one number of 8 bytes: six times faster.
-    pairs = np.stack([xy.view(np.int64)[:, 0] for xy in frames], axis=1)
+    pairs = np.stack([positions.view(np.int64)[:, 0] for positions in frames], axis=1)
+    wall_velocity = None
+    if walls is not None:
+        wall_velocity = walls.copy()
     return Window(
-        pairs.view(np.float32).reshape(*pairs.shape, 2),
-        material.copy(),
-        None if walls is None else walls.copy(),
-        scenario,
-        frame,
+        position=pairs.view(np.float32).reshape(*pairs.shape, 2),
+        material=material.copy(),
+        wall_velocity=wall_velocity,
+        scenario=scenario,
+        frame=frame,
     )

@@ -1,9 +1,9 @@
 """The workers of a Dask cluster, used like the :class:`.Pool` of this machine.
 
-The scheduler runs what a lost worker held on another one. A lost scheduler ends the
-work with an error; results that have arrived by then are not lost. A task runs in the
+The scheduler runs the items of a lost worker on another one. A lost scheduler ends the
+work with an error; results that have arrived by then are not lost. An item runs in the
 worker itself, which must have one thread: Taichi and HDF5 want a process for
-themselves. How far a task is comes as Dask events.
+themselves. Progress comes as Dask events.
 
 A cluster writes a data set to one folder on storage that all its machines share. A mark
 with a random word shows that a worker's folder of that path is the client's. Network
@@ -26,23 +26,23 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
+from types import ModuleType, TracebackType
 from typing import Any, NamedTuple, Self
 
 from lagbench.atomic import check_writable, temporary_name, write_atomically
 from lagbench.errors import LagbenchError, UsageError, WorkFailedError, require
 
-from .machine import environment_of
-from .pool import Event, Task, crashed
+from .machine import describe_machine
+from .pool import Event, WorkItem, crash_error
 
 PATIENCE = 30.0  # how long a file of another machine may take to appear [s]
 PAUSE = 0.1  # pause between two looks for a file [s]
-TELL_SECONDS = 0.5  # time between two events that tell how far a task is [s]
+REPORT_SECONDS = 0.5  # time between two reports of the progress of an item [s]
 CONNECT_SECONDS = 20  # how long a Dask scheduler may take to answer
-POLL_SECONDS = 0.02  # pause between two looks at the tasks [s]
-LOOK_SECONDS = 1.0  # pause between two looks at the workers [s]
+POLL_SECONDS = 0.02  # pause between two looks at the items [s]
+CHECK_SECONDS = 1.0  # pause between two looks at the workers [s]
 LOST_SECONDS = 60.0  # how long a Dask cluster may be without any worker
-STOP_SECONDS = 5  # how long to wait for the workers to hear that they shall stop
+STOP_SECONDS = 5  # how long to wait for the workers to stop
 WORKERS = "dask worker ADDRESS --nworkers -1 --nthreads 1"
 """The command that starts workers as they must be: one a core, each with one thread."""
 
@@ -54,34 +54,45 @@ LOGGERS = ("distributed", "distributed.client", "distributed.comm", "distributed
 
 
 @dataclass(frozen=True)
-class Mark:
-    """A file by which a worker knows the client's folder."""
+class FolderMark:
+    """A file by which a worker recognises the client's folder."""
 
-    path: Path  # where it stands
-    word: str  # what it holds
+    path: Path  # path of the file
+    word: str  # its content
     patience: float  # how long it may take to appear [s]
 
     def check(self, worker: str) -> None:
-        """See that the folder is here and can be written to."""
+        """Check that this machine sees the folder and can write to it.
+
+        Raises:
+            WorkFailedError: another folder, no folder, or it is not writable.
+        """
         folder = self.path.parent
-        if not _appears(self.path, self.patience, holding=self.word):
+        if not _wait_for_file(self.path, self.patience, content=self.word):
+            got = "no such folder"
+            if folder.is_dir():
+                got = "another folder"
             raise WorkFailedError(
                 "a worker does not see the folder of the data set",
                 where=f"{folder}, worker {worker}",
                 expected="one folder under the same path on every worker and here",
-                got="another folder" if folder.is_dir() else "no such folder",
+                got=got,
                 fix="name a folder on storage that all of them share: --root",
             )
         check_writable(folder)
-        for place in folder.iterdir():
-            if place.is_dir():
-                _look_again(place)
+        for path in folder.iterdir():
+            if path.is_dir():
+                _refresh_listing(path)
 
 
 @contextmanager
-def marked(folder: Path) -> Iterator[Mark]:
+def mark_folder(folder: Path) -> Iterator[FolderMark]:
     """Keep a mark in a folder."""
-    mark = Mark(temporary_name(folder / "mark"), secrets.token_hex(16), PATIENCE)
+    mark = FolderMark(
+        path=temporary_name(folder / "mark"),
+        word=secrets.token_hex(16),
+        patience=PATIENCE,
+    )
     write_atomically(mark.path, mark.word.encode())
     try:
         yield mark
@@ -91,143 +102,163 @@ def marked(folder: Path) -> Iterator[Mark]:
 
 def await_file(path: Path) -> None:
     """Wait until a file that another machine has written is seen here."""
-    if not _appears(path, PATIENCE):
-        what = "a worker's file does not appear"
-        expected = f"a file within {PATIENCE:.0f} s"
-        fix = "name a folder on storage that all machines share, then run the same command again"
-        raise WorkFailedError(what, where=str(path), expected=expected, fix=fix)
+    if not _wait_for_file(path, PATIENCE):
+        raise WorkFailedError(
+            "a worker's file does not appear",
+            where=str(path),
+            expected=f"a file within {PATIENCE:.0f} s",
+            fix="name a folder on storage that all machines share, then run the same "
+            "command again",
+        )
 
 
-def _appears(path: Path, patience: float, *, holding: str | None = None) -> bool:
+def _wait_for_file(path: Path, patience: float, *, content: str | None = None) -> bool:
+    """Wait until a file appears, with this content if given; tell whether it did."""
     end = time.monotonic() + patience
     while True:
-        _look_again(path.parent)
-        # Another machine may see the name before the content.
-        if path.is_file() and (
-            holding is None or path.read_text(encoding="utf-8") == holding
-        ):
+        _refresh_listing(path.parent)
+        if _has_content(path, content):
             return True
         if time.monotonic() > end:
             return False
         time.sleep(PAUSE)
 
 
-def _look_again(folder: Path) -> None:
+def _has_content(path: Path, content: str | None) -> bool:
+    if not path.is_file():
+        return False
+    # Another machine may see the name before the content.
+    return content is None or path.read_text(encoding="utf-8") == content
+
+
+def _refresh_listing(folder: Path) -> None:
+    """List a folder, so that a network file system looks at it again."""
     with contextlib.suppress(OSError):
         os.listdir(folder)
 
 
 # --- in a worker ----------------------------------------------------------------------
 
-_STOPPED: set[str] = set()  # clients whose tasks are void
+_stopped_clients: set[str] = set()
+"""Clients that no longer wait for their items."""
 
 
 @dataclass(frozen=True)
 class Client:
-    """For whom a worker works."""
+    """The client that a worker works for."""
 
-    name: str  # topic of the events that tell of its tasks
+    name: str  # topic of the events with the progress of its items
     version: str  # its version of lagbench
-    # what shows that the worker sees its folder; None where none is needed
-    mark: Mark | None = None
+    # shows that the worker sees the client's folder; None where no folder is needed
+    mark: FolderMark | None = None
 
     def check(self, worker: str, *, threads: int) -> None:
-        """Refuse a worker that could not make the client's bits."""
+        """Refuse a worker that could not make the client's bits.
+
+        Raises:
+            WorkFailedError: another version, several threads, or another folder.
+        """
         where = f"worker {worker}"
-        own = version("lagbench")
-        if self.version != own:
-            fix = "install the same version on every worker"
-            what = "a worker runs another version of lagbench"
+        worker_version = version("lagbench")
+        if self.version != worker_version:
             raise WorkFailedError(
-                what, where=where, expected=self.version, got=own, fix=fix
+                "a worker runs another version of lagbench",
+                where=where,
+                expected=self.version,
+                got=worker_version,
+                fix="install the same version on every worker",
             )
         if threads != 1:
-            what = "a worker runs several tasks in one process"
-            fix = f"start the workers with `{WORKERS}`"
             raise WorkFailedError(
-                what,
+                "a worker runs several items in one process",
                 where=where,
                 expected="1 thread",
                 got=f"{threads} threads",
-                fix=fix,
+                fix=f"start the workers with `{WORKERS}`",
             )
         if self.mark is not None:
             self.mark.check(worker)
 
 
-class Done(NamedTuple):
-    """What became of a task."""
+class ItemResult(NamedTuple):
+    """The result of an item."""
 
-    value: Any  # its result
+    value: Any  # the return value
     units: int  # units of work done
-    machine: dict[str, str]  # what identity says of the machine that did it
+    machine: dict[str, str]  # description of the machine that did it
 
 
-def run_task(task: Task, number: int, client: Client) -> Done:
-    """Run a client's task in this process, the only thread of a Dask worker."""
+def run_item(item: WorkItem, number: int, client: Client) -> ItemResult:
+    """Run a client's item in this process, the only thread of a Dask worker."""
     from distributed import get_worker
 
     worker = get_worker()
     client.check(worker.address, threads=worker.state.nthreads)
-    units = 0
-    told = time.monotonic()
+    total_units = 0
+    last_report = time.monotonic()
 
-    def report(done: int) -> None:
-        nonlocal units, told
-        units += done
-        # Dask cannot stop a thread: a task ends itself when nobody waits for it any
-        # more.
-        if client.name in _STOPPED:
-            raise WorkFailedError("the client is gone", where=task.name)
-        if time.monotonic() - told >= TELL_SECONDS:
-            told = time.monotonic()
-            worker.log_event(client.name, [number, units])
+    def report(units: int) -> None:
+        nonlocal total_units, last_report
+        total_units += units
+        # Dask cannot stop a thread: an item ends itself when nobody waits for it.
+        if client.name in _stopped_clients:
+            raise WorkFailedError("the client is gone", where=item.name)
+        if time.monotonic() - last_report >= REPORT_SECONDS:
+            last_report = time.monotonic()
+            worker.log_event(client.name, [number, total_units])
 
     try:
-        value = task.function(*task.arguments, report)
+        value = item.function(*item.arguments, report)
     except LagbenchError:
         raise
     except Exception as error:
-        raise crashed(error) from None
-    return Done(value, units, environment_of("unknown"))
+        raise crash_error(error) from None
+    return ItemResult(value, total_units, describe_machine("unknown"))
 
 
 def stop(client: str) -> None:
-    """End what this worker does for a client."""
-    _STOPPED.add(client)
+    """End the items of a client in this worker."""
+    _stopped_clients.add(client)
 
 
 # --- at the client --------------------------------------------------------------------
 
 
 class Cluster:
-    """The workers of a Dask cluster; use it as a context manager."""
+    """The workers of a Dask cluster; use it as a context manager.
+
+    Args:
+        address: address of the scheduler.
+        folder: folder that the workers must share with this machine; None where they
+            write nothing.
+    """
 
     def __init__(self, address: str, *, folder: Path | None = None) -> None:
-        self.address = address  # that of the scheduler
-        # what the workers must share with this machine; None where they write nothing
+        self.address = address
         self.folder = folder
         self._numbers = itertools.count()
-        self._pending: dict[int, tuple[Task, Any]] = {}
-        self._seen: dict[int, int] = {}
-        self._heard: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
+        # items that are not done, with their futures, by number
+        self._pending: dict[int, tuple[WorkItem, Any]] = {}
+        self._reported_units: dict[int, int] = {}
+        # number and units of work of items, as the workers report them
+        self._reports: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
 
     def __enter__(self) -> Self:
         """Connect, and mark the shared folder."""
         with ExitStack() as stack:
-            self._dask = stack.enter_context(_connected(self.address))
-            if self.folder is None:
-                mark = None
-            else:
-                mark = stack.enter_context(marked(self.folder))
-            self._client = Client(
-                f"lagbench-{secrets.token_hex(8)}", version("lagbench"), mark
-            )
-            self._dask.subscribe_topic(
-                self._client.name, lambda event: self._heard.put(tuple(event[1]))
-            )
+            self._dask = stack.enter_context(_connect(self.address))
+            mark = None
+            if self.folder is not None:
+                mark = stack.enter_context(mark_folder(self.folder))
+            name = f"lagbench-{secrets.token_hex(8)}"
+            self._client = Client(name, version("lagbench"), mark)
+            self._dask.subscribe_topic(name, self._keep_report)
             self._stack = stack.pop_all()
         return self
+
+    def _keep_report(self, event: tuple[Any, Any]) -> None:
+        _, report = event
+        self._reports.put(tuple(report))
 
     def __exit__(
         self,
@@ -235,15 +266,14 @@ class Cluster:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Make the workers drop what they hold, and disconnect."""
-        pending = [future for _, future in self._pending.values()]
+        """Make the workers drop their items, and disconnect."""
+        futures = [future for _, future in self._pending.values()]
         self._pending = {}
         try:
-            if pending and self._dask.status == "running":
-                with contextlib.suppress(
-                    Exception
-                ):  # what cannot be reached is lost anyway
-                    self._dask.cancel(pending)
+            if futures and self._dask.status == "running":
+                # A worker that cannot be reached is lost anyway.
+                with contextlib.suppress(Exception):
+                    self._dask.cancel(futures)
                     self._dask.run(
                         stop,
                         self._client.name,
@@ -253,131 +283,155 @@ class Cluster:
         finally:
             self._stack.__exit__(kind, error, trace)
 
-    def submit(self, task: Task) -> None:
-        """Send a task to the scheduler; also while :meth:`events` runs."""
+    def submit(self, item: WorkItem) -> None:
+        """Send an item to the scheduler; also while :meth:`events` runs."""
         number = next(self._numbers)
-        options = {
-            "key": f"{self._client.name}-{number}",
-            "priority": round(task.cost),
-            "pure": False,
-        }
-        self._pending[number] = (
-            task,
-            self._dask.submit(run_task, task, number, self._client, **options),
+        future = self._dask.submit(
+            run_item,
+            item,
+            number,
+            self._client,
+            key=f"{self._client.name}-{number}",
+            priority=round(item.cost),
+            pure=False,
         )
+        self._pending[number] = (item, future)
 
     def events(self) -> Iterator[Event]:
-        """Yield news until all tasks are done; lost work counts as negative
-        progress.
-        """
-        looked = alive = time.monotonic()
+        """Yield news until all items are done; lost work is negative progress."""
+        last_check = time.monotonic()
+        last_alive = last_check
         while self._pending:
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    number, units = self._heard.get_nowait()
-                    if number in self._pending:
-                        yield self._counted(number, self._pending[number][0], units)
-            ended = [
-                number for number, (_, future) in self._pending.items() if future.done()
-            ]
-            for number in ended:
-                task, future = self._pending.pop(number)
-                done = _fetch(task.name, future)
-                yield self._counted(number, task, done.units)
+            yield from self._progress_events()
+            finished = self._list_finished()
+            for number in finished:
+                item, future = self._pending.pop(number)
+                result = _fetch_result(item.name, future)
+                yield self._count_units(number, item, result.units)
                 yield Event(
-                    task=task, kind="done", value=done.value, machine=done.machine
+                    item=item, kind="done", value=result.value, machine=result.machine
                 )
             now = time.monotonic()
-            if now - looked >= LOOK_SECONDS:
-                looked = now
-                with contextlib.suppress(
-                    OSError
-                ):  # the connection may break after the status was set
-                    if (
-                        self._dask.status == "running"
-                        and self._dask.scheduler_info()["workers"]
-                    ):
-                        alive = now
-            if self._dask.status in ("closed", "failed") or now - alive > LOST_SECONDS:
-                raise _lost(f"{self._dask.status}, no worker for {now - alive:.0f} s")
-            if not ended:
+            if now - last_check >= CHECK_SECONDS:
+                last_check = now
+                if self._has_workers():
+                    last_alive = now
+            lonely_seconds = now - last_alive
+            status = self._dask.status
+            if status in ("closed", "failed") or lonely_seconds > LOST_SECONDS:
+                raise _lost_error(f"{status}, no worker for {lonely_seconds:.0f} s")
+            if not finished:
                 time.sleep(POLL_SECONDS)
 
-    def _counted(self, number: int, task: Task, units: int) -> Event:
-        """Return the progress since the last news; another worker may have begun
-        anew.
+    def _progress_events(self) -> Iterator[Event]:
+        while not self._reports.empty():
+            number, units = self._reports.get()
+            if number in self._pending:
+                item, _ = self._pending[number]
+                yield self._count_units(number, item, units)
+
+    def _list_finished(self) -> list[int]:
+        finished = []
+        for number, (_, future) in self._pending.items():
+            if future.done():
+                finished.append(number)
+        return finished
+
+    def _has_workers(self) -> bool:
+        # The connection may break after the status was set.
+        with contextlib.suppress(OSError):
+            if self._dask.status == "running":
+                return bool(self._dask.scheduler_info()["workers"])
+        return False
+
+    def _count_units(self, number: int, item: WorkItem, units: int) -> Event:
+        """Return the progress since the last report.
+
+        It is negative where another worker has begun anew.
         """
-        before = self._seen.get(number, 0)
-        self._seen[number] = units
-        return Event(task=task, kind="progress", value=units - before)
+        units_before = self._reported_units.get(number, 0)
+        self._reported_units[number] = units
+        return Event(item=item, kind="progress", value=units - units_before)
 
 
 @contextmanager
-def _connected(address: str) -> Iterator[Any]:
-    """Connect, with Dask's logs kept off the terminal: what matters of them becomes an
-    error of ours.
+def _connect(address: str) -> Iterator[Any]:
+    """Connect, with Dask's logs kept off the terminal: their news become our errors.
 
     After an error they stay off: a client that lost its scheduler logs until the
     process ends.
     """
-    # its import sets the levels of its loggers
+    # Its import sets the levels of its loggers.
     distributed = require("distributed", extra="cluster")
-    levels = {name: logging.getLogger(name).level for name in LOGGERS}
+    levels = {}
     for name in LOGGERS:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    try:
-        if not address.startswith(("ucx://", "inproc://")):
-            # A client whose address cannot be one is 40 s in closing.
-            distributed.comm.addressing.get_address_host_port(address)
-        client = distributed.Client(
-            address, timeout=CONNECT_SECONDS, set_as_default=False
-        )
-    except (OSError, ValueError) as error:
-        bad = isinstance(error, ValueError)
-        raise (UsageError if bad else WorkFailedError)(
-            "cannot reach the Dask scheduler",
-            where=f"--scheduler {address}",
-            expected="the address of a running scheduler, as in tcp://10.0.0.5:8786",
-            got=f"{type(error).__name__}: {error}",
-            fix=f"start one with `dask scheduler` and workers with `{WORKERS}`",
-        ) from error
+        logger = logging.getLogger(name)
+        levels[name] = logger.level
+        logger.setLevel(logging.CRITICAL + 1)
+    client = _open_client(distributed, address)
     try:
         yield client
     except (CancelledError, distributed.comm.CommClosedError) as error:
-        raise _lost(error) from error
+        raise _lost_error(error) from error
     finally:
         client.close()
     for name, level in levels.items():
         logging.getLogger(name).setLevel(level)
 
 
-def _lost(got: object) -> WorkFailedError:
+def _open_client(distributed: ModuleType, address: str) -> Any:  # noqa: ANN401
+    try:
+        # A client with an impossible address takes 40 s to close.
+        if not address.startswith(("ucx://", "inproc://")):
+            distributed.comm.addressing.get_address_host_port(address)
+        return distributed.Client(
+            address, timeout=CONNECT_SECONDS, set_as_default=False
+        )
+    except (OSError, ValueError) as error:
+        kind: type[LagbenchError] = WorkFailedError
+        if isinstance(error, ValueError):
+            kind = UsageError
+        raise kind(
+            "cannot reach the Dask scheduler",
+            where=f"--scheduler {address}",
+            expected="the address of a running scheduler, as in tcp://10.0.0.5:8786",
+            got=f"{type(error).__name__}: {error}",
+            fix=f"start one with `dask scheduler` and workers with `{WORKERS}`",
+        ) from error
+
+
+def _lost_error(reason: object) -> WorkFailedError:
+    if isinstance(reason, Exception):
+        reason = f"{type(reason).__name__}: {reason}"
     return WorkFailedError(
         "the Dask cluster is lost",
         where="--scheduler",
-        got=f"{type(got).__name__}: {got}" if isinstance(got, Exception) else got,
+        got=reason,
         fix="start scheduler and workers, then run the same command again",
     )
 
 
-def _fetch(name: str, future: Any) -> Done:  # noqa: ANN401
-    """Return what came of a task; put whatever else came into an error of ours."""
-    killed = require("distributed", extra="cluster").KilledWorker
+def _fetch_result(name: str, future: Any) -> ItemResult:  # noqa: ANN401
+    """Return the result of an item; turn any exception into an error of ours."""
+    killed_worker_error = require("distributed", extra="cluster").KilledWorker
     try:
-        done: Done = future.result()
+        result: ItemResult = future.result()
     except LagbenchError:
         raise
-    except killed as error:
-        what = "workers of the Dask cluster died again and again"
-        fix = "give the workers more memory, or leave --scheduler out"
-        raise WorkFailedError(what, where=name, got=str(error), fix=fix) from error
-    except (
-        Exception
-    ) as error:  # whatever a worker raises that cannot even read the task
+    except killed_worker_error as error:
+        raise WorkFailedError(
+            "workers of the Dask cluster died again and again",
+            where=name,
+            got=str(error),
+            fix="give the workers more memory, or leave --scheduler out",
+        ) from error
+    except Exception as error:  # a worker that cannot read the item raises anything
         if future.status != "error":
-            raise _lost(error) from error
-        what = "a worker of the Dask cluster cannot do the work"
-        got = f"{type(error).__name__}: {error}"
-        fix = "install the same version of lagbench with its extras on every worker"
-        raise WorkFailedError(what, where=name, got=got, fix=fix) from error
-    return done
+            raise _lost_error(error) from error
+        raise WorkFailedError(
+            "a worker of the Dask cluster cannot do the work",
+            where=name,
+            got=f"{type(error).__name__}: {error}",
+            fix="install the same version of lagbench with its extras on every worker",
+        ) from error
+    return result

@@ -1,10 +1,9 @@
-"""Worker processes that take tasks, are replaced when killed, and die with their
-parent.
+"""Worker processes that run work items, are replaced when killed, and die with us.
 
 Each worker is a fresh interpreter that talks over a socket pair. Unlike
 ``multiprocessing`` it never imports the caller's ``__main__`` (a script without a
 guard, a notebook or standard input may call :func:`lagbench.generate`), and unlike
-``concurrent.futures`` one killed worker costs one attempt of one task, not the pool.
+``concurrent.futures`` one killed worker costs one attempt of one item, not the pool.
 """
 
 from __future__ import annotations
@@ -27,19 +26,26 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, Self
 
-from lagbench.errors import LagbenchError, UsageError, WorkFailedError, package_at_fault
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    WorkFailedError,
+    find_faulty_package,
+)
 
 from .machine import available_cores
 
 AVAILABLE = os.name == "posix"
-"""Whether workers can be started here: they inherit a socket, which Windows cannot hand
-on.
+"""Whether workers can be started here.
+
+They inherit a socket, which Windows cannot hand on.
 """
 
-ATTEMPTS = 3  # times that a task is tried when the worker under it dies
+ATTEMPTS = 3
+"""How often an item is tried when its workers die."""
 
 Report = Callable[[int], None]
-"""What a task calls to say how many units of work it has done since it last called."""
+"""Function that an item calls with the units of work done since its last call."""
 
 _FAREWELL = b""
 _PATIENCE = 20.0  # how long a worker may take to end by itself [s]
@@ -49,57 +55,61 @@ _BOOT = (
 )
 
 
-def worker_count(wanted: int | None, *, default: int | None = None) -> int:
-    """Return how many workers to start: those wanted, else the default, else one per
-    core.
+def worker_count(workers: int | None, *, default: int | None = None) -> int:
+    """Return how many workers to start: by default one per core.
+
+    Args:
+        workers: the number that the user gave.
+        default: the number where the user gave none.
+
+    Raises:
+        UsageError: the number is below 1.
     """
-    if wanted is None:
+    if workers is None:
         return default or available_cores()
-    if wanted < 1:
+    if workers < 1:
         raise UsageError(
             "there is no work without a worker",
             where="--workers",
             expected=">= 1",
-            got=wanted,
+            got=workers,
         )
-    return wanted
+    return workers
 
 
 @dataclass(frozen=True, kw_only=True)
-class Task:
-    """Something to run in a worker: ``function(*arguments, report)``, all of it
-    picklable.
-    """
+class WorkItem:
+    """A call for a worker: ``function(*arguments, report)``, all of it picklable."""
 
-    name: str  # what messages call it, as in "cavity tiny scenario 3"
+    name: str  # name in messages, as in "cavity tiny scenario 3"
     function: Callable[..., Any]  # importable by its name from a module
     arguments: tuple[Any, ...] = ()  # its arguments; a Report is added as the last one
-    cost: float = 0.0  # expected work in any unit; the costliest tasks start first
+    cost: float = 0.0  # expected work in any unit; the costliest items start first
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """News from a worker."""
 
-    task: Task  # the task concerned
+    item: WorkItem
     # "progress" (value: units done since the last news), "lost" (its worker died and it
     # starts anew; value: units that were done in vain) or "done" (value: its result)
     kind: str
     value: Any  # see 'kind'
-    # what identity says of another machine that did it; None for this one
+    # description of the other machine that did it; None for this one
     machine: Mapping[str, str] | None = None
 
 
 class _Attempt(NamedTuple):
-    """A task and how many workers have died under it."""
+    """An item, and how many workers have died with it."""
 
-    task: Task
+    item: WorkItem
     deaths: int = 0
 
 
 @dataclass
 class _Worker:
-    """A worker process, the parent's end of its channel and what it works on."""
+    """A worker process, the parent's end of its channel and its present attempt."""
 
     process: subprocess.Popen[bytes]
     channel: Connection
@@ -115,13 +125,11 @@ class Pool:
     # variables added to the environment of the workers
     environment: Mapping[str, str] = field(default_factory=dict)
     _workers: list[_Worker] = field(default_factory=list, init=False)
-    _waiting: list[tuple[float, int, _Attempt]] = field(
-        default_factory=list, init=False
-    )
-    _number: Iterator[int] = field(default_factory=itertools.count, init=False)
+    _queue: list[tuple[float, int, _Attempt]] = field(default_factory=list, init=False)
+    _numbers: Iterator[int] = field(default_factory=itertools.count, init=False)
 
     def __post_init__(self) -> None:
-        """Refuse a pool in which no task could ever run."""
+        """Refuse a pool in which no item could ever run."""
         if not AVAILABLE:
             raise WorkFailedError(
                 "this system cannot start workers", fix="on Windows use WSL"
@@ -135,47 +143,55 @@ class Pool:
     def __exit__(
         self, kind: object, error: BaseException | None, trace: object
     ) -> None:
-        """Let idle workers end by themselves, then kill; after an error kill at
-        once.
-        """
-        if error is None:  # what Taichi compiled is then kept for the next time
-            idle = [worker for worker in self._workers if worker.attempt is None]
-            for worker in idle:
+        """Let idle workers end by themselves; after an error kill all at once."""
+        # A worker that ends by itself keeps Taichi's kernels for the next time.
+        if error is None:
+            idle_workers = self._list_idle()
+            for worker in idle_workers:
                 with contextlib.suppress(OSError):  # it died while idle
                     worker.channel.send_bytes(_FAREWELL)
-            for worker in idle:
+            for worker in idle_workers:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     worker.process.wait(_PATIENCE)
         self.close()
 
-    def submit(self, task: Task) -> None:
-        """Queue a task; also while :meth:`events` runs."""
-        self._queue(_Attempt(task))
+    def submit(self, item: WorkItem) -> None:
+        """Queue an item; also while :meth:`events` runs."""
+        self._enqueue(_Attempt(item))
 
     def events(self) -> Iterator[Event]:
-        """Run every queued task and yield news until all are done."""
-        while self._waiting or any(worker.attempt for worker in self._workers):
-            idle = [worker for worker in self._workers if worker.attempt is None]
-            while self._waiting and (idle or len(self._workers) < self.size):
-                if idle:
-                    worker = idle.pop()
-                else:
-                    worker = self._start()
-                _, _, attempt = heapq.heappop(self._waiting)
-                worker.attempt = attempt
-                worker.progress = 0
-                try:
-                    worker.channel.send_bytes(
-                        pickle.dumps((attempt.task.function, attempt.task.arguments))
-                    )
-                except OSError:  # it died while idle
-                    self._bury(worker, attempt)
-            busy = [worker for worker in self._workers if worker.attempt]
-            # one that died has some too
-            news = wait([worker.channel for worker in busy])
-            for worker in busy:
-                if worker.channel in news and worker.attempt is not None:
+        """Run every queued item and yield news until all are done."""
+        while self._queue or self._list_busy():
+            self._assign_queued()
+            busy_workers = self._list_busy()
+            # The channel of a dead worker is ready too.
+            ready_channels = wait([worker.channel for worker in busy_workers])
+            for worker in busy_workers:
+                if worker.channel in ready_channels and worker.attempt is not None:
                     yield self._receive(worker, worker.attempt)
+
+    def _assign_queued(self) -> None:
+        """Give queued items to idle workers; start workers up to the size."""
+        idle_workers = self._list_idle()
+        while self._queue and (idle_workers or len(self._workers) < self.size):
+            if idle_workers:
+                worker = idle_workers.pop()
+            else:
+                worker = self._start()
+            _, _, attempt = heapq.heappop(self._queue)
+            worker.attempt = attempt
+            worker.progress = 0
+            call = (attempt.item.function, attempt.item.arguments)
+            try:
+                worker.channel.send_bytes(pickle.dumps(call))
+            except OSError:  # it died while idle
+                self._bury(worker, attempt)
+
+    def _list_idle(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.attempt is None]
+
+    def _list_busy(self) -> list[_Worker]:
+        return [worker for worker in self._workers if worker.attempt is not None]
 
     def process_ids(self) -> list[int]:
         """Return the process ids of the living workers."""
@@ -191,29 +207,26 @@ class Pool:
             worker.process.wait()
             worker.channel.close()
 
-    def _queue(self, attempt: _Attempt) -> None:
-        heapq.heappush(self._waiting, (-attempt.task.cost, next(self._number), attempt))
+    def _enqueue(self, attempt: _Attempt) -> None:
+        # Items of one cost keep their order by their number.
+        entry = (-attempt.item.cost, next(self._numbers), attempt)
+        heapq.heappush(self._queue, entry)
 
     def _start(self) -> _Worker:
-        ours, theirs = socket.socketpair()
-        with theirs:
+        parent_socket, worker_socket = socket.socketpair()
+        with worker_socket:
+            descriptor = worker_socket.fileno()
+            arguments = [str(descriptor), json.dumps(sys.path)]
             process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-c",
-                    _BOOT,
-                    str(theirs.fileno()),
-                    json.dumps(sys.path),
-                ],
+                [sys.executable, "-P", "-c", _BOOT, *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[descriptor],
                 env={**os.environ, **self.environment},
                 # Ctrl-C reaches the parent only, which then ends the workers itself.
                 process_group=0,
             )
-        worker = _Worker(process, Connection(ours.detach()))
+        worker = _Worker(process, Connection(parent_socket.detach()))
         self._workers.append(worker)
         return worker
 
@@ -224,47 +237,50 @@ class Pool:
             return self._bury(worker, attempt)
         if kind == "progress":
             worker.progress += value
-            return Event(task=attempt.task, kind=kind, value=value)
+            return Event(item=attempt.item, kind=kind, value=value)
         worker.attempt = None
         if kind == "done":
-            return Event(task=attempt.task, kind=kind, value=value)
+            return Event(item=attempt.item, kind=kind, value=value)
         raise value
 
     def _bury(self, worker: _Worker, attempt: _Attempt) -> Event:
-        """Forget a dead worker; queue its task again unless it was tried often
-        enough.
-        """
+        """Forget a dead worker; queue its item again unless it was tried often."""
         self._workers.remove(worker)
         worker.process.kill()
         code = worker.process.wait()
         worker.channel.close()
-        again = _Attempt(attempt.task, attempt.deaths + 1)
-        if again.deaths >= ATTEMPTS:
+        next_attempt = _Attempt(attempt.item, attempt.deaths + 1)
+        if next_attempt.deaths >= ATTEMPTS:
+            cause = f"exit status {code}"
             if code < 0:
-                got = f"killed by {signal.Signals(-code).name}"
-            else:
-                got = f"exit status {code}"
-            what = f"a worker process died {ATTEMPTS} times"
-            fix = "free memory or take fewer workers: --workers 1"
-            raise WorkFailedError(what, where=again.task.name, got=got, fix=fix)
-        self._queue(again)
-        return Event(task=again.task, kind="lost", value=worker.progress)
+                cause = f"killed by {signal.Signals(-code).name}"
+            raise WorkFailedError(
+                f"a worker process died {ATTEMPTS} times",
+                where=attempt.item.name,
+                got=cause,
+                fix="free memory or take fewer workers: --workers 1",
+            )
+        self._enqueue(next_attempt)
+        return Event(item=attempt.item, kind="lost", value=worker.progress)
 
 
-def crashed(error: Exception) -> WorkFailedError:
-    """Return what a task raised that it should not, as an error of ours."""
-    if (place := package_at_fault(error)) is not None:
-        fix = "mend or uninstall that package"
-        got = ", ".join([repr(error), *getattr(error, "__notes__", ())])
+def crash_error(error: Exception) -> WorkFailedError:
+    """Return an unexpected exception of an item as an error of ours."""
+    place = find_faulty_package(error)
+    if place is not None:
+        messages = [repr(error), *getattr(error, "__notes__", ())]
         return WorkFailedError(
-            "a package failed in a worker", where=place, got=got, fix=fix
+            "a package failed in a worker",
+            where=place,
+            got=", ".join(messages),
+            fix="mend or uninstall that package",
         )
-    last = "".join(traceback.format_exception(error, limit=-6))
-    return WorkFailedError("a worker crashed", got=f"{error!r}\n{last}")
+    trace = "".join(traceback.format_exception(error, limit=-6))
+    return WorkFailedError("a worker crashed", got=f"{error!r}\n{trace}")
 
 
 def serve(descriptor: int) -> None:
-    """Run the tasks that arrive on a socket until the other end closes."""
+    """Run the items that arrive on a socket until the other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = Connection(descriptor)
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -277,22 +293,28 @@ def serve(descriptor: int) -> None:
             os._exit(1)
 
     threading.Thread(target=listen, daemon=True).start()
-    while (message := inbox.get()) != _FAREWELL:
-        try:
-            function, arguments = pickle.loads(message)
-            reply = (
-                "done",
-                function(*arguments, lambda units: channel.send(("progress", units))),
-            )
-        except LagbenchError as error:
-            reply = ("error", error)
-        except Exception as error:
-            reply = ("error", crashed(error))
-        channel.send(reply)
-    if (
-        taichi := sys.modules.get("taichi")
-    ) is not None:  # it keeps what it compiled only if asked to end
-        with contextlib.suppress(
-            Exception
-        ):  # where it cannot, the next run compiles again
+    message = inbox.get()
+    while message != _FAREWELL:
+        channel.send(_run_item(message, channel))
+        message = inbox.get()
+
+    # Taichi keeps compiled kernels only where it ends; else they are compiled again.
+    taichi = sys.modules.get("taichi")
+    if taichi is not None:
+        with contextlib.suppress(Exception):
             taichi.reset()
+
+
+def _run_item(message: bytes, channel: Connection) -> tuple[str, Any]:
+    """Return the kind of the reply and its value: a result or an error."""
+
+    def report(units: int) -> None:
+        channel.send(("progress", units))
+
+    try:
+        function, arguments = pickle.loads(message)
+        return "done", function(*arguments, report)
+    except LagbenchError as error:
+        return "error", error
+    except Exception as error:
+        return "error", crash_error(error)

@@ -1,4 +1,4 @@
-"""How far a piece of work is: counted by a meter, told to whoever asked."""
+"""Progress of a piece of work: a meter counts it and tells a listener."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ def watched() -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a generation or verification is."""
+    """Progress of a generation or verification."""
 
-    stage: str  # what happens now, in a word or two
+    stage: str  # the present stage, in a word or two
     done: int  # units of work done: substeps, summed over scenarios, or files
     total: int  # units to do; 0 where nobody knows
     scenarios_done: int  # scenarios that are finished
@@ -39,33 +39,36 @@ class Meter:
 
     def __init__(self, listener: Callable[[Progress], None] | None = None) -> None:
         self._listener = listener
-        self.stage = ""  # what happens now
-        self._state = Progress(
+        self.stage = ""  # the present stage
+        self._progress = Progress(
             stage="", done=0, total=0, scenarios_done=0, scenarios=0, seconds=0.0
         )
         self._started = time.monotonic()
 
     def begin(self, stage: str, *, total: int, scenarios: int, done: int = 0) -> None:
-        """Start a stage with counts at zero, or at what an earlier run had done."""
+        """Start a stage with counts at zero, or at those of an earlier run."""
         self.stage = stage
-        counts = {
-            "done": done,
-            "total": total,
-            "scenarios_done": done,
-            "scenarios": scenarios,
-        }
-        self._state = Progress(stage=stage, **counts, seconds=0.0, before=done)
+        self._progress = Progress(
+            stage=stage,
+            done=done,
+            total=total,
+            scenarios_done=done,
+            scenarios=scenarios,
+            seconds=0.0,
+            before=done,
+        )
         self._started = time.monotonic()
         self.count()
 
     def count(self, units: int = 0, *, scenarios: int = 0) -> None:
         """Add units of work (negative where work was lost) and finished scenarios."""
-        old = self._state
-        done = old.done + units
-        finished = old.scenarios_done + scenarios
-        seconds = time.monotonic() - self._started
-        self._state = replace(
-            old, stage=self.stage, done=done, scenarios_done=finished, seconds=seconds
+        old = self._progress
+        self._progress = replace(
+            old,
+            stage=self.stage,
+            done=old.done + units,
+            scenarios_done=old.scenarios_done + scenarios,
+            seconds=time.monotonic() - self._started,
         )
         if self._listener is not None:
-            self._listener(self._state)
+            self._listener(self._progress)

@@ -19,10 +19,10 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from lagbench.data.local import remedy, resolve_root
+from lagbench.data.local import resolve_root, suggest_repair
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, load
-from lagbench.errors import LagbenchError, UsageError, nearest
+from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.work.pool import worker_count
 
 from .catalogue import ITEMS
@@ -226,7 +226,7 @@ def rehearse(
     for where in dict.fromkeys(run_split for run_split, _, _ in runs):
         tier = plan.tier(where)
         if read_manifest(plan.root, tier.split, tier.name, tier.major) is None:
-            fix = remedy(tier, root=plan.root)
+            fix = suggest_repair(tier, root=plan.root)
             note(f"{tier.split} {tier.name} is not there yet: {fix}")
 
     jobs: list[Job] = []
@@ -351,7 +351,7 @@ def _chosen_items(only: str | None, split: str | None) -> list[ThesisItem]:
     """Return the items that the options name."""
     if split is not None and split not in EXPECTED:
         raise UsageError(
-            f"no split {split!r}", where="--split", fix=nearest(split, EXPECTED)
+            f"no split {split!r}", where="--split", fix=suggest_name(split, EXPECTED)
         )
     names = only.split(",") if only else list(ITEMS)
     items = []
@@ -360,7 +360,7 @@ def _chosen_items(only: str | None, split: str | None) -> list[ThesisItem]:
             raise UsageError(
                 f"no table or figure {name!r}",
                 where="--only",
-                fix=nearest(name, ITEMS),
+                fix=suggest_name(name, ITEMS),
             )
         if split is None or split in ITEMS[name].needs:
             items.append(ITEMS[name])

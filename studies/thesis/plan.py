@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from lagbench.data.local import rooted
+from lagbench.data.local import load_rooted_registry
 from lagbench.data.manifest import read_manifest
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UsageError
@@ -70,7 +70,7 @@ class Plan:
     @cached_property
     def described(self) -> Registry:
         """Descriptions of the splits, those in the root folder included."""
-        return rooted(self.root, self.registry)
+        return load_rooted_registry(self.root, self.registry)
 
     def tier(self, split: str) -> Size:
         """Return the description of a split at this size."""

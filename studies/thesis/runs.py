@@ -14,7 +14,7 @@ from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.submission.predictions import open_predictions
-from lagbench.work.pool import Report, crashed
+from lagbench.work.pool import Report, crash_error
 from lagbench.work.run import run_all
 
 from .plan import (
@@ -85,7 +85,7 @@ def _make_named(job: tuple[Plan, str, Run], _: Report) -> int:
         complain(error, job_name)
         return error.exit_code
     except Exception as error:  # the other runs go on
-        failure = crashed(error)
+        failure = crash_error(error)
         complain(failure, job_name)
         return failure.exit_code
     return 0

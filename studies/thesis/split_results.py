@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lagbench.board.entry import Cost, Entry, Prediction
+from lagbench.board.entry import Entry, EntryCost, Prediction
 from lagbench.board.entry_file import read_entry
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import UnreadableFileError
@@ -29,8 +29,8 @@ from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.shipped import shipped, shipped_path
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.skill import best_reference
 
 from .roster import ROSTER
 
@@ -45,10 +45,6 @@ RECORD_NAME = "training.json"
 COST_NAME = "predictions.json"
 
 _RUN_NAME = re.compile(r"([a-z0-9]+(?:-[a-z0-9]+)*?)-(\d+)")
-_TRAINING_WORDS = re.compile(
-    r"recipe (\S+), step \d+(?:, (?:predicted with )?(.*))?$",
-)
-"""How predictions describe a training by one of our recipes: its name and changes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,7 +78,8 @@ class Method:
 
     name: str  # as in gns or gns-novorticity
     trainings: tuple[ScoredTraining, ...]  # one per seed
-    cost: Cost | None = None  # of a predicted frame; None where it was not measured
+    # of a predicted frame; None where it was not measured
+    cost: EntryCost | None = None
     parameters: int | None = None  # trained numbers; None where unknown
 
     @cached_property
@@ -286,6 +283,8 @@ class SplitResults:
     def _read_references(self) -> None:
         references = shipped(self.size) or {}
         for reference in references.values():
+            if reference.name not in REFERENCES:
+                continue  # measured by an earlier version of the package
             training = ScoredTraining(
                 seed=None,
                 scores=reference.scores,
@@ -307,7 +306,7 @@ class SplitResults:
         *,
         path: Path,
         record: Mapping[str, Any],
-        cost: Cost | None,
+        cost: EntryCost | None,
         parameters: int | None = None,
     ) -> None:
         """Add one training to a method, unless its scores are of other data."""
@@ -374,7 +373,7 @@ class SplitResults:
         for name, method in self.methods.items():
             if name in COUNTING and self.ranking in method.scores:
                 scores[name] = method.scores[self.ranking]
-        return best_floor(scores)
+        return best_reference(scores)
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best naive baseline``.
@@ -400,15 +399,16 @@ def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
 
     The record is empty unless the training used one of our recipes.
     """
-    match = _TRAINING_WORDS.search(entry.training)
+    provenance = prediction.provenance or entry.provenance
     budget = prediction.budget
     if budget is None and len(entry.predictions) == 1:
         budget = entry.budget  # of several seeds the entry has the mean
-    if match is None or budget is None:
+    if provenance is None or budget is None:
         return {}
     if not budget.steps or budget.cpu_hours is None:
         return {}
 
+    changes = provenance.describe_changes().removeprefix("predicted with ")
     validations = []
     if budget.metric is not None:
         for step, value in budget.validations:
@@ -423,8 +423,8 @@ def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
         "cpu_seconds": 3600.0 * budget.cpu_hours,
         "validation": validations,
         "recipe": {
-            "name": match[1],
-            "changed": match[2],
+            "name": provenance.recipe,
+            "changed": changes or None,
             "training": {"batch": round(windows_seen / budget.steps)},
         },
         "hardware": {
@@ -438,12 +438,12 @@ def _entry_record(entry: Entry, prediction: Prediction) -> dict[str, Any]:
     return record
 
 
-def _read_cost(path: Path) -> Cost | None:
+def _read_cost(path: Path) -> EntryCost | None:
     """Return the cost of a frame that predictions were written with; None without."""
     costs = read_json(path)
     if "seconds_per_frame" not in costs or not costs.get("device"):
         return None
-    return Cost(
+    return EntryCost(
         seconds_per_frame=float(costs["seconds_per_frame"]),
         device=str(costs["device"]),
         solver_seconds_per_frame=costs.get("solver_seconds_per_frame"),

@@ -5,7 +5,7 @@ function drawDetail(tab, state, row) {
   const [filmFigure, film] = drawFilm(tab, row);
   const content = [
     drawTiles(tab, row),
-    drawFlags(tab, row),
+    drawFlags(row),
     el("div", { class: "figures" }, [drawErrors(tab, row), drawScenarios(tab, row), drawMaps(tab, row), filmFigure, drawEnergy(tab, row), drawHistograms(tab, row)]),
     drawFrames(tab, row),
     drawNumbers(tab, row),
@@ -14,8 +14,9 @@ function drawDetail(tab, state, row) {
   return [content, film];
 }
 
-function floorsOf(tab) {
-  return tab.floors.map((one, i) => [`floor${i}`, one]);
+/** Return the reference predictors of a tab, each with the class of its marks. */
+function referencesOf(tab) {
+  return tab.references.map((reference, i) => [`floor${i}`, reference]);
 }
 
 function leaderOf(tab) {
@@ -23,24 +24,27 @@ function leaderOf(tab) {
 }
 
 function drawTiles(tab, row) {
-  const keys = [...presetsOf(tab).main.slice(0, 5), "seconds_per_frame", "parameters"];
+  const keys = [...tab.presets.main.slice(0, 5), "seconds_per_frame", "parameters"];
   const tiles = keys.filter((key) => !isGap(valueOf(tab, row, key))).map((key) => {
-    const cell = cellOf(tab, row, key);
-    const more = key === "speed_up" || key === "seconds_per_frame" ? textOf(tab, row, "device") : cell.title;
+    const isTime = key === "speed_up" || key === "seconds_per_frame";
+    const more = isTime ? textOf(tab, row, "device") : noteOf(tab, row, key);
     return el("li", {}, el("span", { class: "what" }, columnOf(tab, key).quantity), el("span", { class: "big" }, textOf(tab, row, key)), el("span", { class: "more" }, more));
   });
   return el("ul", { class: "tiles" }, tiles);
 }
 
-/** Return the marks beside the name in the table with what they mean. */
-function drawFlags(tab, row) {
-  const said = [...lineOf(tab, row).querySelectorAll(".flag")].map((chip) => el("li", {}, chip.cloneNode(true), el("span", {}, chip.title)));
-  return said.length ? el("ul", { class: "flags" }, said) : null;
+/** Return the marks beside the name in the table with their meanings. */
+function drawFlags(row) {
+  const items = row.flags.map(([kind, label, meaning]) => {
+    const chip = el("span", { class: `flag ${kind}`, title: meaning }, label);
+    return el("li", {}, chip, el("span", {}, meaning));
+  });
+  return items.length ? el("ul", { class: "flags" }, items) : null;
 }
 
 function drawErrors(tab, row) {
   const leader = leaderOf(tab);
-  const rows = [["s0", row], ...(leader && leader !== row ? [["s1", leader]] : []), ...floorsOf(tab)];
+  const rows = [["s0", row], ...(leader && leader !== row ? [["s1", leader]] : []), ...referencesOf(tab)];
   const options = tab.curves.filter(({ key: name }) => row.curves[name]).map(({ key: name, label }) => [name, label]);
   const holder = el("div");
   const show = (by) => {
@@ -56,11 +60,11 @@ function drawErrors(tab, row) {
 
 function drawScenarios(tab, row) {
   const options = Object.keys(row.spread).map((name) => [name, columnOf(tab, name).label]);
-  const rows = [["s0", row], ...floorsOf(tab)];
+  const rows = [["s0", row], ...referencesOf(tab)];
   const holder = el("div");
   const show = (by) => holder.replaceChildren(key(rows.map(([kind, one]) => [kind, short(one.name)]), spot), scenarioChart(tab, by, rows));
   if (options.length) show(options[0][0]);
-  return figure("Every test scenario", holder, "Means over the horizon. Hollow: floors that cost nothing.", {
+  return figure("Every test scenario", holder, "Means over the horizon. Hollow: reference predictors.", {
     tools: options.length > 1 ? chooser("of", options, options[0][0], show) : null,
     name: "scenarios",
   });
@@ -80,7 +84,7 @@ function scenarioChart(tab, by, rows) {
   return plot.draw(`${columnOf(tab, by).label} of every test scenario`, held.map(([, name, values]) => `${name}: ${values.map((v) => written(v)).join(", ")}`).join(". "));
 }
 
-/** Return a mark: a dot for an entry, hollow ones of two shapes for the floors. */
+/** Return a mark: a dot for an entry, hollow ones of two shapes for reference predictors. */
 function spot(kind, x = 11, y = 5) {
   if (/^floor.*[13579]$/.test(kind)) return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
   return svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: kind === "s0" ? 5 : 3.8, class: `spot ${kind}` });
@@ -88,7 +92,7 @@ function spot(kind, x = 11, y = 5) {
 
 function drawEnergy(tab, row) {
   const truth = curveOf(tab.energy);
-  const rows = [["s0", row], ...floorsOf(tab)].filter(([, one]) => one.energy);
+  const rows = [["s0", row], ...referencesOf(tab)].filter(([, one]) => one.energy);
   const lines = rows.map(([kind, one]) => ({ kind, name: short(one.name), ...curveOf(one.energy) }));
   const roof = 3 * Math.max(...truth.mean.filter(Number.isFinite));
   const top = [truth, ...lines].flatMap(({ mean }) => [...mean]).map((value) => Math.min(value, roof));
@@ -98,7 +102,7 @@ function drawEnergy(tab, row) {
   plot.line(truth.frames, truth.mean, "truth", "truth");
   plot.series.reverse();
   const names = [["truth", "truth"], ...rows.map(([kind, one]) => [kind, short(one.name)])];
-  return figure("Kinetic energy", [key(names), plot.draw("Kinetic energy over frames", "One line each for truth, entry and floors.")], "Mean over test scenarios; the band reaches from the lowest to the highest. Cut off at three times the truth's greatest.", { name: "energy", width: "third" });
+  return figure("Kinetic energy", [key(names), plot.draw("Kinetic energy over frames", "One line each for truth, entry and reference predictors.")], "Mean over test scenarios; the band reaches from the lowest to the highest. Cut off at three times the truth's greatest.", { name: "energy", width: "third" });
 }
 
 function grid(head, rows, label, kind = "") {
@@ -115,9 +119,9 @@ function drawFrames(tab, row) {
 }
 
 function drawNumbers(tab, row) {
-  const keys = presetsOf(tab).all.filter((key) => columnOf(tab, key).form === "number" && !Number.isNaN(valueOf(tab, row, key)));
-  const rows = keys.map((key) => [columnOf(tab, key).quantity, textOf(tab, row, key), cellOf(tab, row, key).title, ...tab.floors.map((one) => textOf(tab, one, key))]);
-  const table = grid(["metric", "mean", "interval, spread", ...tab.floors.map((one) => one.name)], rows, "Every metric");
+  const keys = tab.presets.all.filter((key) => columnOf(tab, key).form === "number" && !Number.isNaN(valueOf(tab, row, key)));
+  const rows = keys.map((key) => [columnOf(tab, key).quantity, textOf(tab, row, key), noteOf(tab, row, key), ...tab.references.map((reference) => textOf(tab, reference, key))]);
+  const table = grid(["metric", "mean", "interval, spread", ...tab.references.map((reference) => reference.name)], rows, "Every metric");
   return el("details", { class: "numbers" }, el("summary", {}, `Every metric (${rows.length})`), table);
 }
 
@@ -132,8 +136,10 @@ function drawOrigin(row) {
   ]);
 }
 
-function predictionLine([seed, mean, size, sha256, url, path, score]) {
-  return [seed, mean, size, el("code", { title: sha256 }, sha256.slice(0, 16)), outward(url, "file") ?? (path ? el("code", {}, path) : MISSING), el("code", {}, score)];
+function predictionLine({ seed, mean, size, sha256, url, path, scoreFile }) {
+  const hash = el("code", { title: sha256 }, sha256.slice(0, 16));
+  const inFolder = path ? el("code", {}, path) : MISSING;
+  return [seed, mean, size, hash, outward(url, "file") ?? inFolder, el("code", {}, scoreFile)];
 }
 
 function commandBox(command) {
@@ -156,9 +162,13 @@ async function copied(text, element) {
   }
 }
 
-/** Return who made an entry and where code, paper and weights are, as the table has it. */
-function drawByline(tab, row) {
-  const line = lineOf(tab, row);
-  const links = line.querySelector(".links")?.cloneNode(true);
-  return el("p", { class: "by" }, line.querySelector(".sub").textContent, links ? [" · ", links] : null);
+/** Return who made an entry, with links to code, paper and weights. */
+function drawByline(row) {
+  const links = row.links.map(([label, address]) => {
+    // Python lets only links of the web and paths of the leaderboard's folder through.
+    const inFolder = el("a", { href: address }, label);
+    return address.startsWith("http") ? outward(address, label) : inFolder;
+  });
+  const list = links.length ? [" · ", el("span", { class: "links" }, links)] : null;
+  return el("p", { class: "by" }, row.byline, list);
 }

@@ -3,7 +3,6 @@
 const SECONDS = 9;
 const TRAIL = 7;
 const TRAIL_LENGTH = 0.05;
-const MATERIALS = ["#0072b2", "#d55e00", "#56b4e9", "#e69f00"];
 const quiet = matchMedia("(prefers-reduced-motion: reduce)");
 
 /** Return positions of all particles at a time between the stored frames (Catmull-Rom). */
@@ -33,7 +32,7 @@ function trailGap(film, count) {
 function particleColours(materials, first) {
   const one = materials.every((material) => material === materials[0]);
   const style = getComputedStyle(document.documentElement);
-  if (!one) return materials.map((material) => MATERIALS[material] ?? MATERIALS[0]);
+  if (!one) return materials.map((material) => BOARD.colours.materials[material] ?? BOARD.colours.materials[0]);
   const shades = [0, 1, 4].map((k) => style.getPropertyValue(`--c${k}`).trim());
   return materials.map((_, k) => shades[Math.min(2, Math.max(0, Math.floor(3 * first[2 * k])))]);
 }
@@ -42,9 +41,9 @@ function particleColours(materials, first) {
 class Film {
   constructor(tab, row, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
     Object.assign(this, { rest, ended, rested: 0 });
-    this.frames = pooled(row.pictures.filmFrames);
-    this.materials = pooled(row.pictures.material);
-    this.sides = [["truth", pooled(tab.truth.film)], [short(row.name), pooled(row.pictures.film)]];
+    this.frames = row.pictures.filmFrames;
+    this.materials = row.pictures.material;
+    this.sides = [["truth", numbersOf(tab.truth.film)], [short(row.name), numbersOf(row.pictures.film)]];
     this.time = 0;
     this.playing = false;
     this.canvases = this.sides.map(([name]) => el("canvas", { width: pixels, height: pixels, class: "film", role: "img", "aria-label": `Particles of ${name}` }));

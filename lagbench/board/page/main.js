@@ -29,7 +29,7 @@ function draw() {
     link.tabIndex = chosen ? 0 : -1;
   }
   const tab = tabOf(state);
-  setStage(tab);
+  setHero(tab);
   if (!tab) return;
   const tools = section().querySelector(".tools");
   const filter = tools.querySelector("input[type=search]");
@@ -64,7 +64,7 @@ function linkTools(tab) {
 
 function choosePreset(name) {
   const { key: by } = state.sort;
-  const kept = ["rank", "name", ...presetsOf(tabOf(state))[name]].includes(by);
+  const kept = ["rank", "name", ...tabOf(state).presets[name]].includes(by);
   change({ preset: name, sort: kept ? state.sort : { key: "rank", down: false } }, `[data-preset="${name}"]`);
 }
 
@@ -83,7 +83,7 @@ function openPanel() {
       el("div", {}, [
         el("p", { class: "brand" }, `${tab.split} · ${tab.size}`),
         el("h2", { id: "panel-title", tabindex: -1 }, row.name),
-        drawByline(tab, row),
+        drawByline(row),
         el("p", { class: "muted" }, row.standing),
       ]),
       el("nav", { "aria-label": "Entries" }, move("Previous entry", "←", -1), move("Next entry", "→", 1), button("Close", () => panel.close(), { class: "plain" })),
@@ -93,7 +93,7 @@ function openPanel() {
   if (!panel.open) panel.showModal();
   panel.scrollTop = 0;
   panel.querySelector("h2").focus();
-  playStage();
+  playHero();
   if (!quiet.matches) film.toggle(true);
 }
 
@@ -102,7 +102,7 @@ panel.addEventListener("close", () => {
   film = null;
   const back = state.entry || opener;
   panel.replaceChildren();
-  playStage();
+  playHero();
   if (state.entry) change({ entry: "" });
   if (back) section().querySelector(`[data-entry="${CSS.escape(back)}"] a.name`)?.focus();
 });

@@ -1,7 +1,12 @@
 // Vorticity as pictures: blue turns clockwise, vermilion counter-clockwise, clear is no vorticity.
 
-const CLOCKWISE = [0, 114, 178];
-const COUNTER = [213, 94, 0];
+const CLOCKWISE = channelsOf(BOARD.colours.clockwise);
+const COUNTER_CLOCKWISE = channelsOf(BOARD.colours.counterClockwise);
+
+/** Return red, green and blue of a colour such as #0072b2. */
+function channelsOf(colour) {
+  return [1, 3, 5].map((start) => Number.parseInt(colour.slice(start, start + 2), 16));
+}
 
 /** Return a canvas that shows values at nodes, x node first, clear at 0 and full at the limit. */
 function fieldCanvas(values, nodes, limit, label) {
@@ -13,7 +18,7 @@ function fieldCanvas(values, nodes, limit, label) {
       const value = values[x * nodes + y];
       const at = 4 * ((nodes - 1 - y) * nodes + x);
       if (Number.isNaN(value)) image.data.set([128, 128, 128, 34], at);
-      else image.data.set([...(value < 0 ? CLOCKWISE : COUNTER), 255 * Math.min(1, Math.abs(value) / limit)], at);
+      else image.data.set([...(value < 0 ? CLOCKWISE : COUNTER_CLOCKWISE), 255 * Math.min(1, Math.abs(value) / limit)], at);
     }
   }
   context.putImageData(image, 0, 0);
@@ -26,10 +31,10 @@ function greatest(field) {
 
 function drawMaps(tab, row) {
   const { nodes } = row.pictures;
-  const frames = pooled(row.pictures.mapFrames);
+  const frames = row.pictures.mapFrames;
   if (!frames.length) return null;
-  const truth = tab.truth.maps.map(pooled);
-  const guess = row.pictures.maps.map(pooled);
+  const truth = tab.truth.maps.map(numbersOf);
+  const guess = row.pictures.maps.map(numbersOf);
   const residual = guess.map((field, i) => field.map((value, k) => value - truth[i][k]));
   const limits = [truth, truth, residual].map((fields) => fields.map(greatest));
   const names = ["truth", "prediction", "residual"];
@@ -53,7 +58,7 @@ function drawMaps(tab, row) {
 
 /** Return figures of distributions at a frame that the reader chooses. */
 function drawHistograms(tab, row) {
-  const frames = pooled(row.pictures.mapFrames);
+  const frames = row.pictures.mapFrames;
   if (!frames.length) return null;
   const residual = (i) => [["s0", "predicted minus true", histogramOf(row.residuals[i])]];
   const values = (i) => [

@@ -6,10 +6,10 @@ function drawLines(tab, state, entries, act) {
   const options = tab.curves.map(({ key: name, label }) => [name, label]);
   const by = tab.curves.some((curve) => curve.key === state.curve) ? state.curve : tab.curves[0].key;
   const chosen = entries.filter((row) => row.curves[by]).slice(0, LINES);
-  const lines = [...chosen.map((row, i) => [`s${i}`, row]), ...floorsOf(tab).filter(([, row]) => row.curves[by])];
+  const lines = [...chosen.map((row, i) => [`s${i}`, row]), ...referencesOf(tab).filter(([, row]) => row.curves[by])];
   const body = lines.length ? [key(lines.map(([kind, row]) => [kind, short(row.name)])), lineChart(tab, by, lines)] : el("p", { class: "muted" }, "No entry to show.");
   const more = entries.length > LINES ? `The first ${LINES} entries of the table as it is sorted. ` : "";
-  return figure("Error over frames", body, `${more}Mean over test scenarios; grey: floors that cost nothing.`, {
+  return figure("Error over frames", body, `${more}Mean over test scenarios; grey: reference predictors.`, {
     tools: options.length > 1 ? chooser("of", options, by, act.curve) : null,
     name: "lines",
   });

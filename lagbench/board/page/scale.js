@@ -1,4 +1,4 @@
-// Axes with round ticks, as lagbench/report/chart.py has them.
+// Axes with round ticks, as lagbench/figures/chart.py has them.
 
 const WIDE = 60;
 const DEEPEST = 1e-6;

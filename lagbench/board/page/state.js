@@ -20,7 +20,7 @@ function readAddress(hash) {
   const sort = given.get("sort") ?? "rank";
   const state = { tab: tab?.id ?? OVERVIEW, preset: "main", sort: { key: "rank", down: false }, filter: "", inactive: false, entry: "", curve: "" };
   if (!tab) return state;
-  const presets = presetsOf(tab);
+  const { presets } = tab;
   if (Object.hasOwn(presets, given.get("columns") ?? "")) state.preset = given.get("columns");
   const order = { key: sort.replace(/^-/, ""), down: sort.startsWith("-") };
   if (["rank", "name", ...presets[state.preset]].includes(order.key)) state.sort = order;

@@ -1,82 +1,78 @@
-// The table is drawn in lagbench/board/table.py; here its rows are sorted and filtered, its cells shown or hidden.
+// The table is drawn in lagbench/board/table.py. Here its lines are sorted and filtered, and its cells shown or hidden,
+// by the data of the page; no number is read from a cell.
+
+// Cells before those of the columns: rank and name.
+const FIRST_CELLS = ["rank", "name"];
 
 function sectionOf(tab) {
   return document.getElementById(tab.id);
 }
 
-/** Return the keys of each preset of columns. */
-function presetsOf(tab) {
-  return (tab.presets ??= Object.fromEntries([...sectionOf(tab).querySelectorAll("[data-preset]")].map((one) => [one.dataset.preset, one.dataset.keys.split(" ")])));
-}
-
-/** Return columns by key: place in a row, label, quantity, direction, form. */
-function columnsOf(tab) {
-  const described = (head, place) => {
-    const key = head.querySelector("[data-sort]").dataset.sort;
-    const label = head.querySelector(".metric").textContent;
-    const quantity = head.dataset.unit ? `${label} [${head.dataset.unit}]` : label;
-    return [key, { form: "number", ...head.dataset, key, label, quantity, place, head }];
-  };
-  return (tab.columns ??= Object.fromEntries([...sectionOf(tab).querySelectorAll("thead th")].map(described)));
+/** Return where a column stands among the columns of the data. */
+function indexOf(tab, key) {
+  tab.indices ??= new Map(tab.columns.map((column, index) => [column.key, index]));
+  return tab.indices.get(key);
 }
 
 function columnOf(tab, key) {
-  return columnsOf(tab)[key];
+  return tab.columns[indexOf(tab, key)];
 }
 
-/** Return the line of the table for an entry or a floor. */
+/** Return the keys of all cells of a line. */
+function cellKeys(tab) {
+  return [...FIRST_CELLS, ...tab.columns.map((column) => column.key)];
+}
+
+/** Return the line of the table for an entry or a reference predictor. */
 function lineOf(tab, row) {
-  return (row.line ??= sectionOf(tab).querySelector(`tr[data-entry="${CSS.escape(row.id)}"], tr[data-floor="${CSS.escape(row.id)}"]`));
+  const id = CSS.escape(row.id);
+  row.line ??= sectionOf(tab).querySelector(`tr[data-entry="${id}"], tr[data-reference="${id}"]`);
+  return row.line;
 }
 
-function cellOf(tab, row, key) {
-  return lineOf(tab, row).cells[columnOf(tab, key).place];
-}
-
-/** Return what a row has in a column: a number, or text. */
+/** Return the value of a row in a column: a number, or text. */
 function valueOf(tab, row, key) {
-  const { value } = cellOf(tab, row, key).dataset;
-  if (columnOf(tab, key).form === "text") return value ?? "";
-  return value === undefined ? NaN : Number(value);
+  const value = row.values[indexOf(tab, key)];
+  return columnOf(tab, key).form === "text" ? value : number(value);
 }
 
 function textOf(tab, row, key) {
-  return cellOf(tab, row, key).firstChild.textContent;
+  return row.texts[indexOf(tab, key)];
+}
+
+function noteOf(tab, row, key) {
+  return row.notes[indexOf(tab, key)];
 }
 
 /** Return the entries that are shown, in order, and all that could be. */
 function shownRows(tab, state) {
   const terms = state.filter.toLowerCase().split(/\s+/).filter(Boolean);
-  const matches = (row) => {
-    const line = lineOf(tab, row);
-    const whole = `${line.textContent} ${line.dataset.more}`.toLowerCase();
-    return terms.every((term) => whole.includes(term));
-  };
   const every = tab.rows.filter((row) => state.inactive || row.active);
-  return { every, entries: ordered(tab, every.filter(matches), state.sort) };
+  const matching = every.filter((row) => terms.every((term) => row.search.includes(term)));
+  return { every, entries: ordered(tab, matching, state.sort) };
+}
+
+/** Return the value by which a row is sorted. */
+function sortValue(tab, row, key) {
+  if (key === "rank") return row.place;
+  if (key === "name") return row.name.toLowerCase();
+  // Of a metric that aims at a value, nearer is better.
+  if (columnOf(tab, key).direction === "target") return number(row.losses[indexOf(tab, key)]);
+  return valueOf(tab, row, key);
 }
 
 /** Return rows sorted; those without a value come last whichever way. */
-function ordered(tab, rows, { key: by, down }) {
+function ordered(tab, rows, { key, down }) {
   const sign = down ? -1 : 1;
-  const of = (row) => {
-    if (by === "rank" || by === "name") return by === "rank" ? placeOf(tab, row) : cellOf(tab, row, by).dataset.value;
-    const target = columnOf(tab, by).direction === "target"; // the nearer the better
-    return target ? Number(cellOf(tab, row, by).dataset.loss ?? NaN) : valueOf(tab, row, by);
-  };
-  return rows
-    .map((row) => [row, of(row)])
-    .sort(([one, a], [two, b]) => {
-      const gaps = isGap(a) - isGap(b);
-      const apart = a < b ? -sign : a > b ? sign : 0;
-      return gaps || apart || placeOf(tab, one) - placeOf(tab, two);
-    })
-    .map(([row]) => row);
-}
-
-/** Return where a row stands in the order of the ranking metric. */
-function placeOf(tab, row) {
-  return Number(lineOf(tab, row).cells[0].dataset.value);
+  const pairs = rows.map((row) => [row, sortValue(tab, row, key)]);
+  pairs.sort(([first, a], [second, b]) => {
+    const gaps = isGap(a) - isGap(b);
+    if (gaps) return gaps;
+    if (a < b) return -sign;
+    if (a > b) return sign;
+    return first.place - second.place;
+  });
+  return pairs.map(([row]) => row);
 }
 
 function isGap(value) {
@@ -84,43 +80,47 @@ function isGap(value) {
 }
 
 /** Return the order after a click on a heading: best first, then worst first. */
-function nextSort(tab, by, sort) {
-  const { direction, form } = columnOf(tab, by);
-  const first = by !== "rank" && by !== "name" && ["higher", "none"].includes(direction) && form !== "text";
-  return sort.key === by ? { key: by, down: !sort.down } : { key: by, down: first };
+function nextSort(tab, key, sort) {
+  if (sort.key === key) return { key, down: !sort.down };
+  if (FIRST_CELLS.includes(key)) return { key, down: false };
+  const { direction, form } = columnOf(tab, key);
+  return { key, down: ["higher", "none"].includes(direction) && form !== "text" };
 }
 
-/** Show the rows and columns that were asked for, in order; return the entries shown and all that could be. */
+/** Show the lines and columns that were asked for, in order; return the entries shown and all that could be. */
 function arrange(tab, state) {
-  const keys = new Set(["rank", "name", ...presetsOf(tab)[state.preset]]);
-  const { every, entries } = shownRows(tab, state);
-  const columns = Object.values(columnsOf(tab));
-  for (const { key, head } of columns) {
-    head.hidden = !keys.has(key);
+  const shownKeys = new Set([...FIRST_CELLS, ...tab.presets[state.preset]]);
+  const keys = cellKeys(tab);
+  const heads = sectionOf(tab).querySelectorAll("thead th");
+  keys.forEach((key, place) => {
+    const head = heads[place];
+    head.hidden = !shownKeys.has(key);
     if (key === state.sort.key) head.ariaSort = state.sort.down ? "descending" : "ascending";
     else head.removeAttribute("aria-sort");
-  }
-  const shown = new Set([...tab.floors, ...entries]);
-  const all = [...tab.floors, ...tab.rows];
-  for (const row of all) {
+  });
+
+  const { every, entries } = shownRows(tab, state);
+  const shown = new Set([...tab.references, ...entries]);
+  const rows = [...tab.references, ...tab.rows];
+  for (const row of rows) {
     const line = lineOf(tab, row);
     line.hidden = !shown.has(row);
-    columns.forEach(({ key }, place) => { line.cells[place].hidden = !keys.has(key); });
+    keys.forEach((key, place) => { line.cells[place].hidden = !shownKeys.has(key); });
   }
-  sectionOf(tab).querySelector("tbody").append(...ordered(tab, all, state.sort).map((row) => lineOf(tab, row)));
+  const lines = ordered(tab, rows, state.sort).map((row) => lineOf(tab, row));
+  sectionOf(tab).querySelector("tbody").append(...lines);
   return { every, entries };
 }
 
 /** Return the table as it is shown, as lines of CSV (RFC 4180) with all digits. */
 function csvOf(tab, state) {
-  const keys = presetsOf(tab)[state.preset];
+  const keys = tab.presets[state.preset];
   const head = ["rank", "method", "status", ...keys, `${tab.ranking}_low`, `${tab.ranking}_high`];
-  const lines = [...sectionOf(tab).querySelectorAll("tbody tr:not([hidden])")].map((line) => {
-    const [rank] = line.cells;
-    const { low, high } = line.cells[columnOf(tab, tab.ranking).place].dataset;
-    const status = line.dataset.floor ? "floor" : line.className || "active";
-    const cells = keys.map((name) => line.cells[columnOf(tab, name).place].dataset.value ?? "");
-    return [Number.parseInt(rank.textContent, 10) || "", line.querySelector(".name").textContent, status, ...cells, low ?? "", high ?? ""];
+  const { entries } = shownRows(tab, state);
+  const lines = ordered(tab, [...tab.references, ...entries], state.sort).map((row) => {
+    const values = keys.map((key) => row.values[indexOf(tab, key)] ?? "");
+    const [low, high] = row.interval;
+    return [row.rank ?? "", row.name, row.status, ...values, low ?? "", high ?? ""];
   });
   return [head, ...lines].map((cells) => cells.map(csvCell).join(",")).join("\r\n") + "\r\n";
 }

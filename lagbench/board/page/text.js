@@ -3,9 +3,9 @@
 const MISSING = "–";
 const RAISED = { "-": "⁻", 0: "⁰", 1: "¹", 2: "²", 3: "³", 4: "⁴", 5: "⁵", 6: "⁶", 7: "⁷", 8: "⁸", 9: "⁹" };
 
-/** Return a number of the payload: null stands for NaN, text for what is infinite. */
-function number(held) {
-  return held === null || held === undefined ? NaN : Number(held);
+/** Return a number of the page data: null stands for NaN, text for what is infinite. */
+function number(value) {
+  return value === null || value === undefined ? NaN : Number(value);
 }
 
 function power(exponent) {

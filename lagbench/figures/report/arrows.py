@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -48,7 +49,7 @@ def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigure]:
         f"Scenario {scenario}; colour is speed on the score grid, on one scale for all "
         "panels, and so is the length of arrows. Difference: predicted − true."
     )
-    omitted = [entry.name for entry in subject.entries[MOST_ENTRIES:]]
+    omitted = subject.names[MOST_ENTRIES:]
     if omitted:
         caption += f" Not drawn for want of room: {', '.join(omitted)}."
     ramp = draw_ramp("flow", limit, "speed [length/frame]")
@@ -59,7 +60,7 @@ def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigure]:
             panels = _draw_panels(subject, gallery, moment, entry, limit=limit)
             for row, panel in zip(rows.values(), panels, strict=True):
                 row.append(panel)
-        columns = [f"frame {moment.frame}" for moment in moments]
+        columns = [moment.title for moment in moments]
         panel_grid = draw_panel_grid(columns, list(rows.items()), width=7.4)
         yield ReportFigure(
             name=f"arrows-{entry.number}",
@@ -105,28 +106,32 @@ def _draw_arrows(
     top left.
     """
     grid = fields.grid
-    every = -(-grid.nodes // MOST_ARROWS)
-    nodes = np.argwhere(fields.counted)  # shape [node, 2]
-    nodes = nodes[((nodes - every // 2) % every == 0).all(axis=1)]
+    every = math.ceil(grid.nodes / MOST_ARROWS)
+    counted = np.argwhere(fields.counted)  # shape [node, 2]
+    is_shown = (counted - every // 2) % every == 0
+    column, row = counted[is_shown.all(axis=1)].T
 
     (left, right), (_, top) = subject.task.size.bounds
     scale = SIDE / (right - left)
-    position = (nodes + grid.origin) * grid.spacing
-    x = (position[:, 0] - left) * scale
-    y = (top - position[:, 1]) * scale
+    node_x = (column + grid.origin) * grid.spacing
+    node_y = (row + grid.origin) * grid.spacing
+    x = (node_x - left) * scale
+    y = (top - node_y) * scale
 
-    u, v = velocity[nodes[:, 0], nodes[:, 1]].T
+    u, v = velocity[column, row].T
     speed = np.hypot(u, v)
     longest = scale * every * grid.spacing * LONGEST
-    length = longest * np.minimum(speed / limit, MOST_TIMES_LIMIT)
-    along_x = length * u / np.maximum(speed, TINY)
-    along_y = -length * v / np.maximum(speed, TINY)
+    share = speed / limit
+    length = longest * np.minimum(share, MOST_TIMES_LIMIT)
+    divisor = np.maximum(speed, TINY)
+    along_x = length * u / divisor
+    along_y = -length * v / divisor
 
-    levels = np.clip(speed / limit * LEVELS, 0, LEVELS - 1).astype(int)
+    levels = np.clip(share * LEVELS, 0, LEVELS - 1).astype(int)
     data = [""] * LEVELS
     arrows = zip(x, y, along_x, along_y, levels, strict=True)
     for middle_x, middle_y, a, b, level in arrows:
-        data[level] += _arrow_data(middle_x, middle_y, a, b)
+        data[level] += arrow_data(middle_x, middle_y, a, b)
     paths = []
     for level, level_data in enumerate(data):
         if level_data:
@@ -134,17 +139,19 @@ def _draw_arrows(
     return join(paths)
 
 
-def _arrow_data(x: float, y: float, a: float, b: float) -> str:
+def arrow_data(x: float, y: float, a: float, b: float) -> str:
     """Return path data of an arrow (a, b) around its middle; a short one is a dot."""
     if np.hypot(a, b) < SHORTEST:
         return path_data([(x, y)])
-    tail = (x - a / 2, y - b / 2)
-    tip_x = x + a / 2
-    tip_y = y + b / 2
-    left = (tip_x - HEAD * (a + HEAD_SPREAD * b), tip_y - HEAD * (b - HEAD_SPREAD * a))
-    right = (tip_x - HEAD * (a - HEAD_SPREAD * b), tip_y - HEAD * (b + HEAD_SPREAD * a))
-    shaft = path_data([tail, (tip_x, tip_y)])
-    return shaft + path_data([left, (tip_x, tip_y), right])
+    middle = np.array([x, y])
+    along = np.array([a, b])
+    across = HEAD_SPREAD * np.array([b, -a])
+    tail = middle - along / 2
+    tip = middle + along / 2
+    left = tip - HEAD * (along + across)
+    right = tip - HEAD * (along - across)
+    shaft = path_data([tail, tip])
+    return shaft + path_data([left, tip, right])
 
 
 def _speed(velocity: Floats) -> Floats:

@@ -122,7 +122,7 @@ def method_curves(subject: Subject) -> Iterator[ReportFigure]:
         CORRELATION: "Fig. 5.13",
     }
     for name, thesis in figures.items():
-        rows = [row for row in subject.rows if name in row.scores]
+        rows = subject.rows_with(name)
         if not rows:
             continue
         metric = rows[0].scores[name].metric
@@ -155,7 +155,7 @@ def method_curves(subject: Subject) -> Iterator[ReportFigure]:
 def body_curves(subject: Subject) -> Iterator[ReportFigure]:
     """Yield how elastic bodies keep their shape and hold together (section 4.8.2)."""
     for name in ("shape_error", "connectivity"):
-        rows = [row for row in subject.rows if name in row.scores]
+        rows = subject.rows_with(name)
         if not rows:
             continue
         metric = rows[0].scores[name].metric
@@ -163,7 +163,7 @@ def body_curves(subject: Subject) -> Iterator[ReportFigure]:
         if name == "connectivity":
             y_axis = linear(0.0, 1.0)
         else:
-            y_axis = spanning([line.values for line in series], log=False)
+            y_axis = spanning(_values_of(series), log=False)
         y_label = format_quantity(metric)
         plot = Plot(_frame_axis(subject), y_axis, x_label="frame", y_label=y_label)
         _draw_lines(subject, plot, series)
@@ -188,7 +188,8 @@ def _mean_series(rows: Sequence[ReportRow], name: str) -> list[Series]:
     series = []
     true_score = rows[0].scores.get(f"{name}_true")
     if true_score is not None:
-        series.append(Series("truth", "truth", _mean_over_scenarios(true_score)))
+        true_values = _mean_over_scenarios(true_score)
+        series.append(Series("truth", "truth", true_values))
     for row in rows:
         values = _mean_over_scenarios(row.scores[name])
         series.append(Series(row.name, row.kind, values))
@@ -199,14 +200,14 @@ def _perturbed_run(subject: Subject, name: str) -> list[Series]:
     """Return the error of a perturbed run of the solver, where there is one."""
     if name != POSITION_ERROR:
         return []
-    values = np.asarray(subject.task.twin_floor)
+    values = np.asarray(subject.task.predictability_limit)
     if len(values) != len(subject.frames):
         return []
     return [Series("perturbed run of the solver", "twin", values)]
 
 
 def _error_axis(name: str, series: Sequence[Series]) -> AxisScale:
-    lines = [line.values for line in series]
+    lines = _values_of(series)
     if name == CORRELATION:
         values = np.concatenate(lines)
         lowest = np.min(values[np.isfinite(values)], initial=0.0)
@@ -275,15 +276,15 @@ def _energy_figure(
 ) -> ReportFigure:
     """Return energies over frames; the first series is the truth's."""
     highest = TOLERATED * float(np.nanmax(series[0].values, initial=0.0))
-    lines = [line.values for line in series]
+    lines = np.array(_values_of(series))  # shape [series, frame]
     caption_note = ""
     if highest > 0.0:
-        if any(np.any(values > highest) for values in lines):
+        if (lines > highest).any():
             caption_note = (
                 f" Energies beyond {TOLERATED:g} times the truth's maximum are cut off."
             )
-        lines = [np.minimum(values, highest) for values in lines]
-    y_axis = spanning(lines, log=False)
+        lines = np.minimum(lines, highest)
+    y_axis = spanning([lines], log=False)
     plot = Plot(_frame_axis(subject), y_axis, x_label="frame", y_label=y_label)
     _draw_lines(subject, plot, series)
     methods = ", ".join(line.label for line in series)
@@ -314,13 +315,17 @@ def _compose_figure(
     frames = sorted({*subject.frames_of_interest, int(subject.frames[-1])})
     columns = np.searchsorted(subject.frames, frames)
     head: list[object] = [texts.series]
-    head += [tag("span", f"frame {frame}") for frame in frames]
+    for frame in frames:
+        head.append(tag("span", f"frame {frame}"))
     rows = []
     for line in series:
-        numbers = [wrap_number(value) for value in line.values[columns].tolist()]
-        rows.append([line.label, *numbers])
+        values = line.values[columns].tolist()
+        rows.append([line.label, *map(wrap_number, values)])
 
-    key = draw_key([(line.kind, line.label) for line in (*series, *unlisted)])
+    key_items = []
+    for line in (*series, *unlisted):
+        key_items.append((line.kind, line.label))
+    key = draw_key(key_items)
     return ReportFigure(
         name=texts.name,
         title=texts.title,
@@ -329,6 +334,10 @@ def _compose_figure(
         caption=texts.caption + note,
         data=draw_table(head, rows, label="Numbers"),
     )
+
+
+def _values_of(series: Sequence[Series]) -> list[Floats]:
+    return [line.values for line in series]
 
 
 def _frame_axis(subject: Subject) -> AxisScale:

@@ -55,7 +55,7 @@ SMALL_HEIGHT = 230  # of a chart beside others [pixel]
 def bar_figures(subject: Subject) -> Iterator[ReportFigure]:
     """Yield one figure per metric that is defined in this split."""
     for name, title, thesis in BAR_FIGURES:
-        rows = [row for row in subject.rows if name in row.scores]
+        rows = subject.rows_with(name)
         if rows:
             yield _bar_figure(subject, rows, name, title=title, thesis=thesis)
 
@@ -114,7 +114,10 @@ def _bar_axis(metric: Metric, bars: Sequence[Bar]) -> AxisScale:
 def _sort_bars(subject: Subject, rows: Sequence[ReportRow], name: str) -> list[Bar]:
     """Return a bar per method, from best to worst; the best entry is bold."""
     metric = rows[0].scores[name].metric
-    means = {row.name: mean(row.scores[name].at(subject.key_frame)) for row in rows}
+    means = {}
+    for row in rows:
+        values = row.scores[name].at(subject.key_frame)
+        means[row.name] = mean(values)
 
     def loss(row: ReportRow) -> float:
         return float(np.nan_to_num(metric.loss(means[row.name]), nan=np.inf))
@@ -145,10 +148,13 @@ def _bar_table(subject: Subject, bars: Sequence[Bar], title: str) -> Markup:
     unknown = [np.nan] * len(subject.scenarios)
     rows = []
     for bar in bars:
-        numbers = [bar.value, *(bar.dots or unknown)]
-        rows.append([bar.label, *map(wrap_number, numbers)])
-    columns = [f"scenario {scenario}" for scenario in subject.scenarios]
-    return draw_table(["method", "mean", *columns], rows, label=title)
+        scenario_values = bar.dots or unknown
+        cells = map(wrap_number, scenario_values)
+        rows.append([bar.label, wrap_number(bar.value), *cells])
+    head = ["method", "mean"]
+    for scenario in subject.scenarios:
+        head.append(f"scenario {scenario}")
+    return draw_table(head, rows, label=title)
 
 
 def histogram_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
@@ -201,17 +207,17 @@ def _draw_histogram(subject: Subject, moment: Moment) -> Markup:
         lines.append((entry.name, entry.kind, shares))
     lines.append(("truth", "truth", true_shares))  # on top
 
-    top = max(float(shares.max()) for _, _, shares in lines)
+    all_shares = np.array([shares for _, _, shares in lines])
     plot = Plot(
         linear(float(edges[0]), float(edges[-1]), tight=True),
-        linear(0.0, top),
+        linear(0.0, float(all_shares.max())),
         x_label="vorticity [1/frame]",
         y_label="share of nodes [%]",
         height=SMALL_HEIGHT,
     )
     for name, kind, shares in lines:
         plot.steps(edges, shares, kind, name)
-    names = ", ".join(name for name, _, _ in lines)
+    names = ", ".join([*subject.names, "truth"])
     return plot.svg(
         f"Vorticity distribution at frame {moment.frame}",
         f"Histograms of {names} in scenario {moment.scenario}.",

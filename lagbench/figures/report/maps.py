@@ -61,20 +61,23 @@ def draw_sequential_map(field: NDArray[np.floating], limit: float) -> bytes:
 def _draw_map(field: NDArray[np.floating], limit: float, palette: Bytes) -> bytes:
     """Return a picture of values at nodes, shape [x node, y node]; NaN is grey."""
     share = np.clip(np.nan_to_num(field / limit, nan=0.0), -1.0, 1.0)
-    index = np.where(np.isnan(field), NO_VALUE, np.round(LEVELS + LEVELS * share))
-    rows = np.ascontiguousarray(index.T[::-1])  # first row at the top
-    return encode_indexed_png(rows.astype(np.uint8), palette)
+    level = np.round(LEVELS + LEVELS * share)
+    index = np.where(np.isnan(field), NO_VALUE, level).astype(np.uint8)
+    rows = index.T[::-1]  # first row at the top
+    return encode_indexed_png(np.ascontiguousarray(rows), palette)
 
 
 def _build_palette(below: str, above: str) -> Bytes:
     """Return the colour of each level, then that of no value, shape [entry, 4]."""
-    level = np.arange(-LEVELS, LEVELS + 1)
-    palette = np.empty((NO_VALUE + 1, 4), np.uint8)
-    is_below = level[:, None] < 0
-    palette[:-1, :3] = np.where(is_below, parse_rgb(below), parse_rgb(above))
-    palette[:-1, 3] = np.round(255.0 * np.abs(level) / LEVELS)
-    palette[NO_VALUE] = NO_VALUE_COLOUR
-    return palette
+    entries = []
+    for level in range(-LEVELS, LEVELS + 1):
+        colour = above
+        if level < 0:
+            colour = below
+        opacity = round(255.0 * abs(level) / LEVELS)
+        entries.append((*parse_rgb(colour), opacity))
+    entries.append(NO_VALUE_COLOUR)
+    return np.array(entries, np.uint8)
 
 
 _DIVERGING = _build_palette(CLOCKWISE, COUNTER_CLOCKWISE)
@@ -83,8 +86,8 @@ _SEQUENTIAL = _build_palette(FAST, FAST)
 
 def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    axis = task.setting.grid.axis
-    slack = WALL_SHARE * task.setting.grid.spacing
+    axis = task.config.grid.axis
+    slack = WALL_SHARE * task.config.grid.spacing
     (left, right), (bottom, top) = task.size.bounds
     is_column_inside = (axis >= left - slack) & (axis <= right + slack)
     is_row_inside = (axis >= bottom - slack) & (axis <= top + slack)
@@ -97,7 +100,7 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     frame = subject.key_frame
     moment = gallery.moments[scenario, frame]
     label = gallery.labels[scenario]
-    names = ["truth", *(entry.name for entry in subject.entries)]
+    names = ["truth", *subject.names]
 
     speeds = _masked_speeds(moment)
     vorticities = [moment.true_vorticity]
@@ -112,7 +115,8 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     ) -> list[Markup]:
         panels = []
         for name, field in zip(names, fields, strict=True):
-            png = draw_map(crop_to_walls(subject.task, field), limit)
+            shown = crop_to_walls(subject.task, field)
+            png = draw_map(shown, limit)
             alt = f"{what} of {name}, frame {frame}"
             panels.append(draw_image_panel(png, label.classes, alt))
         return panels
@@ -147,10 +151,13 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
 
 def _masked_speeds(moment: Moment) -> list[Floats]:
     """Return the speed of truth and entries at the nodes, NaN where none counts."""
-    flows = [moment.truth.fields, *(pair.predicted_fields for pair in moment.pairs)]
+    flows = [moment.truth.fields]
+    for pair in moment.pairs:
+        flows.append(pair.predicted_fields)
     speeds = []
     for flow in flows:
-        speed = np.sqrt((flow.velocity**2).sum(axis=-1))
+        squares = flow.velocity**2
+        speed = np.sqrt(squares.sum(axis=-1))
         speeds.append(np.where(flow.counted, speed, np.nan))
     return speeds
 
@@ -160,10 +167,11 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     scenario = subject.scenarios[0]
     moments = gallery.at(scenario, subject.times)
     label = gallery.labels[scenario]
-    limit = limit_of([moment.true_vorticity for moment in moments])
+    limit = limit_of(_true_vorticities(moments))
 
     def draw_panel(field: Floats, what: str, frame: int) -> Markup:
-        png = draw_diverging_map(crop_to_walls(subject.task, field), limit)
+        shown = crop_to_walls(subject.task, field)
+        png = draw_diverging_map(shown, limit)
         return draw_image_panel(png, label.classes, f"{what}, frame {frame}")
 
     true_panels = []
@@ -183,7 +191,7 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
         rows.append((entry.name, panels))
         rows.append(("difference", difference_panels))
 
-    columns = [f"frame {moment.frame}" for moment in moments]
+    columns = [moment.title for moment in moments]
     ramp = draw_ramp("diverging", limit, "vorticity [1/frame]", signed=True)
     return ReportFigure(
         name="vorticity",
@@ -196,22 +204,27 @@ def vorticity_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     )
 
 
+def _true_vorticities(moments: Sequence[Moment]) -> list[Floats]:
+    return [moment.true_vorticity for moment in moments]
+
+
 def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     """Return vorticity at the key frame in every test scenario (5.26 and 5.27)."""
     frame = subject.key_frame
     moments = [gallery.moments[scenario, frame] for scenario in subject.scenarios]
-    limits = [limit_of([moment.true_vorticity]) for moment in moments]
+    true_fields = _true_vorticities(moments)
+    limits = [limit_of([field]) for field in true_fields]
 
     def draw_row(what: str, fields: Sequence[Floats]) -> list[Markup]:
         panels = []
         for moment, field, limit in zip(moments, fields, limits, strict=True):
-            png = draw_diverging_map(crop_to_walls(subject.task, field), limit)
+            shown = crop_to_walls(subject.task, field)
+            png = draw_diverging_map(shown, limit)
             classes = gallery.labels[moment.scenario].classes
             alt = f"{what}, scenario {moment.scenario}"
             panels.append(draw_image_panel(png, classes, alt))
         return panels
 
-    true_fields = [moment.true_vorticity for moment in moments]
     rows = [("truth", draw_row("true vorticity", true_fields))]
     for entry in subject.entries:
         fields = [moment.predicted_vorticity(entry.number) for moment in moments]

@@ -72,9 +72,12 @@ def _scenario_figure(
     interval = subject.task.size.frame_interval
     columns = []
     for moment in moments:
-        columns.append(f"frame {moment.frame}\u2002{moment.frame * interval:.2f} s")
+        seconds = moment.frame * interval
+        columns.append(f"{moment.title}\u2002{seconds:.2f} s")
     materials = np.unique(moments[0].truth.scenario.material).tolist()
-    key = [(f"m{material}", MATERIALS[material]) for material in materials]
+    key = []
+    for material in materials:
+        key.append((f"m{material}", MATERIALS[material]))
     title = f"Particles, scenario {scenario}"
     if label.mark:
         title += f": {label.mark}"
@@ -122,21 +125,25 @@ def draw_materials(
 
     # a block of fine pixels gets its commonest material, as opaque as the block is full
     blocks = image.reshape(SIDE, OVERSAMPLING, SIDE, OVERSAMPLING)
-    counts = np.empty((len(MATERIALS), SIDE, SIDE), np.intp)
+    counts_by_material = []
     for number in range(len(MATERIALS)):
-        counts[number] = (blocks == number + 1).sum(axis=(1, 3))
+        is_material = blocks == number + 1
+        counts_by_material.append(is_material.sum(axis=(1, 3)))
+    counts = np.array(counts_by_material)  # shape [material, row, column]
     filled = counts.sum(axis=0)
-    entry = np.argmax(counts, axis=0) * SHADES + filled
+    commonest = np.argmax(counts, axis=0)
+    entry = commonest * SHADES + filled
     index = np.where(filled > 0, entry, 0).astype(np.uint8)
     return encode_indexed_png(index, _build_palette())
 
 
 def _build_palette() -> NDArray[np.uint8]:
     """Return nothing, then each material in each opacity, shape [entry, 4]."""
-    entries = [(0, 0, 0, 0)]
+    nothing = (0, 0, 0, 0)
+    entries = [nothing]
     for colour in MATERIAL_COLOURS:
-        red, green, blue = parse_rgb(colour).tolist()
+        rgb = parse_rgb(colour).tolist()
         for shade in range(1, SHADES + 1):
             opacity = round(255 * shade / SHADES)
-            entries.append((red, green, blue, opacity))
+            entries.append((*rgb, opacity))
     return np.array(entries, np.uint8)

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import WALLS
-from lagbench.data.local import resolve_root, rooted
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
-from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
+from lagbench.scoring.card import SUBMISSION, ScoreCard, number_methods
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import Predictions, open_predictions
 
@@ -88,14 +88,21 @@ class Subject:
                 name=entry.name, kind=entry.kind, scores=scores, entry=entry
             )
             rows.append(row)
-        reference_scores = {
-            name: scores
-            for name, scores in self.entries[0].card.scores.items()
-            if name != SUBMISSION
-        }
+        reference_scores = dict(self.entries[0].card.scores)
+        del reference_scores[SUBMISSION]
         for number, (name, scores) in enumerate(reference_scores.items()):
-            rows.append(ReportRow(name=name, kind=f"floor{number}", scores=scores))
+            kind = f"floor{number}"
+            rows.append(ReportRow(name=name, kind=kind, scores=scores))
         return tuple(rows)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the entries."""
+        return [entry.name for entry in self.entries]
+
+    def rows_with(self, metric: str) -> list[ReportRow]:
+        """Return the rows that have a score of a metric."""
+        return [row for row in self.rows if metric in row.scores]
 
     @property
     def ranking(self) -> Metric:
@@ -108,13 +115,17 @@ class Subject:
         """The entry with the least loss in the ranking metric, the first of equals."""
         metric = self.ranking
         rows = self.rows[: len(self.entries)]
-        losses = [metric.loss(row.scores[metric.name].mean) for row in rows]
-        return rows[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))]
+        losses = []
+        for row in rows:
+            score = row.scores[metric.name]
+            losses.append(metric.loss(score.mean))
+        finite_losses = np.nan_to_num(losses, nan=np.inf)
+        return rows[int(np.argmin(finite_losses))]
 
     @property
     def is_full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.task.setting.full_box
+        return self.task.config.is_full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -124,21 +135,24 @@ class Subject:
     @property
     def frames(self) -> NDArray[np.int64]:
         """Absolute numbers of the predicted frames, shape [frame]."""
-        return np.array(self.task.setting.predicted_frames)
+        return np.array(self.task.config.predicted_frames)
 
     @property
     def key_frame(self) -> int:
         """The frame of interest nearest to the one at which the thesis compares."""
         target = THESIS_FRAMES.get(self.task.size.split, OTHER_FRAME)
-        return min(
-            self.frames_of_interest, key=lambda frame: (abs(frame - target), frame)
-        )
+
+        def distance(frame: int) -> int:
+            return abs(frame - target)
+
+        # the earlier of two that are as near
+        return min(self.frames_of_interest, key=distance)
 
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
         """Frames of interest, the last predicted one if there are none."""
-        predicted = self.task.setting.predicted_frames
-        frames = set(self.task.setting.frames_of_interest).intersection(predicted)
+        predicted = self.task.config.predicted_frames
+        frames = set(self.task.config.frames_of_interest).intersection(predicted)
         return tuple(sorted(frames)) or (predicted[-1],)
 
     @property
@@ -147,7 +161,8 @@ class Subject:
 
         They are those of interest except the key frame, or evenly spaced.
         """
-        frames = [frame for frame in self.frames_of_interest if frame != self.key_frame]
+        frames = list(self.frames_of_interest)
+        frames.remove(self.key_frame)
         if len(frames) >= TIMES:
             return tuple(frames[:TIMES])
         return self.times
@@ -155,7 +170,7 @@ class Subject:
     @property
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, with the first and last predicted one."""
-        predicted = self.task.setting.predicted_frames
+        predicted = self.task.config.predicted_frames
         if len(self.frames_of_interest) >= TIMES:
             frames = _choose_evenly(self.frames_of_interest, TIMES - 1)
         else:
@@ -201,11 +216,11 @@ def load_subject(
     _check_same_data(cards, predictions)
     header = cards[0].header
     folder = resolve_root(root)
-    splits = rooted(folder, registry)
+    splits = load_rooted_registry(folder, registry)
     task = load_scored_task(splits.size(header.split, header.size), folder)
 
     methods = [card.header.method for card in cards]
-    names = told_apart(methods, taken=cards[0].scores)
+    names = number_methods(methods, taken=cards[0].scores)
     entries = []
     for number, name in enumerate(names):
         entry = ReportEntry(
@@ -248,7 +263,10 @@ class ScenarioLabel:
     @property
     def classes(self) -> str:
         """Classes of a panel, which tell the walls that move."""
-        return " ".join(["panel", *(f"{wall}-moves" for wall in self.moving)])
+        classes = "panel"
+        for wall in self.moving:
+            classes += f" {wall}-moves"
+        return classes
 
     @property
     def details(self) -> list[str]:
@@ -268,6 +286,11 @@ class Moment:
     scenario: int  # id of the scenario
     frame: int  # absolute frame number
     pairs: tuple[FramePair, ...]  # truth and prediction of each entry, in their order
+
+    @property
+    def title(self) -> str:
+        """The frame as a heading."""
+        return f"frame {self.frame}"
 
     @property
     def truth(self) -> Snapshot:
@@ -338,9 +361,9 @@ def _read_pairs(
     true_snapshot = scenario.snapshot(now, before)
     pairs = []
     for file in files:
-        is_first_predicted = frame == scenario.setting.input_frames
+        is_first_predicted = frame == scenario.config.input_frames
         if is_first_predicted:
-            before = scenario.given[-1]
+            before = scenario.input_positions[-1]
             now = file.frames(number, frame, 1)[0]
         else:
             before, now = file.frames(number, frame - 1, 2)
@@ -356,9 +379,14 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
     if "wall_velocity" in file.variables:
         wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
         largest = np.abs(wall_velocity).max(axis=0) * _ALONG  # shape [wall, 2]
-        moving = [wall for wall, v in zip(WALLS, largest, strict=True) if v.any()]
+        for wall, velocity in zip(WALLS, largest, strict=True):
+            if velocity.any():
+                moving.append(wall)
 
-    marks = [str(parameters[name]) for name in ("family", "pair") if name in parameters]
+    marks = []
+    for name in ("family", "pair"):
+        if name in parameters:
+            marks.append(str(parameters[name]))
     if "frequency" in parameters:
         marks.append(f"frequency {parameters['frequency']}")
     reynolds = None
@@ -370,7 +398,8 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
 
 def limit_of(fields: Sequence[Floats]) -> float:
     """Return the magnitude of full colour: almost all nodes stay below it."""
-    values = np.concatenate([np.abs(field[np.isfinite(field)]) for field in fields])
+    values = np.concatenate([field.ravel() for field in fields])
+    values = np.abs(values[np.isfinite(values)])
     if values.size == 0:
         return 1.0
     top = float(np.percentile(values, TOP_PERCENTILE))

@@ -46,25 +46,24 @@ NARROW_SPACE = "\u202f"
 
 def format_title(subject: Subject) -> str:
     """Return the title of the window."""
-    names = ", ".join(entry.name for entry in subject.entries)
-    return f"{names} on {subject.task.size.split} {subject.task.size.name}"
+    size = subject.task.size
+    return f"{', '.join(subject.names)} on {size.split} {size.name}"
 
 
 def draw_head(subject: Subject) -> Markup:
     """Return the top of the page: methods, task and tiles."""
     size = subject.task.size
     header = subject.entries[0].card.header
-    setting = subject.task.setting
+    config = subject.task.config
     intro = (
-        f"Given {setting.input_frames} frames of each of {len(subject.scenarios)} test "
-        f"scenarios, predict the next {setting.horizon}. {subject.title}, "
+        f"Given {config.input_frames} frames of each of {len(subject.scenarios)} test "
+        f"scenarios, predict the next {config.horizon}. {subject.title}, "
         f"{size.particles} particles, data set version {header.dataset_version}."
     )
     brand = f"lagbench · score report · {size.split} {size.name}"
-    names = " · ".join(entry.name for entry in subject.entries)
     parts = [
         tag("p", brand, class_="brand"),
-        tag("h1", names),
+        tag("h1", " · ".join(subject.names)),
         tag("p", intro, class_="lede"),
         tag("ul", *_draw_tiles(subject), class_="tiles"),
     ]
@@ -82,7 +81,7 @@ def _draw_tiles(subject: Subject) -> list[Markup]:
     tiles = []
     if best.entry is not None and best.entry.card.skill is not None:
         skill = best.entry.card.skill
-        note = f"1 - score / score of {skill.floor}"
+        note = f"1 - score / score of {skill.reference}"
         tiles.append(_draw_tile(f"{prefix}skill", skill.value, skill.interval, note))
     ranking_note = _compare_with_references(subject, best)
     title = f"{prefix}{words(ranking)}"
@@ -129,7 +128,8 @@ def _draw_tile(
     ]
     low, high = bounds
     if not math.isnan(low):
-        parts.append(tag("span", f"{text(low)} … {text(high)}", class_="more"))
+        spread = f"{text(low)} … {text(high)}"
+        parts.append(tag("span", spread, class_="more"))
     parts.append(tag("span", note, class_="more"))
     return tag("li", *parts)
 
@@ -196,11 +196,13 @@ def _draw_entry_flags(entry: ReportEntry) -> list[Markup]:
 def _draw_flag(
     state: str, kind: str, name: str, message: str, details: str | None = None
 ) -> Markup:
+    badge = tag("span", state, class_=f"flag {kind}")
     parts: list[object] = [tag("strong", name), message]
     if details is not None:
-        parts.append(tag("span", details, class_="sub"))
-    badge = tag("span", state, class_=f"flag {kind}")
-    return tag("li", badge, tag("span", *parts))
+        below = tag("span", details, class_="sub")
+        parts.append(below)
+    message_part = tag("span", *parts)
+    return tag("li", badge, message_part)
 
 
 def draw_identity(subject: Subject) -> Markup:
@@ -218,9 +220,10 @@ def draw_identity(subject: Subject) -> Markup:
         rows = _identity_rows(entry)
         parts.append(draw_table(head, rows, kind="text", label=entry.name))
 
-    files = " ".join(shlex.quote(entry.predictions.name) for entry in subject.entries)
+    files = [entry.predictions.name for entry in subject.entries]
+    command = f"lagbench score {shlex.join(files)} --report report"
     parts.append(tag("h4", "The same report again"))
-    parts.append(tag("pre", f"lagbench score {files} --report report"))
+    parts.append(tag("pre", command))
     return join(parts)
 
 
@@ -242,4 +245,8 @@ def _identity_rows(entry: ReportEntry) -> list[list[object]]:
         "seed": header.seed,
         "training": header.training,
     }
-    return [[name, value] for name, value in values.items() if value is not None]
+    rows: list[list[object]] = []
+    for name, value in values.items():
+        if value is not None:
+            rows.append([name, value])
+    return rows

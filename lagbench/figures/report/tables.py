@@ -69,7 +69,8 @@ def every_metric(subject: Subject) -> Markup:
     """Return all metrics over the horizon, family by family."""
     parts = []
     for family, metrics in FAMILIES.items():
-        names = _measured(subject, [metric.name for metric in metrics])
+        family_names = [metric.name for metric in metrics]
+        names = _measured(subject, family_names)
         if names:
             parts.append(tag("h4", family.capitalize()))
             parts.append(_horizon_table(subject, names))
@@ -121,10 +122,12 @@ def _horizon_table(subject: Subject, names: Sequence[str]) -> Markup:
 
 def _draw_metric(metric: Metric, *, ranks: bool) -> Markup:
     """Return name, unit, summary and aim of a metric."""
-    parts: list[object] = [metric.name.replace("_", f"_{LINE_BREAK}")]
-    parts.append(tag("span", format_unit(metric), class_="unit"))
+    name = metric.name.replace("_", f"_{LINE_BREAK}")
+    unit = tag("span", format_unit(metric), class_="unit")
+    parts: list[object] = [name, unit]
     if ranks:
-        parts += [" ", tag("span", "ranks", class_="flag ok")]
+        badge = tag("span", "ranks", class_="flag ok")
+        parts += [" ", badge]
     if metric.direction is Direction.TARGET:
         aim = f"aims at {metric.perfect:g}"
     else:
@@ -138,7 +141,8 @@ def _draw_score(score: Score, *, is_best: bool) -> Markup:
     parts = [_draw_number(score.mean, is_best=is_best), interval(score.interval)]
     undefined_count = sum(score.undefined)
     if undefined_count:
-        parts.append(tag("span", f"{undefined_count} undefined", class_="ci"))
+        note = f"{undefined_count} undefined"
+        parts.append(tag("span", note, class_="ci"))
     return join(parts)
 
 
@@ -181,11 +185,14 @@ def frame_table(subject: Subject) -> Markup:
     if subject.is_full_box:
         names = _measured(subject, AT_FRAME_FULL_BOX)
     frame = subject.key_frame
-    lines: list[list[object]] = [[_draw_heading(row)] for row in subject.rows]
+    lines: list[list[object]] = []
+    for row in subject.rows:
+        lines.append([_draw_heading(row)])
     for name in names:
         metric = subject.rows[0].scores[name].metric
         values = [row.scores[name].at(frame) for row in subject.rows]
-        best = _find_best(metric, _comparable(subject, metric, values))
+        comparable = _comparable(subject, metric, values)
+        best = _find_best(metric, comparable)
         for number, line in enumerate(lines):
             value = mean(values[number])
             line.append(_draw_number(value, is_best=number in best))
@@ -230,10 +237,15 @@ def ranking_table(subject: Subject) -> Markup:
     Tests are sign-flip tests, corrected by Holm. Reference predictors follow, unranked.
     """
     name = subject.ranking.name
-    entries = {row.name: row for row in subject.rows if row.entry is not None}
-    scores = {method: row.scores[name] for method, row in entries.items()}
+    entries = {}
+    scores = {}
+    for row in subject.rows:
+        if row.entry is not None:
+            entries[row.name] = row
+            scores[row.name] = row.scores[name]
     ranked = standings(scores)
-    leader_score = scores[next(iter(ranked))]
+    leader = next(iter(ranked))
+    leader_score = scores[leader]
 
     lines: list[list[object]] = []
     for method, standing in ranked.items():

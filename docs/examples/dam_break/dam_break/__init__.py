@@ -7,7 +7,7 @@ import numpy as np
 from lagbench.data.registry import Size
 from lagbench.generators.constants import constants, free_surface_walls
 from lagbench.generators.draws import RandomSource, uniform
-from lagbench.generators.shapes import Rectangle, body_at, seeds
+from lagbench.generators.shapes import Rectangle, body_at, sample_points
 from lagbench.generators.split import FreeSurfaceParameters, InitialState
 
 REGISTRY = Path(__file__).with_name("dam_break.yaml")
@@ -27,7 +27,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         Rectangle(width, height), low + 0.01 + width / 2, low + 0.01 + height / 2
     )
     return InitialState(
-        position=seeds(rng, column, size.particles),
+        position=sample_points(rng, column, size.particles),
         velocity=np.zeros((size.particles, 2)),
         affine=np.zeros((size.particles, 2, 2)),
         material=np.zeros(size.particles, np.int8),

@@ -1,0 +1,133 @@
+"""Do jelly and rope keep their shape, and does matter keep its density?
+
+    python benchmarks/shape_and_density.py --size mini --root DATA [PREDICTIONS ...]
+
+prints two numbers by material, for the truth of the test scenarios of multimaterial and
+for each file of predictions. The first is the distance of particles from their places
+by shape matching (lagbench.baselines.projection), mean over particles [length]. The
+second is the 95th percentile of the density over the greatest one of the first frame.
+Both are given as the mean over scenarios and frames, and as the greatest of all.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from lagbench.baselines.particle_grid import ParticleGrid
+from lagbench.baselines.projection import Density, Shape
+from lagbench.data.local import resolve_root
+from lagbench.data.registry import Size, load
+from lagbench.data.scenario import read_scenario
+from lagbench.figures.tables import markdown
+from lagbench.submission.predictions import Predictions, open_predictions
+
+SPLIT = "multimaterial"
+MATERIALS = ("liquid", "jelly", "snow", "rope")
+FRAME_STEP = 10
+"""Frames between those that are measured."""
+
+ReadFrame = Callable[[int, int], NDArray[np.float32]]
+"""Return the positions of a scenario in a frame, shape [particle, 2]."""
+
+
+def read_predicted(file: Predictions, scenario: int, frame: int) -> NDArray[np.float32]:
+    """Return the predicted positions in one frame."""
+    return np.asarray(file.frames(scenario, frame, 1)[0])
+
+
+def measure(
+    size: Size, root: Path, read_frame: ReadFrame | None, cells: tuple[int, int]
+) -> dict[int, Tensor]:
+    """Return (deviation, density) of each material, shape [scenario and frame, 2].
+
+    None reads the truth. The cells are those of the clusters and of the densities.
+    """
+    cluster_cells, density_cells = cells
+    cluster_grid = ParticleGrid(size.bounds, cluster_cells)
+    density_grid = ParticleGrid(size.bounds, density_cells)
+    rows: dict[int, list[list[float]]] = {kind: [] for kind in range(len(MATERIALS))}
+    for scenario in size.subsets["test"]:
+        truth = {}
+        with read_scenario(size.path(root, scenario)) as file:
+            material = torch.from_numpy(file.read("material").astype(np.int64))
+            first = torch.from_numpy(file.read("position", slice(0, 1))[0])
+            for frame in range(size.task.input_frames, file.header.frames, FRAME_STEP):
+                truth[frame] = file.read("position", slice(frame, frame + 1))[0]
+
+        single_material = torch.zeros_like(material)
+        shape = Shape.of(cluster_grid, first, material, len(MATERIALS))
+        density = Density.of(density_grid, first, single_material, 1)
+        for frame, true_position in truth.items():
+            numbers = true_position
+            if read_frame is not None:
+                numbers = read_frame(scenario, frame)
+            position = torch.from_numpy(numbers)
+            deviation = (shape.matched(position) - position).norm(dim=1)
+            stencil = density_grid.stencil(position, single_material)
+            relative_density, _ = density.relative(stencil)
+            for kind in sorted(set(material.tolist())):
+                is_kind = material == kind
+                mean_deviation = float(deviation[is_kind].mean())
+                high_density = float(relative_density[is_kind].quantile(0.95))
+                rows[kind].append([mean_deviation, high_density])
+    return {kind: torch.tensor(values) for kind, values in rows.items()}
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "predictions", nargs="*", type=Path, help="files to measure beside the truth"
+    )
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--root", type=Path, help="folder of all data sets")
+    parser.add_argument(
+        "--cells",
+        default="15,30",
+        help="cells across the box: of clusters, of densities",
+    )
+    options = parser.parse_args()
+    cluster_cells, density_cells = map(int, options.cells.split(","))
+    size = load().size(SPLIT, options.size)
+    root = resolve_root(options.root)
+    lines = []
+    with ExitStack() as stack:
+        readers: dict[str, ReadFrame | None] = {"truth": None}
+        for path in options.predictions:
+            file = stack.enter_context(open_predictions(path))
+            readers[str(path)] = partial(read_predicted, file)
+        for name, read_frame in readers.items():
+            by_material = measure(
+                size, root, read_frame, (cluster_cells, density_cells)
+            )
+            for kind, values in by_material.items():
+                mean_deviation, mean_density = values.mean(dim=0).tolist()
+                most_deviation, most_density = values.amax(dim=0).tolist()
+                lines.append(
+                    [
+                        name,
+                        MATERIALS[kind],
+                        f"{mean_deviation:.2g}",
+                        f"{most_deviation:.2g}",
+                        f"{mean_density:.2g}",
+                        f"{most_density:.2g}",
+                    ]
+                )
+    heads = ["of", "material", "off its shape", "at most", "density", "at most"]
+    print(markdown(heads, lines))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,1 +1,0 @@
-"""Is the physics of the closed box right: Ghia, energy, decay."""

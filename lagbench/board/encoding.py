@@ -1,0 +1,167 @@
+"""Encode the data of the page: arrays as 16-bit integers, bytes as text.
+
+A value is ``zero + step * level``, or the exponential of that, with integer levels. An
+array is stored as the differences of its rows, which compress well where rows are
+frames; differences wrap around at 16 bits. page/data.js reads all of it.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import math
+import sys
+import zlib
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lagbench.data.checksums import round_digits
+
+LEVELS = 4000
+"""Steps between the least and the greatest value of an array, unless told otherwise."""
+
+MISSING = -(2**15)
+"""Level that stands for NaN."""
+
+SMALLEST_SHARE = 1e-9
+"""A logarithmic range reaches no lower than this share of its top."""
+
+SMALLEST_TOP = sys.float_info.min / SMALLEST_SHARE
+"""Smaller tops have no logarithmic range: its ends may read back as zero."""
+
+DIGITS = 9  # digits of zero and step
+
+GZIP = 16 + zlib.MAX_WBITS  # window bits that mean gzip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scale:
+    """How levels become values."""
+
+    zero: float
+    step: float
+    is_logarithmic: bool
+
+    def levels_of(self, values: NDArray[np.float64]) -> NDArray[np.int16]:
+        """Return the nearest levels; MISSING for what is not finite."""
+        is_known = np.isfinite(values)
+        known = np.where(is_known, values, 0.0)
+        if self.is_logarithmic:
+            known = np.log(np.maximum(known, math.exp(self.zero)))
+        levels = np.rint((known - self.zero) / self.step)
+        return np.where(is_known, levels, MISSING).astype(np.int16)
+
+
+WHOLE_NUMBERS = Scale(zero=0.0, step=1.0, is_logarithmic=False)
+
+
+def scale_for(
+    values: NDArray[np.float64],
+    *,
+    prefer_logarithmic: bool = False,
+    levels: int = LEVELS,
+) -> Scale:
+    """Return a scale of so many steps that spans some values.
+
+    A logarithmic one needs values >= 0; zeros and very small values become the least
+    value of its range.
+    """
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return WHOLE_NUMBERS
+    low = float(known.min())
+    high = float(known.max())
+    is_logarithmic = prefer_logarithmic and low >= 0.0 and high > SMALLEST_TOP
+    if is_logarithmic:
+        low = math.log(known[known > SMALLEST_SHARE * high].min())
+        high = math.log(high)
+    step = (high - low) / levels
+    if step == 0.0:
+        step = 1.0
+    return Scale(
+        zero=round_digits(low, DIGITS),
+        step=round_digits(step, DIGITS),
+        is_logarithmic=is_logarithmic,
+    )
+
+
+@dataclass
+class ArrayStore:
+    """Arrays of numbers one after the other; equal arrays stand there once."""
+
+    _parts: list[bytes] = field(default_factory=list)
+    _length: int = 0  # numbers so far
+    _starts: dict[bytes, int] = field(default_factory=dict)
+
+    def add(
+        self,
+        values: ArrayLike,
+        *,
+        prefer_logarithmic: bool = False,
+        levels: int = LEVELS,
+    ) -> dict[str, float | bool]:
+        """Add an array, shape [row] or [row, column], NaN where values are missing.
+
+        Returns:
+            The reference that page/data.js reads: place, shape and scale.
+        """
+        array = np.asarray(values, np.float64)
+        scale = scale_for(array, prefer_logarithmic=prefer_logarithmic, levels=levels)
+        return self._store(array, scale)
+
+    def add_whole(self, numbers: ArrayLike) -> dict[str, float | bool]:
+        """Add whole numbers, which stay exact: frames or materials."""
+        return self._store(np.asarray(numbers, np.float64), WHOLE_NUMBERS)
+
+    def to_bytes(self) -> bytes:
+        """Return all arrays as little-endian 16-bit integers."""
+        return b"".join(self._parts)
+
+    def _store(
+        self, array: NDArray[np.float64], scale: Scale
+    ) -> dict[str, float | bool]:
+        levels = scale.levels_of(array).reshape(len(array), -1)
+        first_row = np.zeros((1, levels.shape[1]), np.int16)
+        differences = np.diff(levels, axis=0, prepend=first_row)
+        data = differences.astype("<i2").tobytes()
+        if data not in self._starts:
+            self._starts[data] = self._length
+            self._length += differences.size
+            self._parts.append(data)
+        rows, columns = levels.shape
+        return {
+            "start": self._starts[data],
+            "rows": rows,
+            "columns": columns,
+            "zero": scale.zero,
+            "step": scale.step,
+            "log": scale.is_logarithmic,
+        }
+
+
+def encode(data: bytes) -> str:
+    """Return bytes as text that may stand in an HTML element: gzip, then base64.
+
+    >>> decode(encode(b"abc"), longest=3)
+    b'abc'
+    """
+    return base64.b64encode(gzip.compress(data, mtime=0)).decode("ascii")
+
+
+def decode(text: str, *, longest: int) -> bytes:
+    """Return the bytes that a text encodes.
+
+    Raises:
+        ValueError: the text encodes nothing, or more than ``longest`` bytes.
+    """
+    compressed = base64.b64decode(text, validate=True)
+    decompressor = zlib.decompressobj(wbits=GZIP)
+    try:
+        data = decompressor.decompress(compressed, longest + 1)
+    except zlib.error as error:
+        raise ValueError("no gzip") from error
+    if len(data) > longest or not decompressor.eof:
+        raise ValueError("too long, or cut short")
+    return data

@@ -1,0 +1,441 @@
+"""The checks of a leaderboard's folder that need no data set and no git."""
+
+from __future__ import annotations
+
+import math
+import stat
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lagbench.data.checksums import file_sha256
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.score_file import SubmissionStatistics
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
+from lagbench.submission.issues import ValidationIssue
+
+from .entry import Entry, EntryBudget, Prediction, Status, Summary
+from .entry_file import examine, load_plain
+from .fields import latest_date
+from .folder import VERIFIED, Folder, Place, entry_path
+from .identity import confusable_key, find_impossible_values, fingerprint_of
+from .issues import issue_from_error, make_issue
+from .ranking import combine, dataset_of, is_current, summarise
+from .rescoring import TOLERANCE
+from .verified import read_verified, verification_of
+from .weights import check_weights
+
+SHOWN_DIGITS = 16  # digits of a hash in an issue
+
+
+@dataclass(frozen=True)
+class ScoredEntry:
+    """An entry with one of its score files."""
+
+    entry: Entry
+    score_path: Path
+
+
+@dataclass(kw_only=True)
+class FolderChecks:
+    """Checks files one by one, then what they are to each other."""
+
+    folder: Folder
+    registry: Registry
+    unreadable: Mapping[Path, str]  # files that a child process cannot read, and why
+    issues: list[ValidationIssue] = field(default_factory=list)
+    entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
+    readable_score_files: set[Path] = field(default_factory=set)
+    # entries by content hash and by fingerprint of their predictions
+    _scored: dict[str, list[ScoredEntry]] = field(default_factory=dict)
+
+    def run(self) -> None:
+        """Make all checks."""
+        for path in self.folder.entries():
+            self._guard(path, self._check_entry)
+        for path in self.folder.reference_files():
+            self._guard(path, self._check_reference)
+        self._check_misplaced_files()
+        self.issues += check_weights(self.folder, self.entries)
+        self._check_successors()
+        self._check_twins()
+        self._check_names()
+        self._check_stray_score_files()
+        self._check_verified()
+
+    def _add(
+        self,
+        check: str,
+        where: object,
+        got: object,
+        *,
+        what: str | None = None,
+        expected: object = None,
+        fix: str | None = None,
+    ) -> None:
+        self.issues.append(
+            make_issue(check, where, got, what=what, expected=expected, fix=fix)
+        )
+
+    def _guard(self, path: Path, check: Callable[[Path], None]) -> None:
+        """Check one file; an error that nobody thought of must not hide other
+        issues.
+        """
+        try:
+            check(path)
+        except Exception as error:
+            message = ascii(str(error)[:200])[1:-1]
+            self._add("readable", path, f"{type(error).__name__}: {message}")
+
+    def _check_entry(self, path: Path) -> None:
+        """Check the YAML file of an entry and its score files."""
+        try:
+            entry, schema_issues = examine(Entry, load_plain(self.folder.path / path))
+        except UnreadableFileError as error:
+            self.issues.append(issue_from_error("readable", error, path))
+            return
+        for issue in schema_issues:
+            where = f"{path}, {issue.where}"
+            self._add("schema", where, issue.got, what=issue.what, fix=issue.fix)
+        if entry is None:
+            return
+        try:
+            size = self.registry.size(entry.split, entry.size)
+        except UsageError as error:
+            self._add("split", path, f"{entry.split} {entry.size}", fix=error.fix)
+            return
+
+        self.entries.append(entry)
+        if entry.yaml_path != path:
+            self._add("place", path, path, expected=entry.yaml_path)
+        self._check_version(path, entry, size)
+        latest = latest_date()
+        if entry.date > latest:
+            self._add("date", path, entry.date, expected=f"at most {latest}")
+        self._check_predictions(path, entry)
+        self._check_budget(path, entry)
+        self._check_scores(path, entry, size)
+
+    def _check_version(self, path: Path, entry: Entry, size: Size) -> None:
+        dataset = entry.dataset
+        if entry.status is not Status.ACTIVE or is_current(dataset, size):
+            return
+        recorded = "no recorded hash"
+        if size.measured:
+            recorded = size.measured.dataset_sha256[:SHOWN_DIGITS]
+        self._add(
+            "version",
+            path,
+            f"version {dataset.version}, {dataset.sha256[:SHOWN_DIGITS]}",
+            expected=f"version {size.version}, {recorded}",
+        )
+
+    def _check_predictions(self, path: Path, entry: Entry) -> None:
+        """Check the predictions that lie in the folder."""
+        for number, prediction in enumerate(entry.predictions):
+            if prediction.path is None:
+                continue
+            length = self._describe_length(Path(prediction.path))
+            if length != prediction.bytes:
+                self._add(
+                    "predictions",
+                    f"{path}, predictions.{number}",
+                    length,
+                    expected=f"{prediction.path}, a file of {prediction.bytes} bytes",
+                )
+
+    def _describe_length(self, path: Path) -> str | int:
+        """Return the length of a file in the folder [bytes], or why it has none."""
+        if self.folder.link_in(path) is not None:
+            return "a symbolic link"
+        try:
+            status = (self.folder.path / path).lstat()
+        except OSError:
+            return "no such file"
+        if stat.S_ISREG(status.st_mode):
+            return status.st_size
+        return "something that is no regular file"
+
+    def _check_budget(self, path: Path, entry: Entry) -> None:
+        budgets = [prediction.budget for prediction in entry.predictions]
+        mean_budget = EntryBudget.mean_over_seeds(entry.size, budgets)
+        if mean_budget is not None:
+            if entry.budget != mean_budget:
+                where = f"{path}, budget"
+                self._add("budget", where, entry.budget, expected=mean_budget)
+        elif entry.budget is not None and entry.budget.track is not None:
+            self._add("budget", f"{path}, budget.track", entry.budget.track)
+
+    def _check_scores(self, path: Path, entry: Entry, size: Size) -> None:
+        """Check the score files of an entry, and its score block against them."""
+        task = None
+        if is_current(entry.dataset, size):
+            task = size
+        sound_scores = []
+        files = zip(
+            entry.score_paths, entry.score.files, entry.predictions, strict=True
+        )
+        for score_path, file, prediction in files:
+            stored = self._read_score_file(score_path, file.sha256, task)
+            if stored is None:
+                continue
+            self._check_identity(score_path, stored.scores, entry, prediction)
+            impossible_values = list(find_impossible_values(stored))
+            if impossible_values:
+                got = impossible_values[0]
+                if len(impossible_values) > 1:
+                    got += f" and {len(impossible_values) - 1} more"
+                self._add("values", score_path, got)
+            else:
+                sound_scores.append(stored.scores)
+            for identity in (prediction.sha256, fingerprint_of(stored.scores.tallies)):
+                scored_entry = ScoredEntry(entry, score_path)
+                self._scored.setdefault(identity, []).append(scored_entry)
+
+        if entry.score.dataset_sha256 != entry.dataset.sha256:
+            self._add(
+                "score",
+                f"{path}, score",
+                entry.score.dataset_sha256,
+                expected=entry.dataset.sha256,
+            )
+        if len(sound_scores) == len(entry.predictions):
+            self._check_score_block(path, entry, sound_scores)
+
+    def _read_score_file(
+        self, path: Path, sha256: str, task: Size | None
+    ) -> ScoreFile | None:
+        """Return a score file; None, and an issue, where it cannot be one."""
+        file = self.folder.path / path
+        if not file.is_file() or self.folder.link_in(path) is not None:
+            self._add("missing", path, "no such file")
+            return None
+        length = file.stat().st_size
+        if length > MAX_SCORE_BYTES:
+            self._add("oversize", path, f"{length} bytes")
+            return None
+        found_sha256 = file_sha256(file)
+        if found_sha256 != sha256:
+            self._add(
+                "score_file",
+                path,
+                f"SHA-256 {found_sha256[:SHOWN_DIGITS]}, not {sha256[:SHOWN_DIGITS]} "
+                "as the entry says",
+            )
+            return None
+        if file in self.unreadable:
+            self._add("score_file", path, self.unreadable[file])
+            return None
+        try:
+            stored = read_score_file(file, task)
+        except UnreadableFileError as error:
+            self._add("score_file", path, f"{error.what}: {error.got}")
+            return None
+        self.readable_score_files.add(path)
+        return stored
+
+    def _check_identity(
+        self,
+        path: Path,
+        scores: SubmissionStatistics,
+        entry: Entry,
+        prediction: Prediction,
+    ) -> None:
+        """Check that a score file belongs to the entry's data set and predictions."""
+        expected = {
+            "split": entry.split,
+            "size": entry.size,
+            "dataset_version": entry.dataset.version,
+            "dataset_sha256": entry.dataset.sha256,
+            "predictions_sha256": prediction.sha256,
+        }
+        identity = {
+            **scores.identity,
+            "predictions_sha256": scores.predictions_sha256,
+        }
+        for name, value in expected.items():
+            if identity[name] != value:
+                got = ascii(identity[name])[:80]
+                self._add("score_file", path, f"{name} {got}, not {value!a}")
+
+    def _check_score_block(
+        self, path: Path, entry: Entry, scores: Sequence[SubmissionStatistics]
+    ) -> None:
+        """Compare the score block with the scores that the score files give."""
+        # only seeds of the same scenarios and frames have a mean
+        first_extent = _extent_of(scores[0])
+        has_same_extent = True
+        for score_path, stored in zip(entry.score_paths, scores, strict=True):
+            if _extent_of(stored) != first_extent:
+                has_same_extent = False
+                self._add(
+                    "score_file",
+                    score_path,
+                    "other scenarios, frames or ranking metric than the first seed has",
+                )
+        if not has_same_extent:
+            return
+
+        where = f"{path}, score"
+        ranking = scores[0].ranking
+        if entry.score.ranking_metric != ranking:
+            self._add(
+                "score",
+                where,
+                entry.score.ranking_metric,
+                expected=f"ranking_metric {ranking}",
+            )
+        formed = summarise(combine([stored.tallies for stored in scores]))
+        stated = entry.score.metrics
+        differing = []
+        for name in {**formed, **stated}:
+            if not _is_same(formed.get(name), stated.get(name)):
+                differing.append(name)
+        if differing:
+            name = differing[0]
+            got = _format_summary(stated.get(name))
+            if len(differing) > 1:
+                got += f", and {len(differing) - 1} more metrics differ"
+            expected = f"{name}: {_format_summary(formed.get(name))}"
+            self._add("score", where, got, expected=expected)
+
+    def _check_reference(self, path: Path) -> None:
+        """Check the scores of a reference predictor."""
+        file = self.folder.path / path
+        try:
+            size = self.registry.size(*path.parts[1:3])
+            if path.stem not in REFERENCES or file in self.unreadable:
+                got = self.unreadable.get(file, "an unknown name")
+                self._add("floor", path, got, expected=", ".join(REFERENCES))
+                return
+            identity = read_score_file(file, size).scores.identity
+        except LagbenchError as error:
+            self.issues.append(issue_from_error("floor", error, path))
+            return
+        if not is_current(dataset_of(identity), size):
+            self._add(
+                "floor",
+                path,
+                identity["dataset_sha256"],
+                what="scores on another data set",
+            )
+
+    def _check_misplaced_files(self) -> None:
+        named_paths = []
+        for entry in self.entries:
+            for prediction in entry.predictions:
+                if prediction.path is not None:
+                    named_paths.append(Path(prediction.path))
+        for path, reason in self.folder.find_misplaced(named_paths):
+            self._add("folder", ascii(path.as_posix())[1:-1], reason)
+
+    def _check_successors(self) -> None:
+        """Check that successors are there, and that no line of them is a circle."""
+        successor_of: dict[Place, Place] = {}
+        for entry in self.entries:
+            if entry.superseded_by is not None:
+                successor_of[entry.place] = (
+                    entry.split,
+                    entry.size,
+                    entry.superseded_by,
+                )
+        for place, successor in successor_of.items():
+            line = [successor]
+            while line[-1] in successor_of and successor_of[line[-1]] not in line:
+                line.append(successor_of[line[-1]])
+            if not (self.folder.path / entry_path(successor)).is_file():
+                got = f"{successor[2]}, which is not there"
+                self._add("lifecycle", entry_path(place), got)
+            elif place in line:
+                got = " -> ".join(method for _, _, method in line)
+                self._add("lifecycle", entry_path(place), got)
+
+    def _check_twins(self) -> None:
+        """Check that the same predictions stand under one name and seed only."""
+        reported = set()
+        for scored_entries in self._scored.values():
+            paths: list[Path] = []
+            for scored in scored_entries:
+                is_active = scored.entry.status is Status.ACTIVE
+                if is_active and scored.score_path not in paths:
+                    paths.append(scored.score_path)
+            for path in paths[1:]:
+                is_same_data_set = path.parts[1:3] == paths[0].parts[1:3]
+                if is_same_data_set and path not in reported:
+                    reported.add(path)
+                    self._add("twin", path, f"those of {paths[0]}")
+
+    def _check_names(self) -> None:
+        """Check that no two names of active entries look alike."""
+        reference_keys = {confusable_key(name): name for name in REFERENCES}
+        entries_by_key: dict[tuple[str, str, str], Entry] = {}
+        for entry in self.entries:
+            if entry.status is not Status.ACTIVE:
+                continue
+            key = confusable_key(entry.name)
+            if key in reference_keys:
+                owner = f"that of the reference predictor {reference_keys[key]}"
+                self._add("name", entry.yaml_path, owner)
+                continue
+            first = entries_by_key.setdefault((entry.split, entry.size, key), entry)
+            if first is not entry:
+                owner = f"that of {first.method}, {first.name!a}"
+                self._add("name", entry.yaml_path, owner)
+
+    def _check_stray_score_files(self) -> None:
+        """Check that every score file has an entry."""
+        named_paths: set[Path] = set()
+        for entry in self.entries:
+            named_paths.update(entry.score_paths)
+        # score files of entries that cannot be read are no strays
+        readable_places = {entry.place for entry in self.entries}
+        unreadable_places = self.folder.claimed_places() - readable_places
+        for path in self.folder.score_files():
+            method = path.stem.partition("_")[0]
+            place = (path.parts[1], path.parts[2], method)
+            if path not in named_paths and place not in unreadable_places:
+                self._add("stray", path, "none")
+
+    def _check_verified(self) -> None:
+        """Check that every line of verified.yaml has an entry with its scores."""
+        try:
+            verified = read_verified(self.folder)
+        except LagbenchError as error:
+            self.issues.append(issue_from_error("verified", error, VERIFIED))
+            return
+        names = set()
+        for entry in self.entries:
+            if verification_of(entry, verified) is not None:
+                names.add(entry.yaml_path.as_posix())
+        for name in sorted(verified.keys() - names):
+            self._add("verified", VERIFIED, ascii(name)[:120])
+
+
+def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:
+    """Return scenarios, frames and ranking metric."""
+    first_tally = next(iter(scores.tallies.values()))
+    return sorted(scores.tallies), first_tally.frames, scores.ranking
+
+
+def _is_same(first: Summary | None, second: Summary | None) -> bool:
+    if first is None or second is None:
+        return False
+    for (_, a), (_, b) in zip(first, second, strict=True):
+        if a is None or b is None:
+            if a is not b:
+                return False
+        elif not math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=1e-300):
+            return False
+    return True
+
+
+def _format_summary(summary: Summary | None) -> str:
+    if summary is None:
+        return "no such metric"
+    return ", ".join(f"{key} {value}" for key, value in summary)

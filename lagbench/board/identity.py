@@ -1,0 +1,127 @@
+"""Tell equal predictions and look-alike names apart, and find impossible scores.
+
+A fingerprint is a hash of the errors of predictions: only the same predictions share
+it, whatever their label. Two names with the same confusable key look alike to readers
+(compare Unicode Technical Standard 39, Unicode Security Mechanisms).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import unicodedata
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import UnreadableFileError
+from lagbench.metrics.aggregate import Tally
+from lagbench.metrics.metric import Direction, Metric
+from lagbench.metrics.table import METRICS, STATISTICS
+from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
+
+from .entry import Entry
+from .folder import Folder
+
+# share of the greatest value by which rounding may take one below zero, or above one
+ROUNDING = 1e-6
+
+
+def fingerprint_of(tallies: Mapping[int, Tally]) -> str:
+    """Return a hash of the errors of predictions in every scenario and frame.
+
+    Only statistics of lagbench count: what a package measures beside them tells nothing
+    apart.
+    """
+    digest = hashlib.sha256()
+    for scenario, tally in sorted(tallies.items()):
+        names = [name for name in STATISTICS if name in tally.names]
+        rows = [tally.names.index(name) for name in names]
+        totals = tally.total[rows].astype(np.float32)
+        digest.update(f"{scenario} {names} {tally.frames}".encode())
+        digest.update(np.ascontiguousarray(totals).tobytes())
+    return digest.hexdigest()
+
+
+def fingerprints_of_entries(
+    folder: Folder, entries: Mapping[Path, Entry]
+) -> dict[str, str]:
+    """Return the score file of every fingerprint that entries have.
+
+    Score files that cannot be read are passed over: `lagbench leaderboard check`
+    reports them.
+    """
+    score_files = {}
+    for entry in entries.values():
+        for path in entry.score_paths:
+            with suppress(UnreadableFileError):
+                tallies = read_score_file(folder.path / path).scores.tallies
+                score_files[fingerprint_of(tallies)] = str(path)
+    return score_files
+
+
+def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
+    """Yield values that no prediction can have, whoever wrote them.
+
+    Errors and distances are never negative, correlations never above one. Where one
+    error of a scenario is zero at all frames, the others are, too: the prediction is
+    the truth.
+    """
+    for scenario, tally in sorted(stored.scores.tallies.items()):
+        zero_errors = []
+        has_error = False
+        for name in tally.names:
+            series = tally.series(name)
+            defined = series[~np.isnan(series)]
+            if name not in METRICS or not defined.size:
+                continue
+            outlier = _value_out_of_range(METRICS[name], defined)
+            if outlier is not None:
+                yield f"{name} {outlier:.6g} in scenario {scenario}"
+            if name.endswith(("_mse", "_mae")):
+                if np.any(defined != 0.0):
+                    has_error = True
+                else:
+                    zero_errors.append(name)
+        if has_error:
+            for name in zero_errors:
+                yield (
+                    f"{name} 0 at all frames of scenario {scenario}, though the "
+                    "prediction is not the truth"
+                )
+
+
+def _value_out_of_range(metric: Metric, values: NDArray[np.floating]) -> float | None:
+    """Return a value below the perfect 0 or above the perfect 1; None without any."""
+    margin = ROUNDING * np.abs(values).max()
+    lowest = float(values.min())
+    highest = float(values.max())
+    is_error = metric.direction is Direction.LOWER and metric.perfect == 0.0
+    is_correlation = metric.direction is Direction.HIGHER and metric.perfect == 1.0
+    if is_error and lowest < -margin:
+        return lowest
+    if is_correlation and highest > 1.0 + margin:
+        return highest
+    return None
+
+
+LOOKALIKES = str.maketrans(
+    "авекмнорстухіјѕԁһӏԛԝгпαβεηικνορτυχζγω01",  # noqa: RUF001 (that is the point)
+    "abekmhopctyxijsdhlqwrnabehlkvoptuxzywol",
+)
+"""Letters of other scripts, and digits, beside the Latin letters that they look like.
+"""
+
+
+def confusable_key(name: str) -> str:
+    """Return a key that names share which look alike to readers.
+
+    >>> confusable_key("GN\u0405 1") == confusable_key("gns-l")
+    True
+    """
+    folded = unicodedata.normalize("NFKD", name).casefold()
+    decomposed = unicodedata.normalize("NFKD", folded)
+    letters = "".join(letter for letter in decomposed if letter.isalnum())
+    return letters.translate(LOOKALIKES).replace("i", "l")

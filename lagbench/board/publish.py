@@ -1,0 +1,324 @@
+"""Write an entry with its score files and weights, whole or not at all.
+
+All files are written to a staging folder first and then moved to their places, the YAML
+file last, which names the others by SHA-256. A kill between two moves leaves files that
+``lagbench leaderboard check`` finds.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+from lagbench.atomic import move_together, refuse_folders
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.metrics.aggregate import Tally
+from lagbench.scoring.card import SUBMISSION, ScoreCard
+from lagbench.scoring.score_file import write_statistics
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
+
+from .draft import Draft, PredictionsFile, fit
+from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
+from .entry_file import entry_bytes, read_entry_if_valid
+from .folder import REFERENCES, SUBMISSIONS, VERIFIED, Folder, entry_path, score_paths
+from .ranking import combine, scored_file, summarise, write_references
+from .verified import list_without_stale_line
+from .weights import copy_weights, name_weights
+
+# begins the name of the staging folder; a killed process leaves it behind
+STAGING = ".submit-"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubmitResult:
+    """An entry that was written."""
+
+    split: str
+    size: str
+    method: str
+    ranking: str  # name of the ranking metric
+    mean: float | None  # of it over scenarios and seeds; None where undefined
+    std: float | None  # over seeds; None for one seed
+    flags: tuple[str, ...]  # names of flags that were raised
+    board: Path
+    # files that were written; verified.yaml, where the entry before had a line there
+    files: tuple[Path, ...]
+    kept: tuple[Path, ...]  # weights of the entry before that are those of this one
+    removed: tuple[Path, ...]  # files that only the entry before had
+
+
+def publish(
+    draft: Draft,
+    files: Sequence[PredictionsFile],
+    cards: Sequence[ScoreCard],
+    folder: Folder,
+) -> SubmitResult:
+    """Write the entry of a draft with its files; remove files that it no longer has.
+
+    A full disk is met before anything of the previous entry is touched.
+
+    Raises:
+        UsageError: the entry has changed meanwhile, or a place is behind a link.
+        WorkFailedError: a score file is too long.
+        OSError: the disk is full or not writable.
+    """
+    previous = read_entry_if_valid(folder.path / entry_path(draft.place))
+    if draft.extended is not None and previous != draft.extended:
+        raise UsageError(
+            "the entry changed while the files were scored",
+            where=str(entry_path(draft.place)),
+            fix="submit again: what was added meanwhile stays",
+        )
+
+    (folder.path / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=STAGING, dir=folder.path) as scratch:
+        staging = Path(scratch)
+        predictions = [*_kept_predictions(draft), *draft.predictions]
+        staged_scores = _stage_scores(draft, predictions, cards, folder, staging)
+        predictions = _with_weights(draft, predictions, folder, previous)
+        entry = _form_entry(draft, predictions, files, cards, staged_scores)
+
+        moves = _moves_of_scores(draft, staged_scores)
+        moves |= _stage_weights(draft, entry, staging)
+        moves |= _stage_texts(entry, folder, staging)
+        removed = _find_files_to_remove(entry, previous, moves, folder)
+        folder.require_unlinked(
+            [
+                *moves,
+                *(path.relative_to(folder.path).parent for path in removed),
+                Path(REFERENCES, entry.split, entry.size),
+            ]
+        )
+        refuse_folders(removed)
+        references = write_references(cards[0], folder)
+        move_together([(copy, folder.path / path) for path, copy in moves.items()])
+    for path in removed:
+        path.unlink()
+
+    written = [folder.path / path for path in reversed(moves)]
+    return _result_of(
+        entry,
+        board=folder.path,
+        written=(*written, *references),
+        kept=_find_kept_weights(entry, moves, folder),
+        removed=removed,
+    )
+
+
+def _kept_predictions(draft: Draft) -> tuple[Prediction, ...]:
+    if draft.extended is None:
+        return ()
+    return draft.extended.predictions
+
+
+def _kept_score_paths(draft: Draft) -> tuple[Path, ...]:
+    if draft.extended is None:
+        return ()
+    return draft.extended.score_paths
+
+
+def _stage_scores(
+    draft: Draft,
+    predictions: Sequence[Prediction],
+    cards: Sequence[ScoreCard],
+    folder: Folder,
+    staging: Path,
+) -> dict[Path, Path]:
+    """Write the score files of all seeds to the staging folder.
+
+    Seeds that stay keep their score files, under new names where they had but one.
+
+    Returns:
+        Path of each copy, by its place in the leaderboard's folder.
+    """
+    seeds = [prediction.seed for prediction in predictions]
+    staged = {path: staging / path.name for path in score_paths(draft.place, seeds)}
+    copies = list(staged.values())
+    kept_paths = _kept_score_paths(draft)
+    for kept_path, copy in zip(kept_paths, copies, strict=False):
+        shutil.copyfile(folder.path / kept_path, copy)
+    for card, copy in zip(cards, copies[len(kept_paths) :], strict=True):
+        write_statistics(card, copy, option="--board")
+        _require_short(copy, card)
+    return staged
+
+
+def _require_short(path: Path, card: ScoreCard) -> None:
+    length = path.stat().st_size
+    if length > MAX_SCORE_BYTES:
+        raise WorkFailedError(
+            "the score file is too long",
+            where=f"{card.header.split} {card.header.size}",
+            expected=f"at most {MAX_SCORE_BYTES} bytes",
+            got=f"{length} bytes",
+            fix="uninstall packages that add metrics, and submit again",
+        )
+
+
+def _with_weights(
+    draft: Draft,
+    predictions: Sequence[Prediction],
+    folder: Folder,
+    previous: Entry | None,
+) -> list[Prediction]:
+    """Return predictions that name their weights."""
+    named = name_weights(
+        folder=folder,
+        place=draft.place,
+        predictions=predictions,
+        paths=_all_weight_paths(draft),
+        previous=previous,
+        rivals=draft.rivals,
+    )
+    updated = []
+    for prediction, weights in zip(predictions, named, strict=True):
+        updated.append(prediction.model_copy(update={"weights": weights}))
+    return updated
+
+
+def _all_weight_paths(draft: Draft) -> list[Path | None]:
+    """Return the new weights of each prediction: None for seeds that stay."""
+    return [*(None for _ in _kept_predictions(draft)), *draft.weight_paths]
+
+
+def _form_entry(
+    draft: Draft,
+    predictions: Sequence[Prediction],
+    files: Sequence[PredictionsFile],
+    cards: Sequence[ScoreCard],
+    staged_scores: Mapping[Path, Path],
+) -> Entry:
+    """Return the entry with its score block."""
+    header = cards[0].header
+    copies = list(staged_scores.values())
+    kept_count = len(_kept_predictions(draft))
+
+    # score files hold rounded statistics, and score cards have the same
+    tallies: list[Mapping[int, Tally]] = []
+    scored_files: list[ScoredFile] = []
+    reason = ""
+    if draft.extended is not None:
+        reason = draft.extended.reason
+        scored_files += draft.extended.score.files
+        for copy in copies[:kept_count]:
+            tallies.append(read_score_file(copy).scores.tallies)
+    for file, card, copy in zip(files, cards, copies[kept_count:], strict=True):
+        scored_files.append(scored_file(card, copy, file.outside_share))
+        tallies.append(card.tallies[SUBMISSION])
+
+    score_block = ScoreBlock(
+        lagbench=version("lagbench"),
+        dataset_sha256=header.dataset_sha256,
+        ranking_metric=cards[0].ranking,
+        files=tuple(scored_files),
+        metrics=summarise(combine(tallies)),
+    )
+    split, size, method = draft.place
+    keys = {
+        **dict(draft.about),
+        "format": 2,
+        "split": split,
+        "size": size,
+        "method": method,
+        "reason": reason,
+        "dataset": DataSet(
+            version=header.dataset_version, sha256=header.dataset_sha256
+        ),
+        "predictions": tuple(predictions),
+        "score": score_block,
+    }
+    return fit(Entry, keys)
+
+
+def _moves_of_scores(
+    draft: Draft, staged_scores: Mapping[Path, Path]
+) -> dict[Path, Path]:
+    """Return the score files to move; those that lie there already are the same."""
+    kept_paths = _kept_score_paths(draft)
+    return {
+        path: copy for path, copy in staged_scores.items() if path not in kept_paths
+    }
+
+
+def _stage_weights(draft: Draft, entry: Entry, staging: Path) -> dict[Path, Path]:
+    named = [prediction.weights for prediction in entry.predictions]
+    return copy_weights(staging, named, _all_weight_paths(draft))
+
+
+def _stage_texts(entry: Entry, folder: Folder, staging: Path) -> dict[Path, Path]:
+    """Write verified.yaml, where it loses a line, and the entry, which comes last."""
+    # a method may be called verified, so copies have names of their own
+    copies = {}
+    verified = list_without_stale_line(folder, entry)
+    if verified is not None:
+        copies[Path(VERIFIED)] = staging / "0.yaml"
+        copies[Path(VERIFIED)].write_bytes(verified)
+    copies[entry.yaml_path] = staging / "1.yaml"
+    copies[entry.yaml_path].write_bytes(entry_bytes(entry))
+    return copies
+
+
+def _find_files_to_remove(
+    entry: Entry,
+    previous: Entry | None,
+    moves: Mapping[Path, Path],
+    folder: Folder,
+) -> tuple[Path, ...]:
+    """Return the files that the new entry does not have, by their whole paths.
+
+    New weights without a training log leave no old log beside them.
+    """
+    stale_paths: set[Path] = set()
+    if previous is not None:
+        stale_paths = set(previous.files) - set(entry.files)
+    for path in moves:
+        log = path.with_suffix(".json")
+        if path.suffix == ".pt" and log not in moves:
+            stale_paths.add(log)
+    whole_paths = [folder.path / path for path in sorted(stale_paths)]
+    return tuple(path for path in whole_paths if os.path.lexists(path))
+
+
+def _find_kept_weights(
+    entry: Entry, moves: Mapping[Path, Path], folder: Folder
+) -> tuple[Path, ...]:
+    kept = []
+    for prediction in entry.predictions:
+        weights = prediction.weights
+        if weights is not None and Path(weights.path) not in moves:
+            kept.append(folder.path / weights.path)
+    return tuple(kept)
+
+
+def _result_of(
+    entry: Entry,
+    *,
+    board: Path,
+    written: tuple[Path, ...],
+    kept: tuple[Path, ...],
+    removed: tuple[Path, ...],
+) -> SubmitResult:
+    score = entry.score
+    summary = score.metrics[score.ranking_metric]
+    flags: dict[str, None] = {}
+    for file in score.files:
+        for flag in file.flags:
+            flags[flag.name] = None
+    return SubmitResult(
+        split=entry.split,
+        size=entry.size,
+        method=entry.method,
+        ranking=score.ranking_metric,
+        mean=summary.mean,
+        std=summary.std,
+        flags=tuple(flags),
+        board=board,
+        files=written,
+        kept=kept,
+        removed=removed,
+    )

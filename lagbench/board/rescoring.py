@@ -1,0 +1,294 @@
+"""Rescoring: score predictions of entries again, and compare with the leaderboard.
+
+Scoring again is the proof of a score.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lagbench.errors import ChecksFailedError, UnreadableFileError, UsageError
+from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
+from lagbench.metrics.table import METRICS, STATISTICS
+from lagbench.scoring.card import SUBMISSION, ScoreCard
+from lagbench.scoring.score_file import FILM_RANGE, LEVELS, write_statistics
+from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
+from lagbench.submission.issues import ValidationIssue
+
+from .entry import Entry, EntryFlag, Prediction, ScoredFile
+from .folder import Folder
+from .issues import REFERENCES_ANEW, make_issue
+from .ranking import scored_file
+
+TOLERANCE = 1e-6
+"""Relative difference up to which two numbers are equal; NumPy versions may differ in
+the last bits.
+"""
+
+# step of packed film positions [length]
+FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
+
+# Pictures may differ by the steps in which they are packed, and by rounding.
+PICTURE_STEPS = 1.01
+PICTURE_TOLERANCE = 1e-5  # relative
+
+MOST_NAMES = 5  # names of statistics that an issue lists
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """Predictions that, scored again, gave the scores of an entry."""
+
+    predictions: Path
+    entry: Path  # relative to the leaderboard's folder
+    score_file: Path  # likewise
+    difference: float  # greatest relative difference of any statistic
+
+
+@dataclass(frozen=True)
+class EntryFile:
+    """One of the predictions of an entry, with its score file."""
+
+    entry: Entry
+    prediction: Prediction
+    score_path: Path
+    scored_file: ScoredFile
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rescoring:
+    """Scores predictions of entries again."""
+
+    folder: Folder
+    entries: Sequence[Entry]
+    readable_score_files: Collection[Path]
+    score: Callable[..., ScoreCard]  # of predictions and extras that measure more
+    confirmations: list[Confirmation] = field(default_factory=list)
+
+    def rescore(self, path: str | Path) -> Iterator[ValidationIssue]:
+        """Yield where predictions differ from the leaderboard, or their faults."""
+        try:
+            # the scorer alone opens them, after its checks in a child process
+            card = self.score(path)
+        except (UnreadableFileError, ChecksFailedError) as error:
+            yield make_issue(
+                "rescored",
+                path,
+                f"{error.what}: {error.got}",
+                expected="valid predictions",
+                fix="lagbench validate says what is wrong",
+            )
+            return
+
+        yield from self._compare_references(card)
+        files = self._files_with(card.predictions_sha256)
+        if not files:
+            yield make_issue(
+                "rescored",
+                path,
+                card.predictions_sha256,
+                expected="an entry with these predictions",
+            )
+        for file in files:
+            # the checks of score files report files that cannot be read
+            if file.score_path in self.readable_score_files:
+                yield from self._compare(Path(path), card, file)
+
+    def _files_with(self, predictions_sha256: str) -> list[EntryFile]:
+        files = []
+        for entry in self.entries:
+            parts = zip(
+                entry.predictions, entry.score_paths, entry.score.files, strict=True
+            )
+            for prediction, score_path, file in parts:
+                if file.predictions_sha256 == predictions_sha256:
+                    files.append(EntryFile(entry, prediction, score_path, file))
+        return files
+
+    def _compare_references(self, card: ScoreCard) -> Iterator[ValidationIssue]:
+        header = card.header
+        for path in self.folder.reference_files(header.split, header.size):
+            if path.stem not in card.tallies or path.stem == SUBMISSION:
+                continue
+            stored = read_score_file(self.folder.path / path).scores
+            if stored.identity["dataset_sha256"] != header.dataset_sha256:
+                continue
+            differing, _ = compare_tallies(card.tallies[path.stem], stored.tallies)
+            if differing:
+                got = _format_names(differing)
+                yield make_issue("rescored", path, got, fix=REFERENCES_ANEW)
+
+    def _compare(
+        self, path: Path, card: ScoreCard, file: EntryFile
+    ) -> Iterator[ValidationIssue]:
+        """Yield where a score card differs from an entry and its score file."""
+        stored = read_score_file(self.folder.path / file.score_path)
+        extras = _extras_of(stored)
+        if extras:
+            try:
+                card = self.score(path, extras=extras)
+            except UsageError as error:
+                yield make_issue(
+                    "rescored",
+                    path,
+                    f"{error.what}, which measures some of them",
+                    expected=f"the statistics of {file.score_path}",
+                )
+                return
+        with tempfile.TemporaryDirectory() as scratch:
+            new_path = Path(scratch) / "scores.nc"
+            write_statistics(card, new_path)
+            new_file = scored_file(card, new_path)
+            new_stored = read_score_file(new_path)
+
+        differing, difference = compare_tallies(
+            new_stored.scores.tallies, stored.scores.tallies
+        )
+        differing += _compare_pictures(new_stored, stored)
+        if differing:
+            yield make_issue(
+                "rescored",
+                path,
+                _format_names(differing),
+                expected=f"what {file.score_path} holds",
+            )
+
+        issues = list(_compare_remarks(path, card, new_file, file))
+        yield from issues
+        if not differing and not issues:
+            self.confirmations.append(
+                Confirmation(path, file.entry.yaml_path, file.score_path, difference)
+            )
+
+
+def _extras_of(stored: ScoreFile) -> list[str]:
+    """Return the optional packages that measured statistics of a score file."""
+    first_tally = next(iter(stored.scores.tallies.values()))
+    extras = set()
+    for name in first_tally.names:
+        if name in METRICS and METRICS[name].extra is not None:
+            extras.add(str(METRICS[name].extra))
+    return sorted(extras)
+
+
+def _compare_pictures(first: ScoreFile, second: ScoreFile) -> list[str]:
+    """Return the pictures that differ by more than their packing."""
+    vorticity_step = max(first.precision, second.precision)
+    differing = []
+    if not _is_close(
+        first.preview.vorticity, second.preview.vorticity, step=vorticity_step
+    ):
+        differing.append("vorticity pictures")
+    if not _is_close(first.preview.film, second.preview.film, step=FILM_STEP):
+        differing.append("film pictures")
+    return differing
+
+
+def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:
+    a = np.asarray(first, np.float64)
+    b = np.asarray(second, np.float64)
+    if a.shape != b.shape:
+        return False
+    return np.allclose(
+        a, b, rtol=PICTURE_TOLERANCE, atol=PICTURE_STEPS * step, equal_nan=True
+    )
+
+
+def _compare_remarks(
+    path: Path, card: ScoreCard, new_file: ScoredFile, file: EntryFile
+) -> Iterator[ValidationIssue]:
+    """Yield where flags, warnings, diverged scenarios or the budget differ."""
+    old_file = file.scored_file
+    pairs: dict[str, tuple[object, object]] = {
+        "flags": (_flag_names(new_file.flags), _flag_names(old_file.flags)),
+        "warnings": (_flag_names(new_file.warnings), _flag_names(old_file.warnings)),
+        "diverged_at": (
+            dict(sorted(new_file.diverged_at.items())),
+            dict(sorted(old_file.diverged_at.items())),
+        ),
+        "budget": (card.header.budget, file.prediction.budget),
+    }
+    for name, (new_value, old_value) in pairs.items():
+        if new_value != old_value:
+            yield make_issue(
+                "rescored", path, new_value, expected=f"{name} {old_value}"
+            )
+
+
+def _flag_names(flags: Sequence[EntryFlag]) -> list[str]:
+    return sorted(flag.name for flag in flags)
+
+
+def compare_tallies(
+    first: Mapping[int, Tally], second: Mapping[int, Tally]
+) -> tuple[list[str], float]:
+    """Compare the statistics of two sets of scenarios.
+
+    Statistics of packages that one side lacks are on no board, and not compared.
+
+    Returns:
+        Names of the statistics that differ, and the greatest relative difference of the
+        others.
+    """
+    if _frames_of(first) != _frames_of(second):
+        return ["scenarios or frames"], np.inf
+
+    first_tally = next(iter(first.values()))
+    second_tally = next(iter(second.values()))
+    tolerance = TOLERANCE
+    if len(second_tally.frames) > LONG_ROLLOUT:
+        # the last bits may have pushed a value over to the next step of its rounding
+        tolerance = 2.0 ** (1 - LONG_BITS)
+
+    differing = []
+    greatest = 0.0
+    names = {*first_tally.names, *second_tally.names}
+    for name in sorted(names.intersection(STATISTICS)):
+        difference = 0.0
+        for scenario, tally in first.items():
+            scenario_difference = relative_difference(tally, second[scenario], name)
+            difference = max(difference, scenario_difference)
+        if difference > tolerance:
+            differing.append(name)
+        else:
+            greatest = max(greatest, difference)
+    return differing, greatest
+
+
+def _frames_of(tallies: Mapping[int, Tally]) -> dict[int, tuple[int, ...]]:
+    return {scenario: tuple(tally.frames) for scenario, tally in tallies.items()}
+
+
+def relative_difference(first: Tally, second: Tally, name: str) -> float:
+    """Return the greatest relative difference of a statistic in a scenario.
+
+    Infinite where one side lacks it or has gaps at other frames.
+    """
+    if name not in first.names or name not in second.names:
+        return np.inf
+    a = first.series(name)
+    b = second.series(name)
+    has_same_frames = np.array_equal(first.measured(name), second.measured(name))
+    if not has_same_frames or not np.array_equal(np.isnan(a), np.isnan(b)):
+        return np.inf
+
+    # score files hold single precision
+    a = a.astype(np.float32).astype(np.float64)
+    b = b.astype(np.float32).astype(np.float64)
+    is_unequal = a != b
+    distance = np.abs(a - b)[is_unequal]
+    scale = np.maximum(np.abs(a), np.abs(b))[is_unequal]
+    return float(np.nanmax(distance / scale, initial=0.0))
+
+
+def _format_names(names: Sequence[str]) -> str:
+    text = f"other {', '.join(names[:MOST_NAMES])}"
+    if len(names) > MOST_NAMES:
+        return f"{text} and {len(names) - MOST_NAMES} more"
+    return text

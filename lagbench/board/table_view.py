@@ -1,0 +1,339 @@
+"""The board's table as data: columns, and lines of cells with their text and notes.
+
+`draw_table` draws it as HTML, and the page's script sorts and filters by the same data.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from lagbench.data.checksums import round_digits
+from lagbench.figures.html import text
+from lagbench.metrics.metric import Direction, Metric
+
+from .columns import (
+    SKILL,
+    Column,
+    TableRow,
+    columns_of,
+    format_value,
+    loss_of,
+    metric_value,
+    presets_of,
+    value_of,
+)
+from .entry import Entry, EntryFlag
+from .folder import weights_path
+from .model import BoardRow, ReferenceRow, Tab, Value
+
+MOST_REASONS = 4
+"""Reasons of a warning that are shown; those of other scenarios say the same with other
+numbers.
+"""
+
+SHADES = 5
+FEWEST_SHADED = 3  # values that a column needs for shades
+
+LABELS: Mapping[str, tuple[str, str]] = {
+    "copy_suspect": (
+        "copy suspected",
+        "The error moves from frame to frame as that of no rollout does.",
+    ),
+    "below_twin_floor": (
+        "below the predictability limit",
+        "Closer to the truth than the solver itself from positions off by 2⁻²⁰.",
+    ),
+    "physics": (
+        "unphysical",
+        "Kinetic energy or filled area are far from the truth's.",
+    ),
+    "in_domain": (
+        "leaves the box",
+        "Predicted particles lie outside the box; there they carry no weight on "
+        "the grid.",
+    ),
+    "max_displacement": (
+        "jumps",
+        "Predicted particles move farther in a frame than any of the truth.",
+    ),
+    "discontinuous_start": (
+        "jumps at the start",
+        "The first frame is far from the last given.",
+    ),
+}
+"""Label and meaning of flags and warnings on the page."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cell:
+    """One cell."""
+
+    value: float | str  # NaN or an empty text where there is none
+    loss: float  # smaller is better; NaN where nothing is judged
+    text: str
+    note: str  # interval, spread and gaps in words
+    interval: tuple[float, float] | None  # 95 %, where the column ranks
+    has_gaps: bool  # whether some frames have no value
+    classes: tuple[str, ...]  # classes of its colours
+
+    @property
+    def is_known(self) -> bool:
+        """Whether there is a value; a text that is empty counts as one."""
+        return isinstance(self.value, str) or not math.isnan(self.value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chip:
+    """A small mark beside a name: status, data set version, flag or warning."""
+
+    kind: str  # class: bad, warn or unknown
+    label: str
+    meaning: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Line:
+    """One line of the table."""
+
+    row: TableRow
+    place: int  # in the order of the ranking metric
+    cells: Mapping[str, Cell]  # by key of the column
+    chips: Sequence[Chip]
+    byline: str  # authors and affiliation
+    links: Sequence[tuple[str, str]]  # labels and addresses
+
+    @property
+    def id(self) -> str:
+        """Name in addresses: id of the method, or name of the reference predictor."""
+        if isinstance(self.row, ReferenceRow):
+            return self.row.name
+        return self.row.id
+
+    @property
+    def name(self) -> str:
+        """Name of the method or reference predictor."""
+        if isinstance(self.row, ReferenceRow):
+            return self.row.name
+        return self.row.entry.name
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableView:
+    """The table of a tab."""
+
+    tab: Tab
+    columns: Mapping[str, Column]
+    presets: Mapping[str, Sequence[str]]  # keys of columns
+    lines: Sequence[Line]  # in the order of the ranking metric, inactive ones last
+
+    @property
+    def main(self) -> Sequence[str]:
+        """Keys of the columns that are shown at first."""
+        return self.presets["main"]
+
+    def ranks(self, key: str) -> bool:
+        """Tell whether a column ranks: it shows intervals."""
+        return key in (self.tab.ranking, SKILL.key)
+
+
+def make_table(tab: Tab, metrics: Mapping[str, Metric]) -> TableView:
+    """Return the table of a tab."""
+    columns = columns_of(tab, metrics)
+    ranking = columns[tab.ranking]
+    painters = {key: _Painter(tab, column) for key, column in columns.items()}
+
+    def order(row: TableRow) -> tuple[bool, float]:
+        loss = ranking.loss(float(value_of(row, ranking)))
+        if math.isnan(loss):
+            loss = math.inf
+        is_inactive = isinstance(row, BoardRow) and not row.active
+        return is_inactive, loss
+
+    lines = []
+    for place, row in enumerate(sorted(tab.lines, key=order)):
+        cells = {}
+        for key, column in columns.items():
+            cells[key] = _make_cell(
+                row,
+                column,
+                classes=tuple(painters[key].classes_of(row)),
+                ranks=key in (tab.ranking, SKILL.key),
+            )
+        lines.append(_make_line(row, place, cells))
+    return TableView(
+        tab=tab, columns=columns, presets=presets_of(tab, columns), lines=lines
+    )
+
+
+class _Painter:
+    """Colours of a column: the nearer a cell is to the best, the deeper.
+
+    Entries and reference predictors are judged alike. Costs of reference predictors are
+    measured, and no merit: they are not judged.
+    """
+
+    def __init__(self, tab: Tab, column: Column) -> None:
+        self._column = column
+        losses = []
+        for row in tab.lines:
+            loss = loss_of(row, column)
+            if self._is_judged(row) and math.isfinite(loss):
+                losses.append(loss)
+        self._losses = sorted(losses)
+
+    def _is_judged(self, row: TableRow) -> bool:
+        if isinstance(row, BoardRow):
+            return row.active
+        return not self._column.reported
+
+    def classes_of(self, row: TableRow) -> Iterator[str]:
+        """Yield the classes of a row's cell."""
+        loss = loss_of(row, self._column)
+        is_judged = self._is_judged(row) and math.isfinite(loss)
+        if not is_judged or len(self._losses) < 2:
+            return
+        best = self._losses[0]
+        worst = self._losses[-1]
+        form = self._column.form
+        if format_value(loss, form) == format_value(best, form):
+            yield "best"  # equal in the digits shown
+        if self._column is SKILL:
+            # 0 is nothing learned: no entry looks better beside a worse one
+            worst = min(worst, 0.0)
+        if worst > best and len(self._losses) >= FEWEST_SHADED:
+            yield f"heat{_shade_of(loss, best=best, worst=worst)}"
+
+
+def _shade_of(loss: float, *, best: float, worst: float) -> int:
+    """Return the number of a shade, 0 for the deepest; logarithmic for losses > 0."""
+    if best > 0.0:
+        share = math.log(loss / best) / math.log(worst / best)
+    else:
+        share = (loss - best) / (worst - best)
+    return min(SHADES - 1, int(SHADES * share))
+
+
+def _make_cell(
+    row: TableRow, column: Column, *, classes: tuple[str, ...], ranks: bool
+) -> Cell:
+    value = value_of(row, column)
+    if isinstance(value, float):
+        value = round_digits(value)
+    metric = metric_value(row, column.key)
+    interval = None
+    if ranks and metric is not None and not math.isnan(metric.low + metric.high):
+        interval = (metric.low, metric.high)
+    if column.form == "text":
+        classes = ("words", *classes)
+    return Cell(
+        value=value,
+        loss=loss_of(row, column),
+        text=format_value(value, column.form),
+        note=_note_on(row, column, metric),
+        interval=interval,
+        has_gaps=metric is not None and metric.undefined > 0,
+        classes=classes,
+    )
+
+
+def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
+    if column.key == "checked" and isinstance(row, BoardRow) and row.verified:
+        line = row.verified
+        return f"scored again by the maintainers, lagbench {line.lagbench}, {line.date}"
+    if metric is None:
+        return ""
+    notes = []
+    if not math.isnan(metric.low + metric.high):
+        notes.append(f"95 %: {text(metric.low)} … {text(metric.high)}")
+    if not math.isnan(metric.std):
+        notes.append(f"± {text(metric.std)} over seeds")
+    if metric.undefined:
+        notes.append(f"{metric.undefined} frames undefined")
+    return "; ".join(notes)
+
+
+def _make_line(row: TableRow, place: int, cells: Mapping[str, Cell]) -> Line:
+    if isinstance(row, ReferenceRow):
+        return Line(
+            row=row, place=place, cells=cells, chips=(), byline=row.definition, links=()
+        )
+    entry = row.entry
+    parts = [", ".join(entry.authors), entry.affiliation]
+    return Line(
+        row=row,
+        place=place,
+        cells=cells,
+        chips=tuple(chips_of(row)),
+        byline=" · ".join(part for part in parts if part),
+        links=tuple(_links_of(entry)),
+    )
+
+
+def _links_of(entry: Entry) -> Iterator[tuple[str, str]]:
+    """Yield labels and addresses of code, paper and weights."""
+    for label in ("code", "paper", "weights"):
+        address = getattr(entry, label)
+        if address and address.startswith(("http://", "https://")):
+            yield label, address
+    if entry.weights:
+        return
+    seeds = []
+    for prediction in entry.predictions:
+        if prediction.weights:
+            seeds.append(prediction.seed)
+    for seed in seeds:
+        label = f"weights {seed}"
+        if len(seeds) == 1:
+            label = "weights"
+        yield label, weights_path(entry.place, seed).as_posix()
+
+
+def chips_of(row: BoardRow) -> Iterator[Chip]:
+    """Yield the marks beside a name."""
+    entry = row.entry
+    if str(entry.status) != "active":
+        meaning = entry.reason or f"This entry is {entry.status}."
+        if entry.superseded_by:
+            meaning += f" Replaced by {entry.superseded_by}."
+        yield Chip(kind="unknown", label=str(entry.status), meaning=meaning)
+    if not row.current:
+        yield Chip(
+            kind="unknown",
+            label=f"data {entry.dataset.version}",
+            meaning="Scored on a data set version that is no longer current: not "
+            "ranked.",
+        )
+    for flag in row.flags:
+        yield _chip_of(flag, kind="bad", most_reasons=len(flag.reasons))
+    for warning in row.warnings:
+        yield _chip_of(warning, kind="warn", most_reasons=MOST_REASONS)
+    if row.diverged:
+        yield Chip(
+            kind="warn",
+            label="diverged",
+            meaning=f"{row.diverged} rollouts are frozen at their last finite frame.",
+        )
+
+
+def _chip_of(flag: EntryFlag, *, kind: str, most_reasons: int) -> Chip:
+    """Return the mark of a flag; a flag that is unknown here keeps its own name."""
+    label, meaning = LABELS.get(flag.name, (flag.name.replace("_", " "), ""))
+    if flag.share is not None:
+        label = f"{label}: {text(100.0 * flag.share, 2)} %"
+    reasons = list(flag.reasons[:most_reasons])
+    hidden_count = len(flag.reasons) - len(reasons)
+    if hidden_count:
+        reasons.append(f"and {hidden_count} more such")
+    sentences = [meaning]
+    if reasons:
+        sentences.append(f"{'; '.join(reasons)}.")
+    return Chip(kind=kind, label=label, meaning=" ".join(filter(None, sentences)))
+
+
+def target_loss(cell: Cell, column: Column) -> float | None:
+    """Return the loss of a metric that aims at a value; None elsewhere."""
+    if column.direction is Direction.TARGET and cell.is_known:
+        return cell.loss
+    return None

@@ -1,0 +1,155 @@
+"""Provenance of predictions: the training behind them, as data and as a sentence.
+
+A predictions.nc holds the provenance as the JSON attribute ``provenance``, and as the
+attribute ``training``, a sentence for people. Older files and entries of the
+leaderboard have the sentence alone.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Self
+
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+
+MOST_OVERRIDES = 200
+"""Most changed options of one training or prediction."""
+
+SENTENCE = re.compile(
+    r"(?P<split>\S+) (?P<size>\S+) (?P<subsets>\S+), recipe (?P<recipe>\S+), "
+    r"step (?P<step>\d{1,15})(?:, (?P<changes>.+))?"
+)
+START = re.compile(r"started from (?P<recipe>\S+), weights (?P<weights>\w+)")
+PREDICTED_WITH = ", predicted with "
+
+# A value may hold commas, as in model.density=[15, 30, 60]: only what begins the next
+# change ends a change.
+NEXT_CHANGE = re.compile(r", (?=started from |[a-z]\w*(?:\.\w+)*=)")
+
+Word = Annotated[str, StringConstraints(pattern=r"^[!-~]{1,200}$")]
+Override = Annotated[str, StringConstraints(pattern=r"^[ -~]{1,1000}$")]
+Overrides = Annotated[tuple[Override, ...], Field(max_length=MOST_OVERRIDES)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class StartWeights(_Strict):
+    """The weights that a training started from."""
+
+    recipe: Word = Field(description="recipe of the training that made them")
+    weights: Word = Field(description="first digits of the SHA-256 of their file")
+
+
+class TrainingProvenance(_Strict):
+    """The training behind predictions, and the options that the prediction changed."""
+
+    split: Word
+    size: Word
+    subsets: Annotated[tuple[Word, ...], Field(min_length=1, max_length=20)] = Field(
+        description="subsets that gave training windows"
+    )
+    recipe: Word
+    step: Annotated[int, Field(ge=0, lt=10**15)] = Field(
+        description="optimiser step of the weights"
+    )
+    overrides: Overrides = Field(
+        default=(), description="options of the recipe that the training changed"
+    )
+    start: StartWeights | None = None
+    prediction_overrides: Overrides = Field(
+        default=(), description="options that the prediction changed"
+    )
+
+    @classmethod
+    def from_sentence(cls, sentence: str) -> Self | None:
+        """Return the provenance that `describe` wrote; None for words of a person.
+
+        >>> words = "cavity mini train, recipe cavity/mini, step 900, model.width=48"
+        >>> TrainingProvenance.from_sentence(words).overrides
+        ('model.width=48',)
+        >>> TrainingProvenance.from_sentence("three nights on my own cluster")
+        """
+        training, _, prediction = sentence.partition(PREDICTED_WITH)
+        parts = SENTENCE.fullmatch(training)
+        if parts is None:
+            return None
+
+        overrides = _split_changes(parts["changes"])
+        start = None
+        if overrides:
+            start_parts = START.fullmatch(overrides[-1])
+            if start_parts is not None:
+                start = start_parts.groupdict()
+                overrides = overrides[:-1]
+
+        fields = {
+            "split": parts["split"],
+            "size": parts["size"],
+            "subsets": tuple(parts["subsets"].split("+")),
+            "recipe": parts["recipe"],
+            "step": int(parts["step"]),
+            "overrides": overrides,
+            "start": start,
+            "prediction_overrides": _split_changes(prediction),
+        }
+        try:
+            return cls.model_validate(fields)
+        except ValidationError:
+            return None
+
+    @classmethod
+    def from_json(cls, text: str) -> Self | None:
+        """Return the provenance that a text holds as JSON; None where it holds none."""
+        try:
+            return cls.model_validate_json(text)
+        except ValidationError:
+            return None
+
+    def to_json(self) -> str:
+        """Return the provenance as compact JSON; defaults are left out."""
+        return self.model_dump_json(exclude_defaults=True)
+
+    def describe(self) -> str:
+        """Return the provenance as a sentence for people."""
+        subsets = "+".join(self.subsets)
+        sentence = (
+            f"{self.split} {self.size} {subsets}, recipe {self.recipe}, "
+            f"step {self.step}"
+        )
+        changes = self.describe_changes()
+        if changes:
+            return f"{sentence}, {changes}"
+        return sentence
+
+    def describe_changes(self) -> str:
+        """Return what differs from the recipe in words; empty where nothing does."""
+        changes = list(self.overrides)
+        if self.start is not None:
+            start = self.start
+            changes.append(f"started from {start.recipe}, weights {start.weights}")
+        if self.prediction_overrides:
+            settings = ", ".join(self.prediction_overrides)
+            changes.append(f"predicted with {settings}")
+        return ", ".join(changes)
+
+    def training_only(self) -> Self:
+        """Return the provenance without the options that the prediction changed."""
+        return self.model_copy(update={"prediction_overrides": ()})
+
+    def shared_by_seeds(self) -> Self:
+        """Return the part that all seeds of a method share.
+
+        Each seed has a best step of its own, and starts from weights of its own.
+        """
+        start = self.start
+        if start is not None:
+            start = start.model_copy(update={"weights": "any"})
+        return self.model_copy(update={"step": 0, "start": start})
+
+
+def _split_changes(words: str | None) -> tuple[str, ...]:
+    if not words:
+        return ()
+    return tuple(NEXT_CHANGE.split(words))

@@ -1,0 +1,61 @@
+"""Read the data of a leaderboard's page back, as its script does."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.board.encoding import MISSING, decode
+
+LONGEST = 2**26  # bytes
+
+
+@dataclass(frozen=True)
+class PageData:
+    """The data of a page."""
+
+    tabs: list[dict[str, Any]]
+    levels: NDArray[np.int16]
+
+    def array(self, reference: dict[str, Any]) -> NDArray[np.float64]:
+        """Return an array, shape [row, column], NaN where missing."""
+        return read_array(self.levels, reference)
+
+
+def read_page_data(page: str) -> PageData:
+    """Return the data that stand in a page."""
+    data = json.loads(decode(element_text(page, "page-data"), longest=LONGEST))
+    arrays = decode(element_text(page, "page-arrays"), longest=LONGEST)
+    return PageData(tabs=data["tabs"], levels=np.frombuffer(arrays, "<i2"))
+
+
+def element_text(page: str, name: str) -> str:
+    """Return the text of an element that holds encoded data."""
+    pattern = f'<script type="text/plain" id="{name}">(.*?)</script>'
+    (text,) = re.findall(pattern, page, re.DOTALL)
+    return str(text)
+
+
+def read_array(
+    levels: NDArray[np.int16], reference: dict[str, Any]
+) -> NDArray[np.float64]:
+    """Return an array from all levels and the reference to it, number by number."""
+    rows = reference["rows"]
+    columns = reference["columns"]
+    values = np.empty((rows, columns))
+    for column in range(columns):
+        level = 0
+        for row in range(rows):
+            place = reference["start"] + row * columns + column
+            # differences wrap around at 16 bits
+            level = (level + int(levels[place]) + 2**15) % 2**16 - 2**15
+            value = reference["zero"] + reference["step"] * level
+            if reference["log"]:
+                value = np.exp(value)
+            values[row, column] = np.nan if level == MISSING else value
+    return values

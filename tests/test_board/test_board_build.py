@@ -1,0 +1,375 @@
+"""The board as it is collected: numbers against the scorer's, ranks, seeds,
+pictures.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_up import PLACE, BoardBench, copied, master, noisy
+from numpy.typing import NDArray
+
+from lagbench.board.build import (
+    CURVE_FRAMES,
+    RESIDUAL_BINS,
+    build,
+    collect,
+    make_curve,
+    residual_histograms,
+)
+from lagbench.board.folder import Folder
+from lagbench.board.model import Board, BoardRow
+from lagbench.board.ranking import combine
+from lagbench.board.show import choose_data_sets, tables, to_plain
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
+from lagbench.metrics import METRICS, Score, bootstrap_interval
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
+from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.score_file_checks import read_score_file
+
+
+@pytest.fixture(scope="module")
+def bench(home: Path) -> BoardBench:
+    """The shared leaderboard."""
+    return master(home)
+
+
+@pytest.fixture(scope="module")
+def board(bench: BoardBench) -> Board:
+    """It, collected."""
+    return collect(bench.folder, registry=bench.registry)
+
+
+@pytest.fixture
+def own(home: Path, tmp_path: Path) -> BoardBench:
+    """A copy that the test may damage."""
+    return copied(home, tmp_path)
+
+
+@pytest.fixture(scope="module")
+def card(bench: BoardBench) -> ScoreCard:
+    """The score card of ``noisy``, scored apart from the board."""
+    return bench.data.card(bench.predict(noisy, "again"))
+
+
+def row_of(board: Board, method: str) -> BoardRow:
+    """Return a row of the only tab."""
+    return next(row for row in board.tabs[0].rows if row.id == method)
+
+
+def test_values_are_those_of_the_scorer(board: Board, card: ScoreCard) -> None:
+    """Mean, interval, scenarios, undefined frames and frames of interest of every
+    metric.
+    """
+    values = row_of(board, "noisy").values
+    assert set(values) == set(card.submission)
+    for name, score in card.submission.items():
+        value = values[name]
+        low, high = score.interval
+        assert digits(value.mean) == digits(score.mean)
+        assert digits(value.low) == digits(low)
+        assert digits(value.high) == digits(high)
+        np.testing.assert_array_equal(value.per_scenario, score.values)
+        assert value.undefined == sum(score.undefined)
+        assert math.isnan(value.std)
+        for frame, mean in value.at.items():
+            scenario_values = score.at(frame)
+            defined = scenario_values[~np.isnan(scenario_values)]
+            expected = math.nan
+            if defined.size:
+                expected = float(np.mean(defined))
+            assert digits(mean) == digits(expected)
+
+
+def test_references_stand_as_the_scorer_sees_them(
+    board: Board, card: ScoreCard
+) -> None:
+    """Every reference predictor of the scorer is there, with its scores."""
+    references = {row.name: row for row in board.tabs[0].references}
+    assert set(references) == set(card.scores) - {SUBMISSION}
+    assert set(references) < set(REFERENCES)
+    for name, reference in references.items():
+        scores = card.scores[name]
+        assert set(reference.values) == set(scores)
+        for metric, score in scores.items():
+            value = reference.values[metric]
+            expected = pytest.approx(score.values, rel=1e-6, nan_ok=True)
+            assert digits(value.mean) == digits(score.mean)
+            assert value.per_scenario == expected
+
+
+def test_seeds_are_averaged(bench: BoardBench, board: Board) -> None:
+    """Mean over seeds per scenario, sample deviation over seeds, interval over both."""
+    folder = bench.folder / "scores/cavity/tiny"
+    first = read_statistics(folder / "damped_0.nc").scores()
+    second = read_statistics(folder / "damped_3.nc").scores()
+    row = row_of(board, "damped")
+    assert row.entry.seeds == (0, 3)
+    for name in ("vorticity_rmse", "position_rmse", "energy_error"):
+        a = first[name].values
+        b = second[name].values
+        value = row.values[name]
+        mean = (a + b) / 2.0
+        deviation = abs(a.mean() - b.mean()) / math.sqrt(2.0)
+        assert value.per_scenario == pytest.approx(mean)
+        assert value.mean == pytest.approx(mean.mean())
+        assert value.std == pytest.approx(deviation)
+        assert (value.low, value.high) == bootstrap_interval(np.stack([a, b]))
+    ranking = "vorticity_nrmse"
+    means = (first[ranking].mean, second[ranking].mean)
+    assert row.seed_means == pytest.approx(means)
+
+
+def test_a_split_that_is_not_known_here(bench: BoardBench) -> None:
+    """The entry is named: a package that describes its split is missing."""
+    with pytest.raises(DataError) as caught:
+        collect(bench.folder, registry=Registry({}, {}))
+    assert caught.value.where in {
+        str(path) for path in (bench.folder / "submissions").rglob("*.yaml")
+    }
+
+
+def test_few_scenarios_decide_nothing(board: Board) -> None:
+    """With two scenarios there is no p-value and no sign; ranks are the order."""
+    (tab,) = board.tabs
+    assert not tab.decided
+    ranked = [row for row in tab.rows if row.rank is not None]
+    assert {row.id for row in ranked} == {"damped", "noisy", "flipping"}
+    assert [row.rank for row in ranked] == [1, 2, 3]
+    for row in ranked:
+        assert math.isnan(row.p)
+        assert not row.tied
+    means = [row.values[tab.ranking].mean for row in ranked]
+    assert means == sorted(means)
+
+
+def test_withdrawn_superseded_and_outdated_are_not_ranked(own: BoardBench) -> None:
+    """They stay on the board, below, and say why; scores of another task are left
+    out.
+    """
+    own.edit("noisy", lambda held: held.update(status="withdrawn", reason="leaked"))
+    own.edit(
+        "damped",
+        lambda held: held.update(status="superseded", superseded_by="flipping"),
+    )
+    own.edit("flipping", lambda held: held["dataset"].update(sha256="0" * 64))
+    rows = {
+        row.id: row for row in collect(own.folder, registry=own.registry).tabs[0].rows
+    }
+    assert all(row.rank is None for row in rows.values())
+    assert not any(row.active for row in rows.values())
+    assert rows["noisy"].entry.reason == "leaked"
+    assert not rows["flipping"].current
+
+
+def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) -> None:
+    """Maps of truth and prediction share one packing: the tab's truth is the finest."""
+    names = ("flipping", "noisy")
+    coarse, fine = (
+        read_score_file(bench.folder / f"scores/cavity/tiny/{name}.nc")
+        for name in names
+    )
+    assert coarse.precision > 5.0 * fine.precision
+    truth = board.tabs[0].truth.vorticity
+    np.testing.assert_allclose(truth, fine.preview.vorticity[0], atol=fine.precision)
+
+
+def test_pictures_are_those_that_were_taken(board: Board, card: ScoreCard) -> None:
+    """Film and maps come back within half a step of their packing; energy is the
+    scorer's.
+    """
+    row = row_of(board, "noisy")
+    film_error = np.abs(row.pictures.film - card.preview.film[1])
+    assert film_error.max() <= 2.0 / 65534
+
+    vorticity = card.preview.vorticity
+    span = np.nanmax(vorticity) - np.nanmin(vorticity)
+    map_error = np.abs(row.pictures.vorticity - vorticity[1])
+    assert np.nanmax(map_error) <= span / 65534
+
+    predicted = card.submission["energy_predicted"].per_frame
+    true = card.submission["energy_true"].per_frame
+    assert row.energy.mean == pytest.approx(predicted.mean(axis=0))
+    assert board.tabs[0].energy.mean == pytest.approx(true.mean(axis=0))
+
+
+def test_residual_histograms(card: ScoreCard) -> None:
+    """Shares of predicted minus true vorticity over its own range, as NumPy has
+    them.
+    """
+    truth, prediction = card.preview.vorticity.astype(float)
+    histograms = residual_histograms(card.preview)
+    for histogram, difference in zip(histograms, prediction - truth, strict=True):
+        residual = difference[~np.isnan(difference)]
+        greatest = np.abs(residual).max()
+        half_bin = greatest / (RESIDUAL_BINS - 1)
+        end = greatest + half_bin
+        counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
+        assert (histogram.low, histogram.high) == (-greatest, greatest)
+        assert histogram.shares == pytest.approx(counts / residual.size)
+
+
+def made_up(per_frame: NDArray[np.float64]) -> Score:
+    """Return a score of the ranking metric with given values, shape [scenario,
+    frame].
+    """
+    count, frames = per_frame.shape
+    return Score(
+        metric=METRICS["vorticity_rmse"],
+        scenarios=tuple(range(count)),
+        frames=tuple(range(10, 10 + frames)),
+        per_frame=per_frame,
+        values=np.zeros(count),
+        undefined=(0,) * count,
+    )
+
+
+def test_curves_keep_the_ends() -> None:
+    """At most 120 frames, first and last among them; mean, lowest and highest of the
+    scenarios.
+    """
+    steps = np.arange(598.0)
+    per_frame = np.stack([steps, 3.0 * steps])
+    per_frame[0, 0] = np.nan
+    curve = make_curve(made_up(per_frame))
+    assert len(curve.frames) == CURVE_FRAMES
+    assert curve.frames[0] == 10
+    assert curve.frames[-1] == 607
+
+    chosen_steps = np.array(curve.frames) - 10.0
+    assert curve.mean[0] == 0.0
+    assert curve.low[1:] == pytest.approx(chosen_steps[1:])
+    assert curve.high == pytest.approx(3.0 * chosen_steps)
+    assert curve.mean[1:] == pytest.approx(2.0 * chosen_steps[1:])
+
+
+def test_curves_of_sampled_metrics_are_lines() -> None:
+    """A metric that is measured at every tenth frame has these frames, and no gaps
+    between them.
+    """
+    per_frame = np.full((2, 298), np.nan)
+    per_frame[:, 9::10] = np.arange(29.0)
+    curve = make_curve(made_up(per_frame))
+    assert curve.frames == tuple(range(19, 308, 10))
+    assert list(curve.mean) == list(range(29))
+
+
+def test_undefined_seeds_are_left_out(bench: BoardBench) -> None:
+    """A scenario that one seed has no value for takes the other's; none stays
+    undefined.
+    """
+    paths = ("scores/cavity/tiny/noisy.nc", "floors/cavity/tiny/persistence.nc")
+    held = [read_statistics(bench.folder / path) for path in paths]
+    found = combine([scores.tallies for scores in held])["vorticity_pearson"]
+    assert np.array_equal(
+        found.score.values, held[0].scores()["vorticity_pearson"].values
+    )
+    assert math.isnan(found.std)
+
+
+def test_the_order_of_files_does_not_matter(bench: BoardBench, tmp_path: Path) -> None:
+    """The same submissions, copied in another order and time, give the same bytes of
+    the page.
+    """
+    pages = []
+    for reverse in (False, True):
+        target = tmp_path / str(reverse)
+        for path in sorted(
+            filter(Path.is_file, bench.folder.rglob("*.*")), reverse=reverse
+        ):
+            copy = target / path.relative_to(bench.folder)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, copy)
+        pages.append(build(target, registry=bench.registry).page.read_bytes())
+    assert pages[0] == pages[1]
+
+
+def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
+    """Nothing is collected from a folder with a displaced entry, and no board from no
+    folder.
+    """
+    own.entry("noisy").rename(own.folder / PLACE / "other.yaml")
+    with pytest.raises(ChecksFailedError, match="another place"):
+        collect(own.folder, registry=own.registry)
+    with pytest.raises(UsageError, match="no leaderboard here"):
+        collect(own.folder / "nothing", registry=own.registry)
+
+
+def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
+    """What was not asked for is not even read; what was is as in the whole board."""
+
+    def collect_only(*data_sets: tuple[str, str]) -> Board:
+        return collect(own.folder, only=data_sets, registry=own.registry)
+
+    known = Folder(own.folder).data_sets()
+    assert to_plain(collect_only(*known)) == to_plain(board)
+    own.entry("noisy").write_text("no entry")
+    nothing = collect_only(("cavity", "mini"))
+    assert nothing.tabs == ()
+    assert nothing.empty == (("cavity", "mini"),)
+    with pytest.raises(LagbenchError):
+        collect_only(("cavity", "tiny"))
+
+
+def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
+    """Reference predictors stand there without a rank."""
+    (table,) = tables(board, ["position_rmse"])
+    assert table.columns[:5] == (
+        "rank",
+        "method",
+        "skill",
+        "vorticity_nrmse",
+        "position_rmse",
+    )
+    rows = {row[1]: row for row in table.rows}
+    for reference in board.tabs[0].references:
+        row = rows[reference.name]
+        assert row[0] == "-"
+        assert row[-1] == "reference"
+    damped = rows["damped"]
+    assert damped[0] == str(row_of(board, "damped").rank)
+    assert " ± " in damped[3]
+    assert damped[5:7] == ("0.5", "4")
+
+
+def test_json_has_the_numbers_of_the_board(board: Board) -> None:
+    """Digits are those of scores.json."""
+    (plain,) = to_plain(board)["tabs"]
+    rows = {row["id"]: row for row in plain["rows"]}
+    mean = row_of(board, "damped").values["position_rmse"].mean
+    assert rows["damped"]["metrics"]["position_rmse"]["mean"] == digits(mean)
+    assert rows["damped"]["cost"]["speed_up"] == 4.0
+    names = sorted(reference.name for reference in board.tabs[0].references)
+    assert sorted(floor["id"] for floor in plain["floors"]) == names
+
+
+def test_unknown_names_are_refused(board: Board) -> None:
+    """The nearest known name is in the message."""
+    with pytest.raises(UsageError) as caught:
+        choose_data_sets([("cavity", "tiny")], "cavity", "tyni")
+    assert "cavity tiny" in str(caught.value.fix)
+    with pytest.raises(UsageError) as caught:
+        list(tables(board, ["position_rmsee"]))
+    assert caught.value.where == "--metric"
+
+
+def test_boards_without_an_entry_are_named(
+    bench: BoardBench, board: Board, tmp_path: Path
+) -> None:
+    """Every size with scenarios enough to rank is a tab or is named; an empty folder
+    has no tab.
+    """
+    assert ("cavity", "mini") in board.empty
+    assert ("cavity", "tiny") not in board.empty
+    (tmp_path / "submissions").mkdir()
+    empty = collect(tmp_path, registry=bench.registry)
+    assert empty.tabs == ()
+    assert set(board.empty) <= set(empty.empty)
+    assert choose_data_sets([], None, None) == ()
+    assert build(tmp_path, registry=bench.registry).rows == 0

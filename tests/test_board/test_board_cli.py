@@ -1,0 +1,197 @@
+"""The commands submit and leaderboard build, check, show; the stranger's path of
+docs/submitting.md.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from conftest import SIZE, SPLIT
+from typer.testing import Result
+
+from lagbench.board.entry import Entry, EntryBudget, Meta
+from lagbench.board.issues import CHECKS
+from lagbench.make.generate import GenerationResult
+
+DOCS = Path(__file__).parents[2] / "docs"
+TOY = DOCS / "examples" / "toy_model"
+Run = Callable[..., Result]
+
+
+@pytest.fixture
+def run(
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    generated: GenerationResult,
+    tmp_path: Path,
+) -> Run:
+    """A function that runs lagbench in an empty folder on the generated data set."""
+    monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
+    monkeypatch.chdir(tmp_path)
+    return run
+
+
+SUBMIT = ("submit", "predictions.nc", "--from", TOY / "meta.yaml")
+
+
+@pytest.fixture
+def toy(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Predictions of the example model, run as its docstring says."""
+    words = ["toy_model.py", "--split", SPLIT, "--size", SIZE, "-o", "predictions.nc"]
+    monkeypatch.setattr(sys, "argv", words)
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(TOY / "toy_model.py"), run_name="__main__")
+    assert end.value.code == 0
+
+
+@pytest.mark.usefixtures("toy")
+def test_a_strangers_path(run: Run, tmp_path: Path) -> None:
+    """From an own model to a page, each command as documented, nothing asked on
+    stdin.
+    """
+    assert run("validate", "predictions.nc").exit_code == 0
+    assert run(*SUBMIT).exit_code == 2
+    submitted = run(*SUBMIT, "--new-board")
+    assert submitted.exit_code == 0, submitted.output
+    assert "toy-model on curl-noise tiny: vorticity_nrmse" in submitted.stdout
+    entry = tmp_path / "leaderboard/submissions" / SPLIT / SIZE / "toy-model.yaml"
+    assert yaml.safe_load(entry.read_text())["parameters"] == 1
+    assert run("leaderboard", "check").exit_code == 0
+    stale = run("leaderboard", "check", "--page")
+    assert stale.exit_code == 1
+    assert "error [page]" in stale.stderr
+    built = run("leaderboard", "build")
+    assert built.exit_code == 0, built.output
+    assert re.search(r"index.html: 1 entry, 1 tab, .* written", built.stdout)
+    assert run("leaderboard", "build", "--check").exit_code == 0
+    checked = run("leaderboard", "check", "--page", "--predictions", "predictions.nc")
+    assert checked.exit_code == 0, checked.output
+    assert "1 entry, nothing wrong" in checked.stdout
+    assert f"confirms scores/{SPLIT}/{SIZE}/toy-model.nc of" in checked.stdout
+    shown = run("leaderboard", "show", SPLIT, "--size", SIZE)
+    assert "toy-model" in shown.stdout
+    assert "Toy model" in (tmp_path / "leaderboard" / "index.html").read_text()
+
+
+@pytest.mark.usefixtures("toy")
+def test_machines_are_answered_in_json(run: Run) -> None:
+    """Every command has --json; the next step keeps --board; a drifted page fails with
+    exit code 1.
+    """
+    board = ("--board", "trial")
+    assert run(*SUBMIT, *board, "--new-board").stdout.count("--board trial") == 2
+    assert (
+        json.loads(run(*SUBMIT, *board, "--replace", "--json").stdout)["ranking"]
+        == "vorticity_nrmse"
+    )
+
+    def told(command: str, *words: str) -> Any:
+        return json.loads(run("leaderboard", command, *board, *words, "--json").stdout)
+
+    built = told("build")
+    assert (built["rows"], built["tabs"]) == (1, 1)
+    seen = told("check", "--page")
+    assert (seen["findings"], seen["page_checked"]) == ([], True)
+    again = told("check", "--predictions", "predictions.nc", "--record")
+    assert again["recorded"] == [f"submissions/{SPLIT}/{SIZE}/toy-model.yaml"]
+    shown = told("show")
+    assert shown["tabs"][0]["rows"][0]["verified"] is True
+    Path("trial/index.html").write_text("stale")
+    result = run("leaderboard", "build", *board, "--check")
+    assert result.exit_code == 1
+    assert "lagbench leaderboard build" in result.stderr
+    assert run("leaderboard", "build", *board, "--quiet").output == ""
+    assert run("leaderboard", "check", *board, "--base", "main").exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["submit"], 2, "FILE"),
+        (["submit", "none.nc"], 3, "none.nc"),
+        (
+            ["submit", "x.nc", "--url", "javascript:alert(1)"],
+            2,
+            "is not an http:// or https:// address",
+        ),
+        (["submit", "x.nc", "--from", "none.yaml"], 3, "none.yaml"),
+        (["leaderboard", "build"], 2, "no leaderboard here"),
+        (["leaderboard", "check"], 2, "--board FOLDER"),
+        (["leaderboard", "show"], 2, "no leaderboard here"),
+    ],
+)
+def test_errors_have_their_codes(
+    run: Run, words: list[str], code: int, message: str, tmp_path: Path
+) -> None:
+    """One message on stderr, no traceback, the code of docs/scoring.md, nothing
+    written.
+    """
+    result = run(*words)
+    assert result.exit_code == code, result.output
+    assert message in " ".join(result.stderr.split())
+    assert "Traceback" not in result.output
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_page_of_docs_is_true(run: Run) -> None:
+    """docs/submitting.md names every check and key; its commands are accepted, its
+    example is the file's.
+    """
+    text = (DOCS / "submitting.md").read_text()
+    for name, check in CHECKS.items():
+        assert f"| `{name}` | {check.meaning} |" in text
+    for key in (*Meta.model_fields, *Entry.model_fields, *EntryBudget.model_fields):
+        assert f"`{key}`" in text
+    assert (TOY / "meta.yaml").read_text() in text
+    blocks = re.findall(r"```(?:bash|console)\n(.*?)```", text, re.DOTALL)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    commands = [
+        shlex.split(line, comments=True)[1:]
+        for line in lines
+        if line.startswith("lagbench ")
+    ]
+    assert len(commands) >= 8
+    for words in commands:
+        result = run(*words, "--help")
+        assert result.exit_code == 0, words
+
+
+@pytest.mark.usefixtures("toy")
+def test_scores_of_earlier_tasks_alone(run: Run, tmp_path: Path) -> None:
+    """Scores that do not fit the task of today are no table, and are not taken for no
+    entries at all.
+    """
+    assert run(*SUBMIT, "--new-board").exit_code == 0
+    board = tmp_path / "leaderboard"
+    entry = board / "submissions" / SPLIT / SIZE / "toy-model.yaml"
+    held = yaml.safe_load(entry.read_text())
+    held["dataset"]["version"] = "1.0.0"
+    entry.write_text(yaml.safe_dump(held))
+    (board / "scores" / SPLIT / SIZE / "toy-model.nc").write_bytes(
+        b"of an earlier format"
+    )
+    for words in ((), (SPLIT, "--size", SIZE)):
+        result = run("leaderboard", "show", *words)
+        assert result.exit_code == 0, result.output
+        assert "scores of earlier tasks" in result.output
+    result = run("leaderboard", "show", "fluid")
+    assert result.exit_code == 2
+    assert f"{SPLIT} {SIZE}" in result.stderr  # what there is
+
+
+def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
+    """Without any entry it is built, checked and shown."""
+    (tmp_path / "leaderboard" / "submissions").mkdir(parents=True)
+    for words in (["build"], ["check", "--page"], ["show"], ["show", "--json"]):
+        result = run("leaderboard", *words)
+        assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout) == {"tabs": []}

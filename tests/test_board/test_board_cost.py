@@ -1,0 +1,213 @@
+"""Accuracy against cost: places of dots, the front, and what those who do not see it
+are told.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from board_worlds import make_board
+from typer.testing import CliRunner
+
+from lagbench.__main__ import app
+from lagbench.board.cost import CostPoint, draw, find_front, points_of
+from lagbench.board.model import Tab
+from lagbench.data.registry import load
+from lagbench.figures.chart import close_logarithmic
+from lagbench.references import shipped, solver_seconds
+
+
+@pytest.fixture(scope="module")
+def tab() -> Tab:
+    """A tab with eight entries, one of which says nothing about cost."""
+    return make_board((("cavity", "mini"),)).tabs[0]
+
+
+def point(seconds: float, error: float, kind: str = "entry") -> CostPoint:
+    """Return a point named after its place."""
+    return CostPoint(
+        name=f"{seconds:g} {error:g}", seconds=seconds, error=error, kind=kind
+    )
+
+
+def test_costs_are_those_of_the_solvers_machine(tab: Tab) -> None:
+    """An entry twice as fast as the solver on its own machine costs half of the solver
+    here.
+    """
+    raw = {one.name: one.seconds for one in points_of(tab)}
+    here = {
+        one.name: one.seconds for one in points_of(replace(tab, solver_seconds=0.02))
+    }
+    for row in tab.rows:
+        if row.active and row.entry.cost is not None:
+            assert raw[row.entry.name] == row.entry.cost.seconds_per_frame
+            assert here[row.entry.name] == pytest.approx(
+                0.02 / (row.entry.cost.speed_up or math.nan)
+            )
+    silent = {row.entry.name for row in tab.rows if row.entry.cost is None}
+    assert silent
+    assert silent.isdisjoint(raw)
+
+
+def test_the_front_holds_what_no_other_beats() -> None:
+    """By hand: (2, 5) is beaten by (1, 4); (3, 4) costs more than (1, 4) and is no
+    better.
+    """
+    marks = [point(2, 5), point(1, 4), point(3, 4), point(4, 1), point(5, 0.5)]
+    assert [(one.seconds, one.error) for one in find_front(marks)] == [
+        (1, 4),
+        (4, 1),
+        (5, 0.5),
+    ]
+
+
+def classes_of(element: ElementTree.Element) -> list[str]:
+    """Return the classes of an element."""
+    return element.attrib.get("class", "").split()
+
+
+def place_of(circle: ElementTree.Element) -> tuple[float, float]:
+    """Return the middle of a circle."""
+    return float(circle.attrib["cx"]), float(circle.attrib["cy"])
+
+
+def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
+    """Ten times the cost is the same step to the right; every dot has words and the
+    keyboard reaches it.
+    """
+    points = [
+        point(0.001, 1.0),
+        point(0.01, 0.5),
+        point(0.1, 0.25, "coarse"),
+        point(0.05, 0.9, "floor"),
+    ]
+    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    dots = [element for element in svg.iter() if "dot" in classes_of(element)]
+    first, second, third, _ = [place_of(dot[1]) for dot in dots]
+    first_step = np.subtract(second, first)
+    second_step = np.subtract(third, second)
+    assert first_step == pytest.approx(second_step, abs=0.2)
+    assert first_step[1] > 0  # less error stands lower
+
+    for one, dot in zip(points, dots, strict=True):
+        assert dot.attrib["aria-label"].startswith(one.name)
+        assert dot.attrib["tabindex"] == "0"
+    assert svg.attrib["role"] == "group"
+    assert svg.find(".//script") is None
+
+
+class Box(NamedTuple):
+    """A rectangle on the picture; y grows downwards."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+    def overlaps(self, other: Box) -> bool:
+        """Tell whether two rectangles share an area."""
+        is_beside = self.right <= other.left or other.right <= self.left
+        is_above = self.bottom <= other.top or other.bottom <= self.top
+        return not is_beside and not is_above
+
+
+def text_boxes(
+    svg: ElementTree.Element, kind: str, letter_width: float = 6.0
+) -> list[Box]:
+    """Return the boxes of the texts of a kind."""
+    boxes = []
+    for text in svg.iter("text"):
+        classes = classes_of(text)
+        if classes[0] != kind:
+            continue
+        width = letter_width * len(text.text or "")
+        share = {"end": 1.0, "middle": 0.5}.get(classes[-1], 0.0)
+        left = float(text.attrib["x"]) - share * width
+        base = float(text.attrib["y"])
+        boxes.append(Box(left, base - 9, left + width, base + 2))
+    return boxes
+
+
+def dot_boxes(svg: ElementTree.Element) -> list[Box]:
+    """Return the boxes of all circles."""
+    boxes = []
+    for circle in svg.iter("circle"):
+        x, y = place_of(circle)
+        boxes.append(Box(x - 3, y - 3, x + 3, y + 3))
+    return boxes
+
+
+def test_names_do_not_meet_names_or_dots() -> None:
+    """Twenty dots in one place and five near it: no name covers another or a dot."""
+    points = [point(0.01 * (1 + i / 1000), 0.5) for i in range(20)]
+    points += [point(0.01 * (1.2 + i / 5), 0.45 + 0.04 * i) for i in range(5)]
+    svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
+    texts = text_boxes(svg, "name") + text_boxes(svg, "note")
+    assert len(texts) > 3
+    dots = dot_boxes(svg)
+    for number, text in enumerate(texts):
+        for other in (*texts[:number], *dots):
+            assert not text.overlaps(other)
+
+
+def test_a_crowd_at_the_edge_keeps_its_names() -> None:
+    """Six dots, five of them close together near the right edge: each has its name."""
+    places = {
+        "VAR(1)": (0.052, 50.0),
+        "SuperGAT": (0.075, 1.2),
+        "GNS": (0.045, 0.89),
+        "GNS, noise 1e-3": (0.036, 0.59),
+        "analog": (0.0245, 1.5),
+        "persistence": (4e-6, 1.0),
+    }
+    points = []
+    for name, (seconds, error) in places.items():
+        points.append(CostPoint(name=name, seconds=seconds, error=error, kind="entry"))
+    svg = ElementTree.fromstring(draw(points, None, "vorticity_nrmse", "title"))
+    names = set()
+    for text in svg.iter("text"):
+        if classes_of(text)[0] == "name":
+            names.add(text.text)
+    assert names == set(places)
+
+
+def test_axes_end_past_their_values() -> None:
+    """All ticks within the axis; values a step off its ends."""
+    scale = close_logarithmic(0.3, 1.4)
+    assert scale.low < 0.3 < 1.4 < scale.high
+    assert all(scale.low <= tick.value <= scale.high for tick in scale.ticks)
+    assert next(tick.label for tick in close_logarithmic(1e-6, 1e-2).ticks) in (
+        "10⁻⁶",
+        "10⁻⁷",
+    )
+
+
+def test_a_picture_of_what_has_no_entry(tmp_path: Path) -> None:
+    """Without any entry the floors stand there, and what the solver itself takes."""
+    (tmp_path / "board" / "submissions").mkdir(parents=True)
+    target = tmp_path / "cost.svg"
+    words = [
+        "leaderboard",
+        "picture",
+        "cavity",
+        "--size",
+        "mini",
+        "--board",
+        str(tmp_path / "board"),
+    ]
+    done = CliRunner().invoke(app, [*words, "-o", str(target)])
+    assert done.exit_code == 0, done.output
+    said = target.read_text()
+    ElementTree.fromstring(said)
+    size = load().size("cavity", "mini")
+    assert all(name in said for name in shipped(size) or {})
+    assert "the solver itself" in said
+    assert (solver_seconds(size) or 0.0) > 0.0
+    assert not re.search("<script|href=", said)

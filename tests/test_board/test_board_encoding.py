@@ -1,0 +1,96 @@
+"""The encoding of the page's data: arrays as levels, bytes as text."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from page_reader import read_array
+
+from lagbench.board.encoding import LEVELS, ArrayStore, decode, encode
+from lagbench.board.sampling import coarsen
+
+# Taichi, once started in this process, makes its thread round subnormals to zero.
+NUMBERS = st.floats(-1e6, 1e6, allow_subnormal=False)
+GAP = st.just(float("nan"))
+
+
+def restore(store: ArrayStore, reference: dict[str, float | bool]) -> NDArray:
+    """Return an array as the page's script reads it."""
+    levels = np.frombuffer(store.to_bytes(), "<i2")
+    return read_array(levels, reference)
+
+
+@given(st.lists(NUMBERS | GAP, min_size=1, max_size=40), st.booleans())
+@example([sys.float_info.min], True)
+def test_numbers_come_back_within_half_a_step(
+    values: list[float], prefer_logarithmic: bool
+) -> None:
+    """Gaps stay gaps; on a logarithmic scale half a step of the logarithm."""
+    array = np.array(values)
+    store = ArrayStore()
+    reference = store.add(array, prefer_logarithmic=prefer_logarithmic)
+    restored = restore(store, reference)[:, 0]
+
+    np.testing.assert_array_equal(np.isnan(restored), np.isnan(array))
+    is_known = ~np.isnan(array)
+    half_step = 0.5 * float(reference["step"])
+    zero = float(reference["zero"])
+    if reference["log"]:
+        is_inside = is_known & (array >= np.exp(zero))
+        error = np.abs(np.log(restored[is_inside] / array[is_inside]))
+        assert np.all(error <= half_step + 1e-5)
+    else:
+        error = np.abs(restored[is_known] - array[is_known])
+        scale = 1.0 + abs(zero)
+        assert np.all(error <= half_step + 1e-5 * scale)
+
+
+@given(st.integers(1, 20), st.integers(1, 6), st.integers(0, 2**32))
+def test_rows_and_columns_keep_their_places(rows: int, columns: int, seed: int) -> None:
+    """Steps between rows may be as long as the whole range."""
+    values = np.random.default_rng(seed).random((rows, columns))
+    store = ArrayStore()
+    store.add([1.0, 2.0, 4.0])
+    restored = restore(store, store.add(values))
+    np.testing.assert_allclose(restored, values, atol=0.51 / LEVELS)
+
+
+def test_whole_numbers_are_exact_and_stand_once() -> None:
+    """Frames of many curves are the same: the second array takes no room."""
+    store = ArrayStore()
+    frames = [10, 11, 500, 7]
+    first = store.add_whole(frames)
+    length = len(store.to_bytes())
+    second = store.add_whole(frames)
+    assert first == second
+    assert len(store.to_bytes()) == length
+    assert restore(store, first)[:, 0].tolist() == frames
+
+
+@given(st.binary(max_size=200))
+def test_bytes_survive_as_text_without_markup(data: bytes) -> None:
+    """Nothing in the text could end an HTML element."""
+    text = encode(data)
+    assert not set(text) & set("<>&\"'")
+    assert decode(text, longest=len(data)) == data
+
+
+@pytest.mark.parametrize("text", ["", "AAAA", "not base64!", encode(bytes(10_000))])
+def test_text_that_is_too_long_or_none_is_refused(text: str) -> None:
+    """A short text may encode a long content: it is not decompressed whole."""
+    with pytest.raises(ValueError):  # noqa: PT011
+        decode(text, longest=9_999)
+
+
+def test_coarse_field_keeps_its_mean() -> None:
+    """Blocks average the known nodes: 4 x 4 nodes become 2 x 2, worked by hand."""
+    field = np.arange(16.0).reshape(4, 4)
+    field[0, 0] = np.nan
+    # upper left block: 1, 4, 5 are known, mean 10/3
+    np.testing.assert_allclose(coarsen(field, 2), [[10 / 3, 4.5], [10.5, 12.5]])
+    np.testing.assert_array_equal(coarsen(field, 4), field)

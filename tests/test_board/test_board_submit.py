@@ -1,0 +1,420 @@
+"""Submitting: what is written, what is refused, and that it is all or nothing."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from made_up import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
+
+from lagbench import __version__
+from lagbench.board import publish
+from lagbench.board import submit as submitting
+from lagbench.board.check import check_board
+from lagbench.board.entry import Meta
+from lagbench.board.entry_file import read_entry
+from lagbench.data.checksums import file_sha256
+from lagbench.errors import (
+    ChecksFailedError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
+from lagbench.references import references_of
+from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.submission import open_predictions
+
+
+@pytest.fixture
+def own(home: Path, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard."""
+    return copied(home, tmp_path)
+
+
+@pytest.fixture
+def predictions(own: BoardBench) -> Path:
+    """Predictions of a model that is not on the board yet."""
+    labels = {
+        "device": "a laptop",
+        "seconds_per_frame": 0.25,
+        "parameters": 9,
+        "training": "train",
+    }
+    return own.predict(nearer, "my-model", **labels)
+
+
+@pytest.fixture
+def unscored(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail where anything is scored."""
+    monkeypatch.setattr(submitting, "score", pytest.fail)
+
+
+def well(bench: BoardBench) -> bool:
+    """Tell whether the check of the folder finds nothing."""
+    return not check_board(
+        bench.folder, registry=bench.registry, isolated=False
+    ).findings
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) -> None:
+    """Labels of the predictions, what the submitter adds, data set, hashes, scores and
+    their origin.
+    """
+    said = {
+        "name": "My model",
+        "code": "https://a.org/x",
+        "solver_seconds_per_frame": 0.5,
+    }
+    result = own.submit(predictions, **said)
+    entry = read_entry(own.entry("my-model"))
+    assert (entry.name, entry.code, entry.date) == ("My model", "https://a.org/x", DAY)
+    assert (entry.parameters, entry.training) == (9, "train")
+    assert entry.cost is not None
+    cost = {
+        "seconds_per_frame": 0.25,
+        "device": "a laptop",
+        "solver_seconds_per_frame": 0.5,
+    }
+    assert entry.cost.model_dump() == cost
+    with open_predictions(predictions) as opened:
+        assert [made.sha256 for made in entry.predictions] == [opened.content_sha256()]
+        assert entry.dataset.sha256 == opened.header.dataset_sha256
+    assert entry.predictions[0].bytes == predictions.stat().st_size
+    assert entry.score.lagbench == __version__
+    (score_file,) = entry.score_paths
+    assert entry.score.files[0].sha256 == file_sha256(own.folder / score_file)
+    card = own.data.card(predictions)
+    assert result.mean == pytest.approx(card.submission[card.ranking].mean, rel=1e-8)
+    assert [path.name for path in result.files] == ["my-model.yaml", "my-model.nc"]
+    assert all(path.stat().st_size <= 1_000_000 for path in result.files)
+    assert well(own)
+    before = own.state()
+    own.submit(predictions, replace=True, **said)
+    assert own.state() == before
+
+
+def test_replacing_leaves_no_score_file_over(own: BoardBench) -> None:
+    """Two seeds that become one: the score files of both are gone, the new one is
+    there.
+    """
+    own.submit(own.predict(damped, "damped"), replace=True)
+    assert [
+        path.name for path in (own.folder / "scores/cavity/tiny").glob("damped*")
+    ] == ["damped.nc"]
+
+
+def test_predictions_in_the_folder_are_referred_to(own: BoardBench) -> None:
+    """A file inside the leaderboard's folder is named by its path there, one elsewhere
+    is not.
+    """
+    inside = own.folder / "predictions" / "mine.nc"
+    inside.parent.mkdir()
+    own.data.submit(inside, nearer, "inside")
+    own.submit(inside)
+    assert read_entry(own.entry("inside")).predictions[0].path == "predictions/mine.nc"
+    assert read_entry(own.entry("noisy")).predictions[0].path is None
+    assert well(own)
+
+
+@pytest.mark.usefixtures("unscored")
+def test_a_name_that_no_entry_can_hold(own: BoardBench) -> None:
+    """A path inside the folder that the schema refuses is told before anything is
+    scored.
+    """
+    inside = own.folder / ("p" * 150) / f"{'q' * 100}.nc"
+    inside.parent.mkdir()
+    own.data.submit(inside, nearer, "inside")
+    with pytest.raises(ChecksFailedError):
+        own.submit(inside)
+    assert not own.entry("inside").exists()
+
+
+def tree(folder: Path) -> set[str]:
+    """Return everything under a folder, hidden files too."""
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_predictions_are_submitted_once(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of another entry or seed are refused under any label; one file twice is
+    told before the work.
+    """
+    first = own.predict(nearer, "first")
+    own.submit(first)
+    before = tree(own.folder)
+    again = own.predict(nearer, "second")
+    with pytest.raises(UsageError):
+        own.submit(again)
+    with monkeypatch.context() as patch:
+        patch.setattr(submitting, "score", pytest.fail)
+        for files in (
+            (first,),
+            tuple(own.predict(still, "third", seed=seed) for seed in (0, 1)),
+        ):
+            with pytest.raises(UsageError):
+                own.submit(*files, method="other", name="Other")
+    assert tree(own.folder) == before
+    assert own.submit(again, method="first", replace=True).method == "first"
+
+
+@pytest.mark.usefixtures("unscored")
+@pytest.mark.parametrize(
+    "keys",
+    [
+        *(
+            {"authors": ()},
+            {"command": ""},
+            {"method": "noisy"},
+            {"method": "persistence"},
+        ),
+        *({"name": "NO\u0406SY"}, {"name": "Persistence"}),
+        *(
+            {"urls": ("https://a.org/1", "https://a.org/2")},
+            {"date": datetime.date(2999, 1, 1)},
+        ),
+        {"budget": {"track": "converged"}},
+    ],
+)
+def test_refused_before_the_work(
+    keys: dict[str, Any], own: BoardBench, predictions: Path
+) -> None:
+    """What is missing, taken, of a day to come or nobody's to say, before anything is
+    scored or written.
+    """
+    before = tree(own.folder)
+    with pytest.raises(UsageError) as caught:
+        own.submit(predictions, **keys)
+    assert tree(own.folder) == before
+    where = {"date": "date", "budget": "budget.track"}
+    assert all(caught.value.where == where.get(key, caught.value.where) for key in keys)
+
+
+@pytest.mark.parametrize("text", ["a\x07b", "\u2800"])
+def test_words_of_predictions_that_cannot_be_shown(own: BoardBench, text: str) -> None:
+    """What predictions say of their training may be anything; an entry that cannot hold
+    it is refused.
+    """
+    before = tree(own.folder)
+    with pytest.raises(LagbenchError):
+        own.submit(own.predict(nearer, "odd", training=text))
+    assert {path for path in tree(own.folder) if "odd" in path} <= before
+
+
+@pytest.mark.usefixtures("unscored")
+@pytest.mark.parametrize(
+    ("key", "labels"),
+    [
+        ("cost.device", {"device": "bad\x1b[31m\ndev"}),
+        ("cost.device", {"device": "   "}),
+        ("cost.seconds_per_frame", {"seconds_per_frame": 1e-9}),
+        ("cost.solver_seconds_per_frame", {"solver_seconds_per_frame": 1e300}),
+    ],
+)
+def test_a_cost_of_predictions_that_no_entry_can_hold(
+    own: BoardBench, key: str, labels: dict[str, Any]
+) -> None:
+    """Valid predictions may tell a cost beyond what the board takes: the key is named
+    before the work.
+    """
+    path = own.predict(
+        nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels}
+    )
+    with pytest.raises(ChecksFailedError) as told:
+        own.submit(path)
+    assert f"{key}: " in str(told.value.got)
+
+
+def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
+    """All that is wrong with an entry is in one error: whoever mends it all can
+    submit.
+    """
+    keys = {"name": "NO\u0406SY", "urls": ("https://a.org/1", "https://a.org/2")}
+    mended = {"name": "Fine", "urls": (), "method": "fine"}
+    alone = []
+    for key, value in keys.items():
+        with pytest.raises(UsageError) as told:
+            own.submit(predictions, **{**mended, key: value})
+        alone.append(told.value.what)
+    with pytest.raises(UsageError) as together:
+        own.submit(predictions, **keys)
+    assert all(what in str(together.value) for what in alone)
+    assert own.submit(predictions, **mended).method == "fine"
+
+
+@pytest.mark.usefixtures("unscored")
+def test_files_that_do_not_belong_together(own: BoardBench) -> None:
+    """Several files need seeds that differ; a label that is no id needs --method; no
+    file is no entry.
+    """
+    plain = own.predict(still, "plain")
+    other = own.predict(noisy, "other")
+    same = own.predict(still, "same", seed=4)
+    two = own.predict(still, "one", seed=0), own.predict(noisy, "another", seed=1)
+    odd = own.data.submit(own.folder.parent / "odd.nc", still, "My Model!")
+    small, large = (
+        own.predict(still, "sized", seed=n, parameters=9 + n) for n in (0, 1)
+    )
+    for files, keys in (
+        ((), {}),
+        ((small, large), {}),
+        ((plain, other), {"method": "both"}),
+        ((same, same), {}),
+        ((odd,), {}),
+        (two, {"method": "both"}),
+    ):
+        with pytest.raises(UsageError):
+            own.submit(*files, **keys)
+
+
+def test_invalid_predictions_leave_nothing(
+    own: BoardBench, predictions: Path, tmp_path: Path
+) -> None:
+    """A damaged second file: the first is not scored, nothing is written."""
+    import h5py
+
+    damaged = tmp_path / "damaged.nc"
+    damaged.write_bytes(predictions.read_bytes())
+    with h5py.File(damaged, "r+") as file:
+        file["position"][0, 0, 0, 0] = float("nan")
+    before = tree(own.folder)
+    with pytest.raises(ChecksFailedError, match="finite"):
+        own.submit(predictions, damaged)
+    with pytest.raises(UnreadableFileError):
+        own.submit(tmp_path / "none.nc")
+    assert tree(own.folder) == before
+
+
+def test_an_interruption_is_found(
+    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Score files come first, the entry last: what a kill leaves is a score file
+    without an entry.
+    """
+    before = own.state()
+    move = os.replace
+
+    def killed(source: Path, target: Path) -> None:
+        if target.suffix == ".yaml":
+            raise KeyboardInterrupt
+        move(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            own.submit(predictions)
+    left = "scores/cavity/tiny/my-model.nc"
+    assert own.state() == before | {left: own.state()[left]}
+    result = check_board(own.folder, registry=own.registry, isolated=False)
+    assert [finding.check for finding in result.findings] == ["stray"]
+    own.submit(predictions)
+    assert well(own)
+
+
+def test_a_score_file_that_is_too_long_is_not_published(
+    own: BoardBench, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """More than 1 MB: the work failed, and nothing is left behind."""
+    monkeypatch.setattr(publish, "MAX_SCORE_BYTES", 1000)
+    before = tree(own.folder)
+    with pytest.raises(WorkFailedError, match="too long"):
+        own.submit(predictions)
+    assert tree(own.folder) == before
+
+
+def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> None:
+    """Those that are missing, or of another data set, are written anew, the same bytes
+    whoever submits.
+    """
+    folder = own.folder / "floors/cavity/tiny"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    assert set(before) == {
+        f"{floor.name}.nc"
+        for floor in references_of(own.data.size)
+        if floor.counts and not floor.reads_train
+    }
+    first = min(before)
+    (folder / first).unlink()
+    (folder / max(before)).write_bytes(b"something else")
+    result = own.submit(predictions)
+    assert set(result.files) >= {folder / first, folder / max(before)}
+    assert {path.name for path in folder.iterdir()} == set(before)
+    for path in folder.iterdir():
+        assert read_score_file(path).scores.identity["method"] == path.stem
+    assert well(own)
+
+
+def test_leaving_the_box_comes_with_its_share(own: BoardBench) -> None:
+    """One particle in 2048, say, that lies outside at all frames but some: the share is
+    that of positions.
+    """
+
+    def leaving(truth: Any, n: int, h: int) -> Any:
+        guess = np.array(nearer(truth, n, h))
+        guess[1:, :3, 0] += np.linspace(0.0, 3.0, h - 1)[:, None]
+        return guess
+
+    own.submit(own.predict(leaving, "leaving"))
+    told = read_entry(own.entry("leaving")).score.files[0].warnings
+    (warning,) = (one for one in told if one.name == "in_domain")
+    task = own.data.size.task
+    size = own.data.size
+    outside = 0
+    room = size.bounds[0][1] + 1.0 / size.grid
+    for scenario in size.subsets["test"]:
+        guess = leaving(motion(size, scenario), task.input_frames, task.horizon)
+        outside += int((guess.astype(np.float32)[..., 0] > room).sum())
+    count = len(size.subsets["test"]) * task.horizon * size.particles
+    assert 0.0 < outside < count
+    assert warning.share == pytest.approx(outside / count, rel=1e-3)
+
+
+def test_no_board_is_begun_by_mistake(
+    own: BoardBench, predictions: Path, tmp_path: Path
+) -> None:
+    """It has to be asked for, and not among other files; what git and a README put
+    there is no obstacle.
+    """
+    meta = Meta(authors=("A. Author",), command="make", date=DAY)
+    board = tmp_path / "site"
+    where = own.where | {"board": board}
+    with pytest.raises(UsageError) as error:
+        submitting.submit([predictions], meta, **where)
+    assert "--new-board" in str(error.value.fix)
+    assert not board.exists()
+    where["new_board"] = True
+    assert submitting.submit([predictions], meta, **where).board == board
+    shutil.rmtree(board)
+    (board / ".git").mkdir(parents=True)
+    for name in ("README.md", "index.html"):
+        (board / name).write_text("mine")
+    with pytest.raises(UsageError) as error:
+        submitting.submit([predictions], meta, **where)
+    assert (error.value.where, error.value.got) == (str(board), "'index.html'")
+    assert sorted(path.name for path in board.iterdir()) == [
+        ".git",
+        "README.md",
+        "index.html",
+    ]
+    (board / "index.html").unlink()
+    assert submitting.submit([predictions], meta, **where).board == board
+
+
+def test_what_is_not_given(own: BoardBench) -> None:
+    """The date is today's in UTC; seeds timed on different machines have no cost."""
+    first = own.predict(nearer, "mixed", seed=0, device="one", seconds_per_frame=0.25)
+    second = own.predict(still, "mixed", seed=1, device="two", seconds_per_frame=0.25)
+    own.submit(first, second, date=None)
+    entry = read_entry(own.entry("mixed"))
+    assert entry.cost is None
+    assert abs(
+        entry.date - datetime.datetime.now(datetime.UTC).date()
+    ) <= datetime.timedelta(days=1)

@@ -1,0 +1,295 @@
+"""The content hash says what the values say, and nothing else."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+
+from lagbench.data.checksums import (
+    ContentHasher,
+    VariableHasher,
+    canonical_json,
+    dataset_hash,
+    dtype_name,
+    file_sha256,
+    subset_hash,
+    to_plain,
+)
+from lagbench.errors import DataError
+
+FLOATS = hnp.arrays(
+    st.sampled_from(["<f4", "<f8"]),
+    hnp.array_shapes(min_dims=1, max_dims=3, max_side=5),
+    elements={"allow_nan": True, "allow_subnormal": True},
+)
+IDENTITY = {
+    "split": "cavity",
+    "size": "tiny",
+    "major": 1,
+    "scenario": 3,
+    "subset": "test",
+    "seed": "s",
+}
+IDENTITY["parameters"] = {"dt": 0.002, "grid": 16, "name": "ä"}
+
+
+def digest(
+    values: NDArray[Any], *, name: str = "position", dims: tuple[str, ...] | None = None
+) -> str:
+    """Return the hash of values given in one piece."""
+    values = np.asarray(values)
+    hasher = VariableHasher(
+        name, values.dtype, dims or tuple("abcdef"[: values.ndim]), values.shape
+    )
+    hasher.update(values)
+    return hasher.hexdigest()
+
+
+def test_hashes_of_variables_by_hand() -> None:
+    """Header, newline and bytes as docs/format.md spells them out.
+
+    Strings are UTF-8 joined by NUL, whatever type holds them.
+    """
+    header = b'{"dims":["frame"],"dtype":"float32","name":"x","shape":[2]}\n'
+    data = bytes.fromhex("0000803f00000000")  # 1.0f, and 0.0f for -0.0f
+    expected = hashlib.sha256(header + data).hexdigest()
+    assert (
+        digest(np.array([1.0, -0.0], np.float32), name="x", dims=("frame",)) == expected
+    )
+    header = b'{"dims":["space"],"dtype":"string","name":"s","shape":[2]}\n'
+    expected = hashlib.sha256(header + "x\0ä".encode()).hexdigest()
+    for kind in (None, object, np.dtypes.StringDType()):
+        assert digest(np.array(["x", "ä"], kind), name="s", dims=("space",)) == expected
+
+
+def test_content_hash_by_hand() -> None:
+    """The content hash is the SHA-256 of one JSON text."""
+    values = np.array([1, 2], np.int32)
+    inner = hashlib.sha256(
+        b'{"dims":["a"],"dtype":"int32","name":"v","shape":[2]}\n' + values.tobytes()
+    )
+    text = (
+        '{"major":1,"parameters":{"dt":0.002,"grid":16,"name":"ä"},"scenario":3,"seed":"s","size":"tiny",'
+        f'"split":"cavity","subset":"test","variables":{{"v":"{inner.hexdigest()}"}}}}'
+    )
+    hasher = ContentHasher(IDENTITY)
+    hasher.declare("v", values.dtype, ("a",), values.shape)
+    hasher.update("v", values)
+    assert hasher.hexdigest() == hashlib.sha256(text.encode()).hexdigest()
+    for key in (
+        "split",
+        "size",
+        "major",
+        "scenario",
+        "subset",
+        "seed",
+    ):  # another one is another scenario
+        assert (
+            ContentHasher({**IDENTITY, key: 7}).hexdigest()
+            != ContentHasher(IDENTITY).hexdigest()
+        )
+
+
+@given(FLOATS, st.data())
+def test_pieces_order_and_endianness_do_not_matter(
+    values: NDArray[Any], data: st.DataObject
+) -> None:
+    """Any cut into pieces, memory order and byte order gives the hash of the whole."""
+    cut = data.draw(st.integers(0, values.shape[0]))
+    dims = tuple("abcdef"[: values.ndim])
+    hasher = VariableHasher("position", values.dtype, dims, values.shape)
+    hasher.update(values[:cut])
+    big_endian = values.dtype.newbyteorder(">")
+    rest = np.asfortranarray(values[cut:])
+    hasher.update(rest.astype(big_endian))
+    assert hasher.hexdigest() == digest(values)
+
+
+@given(FLOATS, st.data())
+def test_any_change_of_a_value_changes_the_hash(
+    values: NDArray[Any], data: st.DataObject
+) -> None:
+    """One flipped bit matters, except the sign of zero and what a NaN carries."""
+    flat = values.reshape(-1).copy()
+    place = data.draw(st.integers(0, flat.size - 1))
+    bit = data.draw(st.integers(0, 8 * flat.itemsize - 1))
+    before = flat[place].copy()
+    bits = flat.view(f"<u{flat.itemsize}")
+    unsigned = bits.dtype.type
+    bits[place] ^= unsigned(1) << unsigned(bit)
+    after = flat[place]
+    are_zeros = before == 0 and after == 0
+    are_nans = np.isnan(before) and np.isnan(after)
+    has_same_hash = digest(flat.reshape(values.shape)) == digest(values)
+    assert has_same_hash == (are_zeros or are_nans)
+    # The smallest integer is a value like any other, not a zero.
+    whole = np.zeros((2, 3), np.int32)
+    least = np.full((2, 3), -(2**31), np.int32)
+    assert len({digest(whole), digest(least), digest(whole + 1)}) == 3
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_every_nan_is_one(dtype: Any) -> None:
+    """NaN of any sign and payload, quiet or signalling, hashes as the canonical one."""
+    item_bytes = np.dtype(dtype).itemsize
+    quiet = np.full(4, np.nan, dtype)
+    bits = quiet.view(f"u{item_bytes}").copy()
+    unsigned = bits.dtype.type
+    sign = 1 << (8 * item_bytes - 1)
+    bits[1] |= unsigned(sign)
+    bits[2] |= unsigned(5)
+    exponent = np.array(np.inf, dtype).view(bits.dtype)
+    bits[3] = exponent | unsigned(1)
+    assert digest(bits.view(dtype)) == digest(quiet)
+
+
+@given(FLOATS.filter(lambda values: values.dtype == np.float32))
+def test_name_type_dims_and_shape_matter(values: NDArray[Any]) -> None:
+    """Equal bytes under another header have another hash."""
+    base = digest(values)
+    with np.errstate(all="ignore"):
+        wider = values.astype(np.float64)
+    longer = values[None]
+    others = {
+        digest(values, name="velocity"),
+        digest(values, dims=tuple("zyxwvu"[: values.ndim])),
+    }
+    others |= {digest(wider), digest(longer, dims=(*"abcdef"[: values.ndim], "g"))}
+    others |= {digest(values.reshape(-1).view(np.int32).reshape(values.shape))}
+    assert base not in others
+    assert len(others) == 5
+
+
+@given(
+    st.lists(
+        st.text(st.characters(codec="utf-8", exclude_characters="\0")),
+        min_size=2,
+        max_size=5,
+    )
+)
+def test_string_borders_matter(texts: list[str]) -> None:
+    """Moving a letter from one string to the next changes the hash."""
+    moved = [texts[0] + texts[1], "", *texts[2:]]
+    same = moved == texts
+    assert (digest(np.array(moved, object)) == digest(np.array(texts, object))) == same
+
+
+@given(
+    st.dictionaries(
+        st.text("abc", min_size=1, max_size=3),
+        st.one_of(
+            st.integers(-9, 9),
+            st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=False),
+            st.text("xyz", max_size=3),
+        ),
+        min_size=1,
+    ),
+    st.data(),
+)
+def test_any_change_of_a_parameter_matters(
+    parameters: dict[str, Any], data: st.DataObject
+) -> None:
+    """Name and value of each parameter enter; their order does not."""
+    hashed = ContentHasher({**IDENTITY, "parameters": parameters}).hexdigest()
+    backwards = dict(reversed(parameters.items()))
+    assert ContentHasher({**IDENTITY, "parameters": backwards}).hexdigest() == hashed
+    name = data.draw(st.sampled_from(sorted(parameters)))
+    renamed = {**parameters, name + "d": parameters[name]}
+    del renamed[name]
+    assert ContentHasher({**IDENTITY, "parameters": renamed}).hexdigest() != hashed
+    assert (
+        ContentHasher(
+            {**IDENTITY, "parameters": {**parameters, name: "other"}}
+        ).hexdigest()
+        != hashed
+    )
+
+
+def test_variables_can_arrive_side_by_side() -> None:
+    """Frames of two variables in turn hash as one variable after the other."""
+    position = np.arange(12, dtype=np.float32).reshape(3, 2, 2)
+    hashed = []
+    for pieces in (position, position[None]):
+        hasher = ContentHasher(IDENTITY)
+        for name in ("velocity", "position"):
+            hasher.declare(
+                name, np.float32, ("frame", "particle", "space"), position.shape
+            )
+        for piece in pieces:
+            hasher.update("position", piece)
+            hasher.update("velocity", -piece)
+        hashed.append(hasher.hexdigest())
+    assert hashed[0] == hashed[1]
+
+
+def test_values_must_fit_what_was_declared() -> None:
+    """Too few, too many, another type: each is told with the variable's name."""
+    hasher = VariableHasher("position", np.float32, ("frame",), (2,))
+    with pytest.raises(DataError, match=r"another type.*\n.*'position'"):
+        hasher.update(np.zeros(1))
+    hasher.update(np.zeros(1, np.float32))
+    with pytest.raises(DataError, match=r"missing.*\n.*'position'"):
+        hasher.hexdigest()
+    with pytest.raises(DataError, match="too many"):
+        hasher.update(np.zeros(2, np.float32))
+    with pytest.raises(DataError, match="not a string"):
+        digest(np.array([1, None], object))
+    with pytest.raises(DataError, match="type cannot be hashed"):
+        dtype_name(np.complex64)
+
+
+@pytest.mark.parametrize(
+    "bad", [float("nan"), float("inf"), "a\0b", None, {1, 2}, [float("nan")]]
+)
+def test_what_has_no_canonical_json_is_refused(bad: object) -> None:
+    """Values that JSON cannot hold, or would hold ambiguously; those of NumPy become
+    what JSON has.
+    """
+    with pytest.raises(DataError, match="cannot be hashed"):
+        canonical_json({"a": bad})
+    given_values = [
+        np.float32(0.5),
+        np.array([3]),
+        b"a",
+        True,
+        np.int8(-1),
+        -0.0,
+        [np.float64(2)],
+    ]
+    assert repr([to_plain(value) for value in given_values]) == repr(
+        [0.5, 3, "a", 1, -1, 0.0, [2.0]]
+    )
+
+
+def test_hashes_of_subsets_data_sets_and_files_by_hand(tmp_path: Path) -> None:
+    """Lines by id, then one JSON text; `extra` stays outside, a missing subset is an
+    error.
+    """
+    (tmp_path / "f").write_bytes(b"abc")  # FIPS 180-2, appendix B.1
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert file_sha256(tmp_path / "f") == known
+    lines = f"0002 {'a' * 64}\n0010 {'b' * 64}\n"
+    assert (
+        subset_hash({10: "b" * 64, 2: "a" * 64})
+        == hashlib.sha256(lines.encode()).hexdigest()
+    )
+    subsets = {"valid": "1" * 64, "train": "0" * 64, "test": "2" * 64}
+    text = (
+        '{"major":1,"size":"tiny","split":"cavity","subsets":'
+        f'{{"test":"{"2" * 64}",'
+        f'"train":"{"0" * 64}",'
+        f'"valid":"{"1" * 64}"}}}}'
+    )
+    expected = hashlib.sha256(text.encode()).hexdigest()
+    assert dataset_hash("cavity", "tiny", 1, subsets) == expected
+    assert dataset_hash("cavity", "tiny", 1, {**subsets, "extra": "3" * 64}) == expected
+    with pytest.raises(DataError, match="valid"):
+        dataset_hash("cavity", "tiny", 1, {"train": "0" * 64, "test": "2" * 64})

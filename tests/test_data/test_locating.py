@@ -1,0 +1,242 @@
+"""Roots; splits by name and by path: what a user names is found, what a file names is
+not a path.
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import h5py
+import numpy as np
+import platformdirs
+import pytest
+from exchange_readers import straight_runs
+from scenario_factory import make_key
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.__main__ import app
+from lagbench.data.layout import dataset_folder, scenario_path
+from lagbench.data.local import (
+    is_split_name,
+    load_rooted_registry,
+    locate,
+    locate_new,
+    locate_split,
+    resolve_root,
+)
+from lagbench.data.registry import load
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.exchange import adopt
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.verify import verify
+
+
+def test_root_given_then_environment_then_platform(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Option, LAGBENCH_ROOT unless empty, user data folder; a root is made absolute, ~
+    is the home folder.
+    """
+    monkeypatch.setenv("LAGBENCH_ROOT", str(tmp_path / "b"))
+    assert resolve_root(tmp_path / "a") == tmp_path / "a"
+    assert resolve_root() == tmp_path / "b"
+    monkeypatch.setenv("LAGBENCH_ROOT", "")
+    assert resolve_root() == platformdirs.user_data_path("lagbench", appauthor=False)
+    monkeypatch.chdir(tmp_path)
+    assert resolve_root("data") == tmp_path / "data"
+    assert resolve_root("~/data") == Path.home() / "data"
+    assert (
+        scenario_path(Path("r"), make_key(7)).as_posix()
+        == "r/cavity/tiny/v2/test/0007.nc"
+    )
+
+
+@pytest.mark.parametrize(
+    "root",
+    [
+        "x" * 300,
+        "a/" * 3000,
+        "nul\0",
+        "",
+        " ",
+        "s3://",
+        "s3:",
+        "file:///",
+        "~nobodyx/y",
+    ],
+)
+def test_a_root_that_no_folder_can_be_named_is_ours_to_refuse(root: str) -> None:
+    """Too long, a NUL, nothing, a scheme alone, the home of nobody: exit code 2."""
+    with pytest.raises(UsageError) as caught:
+        resolve_root(root)
+    assert "--root" in str(caught.value.where)
+
+
+def test_an_empty_option_is_not_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A path made of nothing is ".", so the command line looks before."""
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["list", "--root", ""])
+    assert done.exit_code == 2
+    assert CliRunner().invoke(app, ["list", "--root", "."]).exit_code == 0
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    """A local split named own."""
+    folder = tmp_path_factory.mktemp("made")
+    np.save(folder / "runs.npy", np.stack(straight_runs(3)))
+    return adopt(
+        folder / "runs.npy", output=folder / "own", radius=0.1, frame_interval=0.1
+    )
+
+
+@pytest.fixture
+def own(made: LocalSplit, tmp_path: Path) -> Path:
+    """A copy of it that a test may change."""
+    shutil.copytree(made.folder, tmp_path / "root" / "own")
+    return tmp_path / "root" / "own"
+
+
+def test_all_ways_to_name_it(
+    own: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """By path, or by name with a root, LAGBENCH_ROOT or the current folder; a path is
+    in no other root.
+    """
+    monkeypatch.chdir(own.parent)
+    by_path = [
+        (name, None)
+        for name in (own, Path("own"), str(own), f"{own}/", "./own", "own/")
+    ]
+    for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
+        found = locate_split(split, root=root)
+        assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())
+    monkeypatch.chdir(own.parent.parent)
+    monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
+    assert locate_split("own").root == own.parent
+    assert locate("root/own").size.split == "own"
+    assert locate(str(own), root=own.parent).root == own.parent
+    with pytest.raises(UsageError, match="another root"):
+        locate(str(own), root=tmp_path)
+
+
+def test_ours_are_found_as_before(tmp_path: Path) -> None:
+    """A name of the registry means that split, whatever the root holds."""
+    (tmp_path / "cavity").mkdir()
+    (tmp_path / "cavity" / "split.yaml").write_text("format: 1")
+    found = locate("cavity", "tiny", root=tmp_path)
+    assert (found.size.generator, found.root) == (
+        "lagbench.generators.cavity",
+        tmp_path,
+    )
+    with pytest.raises(UsageError, match="taken by another split"):
+        locate(str(tmp_path / "cavity"), "tiny")
+
+
+def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
+    """One size there: that one. None or several: an error that names them. What is to
+    be made: mini.
+    """
+    with pytest.raises(UsageError) as none:
+        lagbench.open_split("cavity", root=tmp_path)
+    assert none.value.where == "--size"
+    for size in ("tiny", "full"):
+        folder = (
+            dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major)
+            / "test"
+        )
+        folder.mkdir(parents=True)
+        (folder / "0000.nc").touch()
+        if size == "tiny":
+            assert locate("cavity", root=tmp_path).size.name == "tiny"
+    for opened in (
+        lagbench.open_split,
+        lagbench.windows,
+        lagbench.load_manifest,
+        verify,
+    ):
+        with pytest.raises(UsageError) as several:
+            opened("cavity", root=tmp_path)
+        assert (several.value.where, several.value.fix) == ("--size", "--size full")
+    assert locate_new("cavity", root=tmp_path).size.name == "mini"
+    # Where a split has no mini, its only size is the default.
+    assert (
+        locate_new("own", root=own.parent).size.name
+        == locate("own", root=own.parent).size.name
+    )
+
+
+def test_unknown_names_list_local_ones(own: Path) -> None:
+    """The nearest known name may be that of a local split."""
+    with pytest.raises(UsageError, match="did you mean 'own'"):
+        locate("owm", root=own.parent)
+    with pytest.raises(UsageError, match="no local split there"):
+        locate(str(own.parent / "other"))
+    with pytest.raises(UsageError, match="has no size 'tiny'"):
+        locate(str(own), "tiny")
+
+
+def test_a_folder_may_be_moved_but_not_renamed(
+    own: Path, made: LocalSplit, tmp_path: Path
+) -> None:
+    """The name is part of every hash, so the folder must keep it; where it lies is part
+    of nothing.
+    """
+    moved = Path(shutil.move(own, tmp_path / "own"))
+    assert lagbench.verify(str(moved)).dataset_sha256 == made.dataset_sha256
+    with pytest.raises(UnreadableFileError, match="not named like its split"):
+        locate(str(moved.rename(moved.with_name("mine"))))
+
+
+def test_a_description_harms_no_other_split_and_chooses_no_code(own: Path) -> None:
+    """It is told only when it is asked for; a generator in it, which would be imported,
+    is refused.
+    """
+    path = own / "split.yaml"
+    path.write_text(
+        path.read_text().replace("generator: none", "generator: antigravity")
+    )
+    with pytest.raises(UnreadableFileError, match="cannot name a generator"):
+        locate(str(own))
+    path.write_text("splits: [")
+    assert locate("cavity", "tiny", root=own.parent).size.split == "cavity"
+    with pytest.raises(UnreadableFileError, match="not a plain YAML file"):
+        locate("own", root=own.parent)
+
+
+@pytest.mark.parametrize(
+    "name", ["../own", "/etc", "own/", ".", "..", "", "Own", "a b", "a" * 65, "own\0"]
+)
+def test_paths_are_no_names(name: str) -> None:
+    """Whatever could leave the root folder cannot be the name of a split."""
+    assert not is_split_name(name)
+
+
+@pytest.mark.parametrize("path", ["relative", "absolute"])
+def test_predictions_cannot_name_paths(own: Path, tmp_path: Path, path: str) -> None:
+    """A stranger's file whose split is the path of a local split is for no known
+    split.
+    """
+    target = tmp_path / "predictions.nc"
+    lagbench.template(str(own), output=target)
+    assert lagbench.validate(target, root=own.parent, isolated=False).valid
+    with h5py.File(target, "a") as file:
+        file.attrs["split"] = "../root/own" if path == "relative" else str(own)
+    result = lagbench.validate(target, root=own.parent, isolated=False)
+    assert [finding.check for finding in result.errors] == ["split"]
+    assert not lagbench.validate(target, isolated=False).valid
+
+
+def test_a_rooted_registry_leaves_its_base_alone(own: Path) -> None:
+    """Looking up a local split adds it to no other registry, nor to another root's."""
+    base = load()
+    known = load_rooted_registry(own.parent, base)
+    assert known.split("own").generator == "none"
+    assert "own" not in base.splits
+    assert load_rooted_registry(own.parent.parent, known).local_names() == ()
+    with pytest.raises(UsageError):
+        load_rooted_registry(own.parent.parent, known).split("own")

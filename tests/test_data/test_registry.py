@@ -1,0 +1,533 @@
+"""The registry: the numbers of design and thesis; mistakes, limits and packages of
+others that are named.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lagbench.data import registry
+from lagbench.data.limits import NEEDED, SUBSETS, Limit
+from lagbench.data.registry import Registry, default_path, load
+from lagbench.data.yamlfile import read_yaml
+from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.generators.constants import LIMITS
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
+
+SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
+
+
+@pytest.mark.parametrize(
+    ("split", "interval", "expected"),
+    [
+        ("fluid", 1 / 60, (2500, 128, 20, 22_800, 28, 8, 16)),
+        ("multimaterial", 1 / 60, (2500, 64, 20, 43_200, 48, 8, 16)),
+        ("cavity", 0.1, (8192, 40, 50, 45_600, 48, 8, 20)),
+        ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
+    ],
+)
+def test_full_sizes_are_those_of_the_documentation(
+    split: str, interval: float, expected: tuple[int, ...]
+) -> None:
+    """Particles, grid, substeps, frames and scenarios of train, valid and test."""
+    full = load().size(split, "full")
+    frame_count = 0
+    scenario_counts = []
+    for name in ("train", "valid", "test"):
+        ids = full.subsets[name]
+        scenario_counts.append(len(ids))
+        frame_count += sum(full.frame_count(scenario) for scenario in ids)
+    numbers = (full.particles, full.grid, full.substeps_per_frame, frame_count)
+    assert (*numbers, *scenario_counts) == expected
+    assert full.frame_interval == pytest.approx(interval, rel=1e-15)
+    assert full.dt == pytest.approx(interval / full.substeps_per_frame, rel=1e-15)
+
+
+def test_subsets_are_runs_of_ids() -> None:
+    """The subset extra and the long scenarios of fluid are the documented ones."""
+    registry = load()
+    fluid = registry.size("fluid", "full")
+    assert fluid.subsets["test"] == tuple(range(36, 52))
+    assert fluid.subsets["valid"] == tuple(range(28, 36))
+    assert fluid.frame_count(0) == 600
+    assert fluid.frame_count(26) == 600
+
+    multimaterial = registry.size("multimaterial", "full")
+    extra = multimaterial.subsets["extra"]
+    assert extra == tuple(range(72, 87))
+    assert {multimaterial.frame_count(scenario) for scenario in extra} == {1200}
+
+    cavity = registry.size("cavity", "full")
+    assert cavity.subsets["test"] == tuple(range(56, 76))
+    noise = registry.size("curl-noise", "full")
+    assert noise.subsets["test"] == tuple(range(56, 72))
+
+
+@pytest.mark.parametrize("size", ["full", "mini", "tiny"])
+@pytest.mark.parametrize("split", SPLITS)
+def test_every_size_is_consistent(split: str, size: str) -> None:
+    """Frames cover the task, frames of interest are predicted ones, bounds lie in the
+    unit box.
+    """
+    entry = load().size(split, size)
+    task = entry.task
+    last = task.input_frames + task.horizon - 1
+    assert all(entry.frame_count(i) > last for i in entry.subsets["test"])
+    assert all(task.input_frames <= frame <= last for frame in task.frames_of_interest)
+    assert all(0.0 < low < high < 1.0 for low, high in entry.bounds)
+    assert all(
+        low + high == pytest.approx(1.0, abs=1e-12) for low, high in entry.bounds
+    )
+    assert set(entry.subsets) <= set(SUBSETS)
+    assert entry.scenarios == tuple(
+        sorted({i for ids in entry.subsets.values() for i in ids})
+    )
+    assert all(
+        p.unit and p.description and p.value is not None
+        for p in entry.parameters.values()
+    )
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_mini_and_tiny_are_small_relatives(split: str) -> None:
+    """As many particles per cell, the same frame interval, substeps as cells; tiny for
+    tests.
+    """
+    full, mini, tiny = (load().size(split, size) for size in ("full", "mini", "tiny"))
+    inside = [
+        (size.bounds[0][1] - size.bounds[0][0]) * size.grid for size in (full, mini)
+    ]
+    if split in ("cavity", "curl-noise"):
+        per_cell = [
+            size.particles / cells**2
+            for size, cells in zip((full, mini), inside, strict=True)
+        ]
+        assert per_cell[1] == pytest.approx(per_cell[0], rel=0.06)
+    else:
+        assert mini.particles == full.particles / 4
+    assert mini.frame_interval == tiny.frame_interval == full.frame_interval
+    assert mini.substeps_per_frame / mini.grid == full.substeps_per_frame / full.grid
+    assert 256 <= tiny.particles <= 640
+    assert len(mini.subsets["train"]) == 24
+    assert mini.scenarios == tuple(range(len(mini.scenarios)))
+
+
+Change = Callable[[dict[str, Any]], object]
+
+
+def edited(tmp_path: Path, change: Change) -> Path:
+    """Write a copy of our registry after a function has changed it."""
+    data = read_yaml(default_path())
+    data.pop("measured", None)
+    change(data["splits"])
+    path = tmp_path / "datasets.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def within(*below: str, **values: object) -> Change:
+    """Return a change of a mapping in a registry; None takes a key away."""
+
+    def change(splits: dict[str, Any]) -> None:
+        entry = splits
+        for key in below:
+            entry = entry[key]
+        entry.update(values)
+        for key in [key for key, value in values.items() if value is None]:
+            del entry[key]
+
+    return change
+
+
+cavity = partial(within, "cavity", "sizes", "full")
+tiny = partial(within, "fluid", "sizes", "tiny", "parameters")
+always = partial(within, "fluid", "parameters")  # what fluid declares for all sizes
+
+
+def test_unknown_names_offer_the_nearest() -> None:
+    """Split, size, parameter and scenario, each with what is known."""
+    with pytest.raises(UsageError, match="did you mean 'multimaterial'"):
+        load().size("multimatrial", "full")
+    with pytest.raises(UsageError, match="did you mean 'full'"):
+        load().size("fluid", "ful")
+    with pytest.raises(UsageError, match="did you mean 'liquid_modulus'"):
+        load().size("fluid", "full").value("liqid_modulus")
+    with pytest.raises(UsageError, match="extra 72-86"):
+        load().size("multimaterial", "full").subset_of(87)
+
+
+def test_a_registry_of_ones_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LAGBENCH_REGISTRY replaces ours; a change of the file is seen in the same
+    process.
+
+    YAML reads hexadecimals of any length, which Python does not print.
+    """
+    path = edited(tmp_path, lambda splits: splits.pop("fluid"))
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
+    assert set(load().splits) == {"cavity", "curl-noise", "multimaterial"}
+    edited(tmp_path, lambda splits: splits.pop("cavity"))
+    assert set(load().splits) == {"fluid", "curl-noise", "multimaterial"}
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(tmp_path / "none.yaml"))
+    with pytest.raises(UnreadableFileError, match=r"none\.yaml"):
+        load()
+    path.write_text(f"format: 0x{'f' * 5000}")
+    refused(path, ("format",), lambda: load(path))
+
+
+def renamed(split: str, old: str, new: str) -> Change:
+    """Return a change of a parameter's name, wherever it stands."""
+
+    def change(splits: dict[str, Any]) -> None:
+        entry = splits[split]
+        for mapping in (
+            entry["parameters"],
+            *(s["parameters"] for s in entry["sizes"].values()),
+        ):
+            if old in mapping:
+                mapping[new] = mapping.pop(old)
+
+    return change
+
+
+def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> None:
+    """Assert that a call names file and parts, exit code 3."""
+    with pytest.raises(UnreadableFileError) as caught:
+        call()
+    text = str(caught.value)
+    assert caught.value.exit_code == 3
+    assert all(part in text for part in (str(path), *parts)), text
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (within("cavity", splts={}), ("cavity", "unknown key 'splts'")),
+        (cavity(taks={}), ("splits.cavity.sizes.full", "did you mean 'task'?")),
+        (cavity("task", radios=1.0), ("task", "did you mean 'radius'?")),
+        (cavity("task", horizon="ninety"), ("task.horizon", "valid integer")),
+        (cavity("parameters", gird=40), ("cavity", "did you mean 'grid'?")),
+        (cavity("parameters", grid=None), ("cavity", "no value for grid")),
+        (cavity("subsets", test="54-x"), ("subsets.test", "no id and no range")),
+        (cavity("subsets", tset="90"), ("cavity", "did you mean 'test'?")),
+        (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
+        (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
+        (within("cavity", version="1.0"), ("cavity.version", "match pattern")),
+        (
+            lambda splits: splits["cavity"]["sizes"].update(
+                {"../x": dict(splits["cavity"]["sizes"].pop("tiny"))}
+            ),
+            ("cavity.sizes", "../x", "match pattern"),
+        ),
+        (
+            tiny(substeps_per_frame="many"),
+            ("tiny.parameters.substeps_per_frame", ">= 1", "'many'"),
+        ),
+        (
+            tiny(substeps_per_frame=2.5),
+            ("tiny.parameters.substeps_per_frame", "an integer", "2.5"),
+        ),
+        (
+            tiny(substeps_per_frame=0),
+            ("tiny.parameters.substeps_per_frame", ">= 1", "0"),
+        ),
+        (
+            tiny(particles=True),
+            ("tiny.parameters.particles", "an integer, >= 1", "True"),
+        ),
+        (
+            tiny(particles=99999999999),
+            ("tiny.parameters.particles", "<= 10000000", "99999999999"),
+        ),
+        (tiny(grid=10**6), ("tiny.parameters.grid", "<= 4096", "1000000")),
+        (
+            always("frame_rate", value=0),
+            ("parameters.frame_rate.value", "a finite number, > 0", "got 0"),
+        ),
+        (
+            always("gravity", value=math.nan),
+            ("parameters.gravity.value", "a finite number", "nan"),
+        ),
+        (
+            always("gravity", value=math.inf),
+            ("parameters.gravity.value", "a finite number", "inf"),
+        ),
+        (
+            within("fluid", "sizes", "tiny", frames=0),
+            ("sizes.tiny.frames", "an integer, >= 1", "got 0"),
+        ),
+        (
+            within("fluid", "sizes", "tiny", frames={31: "0-3", 32: "4"}),
+            ("sizes.tiny.frames", "horizon = 32 for test scenario 3", "got 31"),
+        ),
+        (
+            renamed("fluid", "particles", "particels"),
+            ("'particles'", "did you mean 'particels'?"),
+        ),
+        (
+            renamed("cavity", "density", "denstiy"),
+            ("'density'", "did you mean 'denstiy'?", "needs"),
+        ),
+    ],
+)
+def test_mistakes_are_named_on_load(
+    change: Change, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """An unknown key or a value that cannot be: file, key, what is expected, what was
+    got.
+    """
+    path = edited(tmp_path, change)
+    refused(path, parts, lambda: load(path))
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (
+            renamed("fluid", "gravity", "gravty"),
+            ("parameter gravity", "did you mean 'gravty'?"),
+        ),
+        (
+            always("gravity", value="down"),
+            ("parameter gravity", "a finite number", "'down'"),
+        ),
+        (
+            always("liquid_modulus", value=-1.0),
+            ("parameter liquid_modulus", "a finite number, > 0", "-1.0"),
+        ),
+        (
+            always("jacobian_relaxation", value=2),
+            ("parameter jacobian_relaxation", ">= 0 and <= 1", "2"),
+        ),
+        (tiny(wall=16), ("parameter wall", "an integer, >= 0 and <= 14", "16")),
+        (
+            always("area_min", value="big"),
+            ("size tiny", "generators.fluid can use", "area_min = 'big'"),
+        ),
+        (
+            renamed("fluid", "area_max", "aera_max"),
+            ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
+        ),
+    ],
+)
+def test_a_solver_that_cannot_be_fed_is_refused_before_work(
+    change: Change, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """By ``generate``, dry or not, and by ``verify --regenerate``; nothing is
+    written.
+    """
+    path = edited(tmp_path, change)
+    root = tmp_path / "data"
+    options = {"root": root, "registry": load(path), "workers": 1}
+    for dry_run in (True, False):
+        refused(
+            path,
+            parts,
+            lambda dry_run=dry_run: generate(
+                "fluid", "tiny", dry_run=dry_run, **options
+            ),
+        )
+    assert [
+        p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")
+    ] == []
+    refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
+
+
+def test_our_own_values_hold_with_room() -> None:
+    """Every number of ours lies within its limit, at every size, or the limits are
+    wrong.
+    """
+    for split, entry in load().splits.items():
+        for name in entry.sizes:
+            size = load().size(split, name)
+            for parameter, limit in {**LIMITS, **NEEDED}.items():
+                if parameter in size.parameters:
+                    assert limit.holds(size.value(parameter)), (split, name, parameter)
+
+
+@given(st.one_of(st.integers(), st.floats(), st.booleans(), st.text()))
+def test_limits_agree_with_their_words(value: object) -> None:
+    """An integer from -2 to 5, exclusive of 5, is what `holds` says, whatever the
+    type.
+    """
+    whole = Limit(low=-2, high=5, whole=True, open_high=True)
+    assert whole.holds(value) == (type(value) is int and value in range(-2, 5))
+    real = Limit(low=0.0, open_low=True)
+    assert real.holds(value) == (type(value) in (int, float) and 0 < value < math.inf)  # type: ignore[operator]
+    assert str(whole) == "an integer, >= -2 and < 5"
+    assert str(real) == "a finite number, > 0"
+
+
+Plug = Callable[..., Registry]
+
+
+@pytest.fixture
+def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Plug]:
+    """A function that loads our registry with other packages' modules, given as
+    name=source.
+    """
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delenv(registry.REGISTRY_VARIABLE, raising=False)
+
+    def plug(**sources: str) -> Registry:
+        points = [EntryPoint("cavity", "lagbench.generators.cavity", registry.GROUP)]
+        for name, source in sources.items():
+            (tmp_path / f"{name}_split.py").write_text(source)
+            points += 2 * [
+                EntryPoint(name, f"{name}_split", registry.GROUP)
+            ]  # found on two paths
+        monkeypatch.setattr(registry, "list_entry_points", lambda group: points)
+        registry._load.cache_clear()
+        return load()
+
+    yield plug
+    registry._load.cache_clear()
+
+
+@pytest.fixture
+def theirs(tmp_path: Path) -> str:
+    """A datasets.yaml of a split of one's own that also rewrites the cavity and its
+    hash.
+    """
+    data = read_yaml(default_path())
+    splits = {"sloshing": data["splits"]["fluid"], "cavity": data["splits"]["cavity"]}
+    splits["cavity"]["title"] = "Hijacked"
+    nothing = {
+        "subset_sha256": {},
+        "scenario_sha256": {},
+        "statistics": {},
+        "twin_floor": [],
+    }
+    measured = {"cavity": {"tiny": {"dataset_sha256": "0" * 64, **nothing}}}
+    path = tmp_path / "theirs.yaml"
+    path.write_text(
+        yaml.safe_dump({"format": 1, "splits": splits, "measured": measured})
+    )
+    return str(path)
+
+
+def test_other_packages_add_splits_and_change_none(plugged: Plug, theirs: str) -> None:
+    """Only the split that an entry point names is taken: our split and its hash stay
+    ours.
+    """
+    before = load(default_path())
+    found = plugged(sloshing=f"REGISTRY = {theirs!r}")
+    assert set(found.splits) == {*before.splits, "sloshing"}
+    assert found.size("sloshing", "tiny").particles == 256
+    assert found.size("cavity", "tiny") == before.size("cavity", "tiny")
+    assert found.split("cavity") == before.split("cavity")
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "reason"),
+    [
+        ("careless", "", "REGISTRY"),
+        (
+            "broken",
+            "import no_such_module_at_all",
+            "ModuleNotFoundError.*no_such_module_at_all",
+        ),
+        ("lost", "REGISTRY = '/nowhere/datasets.yaml'", "/nowhere/datasets.yaml"),
+        ("silent", "REGISTRY = {theirs!r}", "no split 'silent'"),
+        ("cavity", "REGISTRY = {theirs!r}", "its name is taken"),
+    ],
+)
+def test_a_broken_package_is_left_out(
+    name: str, source: str, reason: str, plugged: Plug, theirs: str
+) -> None:
+    """A package that cannot be imported or read costs one warning that names it, and
+    none of our splits.
+    """
+    with pytest.warns(
+        registry.PluginWarning, match=f"(?s)package {name}_split .*{reason}"
+    ) as told:
+        found = plugged(**{name: source.format(theirs=theirs)})
+    assert len(told) == 1
+    assert found.splits == load(default_path()).splits
+
+
+def test_packages_come_and_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package installed after the first look is found, and one that was uninstalled
+    is not.
+    """
+    monkeypatch.syspath_prepend(tmp_path)
+    os.utime(tmp_path, (0, 0))  # times of change have some milliseconds of grain
+    assert registry.list_entry_points("some.group") == ()
+    folder = tmp_path / "wave_splits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
+    )
+    (folder / "entry_points.txt").write_text("[some.group]\nwaves = wave_splits\n")
+    assert [point.name for point in registry.list_entry_points("some.group")] == [
+        "waves"
+    ]
+    shutil.rmtree(folder)
+    os.utime(tmp_path, (1, 1))
+    assert registry.list_entry_points("some.group") == ()
+
+
+def test_a_broken_package_breaks_no_command(tmp_path: Path) -> None:
+    """An installed package whose module is gone: the command works, one line on stderr
+    names the package.
+    """
+    folder = tmp_path / "wave_splits-1.0.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: wave-splits\nVersion: 1.0\n"
+    )
+    (folder / "entry_points.txt").write_text(
+        f"[{registry.GROUP}]\nwaves = wave_splits.gone\n"
+    )
+    code = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r}); "
+        "from lagbench.__main__ import app; app()"
+    )
+    command = [sys.executable, "-c", code, "cite", "cavity", "--json"]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert '"split": "cavity"' in done.stdout
+    assert done.stderr.startswith("warning: package wave-splits adds no split 'waves'")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("split", "expected"),
+    [("cavity", (0.002191, 0.002195)), ("curl-noise", (1.600e-03, 1.600e-03))],
+)
+def test_statistics_of_train_are_those_of_the_thesis(
+    split: str, expected: tuple[float, float]
+) -> None:
+    """Standard deviations of per-frame velocities within 5 % of Tables 5.1 and 5.3, by
+    component.
+
+    Positions of curl noise spread as in Table 5.1 (0.272): a uniform box of this width
+    gives it within 2 %.
+    """
+    size = load().size(split, "full")
+    assert size.measured.statistics["velocity_std"] == pytest.approx(expected, rel=0.05)
+    if split == "curl-noise":
+        (low, high), _ = size.bounds
+        uniform = (high - low) / 12**0.5
+        assert size.measured.statistics["position_std"] == pytest.approx(
+            (uniform, uniform), rel=1e-3
+        )
+        assert uniform == pytest.approx(0.272, rel=0.02)

@@ -1,0 +1,728 @@
+"""Adopting one's own trajectories: what goes in comes out, hashed, with a task, or an
+error says why not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import netCDF4
+import numpy as np
+import pytest
+from exchange_readers import straight_runs
+from numpy.typing import NDArray
+from typer.testing import Result
+
+import lagbench
+from lagbench.data.checksums import dataset_hash, subset_hash
+from lagbench.data.local import locate
+from lagbench.data.scenario import check_scenario, read_scenario
+from lagbench.errors import (
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+    WorkFailedError,
+)
+from lagbench.exchange import adopt, import_split, local_split
+from lagbench.exchange.adoption import _divide_into_subsets
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
+from lagbench.work.progress import Progress
+
+BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
+Runs = list[NDArray[np.float32]]
+Run = Callable[..., Result]
+
+
+def save_runs(folder: Path, runs: Runs) -> list[Path]:
+    """Write each trajectory to a .npy file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"run{number}.npy" for number in range(len(runs))]
+    for path, run in zip(paths, runs, strict=True):
+        np.save(path, run)
+    return paths
+
+
+def adopted(folder: Path, runs: Runs, **options: Any) -> LocalSplit:
+    """Adopt each trajectory from a file of its own."""
+    return adopt(
+        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **options}
+    )
+
+
+def stored(made: LocalSplit, number: int, name: str) -> NDArray[Any]:
+    """Return an array of a scenario."""
+    size, root, _ = locate(str(made.folder))
+    with read_scenario(size.path(root, number)) as file:
+        return file.read(name)
+
+
+@pytest.fixture(scope="module")
+def runs() -> Runs:
+    """Six trajectories of 12 frames and 40 particles."""
+    return straight_runs(6)
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory, runs: Runs) -> LocalSplit:
+    """A local split of these trajectories, four to train on."""
+    return adopted(tmp_path_factory.mktemp("own"), runs)
+
+
+def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None:
+    """Every subset of the opened split holds the arrays bit for bit, the last ones in
+    test.
+
+    v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1).
+    """
+    for subset, wanted in {
+        "train": runs[:4],
+        "valid": runs[4:5],
+        "test": runs[5:],
+    }.items():
+        with lagbench.open_split(str(own.folder), subset=subset) as data:
+            np.testing.assert_array_equal(data["position"].values, np.stack(wanted))
+            assert data["time"].values[-1] == 11 * 0.25
+    velocity = stored(own, 0, "velocity")
+    wanted = (np.diff(runs[0].astype(np.float64), axis=0) / 0.25).astype(np.float32)
+    np.testing.assert_array_equal(velocity[1:], wanted)
+    np.testing.assert_array_equal(velocity[0], wanted[0])
+
+
+def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
+    """The data set hash is that of the files' own content hashes, and what split.yaml
+    records.
+    """
+    size, root, _ = locate(str(own.folder))
+    content = {i: check_scenario(size.path(root, i)) for i in range(6)}
+    parts = {
+        "train": range(4),
+        "valid": [4],
+        "test": [5],
+    }
+    subsets = {
+        name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()
+    }
+    assert own.dataset_sha256 == dataset_hash("mine", "full", 1, subsets)
+    assert size.measured is not None
+    assert size.measured.dataset_sha256 == own.dataset_sha256
+    assert size.measured.scenario_sha256 == {
+        i: digest[:16] for i, digest in content.items()
+    }
+
+
+def test_the_same_arrays_give_the_same_split(
+    own: LocalSplit, tmp_path: Path, runs: Runs
+) -> None:
+    """Once in files of their own, once as one array of four dimensions."""
+    np.save(tmp_path / "all.npy", np.stack(runs))
+    made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", **BASIC)
+    assert made.dataset_sha256 == own.dataset_sha256
+    assert (made.folder / "split.yaml").read_bytes() == (
+        own.folder / "split.yaml"
+    ).read_bytes()
+
+
+def test_a_local_split_is_verified_templated_and_scored(
+    own: LocalSplit, tmp_path: Path
+) -> None:
+    """Commands take its folder; straight flight is what the constant-velocity floor
+    predicts.
+    """
+    path = str(own.folder)
+    assert lagbench.verify(path).verdict == "equal to split.yaml"
+    target = tmp_path / "predictions.nc"
+    lagbench.template(path, output=target)
+    card = lagbench.score(
+        target,
+        root=own.folder.parent,
+        output_dir=tmp_path,
+        workers=1,
+    )
+    floor = card.scores["constant-velocity"]["position_rmse"]
+    assert np.max(floor.per_frame) < 1e-5
+    assert np.min(card.scores["persistence"]["position_rmse"].per_frame) > 1e-3
+    assert card.header.split == "mine"
+
+
+def test_progress_counts_towards_the_number_of_trajectories(tmp_path: Path) -> None:
+    """Each subset ends with all of its trajectories written, of as many."""
+    told: dict[str, Progress] = {}
+    adopted(
+        tmp_path,
+        straight_runs(6),
+        test=2,
+        progress=lambda news: told.update({news.stage: news}),
+    )
+    counts = {
+        stage: (news.scenarios_done, news.scenarios, news.total)
+        for stage, news in told.items()
+    }
+    assert counts == {
+        "writing train": (3, 3, 3),
+        "writing valid": (1, 1, 1),
+        "writing test": (2, 2, 2),
+    }
+
+
+def test_ten_comes_after_two(tmp_path: Path) -> None:
+    """Files count by the numbers in their names, as a shell lists them or in a folder;
+    others stay.
+    """
+    names = [f"run{n}.npz" for n in (0, 1, 10, 11, 2)]
+    for name in names:
+        (tmp_path / name).write_bytes(b"1")
+    given = [tmp_path / name for name in names]
+    wanted = {
+        "train": ["run0", "run1", "run2"],
+        "valid": ["run10"],
+        "test": ["run11"],
+    }
+    for paths in (given, [tmp_path]):
+        found = _divide_into_subsets(paths, valid=1, test=1)
+        assert {
+            subset: [path.stem for path, _ in rows] for subset, rows in found.items()
+        } == wanted
+    found = _divide_into_subsets(given[::-1], valid=1, test=1)
+    assert [path.stem for path, _ in found["test"]] == ["run0"]
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz", "nc"])
+def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
+    """It is told as such, and not counted among too few."""
+    save_runs(tmp_path, straight_runs(2))
+    (tmp_path / f"run2.{ending}").touch()
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(tmp_path, output=tmp_path / "mine", **BASIC)
+    assert caught.value.where == str(tmp_path / f"run2.{ending}")
+
+
+def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
+    """An .npz file may hold velocities, materials and walls; all of them are stored."""
+    named = {
+        "material": np.arange(40) % 4,
+        "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]]),
+    }
+    for number, run in enumerate(runs[:3]):
+        np.savez(
+            tmp_path / f"{number}.npz",
+            position=run,
+            velocity=-run,
+            **named,
+        )
+    made = adopt(
+        [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
+    )
+    np.testing.assert_array_equal(stored(made, 2, "velocity"), -runs[2])
+    np.testing.assert_array_equal(stored(made, 2, "material"), named["material"])
+    np.testing.assert_array_equal(
+        stored(made, 2, "wall_velocity")[5], named["wall_velocity"]
+    )
+
+
+def variable(
+    file: netCDF4.Dataset, shape: tuple[int, ...], kind: str
+) -> netCDF4.Variable:
+    """Return a new variable for positions."""
+    names = ("time", "point", "axis")
+    for name, length in zip(names, shape, strict=True):
+        file.createDimension(name, length)
+    return file.createVariable("position", kind, names)
+
+
+def test_netcdf(tmp_path: Path, runs: Runs) -> None:
+    """NetCDF files of double precision in subset folders are read frame by frame,
+    rounded once.
+    """
+    for number, subset in enumerate(("train", "valid", "test")):
+        (tmp_path / "in" / subset).mkdir(parents=True)
+        with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
+            variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
+    made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+    assert made.scenarios == {
+        "train": 1,
+        "valid": 1,
+        "test": 1,
+    }
+    wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
+    np.testing.assert_array_equal(stored(made, 2, "position"), wanted)
+
+
+def test_packed_netcdf_is_refused(tmp_path: Path, runs: Runs) -> None:
+    """Values that stand for others by scale_factor would be taken for positions: the
+    file is named.
+    """
+    paths = save_runs(tmp_path, runs[:2])
+    with netCDF4.Dataset(tmp_path / "packed.nc", "w") as file:
+        position = variable(file, runs[2].shape, "f4")
+        position.scale_factor = 2.0
+        position[:] = runs[2]
+    with pytest.raises(UnreadableFileError, match="packed"):
+        adopt([*paths, tmp_path / "packed.nc"], output=tmp_path / "mine", **BASIC)
+
+
+def test_the_folder_of_another_writer_is_left_alone(
+    tmp_path: Path, runs: Runs, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A temporary folder of the same name, as of another machine, is neither used nor
+    removed.
+    """
+    theirs = tmp_path / ".mine.partial"
+    theirs.mkdir()
+    monkeypatch.setattr(local_split, "temporary_name", lambda _: theirs)
+    with pytest.raises(WorkFailedError, match="cannot write there"):
+        adopted(tmp_path, runs)
+    assert theirs.is_dir()
+
+
+def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
+    """Ragged trajectories are padded when opened; the task follows the shortest test
+    scenario.
+    """
+    shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
+    ragged = [
+        straight_runs(
+            1,
+            frames=f,
+            particles=p,
+            seed=f,
+        )[0]
+        for f, p in shapes
+    ]
+    made = adopted(tmp_path, ragged, test=2)
+    assert (made.horizon, made.particles) == (12, (25, 40))
+    with lagbench.open_split(str(made.folder), subset="train") as data:
+        assert data["frame_count"].values.tolist() == [12, 20]
+        assert data["particle_count"].values.tolist() == [40, 30]
+        np.testing.assert_array_equal(data["position"].values[1, :20, :30], ragged[1])
+    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+    assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
+
+
+def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
+    """Test scenarios of different particle numbers can be opened, and a note says what
+    cannot be.
+    """
+    ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
+    made = adopted(tmp_path, ragged, test=2, valid=1)
+    assert "20 to 30 particles" in made.notes[0]
+    with pytest.raises(DataError, match="other frames or particles"):
+        lagbench.template(str(made.folder), output=tmp_path / "p.nc")
+
+
+def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
+    """A box of 3 is divided by 4: times 4, every position is the source's."""
+    wide = straight_runs(3, box=3.0)
+    made = adopted(
+        tmp_path,
+        wide,
+        radius=0.3,
+        bounds=((0.0, 3.0), (0.0, 3.0)),
+        rescale=True,
+    )
+    size = locate(str(made.folder)).size
+    assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (
+        0.075,
+        (0.0, 0.75),
+        4.0,
+    )
+    np.testing.assert_array_equal(stored(made, 0, "position") * 4, wide[0])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "scale", "corner"),
+    [
+        (
+            ((0.0, 1.0), (0.0, 0.5)),
+            1.0,
+            (0.0, 0.0),
+        ),
+        (
+            ((0.1, 5.3), (0.0, 2.0)),
+            8.0,
+            (0.0, 0.0),
+        ),
+        (
+            ((-1.0, 1.0), (0.0, 3.0)),
+            4.0,
+            (-1.0, 0.0),
+        ),
+        (
+            ((7.0, 7.5), (7.0, 7.25)),
+            8.0,
+            (0.0, 0.0),
+        ),
+    ],
+)
+def test_a_fitted_box_lies_in_the_unit_box(
+    bounds: Any, scale: float, corner: tuple[float, float]
+) -> None:
+    """Scale and corner are the least that bring a box into the unit box."""
+    transform = BoxTransform.fit(bounds)
+    assert (transform.scale, transform.corner) == (scale, corner)
+    box = np.array(transform.transform_box(bounds))
+    assert box.min() >= 0.0
+    assert box.max() <= 1.0
+
+
+def test_the_spacing_of_a_lattice_is_found() -> None:
+    """On a square lattice the estimate is within 5 % of the lattice constant."""
+    axis = 0.2 + 0.01 * np.arange(40)
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    assert math.isclose(estimate_spacing(lattice, 0.015), 0.01, rel_tol=0.05)
+
+
+def holed(run: NDArray[np.float32], frame: int, value: float) -> NDArray[np.float32]:
+    """Return a trajectory with another number in one place."""
+    run[frame, 5, 0] = value
+    return run
+
+
+BROKEN: dict[
+    str, tuple[Callable[[NDArray[np.float32]], NDArray[Any]], type[LagbenchError], str]
+] = {
+    "flat": (lambda run: run[0], UnreadableFileError, "no positions"),
+    "space": (
+        lambda run: np.concatenate([run, run[..., :1]], axis=-1),
+        DataError,
+        "3 components",
+    ),
+    "transposed": (lambda run: run.swapaxes(1, 2), DataError, "40 components"),
+    "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
+    "single": (lambda run: run[:1], DataError, "too little"),
+    "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
+    "missing at once": (lambda run: holed(run, 0, np.nan), DataError, "not finite"),
+    "beyond float32": (
+        lambda run: run.astype(np.float64) * 1e300,
+        DataError,
+        "not finite",
+    ),
+    "outside": (lambda run: holed(run, 3, 1.5), DataError, "outside the unit box"),
+    "objects": (
+        lambda run: np.array([run, None], dtype=object),
+        UnreadableFileError,
+        "pickled",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None:
+    """Each fault has its message, which names the file, and no folder is made."""
+    broken, error, words = BROKEN[kind]
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    np.save(paths[2], broken(straight_runs(1)[0]), allow_pickle=True)
+    with pytest.raises(error, match=words) as caught:
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    assert "run2.npy" in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"radius": None},
+            "the radius is not known",
+        ),
+        (
+            {"radius": -1.0},
+            "not a number above 0",
+        ),
+        (
+            {"horizon": 7},
+            "too short for the task",
+        ),
+        *(({"horizon": count}, "where: --horizon") for count in (0, -1)),
+        (
+            {"input_frames": 1},
+            "where: --input-frames",
+        ),
+        (
+            {"input_frames": 12},
+            "too short for the task",
+        ),
+        (
+            {"test": 3, "valid": 3},
+            "each subset needs a trajectory",
+        ),
+        (
+            {"rescale": True},
+            "where: --rescale",
+        ),
+        (
+            {"bounds": ((1.0, 0.0), (0.0, 1.0))},
+            "low to high",
+        ),
+        (
+            {"bounds": ((0.0, 0.3), (0.0, 1.0))},
+            "outside the stated bounds",
+        ),
+        (
+            {"output": "My Data"},
+            "--output my-data",
+        ),
+        (
+            {"output": "cavity"},
+            "one of the splits of lagbench",
+        ),
+        (
+            {"output": "in"},
+            "there already",
+        ),
+    ],
+)
+def test_what_a_user_says_is_checked(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    """Wrong options are usage errors that name the option, and no folder is made."""
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    options = {
+        "output": "mine",
+        **BASIC,
+        **changes,
+    }
+    with pytest.raises(UsageError, match=words):
+        adopt(paths, **{**options, "output": tmp_path / options["output"]})
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
+def test_command(tmp_path: Path, run: Run) -> None:
+    """`lagbench adopt` says what it made, and other commands take the folder it
+    names.
+    """
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    target = tmp_path / "mine"
+    options = [
+        "--radius",
+        "0.1",
+        "--frame-interval",
+        "0.25",
+        "--frames-of-interest",
+        "8,10",
+    ]
+    done = run("adopt", *paths, "-o", target, *options, "--bounds", "0,1,0.25,1")
+    assert done.exit_code == 0, done.output
+    assert "2 train, 1 valid, 1 test, 48 frames, 40 particles" in done.stdout
+    size = locate(str(target)).size
+    assert size.task.frames_of_interest == (8, 10)
+    assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
+    assert "mine" in run("info", f"{target}/").stdout
+    refused = run("generate", "--split", target)
+    assert refused.exit_code == 2
+    assert "cannot be simulated" in refused.output
+
+
+PLAIN: dict[str, Any] = {
+    "radius": 0.15,
+    "frame_interval": 0.25,
+    "density": 1.5,
+    "spacing": 0.05,
+    "cells": 8,
+    "input_frames": 3,
+    "horizon": 8,
+    "frames_of_interest": (10,),
+    "bounds": ((0.0, 1.0), (0.0, 1.0)),
+    "full_box": True,
+}
+
+
+@pytest.mark.parametrize("spelled", ["numpy", "texts and floats"])
+def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
+    """NumPy's scalars and arrays, and what --describe takes for numbers, give the same
+    description.
+    """
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    other = {
+        **PLAIN,
+        "radius": "0.15",
+        "cells": 8.0,
+        "horizon": 8.0,
+        "density": "1.5",
+        "title": None,
+    }
+    if spelled == "numpy":
+        other = {name: np.asarray(value)[()] for name, value in PLAIN.items()}
+        other["density"] = np.float32(1.5)
+    texts = [
+        (
+            adopt(paths, output=tmp_path / kind / "mine", **wishes).folder
+            / "split.yaml"
+        ).read_bytes()
+        for kind, wishes in (("plain", PLAIN), ("other", other))
+    ]
+    assert texts[0] == texts[1]
+
+
+@pytest.mark.parametrize(
+    ("wish", "key"),
+    [
+        (
+            {"radius": "far"},
+            "radius",
+        ),
+        (
+            {"density": [1.0]},
+            "density",
+        ),
+        (
+            {"cells": 16.5},
+            "cells",
+        ),
+        (
+            {"horizon": "all"},
+            "horizon",
+        ),
+        (
+            {"horizon": np.array([5])},
+            "horizon",
+        ),
+        (
+            {"horizon": 10**5000},
+            "horizon",
+        ),
+        (
+            {"frames_of_interest": 8},
+            "frames_of_interest",
+        ),
+        (
+            {"frames_of_interest": [10**5000]},
+            "frames_of_interest.0",
+        ),
+        ({"title": 3}, "title"),
+        (
+            {"title": 10**5000},
+            "title",
+        ),
+        (
+            {"bounds": ((0.0, 1.0),) * 3},
+            "bounds",
+        ),
+        (
+            {"bounds": 1.0},
+            "bounds",
+        ),
+        (
+            {"raduis": 0.1},
+            "raduis",
+        ),
+    ],
+)
+def test_a_value_that_does_not_fit_names_its_key(
+    tmp_path: Path, wish: dict[str, Any], key: str
+) -> None:
+    """By adopt and by import, before a file is looked at."""
+    with pytest.raises(UsageError) as adopted:
+        adopt(tmp_path / "none", output=tmp_path / "mine", **{**BASIC, **wish})
+    with pytest.raises(UsageError) as imported:
+        import_split(
+            tmp_path / "none",
+            format="gns-npz",
+            output=tmp_path / "mine",
+            **wish,
+        )
+    assert adopted.value.where == imported.value.where == key
+    assert not list(tmp_path.iterdir())
+
+
+def test_walls_in_some_trajectories_only_are_refused(tmp_path: Path) -> None:
+    """Whichever of them come first, the error names the first that is otherwise."""
+    for walled in ({0}, {1, 2}):
+        paths = []
+        for number, run in enumerate(straight_runs(3)):
+            paths.append(tmp_path / f"run{number}.npz")
+            walls = {"wall_velocity": np.zeros((4, 2))} if number in walled else {}
+            np.savez(paths[-1], position=run, **walls)
+        with pytest.raises(DataError) as caught:
+            adopt(paths, output=tmp_path / "mine", **BASIC)
+        assert caught.value.where == str(paths[1])
+        assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("way", ["twice", "folder", "link", "subsets"])
+def test_a_trajectory_named_twice_is_refused(tmp_path: Path, way: str) -> None:
+    """It would be trained on and tested: by its name, in its folder, by a link, and in
+    two subsets.
+    """
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    link = tmp_path / ("in/test/run9.npy" if way == "subsets" else "run9.npy")
+    given = {
+        "twice": [*paths, paths[0]],
+        "folder": [tmp_path / "in", paths[2]],
+        "link": [*paths, link],
+    }
+    if way == "subsets":
+        for subset, path in zip(("train", "valid", "test"), paths, strict=False):
+            (tmp_path / "in" / subset).mkdir()
+            path.rename(tmp_path / "in" / subset / path.name)
+        link.symlink_to(tmp_path / "in/train/run0.npy")
+    elif way == "link":
+        link.symlink_to(paths[1])
+    with pytest.raises(UsageError) as caught:
+        adopt(given.get(way, [tmp_path / "in"]), output=tmp_path / "mine", **BASIC)
+    assert "run" in str(caught.value.where)
+    assert not (tmp_path / "mine").exists()
+
+
+@pytest.mark.parametrize("text", ["x", "8-", "9-8", "8,8"])
+def test_bad_frames_of_interest_name_their_option(
+    tmp_path: Path, run: Run, text: str
+) -> None:
+    """The list is read as one of scenarios is, and the message speaks of frames."""
+    paths = save_runs(tmp_path / "in", straight_runs(3))
+    options = ["-o", tmp_path / "mine", "--radius", "0.1", "--frame-interval", "0.25"]
+    done = run("adopt", *paths, *options, "--frames-of-interest", text)
+    assert done.exit_code == 2
+    assert "where: --frames-of-interest" in done.output
+    assert "--scenarios" not in done.output
+
+
+def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> None:
+    """Keys of `--describe` count where no option says otherwise; unknown keys and wrong
+    types are refused.
+    """
+    paths = save_runs(tmp_path / "in", straight_runs(4))
+    told = tmp_path / "data.yaml"
+    options = [
+        "-o",
+        tmp_path / "mine",
+        "--describe",
+        told,
+        "--free-surface",
+        "--horizon",
+        "3",
+    ]
+    words = ["adopt", *paths, *options]
+    endless = f"0x{'f' * 5000}"  # an integer whose digits Python does not spell
+    wrong = [
+        "colour: red",
+        "radius: far",
+        "- radius",
+        f"title: {endless}",
+        f"horizon: {endless}",
+    ]
+    for line in (*wrong, f"density: [{endless}]", f"? {endless}\n: 1"):
+        told.write_text(line)
+        assert run(*words).exit_code == 2
+    assert not (tmp_path / "mine").exists()
+    told.write_text(
+        "radius: 0.1\nframe_interval: 0.25\nbounds: [[0, 1], [0.25, 1]]\nhorizon: 4\n"
+        "frames_of_interest: [8]\nlicence: CC0-1.0\ndensity: 2\nspacing: "
+        "0.05\nfull_box: true\n"
+    )
+    done = run(*words)
+    assert done.exit_code == 0, done.output
+    size, _, splits = locate(str(tmp_path / "mine"))
+    assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (
+        0.1,
+        3,
+        (8,),
+    )
+    assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
+    assert size.value("density") == 2.0
+    assert splits.split("mine").licence == "CC0-1.0"
+    assert size.task.score_grid.placement == "nodes"

@@ -1,0 +1,230 @@
+"""Imports: what comes back is what was there, and nothing in a file is run."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from exchange_readers import read_gns, read_h5, straight_runs
+from exchange_writers import SUBSETS, write_gns, write_h5
+from typer.testing import Result
+
+import lagbench
+from lagbench.data.local import locate
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, UnreadableFileError
+from lagbench.exchange import export, import_split
+from lagbench.make.generate import GenerationResult
+
+
+def positions(folder: Path, subset: str = "train") -> np.ndarray:
+    """Return the positions of a local split's subset."""
+    with lagbench.open_split(str(folder), subset=subset) as data:
+        return np.asarray(data["position"].values)
+
+
+@pytest.mark.parametrize(
+    "form", ["gns-npz", "lagrangebench-h5", "lagrangebench-h5 --from-walls"]
+)
+def test_an_export_comes_back(
+    generated: GenerationResult, unmeasured: Registry, tmp_path: Path, form: str
+) -> None:
+    """Every subset has the stored bits again, and the task is the one that was
+    exported.
+    """
+    name, _, walls = form.partition(" ")
+    options: dict[str, Any] = {
+        "root": generated.root,
+        "registry": unmeasured,
+        "from_walls": bool(walls),
+    }
+    export(
+        "curl-noise",
+        "tiny",
+        format=name,
+        output=tmp_path / "out",
+        **options,
+    )
+    made = import_split(tmp_path / "out", format=name, output=tmp_path / "back")
+    for subset in SUBSETS:
+        with lagbench.open_split(
+            "curl-noise",
+            subset=subset,
+            size="tiny",
+            root=generated.root,
+        ) as data:
+            np.testing.assert_array_equal(
+                positions(made.folder, subset), data["position"].values
+            )
+            mass = data["particle_mass"].values[0]
+    here = locate(str(made.folder)).size
+    there = unmeasured.size("curl-noise", "tiny")
+    assert (here.task, here.bounds) == (there.task, there.bounds)
+    assert here.frame_interval == there.frame_interval
+    with lagbench.open_split(str(made.folder)) as data:
+        assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
+
+
+@pytest.mark.parametrize("form", ["gns-npz", "lagrangebench-h5"])
+def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
+    """Positions of the local split are those that a reader takes, and a force.py beside
+    them is not run.
+    """
+    gns = form == "gns-npz"
+    source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
+    (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
+    made = import_split(source, format=form, output=tmp_path / "own")
+    assert not (tmp_path / "trace").exists()
+    read = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
+    np.testing.assert_array_equal(positions(made.folder), [run for run, _ in read])
+    interval = 0.01 if gns else 0.05
+    assert locate(str(made.folder)).size.frame_interval == pytest.approx(interval)
+
+
+def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -> None:
+    """With a horizon of the user's own the frame of interest is again the last
+    predicted one.
+    """
+    hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
+    source = write_gns(tmp_path / "in", straight_runs(3), **hints)
+    kept = import_split(source, format="gns-npz", output=tmp_path / "a")
+    # None says nothing: metadata do
+    options: dict[str, Any] = {
+        "horizon": 3,
+        "radius": None,
+        "bounds": None,
+    }
+    own = import_split(
+        source,
+        format="gns-npz",
+        output=tmp_path / "b",
+        **options,
+    )
+    interest = [
+        locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)
+    ]
+    assert interest == [(10,), (8,)]
+
+
+@pytest.mark.parametrize("protocol", [3, 4])
+def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
+    """Pairs and triples, joint and single, as any NumPy saves them, doubles rounded to
+    float32.
+    """
+    runs = [run.astype(np.float64) + 1e-9 for run in straight_runs(3)]
+    source = write_gns(tmp_path / "in", runs)
+    joint = np.empty(2, dtype=object)
+    joint[:] = [(runs[0], np.full(40, 6), 0.3), (runs[1], 7, 0.3)]
+    with (
+        zipfile.ZipFile(source / "train.npz", "w") as archive,
+        archive.open("gns_data.npy", "w") as stream,
+    ):
+        header = {
+            "descr": "|O",
+            "fortran_order": False,
+            "shape": (2,),
+        }
+        np.lib.format.write_array_header_1_0(stream, header)
+        pickle.dump(joint, stream, protocol=protocol)
+    made = import_split(source, format="gns-npz", output=tmp_path / "own")
+    assert made.scenarios["train"] == 2
+    np.testing.assert_array_equal(
+        positions(made.folder), np.stack(runs[:2]).astype(np.float32)
+    )
+    with lagbench.open_split(str(made.folder), subset="train") as data:
+        assert data["material"].values[:, 0].tolist() == [2, 1]
+        assert data.attrs["material_property"] == 0.3
+
+
+def test_kinds_without_a_material(tmp_path: Path) -> None:
+    """Walls are refused until the user says what they are; padding is left out by
+    itself.
+    """
+    kinds = np.array([0] * 30 + [1] * 6 + [-1] * 4)
+    source = write_h5(tmp_path / "in", straight_runs(3), kinds)
+    with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    named = import_split(
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "a",
+        kinds={1: "rope"},
+    )
+    dropped = import_split(
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "b",
+        kinds={1: "drop"},
+    )
+    assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
+    np.testing.assert_array_equal(
+        positions(dropped.folder)[0], straight_runs(3)[0][:, :30]
+    )
+
+
+def test_periodic_boxes(tmp_path: Path) -> None:
+    """Periodic data come in where nothing crosses the boundary; a jump of more than
+    half the box is told.
+    """
+    runs = straight_runs(3)
+    periodic = {"periodic_boundary_conditions": [True, True]}
+    source = write_h5(tmp_path / "in", runs, **periodic)
+    import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    runs[1][5:, 0, 0] += np.float32(0.42 if runs[1][5, 0, 0] < 0.5 else -0.42)
+    source = write_h5(tmp_path / "in", runs, **periodic)
+    with pytest.raises(
+        DataError, match=r"periodic boundary\n  where: .*valid.h5.*frame 5"
+    ):
+        import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
+
+
+def test_what_the_user_says_goes_before_the_metadata(
+    tmp_path: Path, run: Callable[..., Result]
+) -> None:
+    """`lagbench import` takes radius, task and box from its options where they are
+    given.
+    """
+    source = write_h5(
+        tmp_path / "in", straight_runs(3, box=3.0), bounds=[[0, 3], [0, 3]], dx=0.2
+    )
+    arguments = [
+        "import",
+        source,
+        "--format",
+        "lagrangebench-h5",
+        "-o",
+        tmp_path / "own",
+    ]
+    refused = run(*arguments)
+    assert refused.exit_code == 4
+    assert "--rescale" in refused.output
+    options = [
+        "--rescale",
+        "--radius",
+        "0.4",
+        "--horizon",
+        "4",
+        "--input-frames",
+        "2",
+        "--full-box",
+    ]
+    done = run(*arguments, *options)
+    assert done.exit_code == 0, done.output
+    size = locate(str(tmp_path / "own")).size
+    assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
+    assert size.task.score_grid.placement == "cell_centres"
+    assert size.value("spacing") == 0.05
+
+
+def test_the_other_format_is_recognised(tmp_path: Path) -> None:
+    """Where the files are those of the other format, the message names it."""
+    for subset in SUBSETS:
+        (tmp_path / f"{subset}.h5").touch()
+    with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
+        import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
+    assert "--format lagrangebench-h5" in str(caught.value)

@@ -1,0 +1,234 @@
+"""Charts, labels and numbers against answers known without them."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+from html_check import Reading, read_html
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lagbench.figures.chart import (
+    Bar,
+    Plot,
+    Spot,
+    bar_chart,
+    linear,
+    logarithmic,
+    spanning,
+)
+from lagbench.figures.html import interval, text
+from lagbench.figures.labels import LabelBox, place_labels
+
+PLOT_BOX = LabelBox(0.0, 0.0, 400.0, 200.0)
+
+
+def draw_bar(label: str, value: float, *, dots: tuple[float, ...] = ()) -> Bar:
+    """Return a bar whose text is its value."""
+    return Bar(label=label, value=value, value_text=text(value), dots=dots, kind="s0")
+
+
+def empty_plot() -> Plot:
+    """Return a plot of 0 to 4 along both axes."""
+    axis = linear(0, 4)
+    return Plot(axis, axis, x_label="x", y_label="y")
+
+
+def read_plot(plot: Plot) -> Reading:
+    """Return the elements of a chart without faults."""
+    reading = read_html(plot.svg("title", "description"))
+    assert not reading.faults
+    return reading
+
+
+def test_missing_values_leave_gaps() -> None:
+    """A NaN ends a line and a band; the next value starts another."""
+    plot = empty_plot()
+    x = [0, 1, 2, 3, 4]
+    low = [0, 0, math.nan, 1, 1]
+    high = [1, 1, 2, 2, 2]
+    plot.band(x, low, high, "s1")
+    plot.line(x, low, "s2")
+    plot.steps([0, 1, 2, 3], [1, math.nan, 2], "s3")
+    reading = read_plot(plot)
+    assert len(reading.of_class("band")) == 2
+    for kind in ("s2", "s3"):
+        (path,) = reading.of_class(kind)
+        assert path.attributes["d"].count("M") == 2
+
+
+def test_bars_are_as_long_as_their_values() -> None:
+    """Half the value is half the length; a bar without a value is left out."""
+    bars = [
+        draw_bar("half", 0.5, dots=(0.25, math.nan)),
+        draw_bar("whole", 1.0),
+        draw_bar("none", math.nan),
+    ]
+    chart = bar_chart(
+        bars, linear(0, 1), label="share", title="title", description="words"
+    )
+    reading = read_html(chart)
+    assert not reading.faults
+    widths = [float(box.attributes["width"]) for box in reading.of_class("bar")]
+    assert len(widths) == 2
+    assert widths[0] == pytest.approx(widths[1] / 2)
+    assert "none  –" in reading.elements[0].text
+
+
+def test_logarithmic_axis_is_even_in_decades() -> None:
+    """Each decade takes the same room; zero and negatives have no place."""
+    axis = logarithmic(2e-4, 0.03)
+    assert (axis.low, axis.high) == pytest.approx((1e-4, 0.1))
+    shares = axis.share([1e-4, 1e-3, 1e-2, 1e-1])
+    np.testing.assert_allclose(shares, [0, 1 / 3, 2 / 3, 1], atol=1e-12)
+    assert np.isnan(axis.share([0.0, -1.0, math.nan])).all()
+    assert [tick.label for tick in axis.ticks] == ["10⁻⁴", "10⁻³", "10⁻²", "10⁻¹"]
+
+
+@pytest.mark.parametrize(
+    ("high", "labels", "factor"),
+    [
+        (10, ["0", "2", "4", "6", "8", "10"], ""),
+        (0.9, ["0", "0.2", "0.4", "0.6", "0.8", "1.0"], ""),
+        (2.2e6, ["0", "0.5", "1.0", "1.5", "2.0", "2.5"], "×10⁶"),
+    ],
+)
+def test_ticks_are_round(high: float, labels: list[str], factor: str) -> None:
+    """Steps are 1, 2, 2.5 or 5 times a power of ten; large numbers share a factor."""
+    axis = linear(0, high)
+    assert [tick.label for tick in axis.ticks] == labels
+    assert axis.factor == factor
+
+
+@given(
+    st.floats(-1e12, 1e12, allow_subnormal=False),
+    st.floats(1e-12, 1e12),
+    st.integers(2, 8),
+)
+def test_axes_hold_their_range(low: float, width: float, count: int) -> None:
+    """A loose axis covers its range, and its labels times its factor are its ticks."""
+    high = low + width
+    is_distinct = high - low > 1e-9 * max(abs(low), abs(high))
+    if not is_distinct:
+        return
+    axis = linear(low, high, count=count)
+    slack = 1e-6 * (axis.high - axis.low)
+    assert axis.low <= low + slack
+    assert axis.high >= high - slack
+    assert 2 <= len(axis.ticks) <= count + 2
+    for tick in axis.ticks:
+        number = float(tick.label.replace("−", "-"))
+        value = number * 10.0**axis.exponent
+        assert value == pytest.approx(tick.value, abs=2 * slack, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "is_logarithmic"),
+    [
+        (np.geomspace(1e-4, 1.0, 20), True),
+        ([0.5, 1.0], False),
+        ([-1.0, 1e-6, 1.0], False),
+    ],
+)
+def test_wide_ranges_are_logarithmic(values: list[float], is_logarithmic: bool) -> None:
+    """Narrow and signed ranges are linear and hold 0."""
+    axis = spanning([values])
+    assert axis.log == is_logarithmic
+    if not is_logarithmic:
+        assert axis.low <= 0.0
+
+
+@pytest.mark.parametrize("values", [[], [math.nan], [0.0], [math.inf, 1e301]])
+def test_series_without_numbers_have_an_axis(values: list[float]) -> None:
+    """Values that are not finite or too large are left out."""
+    axis = spanning([values])
+    assert axis.high > axis.low
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (0.5, "0.500"),
+        (123.456, "123"),
+        (1.2e-4, "1.20×10⁻⁴"),
+        (1e9, "1.00×10⁹"),
+        (-3.0, "−3"),
+        (0.0, "0"),
+        (0.99999, "1.00"),
+        (math.inf, "∞"),
+        (-math.inf, "−∞"),
+        (math.nan, "–"),
+    ],
+)
+def test_numbers_are_short(value: float, expected: str) -> None:
+    """Three digits, powers of ten where zeros would stand, a dash for NaN."""
+    assert text(value) == expected
+
+
+def test_an_interval_without_an_end_is_empty() -> None:
+    """There is no interval of one scenario."""
+    assert interval((math.nan, 1.0)) == ""
+
+
+@given(st.floats(-1e300, 1e300, allow_subnormal=False))
+def test_numbers_are_right(value: float) -> None:
+    """A text reads back to three digits."""
+    written = text(value).replace("−", "-")
+    mantissa, _, power = written.partition("×10")
+    exponent = power.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")) or "0"
+    number = float(f"{mantissa}e{exponent}")
+    assert number == pytest.approx(value, rel=5.1e-3, abs=1e-300)
+
+
+coordinates = st.tuples(st.floats(0.0, 400.0), st.floats(0.0, 200.0))
+
+
+@given(st.lists(coordinates, max_size=12))
+def test_labels_cover_nothing(dots: list[tuple[float, float]]) -> None:
+    """Labels lie within the plot, and on no dot, note or other label."""
+    note = LabelBox(0.0, 0.0, 90.0, 14.0)
+    names = [f"method {number}" for number in range(len(dots))]
+    placed = place_labels(names, dots, plot=PLOT_BOX, taken=[note])
+    assert len(placed) == len(dots)
+    boxes = [note]
+    for x, y in dots:
+        boxes.append(LabelBox(x - 5, y - 5, x + 5, y + 5))
+    for label in placed:
+        if label is not None:
+            assert label.box.left >= 0.0
+            assert label.box.right <= 400.0
+            assert not any(label.box.overlaps(other) for other in boxes)
+            boxes.append(label.box)
+
+
+def test_a_lonely_dot_has_its_label_to_the_right() -> None:
+    """At the right rim the label stands to the left."""
+    names = ["first", "second"]
+    dots = [(100.0, 100.0), (395.0, 100.0)]
+    first, second = place_labels(names, dots, plot=PLOT_BOX)
+    assert first is not None
+    assert first.box.left > 100.0
+    assert second is not None
+    assert second.box.right < 395.0
+
+
+def test_a_dot_without_room_for_a_label_says_its_name() -> None:
+    """Of many dots at one place the first is labelled; the others have a title."""
+    plot = empty_plot()
+    spots = []
+    for number in range(20):
+        name = f"method number {number}"
+        spots.append(Spot(x=2, y=2, name=name, description=name, kind="entry"))
+    plot.spots(spots)
+    reading = read_plot(plot)
+    labels = [element.text for element in reading.of_class("name")]
+    assert labels[0] == "method number 0"
+    assert len(labels) < len(spots)
+    titles = {element.text for element in reading.named("title")}
+    assert {spot.description for spot in spots} <= titles
+    dots = reading.of_class("dot")
+    assert all(dot.attributes["tabindex"] == "0" for dot in dots)
+    assert not re.search("nan", plot.svg("title", "description"))

@@ -1,0 +1,422 @@
+"""Pictures: right fields, right colours, small files with equal bytes, refusals."""
+
+from __future__ import annotations
+
+import math
+import struct
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from exchange_readers import straight_runs
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from numpy.typing import NDArray
+from PIL import Image
+from rotating_disc import OMEGA, TOP_TO_THE_RIGHT, write_swirl
+
+from lagbench import errors
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.exchange import adopt
+from lagbench.figures.canvas import (
+    build_palette,
+    build_speed_map,
+    build_vorticity_map,
+    figure,
+    pixels_of,
+)
+from lagbench.figures.colours import (
+    INK,
+    MATERIAL_COLOURS,
+    MOVING,
+    MUTED,
+    PAPER,
+    WALL,
+    parse_rgb,
+)
+from lagbench.figures.panels import Panel, draw_walls, limit_of
+from lagbench.figures.plot import KINDS, contact_sheet, describe, plot_frame
+from lagbench.figures.recording import open_recording
+from lagbench.store.dataset import open_split
+
+Pixels = NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def swirl(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One cavity scenario whose top wall moves to the right."""
+    return write_swirl(tmp_path_factory.mktemp("root"))
+
+
+def read_pixels(path: Path) -> Pixels:
+    """Return a picture as RGB bytes."""
+    with Image.open(path) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def has_colour(pixels: Pixels, colour: str) -> NDArray[np.bool_]:
+    """Return which pixels have a colour."""
+    is_equal: NDArray[np.bool_] = (pixels == parse_rgb(colour)).all(axis=-1)
+    return is_equal
+
+
+def chunk_names(png: bytes) -> set[bytes]:
+    """Return the types of the chunks of a PNG file."""
+    names = set()
+    start = 8  # behind the signature
+    while start < len(png):
+        length, name = struct.unpack_from(">I4s", png, start)
+        names.add(name)
+        start += 12 + length
+    return names
+
+
+def test_every_kind_of_picture_is_small_and_has_the_same_bytes_twice(
+    swirl: Path, tmp_path: Path
+) -> None:
+    """PNGs hold no date or software; no two kinds are the same."""
+    pictures = set()
+    for kind in KINDS:
+        first = plot_frame(swirl, 2, tmp_path / "first.png", kind=kind).read_bytes()
+        second = plot_frame(swirl, 2, tmp_path / "second.png", kind=kind).read_bytes()
+        assert first == second
+        assert len(first) < 300_000
+        assert chunk_names(first) == {b"IHDR", b"PLTE", b"IDAT", b"IEND"}
+        pictures.add(first)
+    assert len(pictures) == len(KINDS)
+
+
+def test_a_data_set_draws_what_its_file_draws(swirl: Path, tmp_path: Path) -> None:
+    """A data set of several scenarios is refused."""
+    from_file = plot_frame(swirl, -1, tmp_path / "file.png")
+    with xr.open_dataset(swirl) as data:
+        from_data = plot_frame(data, 5, tmp_path / "data.png")
+        with pytest.raises(UsageError) as caught:
+            plot_frame(data.expand_dims(scenario=[0]), 0, tmp_path / "x.png")
+    assert from_file.read_bytes() == from_data.read_bytes()
+    assert "sel(scenario" in str(caught.value.fix)
+
+
+def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(
+    tmp_path: Path,
+) -> None:
+    """The padding of the shorter of two scenarios is not drawn."""
+    frame_counts = {0: 4, 1: 6}
+    for scenario, frame_count in frame_counts.items():
+        write_swirl(
+            tmp_path,
+            "fluid",
+            scenario,
+            frames=frame_count,
+            walls=None,
+            parameters={"family": "disc"},
+        )
+    with open_split("fluid", subset="train", size="tiny", root=tmp_path) as split:
+        from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
+    file = tmp_path / "fluid/tiny/v2/train/0000.nc"
+    from_file = plot_frame(file, 3, tmp_path / "file.png")
+    assert from_split.read_bytes() == from_file.read_bytes()
+
+
+CUTS = {
+    "late": slice(1, None),
+    "strided": slice(None, None, 2),
+    "short": slice(0, 3),
+    "one": 2,
+}
+
+
+@pytest.mark.parametrize("cut", CUTS)
+def test_a_data_set_cut_in_frames_is_refused(tmp_path: Path, cut: str) -> None:
+    """Frames may be missing before, between or behind those that are left."""
+    for scenario in (0, 1):
+        write_swirl(
+            tmp_path, "fluid", scenario, walls=None, parameters={"family": "disc"}
+        )
+    with open_split("fluid", subset="train", size="tiny", root=tmp_path) as data:
+        part = data.isel(scenario=0, frame=CUTS[cut])
+        with pytest.raises(UsageError) as caught:
+            plot_frame(part, 0, tmp_path / "x.png")
+    assert caught.value.where == "coordinate frame"
+
+
+def test_a_scenario_of_a_local_split_is_drawn_with_its_own_grid(tmp_path: Path) -> None:
+    """An opened split and one of its files know the split that stands beside them."""
+    runs = tmp_path / "runs.npy"
+    np.save(runs, np.stack(straight_runs(3)))
+    adopted = adopt(runs, output=tmp_path / "mine", radius=0.1, frame_interval=0.25)
+    file = adopted.folder / "full/v1/test/0002.nc"
+    expected = plot_frame(file, 3, tmp_path / "file.png").read_bytes()
+    with open_split(str(adopted.folder)) as split, xr.open_dataset(file) as data:
+        for source in (split.isel(scenario=0), data):
+            picture = plot_frame(source, 3, tmp_path / "data.png")
+            assert picture.read_bytes() == expected
+
+
+@pytest.mark.parametrize("frame", [0, 3])
+def test_vorticity_of_solid_body_rotation(swirl: Path, frame: int) -> None:
+    """It is twice the angular velocity: per frame on the grid, else per second."""
+    with open_recording(swirl) as recording:
+        scene = recording.scene(frame)
+        # clear of the rim on the 8 x 8 grid
+        per_frame = scene.fields.vorticity[3:5, 3:5]
+        np.testing.assert_allclose(per_frame, 2.0 * OMEGA, rtol=0.02)
+        per_second = scene.vorticity[3:5, 3:5]
+        expected = 2.0 * OMEGA / recording.size.frame_interval
+        np.testing.assert_allclose(per_second, expected, rtol=0.02)
+
+        # the scale of its colours is in that unit too
+        magnitudes = np.abs(scene.vorticity[scene.fields.differentiable])
+        limit = limit_of(Panel.VORTICITY, scene)
+        assert limit == pytest.approx(np.percentile(magnitudes, 99.0))
+
+
+def test_area_is_that_of_the_material(swirl: Path) -> None:
+    """The disc has radius 0.4."""
+    with open_recording(swirl) as recording:
+        assert recording.area == pytest.approx(np.pi * 0.4**2)
+
+
+@pytest.mark.parametrize(
+    ("split", "units"),
+    [
+        ("cavity", ["1/s", "length/s", "length/s"]),
+        ("multimaterial", ["1/s", "length/s"]),
+    ],
+)
+def test_a_figure_has_one_unit_of_time(
+    split: str,
+    units: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Colour bars are in seconds, and so is the number at a moving wall."""
+    texts: list[str] = []
+
+    def collect(drawn: Figure, output: Path) -> Path:
+        texts.extend(text.get_text() for text in drawn.findobj(Text))
+        return output
+
+    monkeypatch.setattr("lagbench.figures.plot.save", collect)
+    if split == "cavity":
+        source = write_swirl(tmp_path)
+    else:
+        source = write_swirl(tmp_path, split, materials=3, walls=None)
+    plot_frame(source, 2, tmp_path / "all.png", kind="all")
+    labels = [text for text in texts if "[" in text]
+    assert sorted(label.partition("[")[2].rstrip("]") for label in labels) == units
+    assert not any("/frame" in text for text in texts)
+
+
+def test_the_scale_of_speeds_leaves_out_the_extreme_per_cent(swirl: Path) -> None:
+    """Speeds of a disc are OMEGA r; 99 of 100 particles are within 0.4 sqrt(0.99)."""
+    with open_recording(swirl) as recording:
+        scene = recording.scene(1)
+        angular_velocity = OMEGA / recording.size.frame_interval
+        expected = angular_velocity * 0.4 * np.sqrt(0.99)
+        assert limit_of(Panel.SPEED, scene) == pytest.approx(expected, rel=1e-3)
+
+
+def test_dpi_scales_a_picture(swirl: Path, tmp_path: Path) -> None:
+    """Twice the pixels per inch are twice the pixels a side."""
+    coarse = read_pixels(plot_frame(swirl, 0, tmp_path / "64.png", dpi=64))
+    fine = read_pixels(plot_frame(swirl, 0, tmp_path / "128.png", dpi=128))
+    height, width, _ = coarse.shape
+    assert fine.shape[:2] == pytest.approx((2 * height, 2 * width), abs=1)
+
+
+@pytest.mark.parametrize("dpi", [0, -1, math.nan, 1e6, "128"])
+def test_pixels_per_inch_out_of_range_are_refused(
+    swirl: Path, tmp_path: Path, dpi: Any
+) -> None:
+    """The error names the option, and nothing is written, of a frame or of a sheet."""
+    path = tmp_path / "x.png"
+    root = swirl.parents[4]
+    with pytest.raises(UsageError) as of_frame:
+        plot_frame(swirl, 0, path, dpi=dpi)
+    with pytest.raises(UsageError) as of_sheet:
+        contact_sheet("cavity", "tiny", path, root=root, dpi=dpi)
+    assert of_frame.value.where == of_sheet.value.where == "--dpi"
+    assert not list(tmp_path.iterdir())
+
+
+def test_captions_say_what_sets_a_scenario_apart(swirl: Path, tmp_path: Path) -> None:
+    """Reynolds number, family or frequency stand beside split, size and id."""
+    with open_recording(swirl) as recording:
+        assert describe(recording) == "cavity tiny  ·  scenario 0  ·  Re 100"
+    parameters = {"family": "splash"}
+    splash = write_swirl(tmp_path, "fluid", 3, walls=None, parameters=parameters)
+    with open_recording(splash) as recording:
+        assert describe(recording) == "fluid tiny  ·  scenario 3  ·  family splash"
+
+
+def test_a_frame_counts_from_the_end(swirl: Path) -> None:
+    """Frame -1 is the last; integers of NumPy are frame numbers too."""
+    with open_recording(swirl) as recording:
+        assert recording.scene(-1).frame == 5
+        assert recording.scene(np.int64(1)).frame == 1
+
+
+@pytest.mark.parametrize("frame", [6, -7, 1.0])
+def test_a_frame_that_does_not_exist_is_refused(
+    swirl: Path, tmp_path: Path, frame: Any
+) -> None:
+    """The error names the range of frames, for numbers beyond it and for floats."""
+    with pytest.raises(UsageError) as caught:
+        plot_frame(swirl, frame, tmp_path / "x.png")
+    assert caught.value.where == "scenario 0"
+    assert caught.value.expected == "0 to 5"
+    assert not (tmp_path / "x.png").exists()
+
+
+def draw_empty_box(path: Path) -> Pixels:
+    """Return the walls of a scenario at its first frame."""
+    with open_recording(path) as recording, figure(2.0, 2.0) as page:
+        axes = page.add_axes((0, 0, 1, 1))
+        draw_walls(axes, recording, 0)
+        return pixels_of(page)
+
+
+def test_moving_walls_are_marked(tmp_path: Path) -> None:
+    """The moving wall is vermilion, the others are grey."""
+    box = draw_empty_box(write_swirl(tmp_path, walls=TOP_TO_THE_RIGHT))
+    side = len(box)
+    middle = side // 2
+    band = int(0.025 * side)  # middle of the wall of tiny, which is 0.05 wide
+    assert has_colour(box[band, int(0.2 * side)], MOVING)
+    assert has_colour(box[-band, middle], WALL)
+    assert has_colour(box[middle, middle], PAPER)
+
+
+def test_arrowheads_point_where_a_wall_slides(tmp_path: Path) -> None:
+    """Reversed walls draw the mirror image."""
+    to_right = write_swirl(tmp_path / "right", walls=TOP_TO_THE_RIGHT)
+    to_left = write_swirl(tmp_path / "left", walls=-TOP_TO_THE_RIGHT)
+    right = draw_empty_box(to_right).astype(int)
+    left = draw_empty_box(to_left).astype(int)
+    mirror_difference = np.abs(right[:, ::-1] - left).mean()
+    assert mirror_difference < 0.2 * np.abs(right - left).mean()
+
+
+@pytest.mark.parametrize(("ending", "head"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_vector_pictures_have_the_same_bytes_twice(
+    swirl: Path, tmp_path: Path, ending: str, head: bytes
+) -> None:
+    """PDF and SVG hold no date."""
+    first = plot_frame(swirl, 0, tmp_path / f"first.{ending}").read_bytes()
+    second = plot_frame(swirl, 0, tmp_path / f"second.{ending}").read_bytes()
+    assert first == second
+    assert first.startswith(head)
+
+
+def test_another_ending_is_refused(swirl: Path, tmp_path: Path) -> None:
+    """Nothing is written."""
+    with pytest.raises(UsageError):
+        plot_frame(swirl, 0, tmp_path / "x.jpg")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_picture_that_cannot_be_written_names_its_option(swirl: Path) -> None:
+    """Where a file is in the way, the fix is the option that names the picture."""
+    with pytest.raises(WorkFailedError) as caught:
+        plot_frame(swirl, 0, swirl / "x.png")
+    assert "--output" in str(caught.value.fix)
+
+
+def test_without_matplotlib_the_extra_is_named(
+    swirl: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message holds the command that installs what is missing."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(UsageError) as caught:
+        plot_frame(swirl, 0, tmp_path / "x.png")
+    assert "pip install 'lagbench[plots]'" in str(caught.value)
+
+
+def test_a_broken_dependency_is_not_called_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An import that fails inside an installed module shows its own error."""
+    (tmp_path / "broken_extra.py").write_text("import no_such_module_at_all\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ModuleNotFoundError, match="no_such_module_at_all"):
+        errors.require("broken_extra", extra="plots")
+
+
+def test_sheet_of_driven_scenarios_has_a_panel_for_each(tmp_path: Path) -> None:
+    """More scenarios make a wider page; the same page has the same bytes."""
+
+    def draw_sheet(name: str) -> Path:
+        path = tmp_path / name
+        return contact_sheet("cavity", "tiny", path, root=tmp_path, frame=2)
+
+    write_swirl(tmp_path, scenario=0)
+    one = read_pixels(draw_sheet("one.png"))
+    for scenario in (1, 2, 3, 4):
+        write_swirl(tmp_path, scenario=scenario)
+    path = draw_sheet("five.png")
+    five = read_pixels(path)
+    assert five.shape[1] > one.shape[1]
+    assert draw_sheet("again.png").read_bytes() == path.read_bytes()
+
+    # each of the five panels shows the vermilion of its moving top wall
+    is_moving = has_colour(five, MOVING).any(axis=0)
+    starts = np.diff(is_moving.astype(int)) == 1
+    assert np.count_nonzero(starts) >= 5
+
+
+def test_sheet_of_families_has_a_row_for_each(tmp_path: Path) -> None:
+    """Scenarios of one family share a row, families lie below each other."""
+    heights = []
+    for scenario, family in enumerate(["circle", "circle", "splash"]):
+        parameters = {"family": family}
+        write_swirl(tmp_path, "fluid", scenario, walls=None, parameters=parameters)
+        sheet = contact_sheet("fluid", "tiny", tmp_path / "s.png", root=tmp_path)
+        heights.append(read_pixels(sheet).shape[0])
+    assert heights[0] == heights[1] < heights[2]
+
+
+def test_sheet_of_materials_shows_their_colours(tmp_path: Path) -> None:
+    """Pairs of materials are coloured by material, each colour as the key has it."""
+    write_swirl(
+        tmp_path,
+        "multimaterial",
+        0,
+        walls=None,
+        materials=3,
+        parameters={"pair": "made-up"},
+    )
+    sheet = contact_sheet("multimaterial", "tiny", tmp_path / "s.png", root=tmp_path)
+    image = read_pixels(sheet)
+    shown = [bool(has_colour(image, colour).any()) for colour in MATERIAL_COLOURS]
+    assert shown == [True, True, True, False]
+
+
+def test_sheet_of_nothing_names_the_command(tmp_path: Path) -> None:
+    """Without scenarios the fix says how to make them."""
+    with pytest.raises(DataError) as caught:
+        contact_sheet("cavity", "tiny", tmp_path / "s.png", root=tmp_path)
+    assert "lagbench generate --split cavity --size tiny" in str(caught.value.fix)
+
+
+def test_sheet_of_an_unknown_split_names_the_nearest(tmp_path: Path) -> None:
+    """A slip of the pen is pointed out."""
+    with pytest.raises(UsageError) as caught:
+        contact_sheet("cavty", "tiny", tmp_path / "s.png", root=tmp_path)
+    assert "cavity" in str(caught.value.fix)
+
+
+def test_every_colour_is_in_the_palette() -> None:
+    """Every level of both maps and every flat colour keeps its value in a file."""
+    palette = build_palette()
+    assert palette.shape == (256, 3)
+    colours = {tuple(colour) for colour in palette.tolist()}
+    for flat in (PAPER, INK, MUTED, WALL, MOVING, *MATERIAL_COLOURS):
+        assert tuple(parse_rgb(flat).tolist()) in colours
+    for colour_map in (build_speed_map(), build_vorticity_map()):
+        levels = np.asarray(colour_map.colors)[:, :3] * 255.0
+        for level in levels.round().astype(int).tolist():
+            assert tuple(level) in colours

@@ -1,0 +1,502 @@
+"""The report: whole, harmless, the same every time, and right in what it shows."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from html_check import Reading, read_html
+from hypothesis import example, given
+from hypothesis import strategies as st
+from made_up import (
+    METHODS,
+    SPLITS,
+    Method,
+    ReportBench,
+    damped,
+    make_report_bench,
+    motion,
+    noisy,
+    page_of,
+    runaway,
+    still,
+)
+from numpy.typing import NDArray
+from PIL import Image
+
+import lagbench.figures
+from lagbench.data.grid import Grid, fields
+from lagbench.data.registry import load
+from lagbench.errors import UsageError
+from lagbench.figures.html import Markup, tag, text
+from lagbench.figures.report.maps import crop_to_walls
+from lagbench.figures.report.report import write_report
+from lagbench.figures.report.subject import Subject, limit_of
+from lagbench.figures.report.summary import describe_stability
+from lagbench.metrics import METRICS, Tally, TaskConfig, aggregate
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.task import ScoredTask
+from lagbench.submission.truth import Truth
+
+ROOT = Path(__file__).parents[2]
+
+HOSTILE = (
+    "<script>alert(1)</script>",
+    '" onmouseover="alert(1)" x=\'',
+    "'><img src=x onerror=alert(1)>",
+    "</style></title><svg onload=alert(1)>",
+    "a\u202egnp.exe\u0000\u0007",
+    "javascript:alert(1)//${alert(1)}{{alert(1)}}",
+)
+
+ACTIVE_ELEMENTS = {"script", "iframe", "object", "embed", "form", "base"}
+ADDRESS_ATTRIBUTES = {"src", "href", "xlink:href", "action", "data", "srcset"}
+HARMLESS_ADDRESSES = ("#", "data:image/png;base64,", "data:,")
+NUMERIC_ATTRIBUTES = ("d", "x", "y", "width", "height", "viewbox", "transform")
+
+EVERYWHERE = {
+    "histogram": "Fig. 5.12",
+    "bars-vorticity-pearson": "Fig. 5.13",
+    "residuals-truth": "Fig. 5.14",
+    "residuals-node": "Fig. 5.15",
+    "bars-vorticity-kl": "Fig. 5.16",
+    "fields": "Fig. 5.17",
+    "histograms": "Fig. 5.18",
+    "energy-kept": "Fig. 5.19",
+    "energy-raw": "Fig. 5.28",
+    "methods-position-rmse": "Fig. 5.11",
+    "scenarios-position-rmse-0": "Fig. 5.10",
+}
+"""Figures of every split, and those of the thesis that they correspond to."""
+
+FULL_BOX = {
+    "scenarios-vorticity-mse-0": "Fig. 5.10",
+    "methods-vorticity-mse": "Fig. 5.11",
+    "arrows-0": "Figs. 5.22–5.24",
+    "vorticity": "Figs. 5.25–5.27",
+    "every-scenario": "Figs. 5.26, 5.27",
+}
+
+FREE_SURFACE = {
+    "scenarios-attribute-mse-0": "Fig. 5.10",
+    "methods-attribute-mse": "Fig. 5.11",
+}
+
+PARTICLES = {
+    "fluid": {
+        "particles-3": "Fig. 4.11",
+        "particles-4": "Fig. 4.11",
+    },
+    "multimaterial": {
+        "particles-7": "Figs. 4.12, 4.13",
+        "particles-8": "Figs. 4.12, 4.13",
+        "particles-9": "Figs. 4.12, 4.13",
+        "particles-10": "Figs. 4.12, 4.13",
+        "particles-11": "Fig. 4.11",
+        "particles-12": "Figs. 4.12, 4.13",
+        "bodies-shape-error": "section 4.8.2",
+        "bodies-connectivity": "section 4.8.2",
+    },
+}
+
+
+def expected_figures(split: str) -> dict[str, str]:
+    """Return the figures that a report on a split must have."""
+    if split in PARTICLES:
+        return EVERYWHERE | FREE_SURFACE | PARTICLES[split]
+    return EVERYWHERE | FULL_BOX
+
+
+@dataclass(frozen=True)
+class ScoredFiles:
+    """Scored submissions to one data set."""
+
+    bench: ReportBench
+    cards: list[ScoreCard]
+    paths: list[Path]
+
+    def report(self, folder: Path) -> Path:
+        """Write their report."""
+        root = self.bench.root
+        registry = self.bench.registry
+        return write_report(
+            folder, self.cards, self.paths, root=root, registry=registry
+        )
+
+
+def score_methods(
+    bench: ReportBench, folder: Path, *methods: tuple[str, Method], **labels: Any
+) -> ScoredFiles:
+    """Submit and score methods by name."""
+    cards = []
+    paths = []
+    for number, (name, method) in enumerate(methods):
+        path = bench.submit(folder / f"{number}.nc", method, name, **labels)
+        paths.append(path)
+        cards.append(bench.card(path))
+    return ScoredFiles(bench, cards, paths)
+
+
+@pytest.fixture(scope="module")
+def page(home: Path) -> Callable[[str], str]:
+    """A function that returns the page of two methods on a split."""
+    return lambda split: page_of(home, split).read_text("utf-8")
+
+
+def assert_harmless(reading: Reading) -> None:
+    """Nothing runs, and nothing is fetched from outside the page."""
+    assert not {e.name for e in reading.elements} & ACTIVE_ELEMENTS
+    for element in reading.elements:
+        for name, value in element.attributes.items():
+            assert not name.startswith("on"), (element.name, name)
+            if name in ADDRESS_ATTRIBUTES:
+                assert value.startswith(HARMLESS_ADDRESSES), value
+            assert "url(" not in value
+    for style in reading.named("style"):
+        assert not re.search(r"url\(|@import|@font-face|https?:", style.text)
+        assert style.text.count("{") == style.text.count("}")
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_page_is_whole_and_harmless(page: Callable[[str], str], split: str) -> None:
+    """Elements close in order, links lead somewhere, nothing runs; 3 MB hold it."""
+    html = page(split)
+    reading = read_html(html)
+    assert not reading.faults
+    assert html.startswith("<!DOCTYPE html>")
+    assert len(html.encode()) < 3_000_000
+    targets = {a.attributes["href"].removeprefix("#") for a in reading.named("a")}
+    assert targets
+    assert targets <= set(reading.ids)
+    assert_harmless(reading)
+    metas = [meta.attributes for meta in reading.named("meta")]
+    (policy,) = [meta["content"] for meta in metas if "http-equiv" in meta]
+    assert policy.startswith("default-src 'none'")
+    assert "script-src" not in policy
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_every_figure_of_the_thesis_has_its_counterpart(
+    page: Callable[[str], str], split: str
+) -> None:
+    """Captions name the figure of the thesis, and figures are numbered in order."""
+    reading = read_html(page(split))
+    figures = {e.attributes["id"]: e for e in reading.named("figure")}
+    for name, thesis in expected_figures(split).items():
+        assert name in figures, name
+        assert f"thesis {thesis}" in figures[name].text, name
+    numbers = [element.text for element in reading.of_class("number")]
+    assert numbers == [f"Figure {k}" for k in range(1, len(figures) + 1)]
+    assert len(reading.named("figcaption")) == len(figures)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_every_figure_can_be_read_aloud(page: Callable[[str], str], split: str) -> None:
+    """Pictures have a text, drawings a title, charts a description too."""
+    html = page(split)
+    reading = read_html(html)
+    assert all(image.attributes.get("alt") for image in reading.named("img"))
+    assert html.count("<desc>") == len(reading.of_class("chart")) > 0
+    for drawing in reading.named("svg"):
+        is_hidden = drawing.attributes.get("aria-hidden") == "true"
+        assert is_hidden or drawing.text or "role" not in drawing.attributes
+
+
+def test_text_of_strangers_is_shown_not_run(home: Path, tmp_path: Path) -> None:
+    """Hostile names of methods, files and trainings stand on the page as text."""
+    bench = make_report_bench(home, "curl-noise")
+    cards = []
+    paths = []
+    for number, name in enumerate(HOSTILE):
+        if "\0" in name:
+            continue
+        file = tmp_path / f"{number} '\"<b>&.nc"
+        labels = {"training": name, "device": name}
+        path = bench.submit(file, noisy, name, **labels)
+        paths.append(path)
+        cards.append(bench.card(path))
+    page = ScoredFiles(bench, cards, paths).report(tmp_path / "out")
+    reading = read_html(page.read_text("utf-8"))
+    assert not reading.faults
+    assert_harmless(reading)
+    heading = reading.named("h1")[0].text
+    assert all(card.header.method in heading for card in cards)
+    assert "0 '" in reading.named("pre")[0].text
+
+
+PLAIN = "Größe µ ≤ 3 × 10⁻⁴,\n\t'x' & \"y\" <z> 中文 🙂"
+"""Letters, signs and line breaks, none of which is replaced."""
+
+
+@given(st.text())
+@example(PLAIN)
+def test_any_text_survives_escaping(words: str) -> None:
+    """Text in an element and in an attribute stays, but for what cannot be shown."""
+    reading = read_html(tag("p", words, title=words))
+    assert not reading.faults
+    (element,) = reading.elements
+    assert element.attributes["title"] == element.text
+    for shown, meant in zip(element.text, words, strict=True):
+        is_replaced = shown in "\ufffd?" and words != PLAIN
+        assert shown == meant or is_replaced
+
+
+def test_markup_is_not_escaped_again() -> None:
+    """An element may hold elements."""
+    assert tag("p", Markup("<b>x</b>")) == "<p><b>x</b></p>"
+
+
+def test_same_bytes_every_time(
+    home: Path, page: Callable[[str], str], tmp_path: Path
+) -> None:
+    """The same predictions give the same page; no folder stands in it."""
+    bench = make_report_bench(home, "multimaterial")
+    first = bench.report(tmp_path / "there", METHODS).read_text("utf-8")
+    assert first == page("multimaterial")
+    assert "the bands are" in first
+    assert str(tmp_path) not in first
+    assert str(bench.root) not in first
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_undefined_and_huge_numbers_are_drawn_around(
+    home: Path, tmp_path: Path, split: str
+) -> None:
+    """A prediction at rest has no correlation, a runaway leaves every axis."""
+    bench = make_report_bench(home, split)
+    page = bench.report(tmp_path, {"rest": still, "odd": runaway})
+    reading = read_html(page.read_text("utf-8"))
+    assert not reading.faults
+    for element in reading.elements:
+        for name in NUMERIC_ATTRIBUTES:
+            value = element.attributes.get(name, "")
+            place = (element.name, name, value[:80])
+            assert not re.search(r"nan|inf|e\+?\d", value), place
+            assert all(len(number) < 8 for number in re.findall(r"\d+", value)), place
+    assert set(expected_figures(split)) <= set(reading.ids)
+
+
+@pytest.fixture(scope="module")
+def damped_cavity(
+    home: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[ScoreCard, Path]:
+    """One method on cavity with its report."""
+    bench = make_report_bench(home, "cavity")
+    folder = tmp_path_factory.mktemp("damped")
+    labels = {"parameters": 1_600_000, "seconds_per_frame": 0.25}
+    scored = score_methods(bench, folder, ("damped", damped), **labels)
+    return scored.cards[0], scored.report(folder)
+
+
+def test_scores_on_the_page_are_those_of_the_scorer(
+    damped_cavity: tuple[ScoreCard, Path],
+) -> None:
+    """The ranking metric opens the table; there is no interval of two scenarios."""
+    card, path = damped_cavity
+    html = path.read_text("utf-8")
+    reading = read_html(html)
+    scores = [scores[card.ranking] for scores in card.scores.values()]
+    means = [element.text for element in reading.of_class("n")]
+    assert means[: len(scores)] == [text(score.mean) for score in scores]
+    assert np.isnan([score.interval for score in scores]).all()
+    assert not any("…" in element.text for element in reading.of_class("ci"))
+    assert "the bands are" not in html
+
+
+def test_the_page_identifies_what_was_scored(
+    damped_cavity: tuple[ScoreCard, Path],
+) -> None:
+    """Hashes, the number of parameters, flags and the command stand on it."""
+    card, path = damped_cavity
+    reading = read_html(path.read_text("utf-8"))
+    (main,) = reading.named("main")
+    expected = [
+        card.predictions_sha256,
+        card.header.dataset_sha256,
+        "lagbench score 0.nc --report report",
+        "1\u202f600\u202f000",
+    ]
+    expected += [flag.name.replace("_", " ") for flag in card.flags]
+    assert [words for words in expected if words not in main.text] == []
+
+
+def test_reference_predictors_have_no_rank(home: Path, tmp_path: Path) -> None:
+    """Two submissions, both worse than persistence, are ranked 1 and 2."""
+    bench = make_report_bench(home, "curl-noise")
+    page = bench.report(tmp_path, {"m0": noisy, "m1": noisy}).read_text("utf-8")
+    (part,) = re.findall(r'aria-label="Comparison".*?</table>', page, re.DOTALL)
+    ranks = []
+    for row in re.findall(r"<tr>(.*?)</tr>", part)[1:]:
+        cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row)
+        ranks.append(cells[1])
+    assert ranks[:2] == ["1", "2"]
+    assert len(ranks) > 4
+    assert set(ranks[2:]) == {""}
+
+
+def test_methods_of_one_name_are_told_apart(home: Path, tmp_path: Path) -> None:
+    """Two files of one method get numbers, and so does a reference predictor's name."""
+    bench = make_report_bench(home, "curl-noise")
+    methods = (("gns", damped), ("gns", noisy), ("persistence", still))
+    page = score_methods(bench, tmp_path, *methods).report(tmp_path)
+    heading = read_html(page.read_text("utf-8")).named("h1")[0].text
+    assert heading == "gns (1) · gns (2) · persistence (1)"
+
+
+def test_score_reports_must_belong_together(home: Path, tmp_path: Path) -> None:
+    """No score report, one without its file, and two data sets are refused."""
+    noise_bench = make_report_bench(home, "curl-noise")
+    cavity_bench = make_report_bench(home, "cavity")
+    noise = score_methods(noise_bench, tmp_path / "noise", ("a", still))
+    cavity = score_methods(cavity_bench, tmp_path / "cavity", ("a", still))
+    mixtures = [
+        ScoredFiles(cavity_bench, [], []),
+        ScoredFiles(noise_bench, noise.cards, []),
+        ScoredFiles(
+            cavity_bench, noise.cards + cavity.cards, noise.paths + cavity.paths
+        ),
+    ]
+    for scored in mixtures:
+        with pytest.raises(UsageError):
+            scored.report(tmp_path)
+    assert not (tmp_path / "index.html").exists()
+
+
+def test_pages_of_others_stay(home: Path, tmp_path: Path) -> None:
+    """A report replaces a report, and no other page."""
+    bench = make_report_bench(home, "cavity")
+    scored = score_methods(bench, tmp_path, ("a", still))
+    scored.report(tmp_path / "report")
+    page = scored.report(tmp_path / "report")
+    page.write_text("<!doctype html><title>My thesis</title>")
+    with pytest.raises(UsageError) as caught:
+        scored.report(tmp_path / "report")
+    assert caught.value.where == "--report"
+    assert caught.value.got == str(page)
+    assert "My thesis" in page.read_text()
+
+
+def subject_on(split: str, size_name: str) -> Subject:
+    """Return a subject without entries: enough to ask which frames are shown."""
+    size = load().size(split, size_name)
+    config = TaskConfig(
+        grid=Grid(size.task.score_grid.cells),
+        attribute_std=(1.0,) * 4,
+        input_frames=size.task.input_frames,
+        horizon=size.task.horizon,
+        frames_of_interest=size.task.frames_of_interest,
+        radius=size.task.radius,
+    )
+    task = ScoredTask(truth=Truth(size, Path()), config=config, density=1.0)
+    return Subject(task=task, title=split, entries=())
+
+
+@pytest.mark.parametrize("size", ["full", "mini"])
+@pytest.mark.parametrize(
+    ("split", "frame"),
+    [("cavity", 54), ("curl-noise", 40), ("fluid", 60), ("multimaterial", 60)],
+)
+def test_models_are_compared_at_the_frame_of_the_thesis(
+    split: str, frame: int, size: str
+) -> None:
+    """That is frame 54, 35 after the last given one (5), and 60."""
+    assert subject_on(split, size).key_frame == frame
+
+
+@pytest.mark.parametrize("size", ["full", "mini", "tiny"])
+@pytest.mark.parametrize("split", SPLITS)
+def test_pictures_over_time_show_six_predicted_frames(split: str, size: str) -> None:
+    """They ascend; the first and the last predicted frame are among them."""
+    subject = subject_on(split, size)
+    predicted = subject.task.config.predicted_frames
+    assert len(subject.times) == 6
+    assert subject.times[0] == predicted[0]
+    assert subject.times[-1] == predicted[-1]
+    assert list(subject.times) == sorted(subject.times)
+
+
+def test_histograms_of_cavity_are_at_the_frames_of_the_thesis() -> None:
+    """Fig. 5.18 shows frames 6, 9, 18, 21, 48 and 51."""
+    subject = subject_on("cavity", "full")
+    assert subject.histogram_frames == (6, 9, 18, 21, 48, 51)
+
+
+def read_values(address: str) -> NDArray[np.float64]:
+    """Return a signed picture's values from -1 to 1, shape [x node, y node]."""
+    png = base64.b64decode(address.removeprefix("data:image/png;base64,"))
+    image = Image.open(io.BytesIO(png)).convert("RGBA")
+    pixels = np.asarray(image).astype(np.float64)
+    red, green, blue, opacity = np.moveaxis(pixels, -1, 0)
+    sign = np.where(red > blue, 1.0, -1.0)
+    is_grey = (red == 128) & (green == 128)
+    values = np.where(is_grey, np.nan, sign * opacity / 255.0)
+    return values[::-1].T
+
+
+def test_maps_show_their_frames(home: Path, tmp_path: Path) -> None:
+    """Each panel of true vorticity holds the field of x(f) - x(f-1) at its frame f."""
+    bench = make_report_bench(home, "curl-noise")
+    page = bench.report(tmp_path, {"damped": damped}).read_text("utf-8")
+    first_scenario = bench.size.subsets["test"][0]
+    truth = motion(bench.size, first_scenario).astype(np.float32).astype(np.float64)
+    grid = Grid(bench.size.task.score_grid.cells)
+    (low, high), _ = bench.size.bounds
+    full = grid.full_weight(bench.size.particles, (high - low) ** 2)
+
+    shown = {}
+    expected = {}
+    for image in read_html(page).named("img"):
+        match = re.fullmatch(r"true vorticity, frame (\d+)", image.attributes["alt"])
+        if match is None:
+            continue
+        frame = int(match[1])
+        shown[frame] = read_values(image.attributes["src"])
+        displacement = truth[frame] - truth[frame - 1]
+        flow = fields(truth[frame], displacement, grid, full=full)
+        expected[frame] = flow.vorticity
+    assert len(shown) == 6
+
+    limit = limit_of(list(expected.values()))
+    for frame, values in shown.items():
+        field = crop_to_walls(bench.task, expected[frame])
+        share = np.clip(field / limit, -1.0, 1.0)
+        np.testing.assert_allclose(values, share, atol=0.0101, equal_nan=True)
+
+
+def test_style_sheet_is_packaged() -> None:
+    """Files in the folder that are no modules are named in pyproject.toml."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    patterns = project["tool"]["setuptools"]["package-data"]["lagbench.figures"]
+    folder = Path(str(lagbench.figures.__file__)).parent
+    names = []
+    for path in folder.iterdir():
+        if path.is_file() and path.suffix != ".py":
+            names.append(path.name)
+    assert "style.css" in names
+    for name in names:
+        assert any(fnmatch(name, pattern) for pattern in patterns), name
+
+
+def test_the_stable_tile_says_how_many_frames_do_not_count() -> None:
+    """Two scenarios of 3 frames have 2 frames without a correlation."""
+    name = "vorticity_pearson"
+    correlations = [(0.96, math.nan, math.nan), (0.96, 0.96, 0.9)]
+    tallies = {}
+    for scenario, values in enumerate(correlations):
+        by_frame = {frame: {name: value} for frame, value in enumerate(values, start=2)}
+        tallies[scenario] = Tally.of([name], range(2, 5), by_frame)
+    metric = METRICS["stable_frames"]
+    stable = aggregate([metric], tallies)["stable_frames"]
+    assert stable.values.tolist() == [1.0, 2.0]
+    note = describe_stability(stable)
+    assert note == "of 3, correlation above 0.95; 2 of 6 frames undefined"

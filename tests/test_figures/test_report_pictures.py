@@ -1,0 +1,108 @@
+"""Pictures of the report: right colours at right places, right shares of nodes."""
+
+from __future__ import annotations
+
+import io
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from lagbench.figures.report.arrows import arrow_data
+from lagbench.figures.report.distributions import histogram_shares
+from lagbench.figures.report.maps import (
+    LEVELS,
+    draw_diverging_map,
+    draw_sequential_map,
+)
+from lagbench.figures.report.particles import SIDE, draw_materials
+
+BLUE = [0x00, 0x72, 0xB2]
+VERMILION = [0xD5, 0x5E, 0x00]
+ORANGE = [0xE6, 0x9F, 0x00]
+GREY = [128, 128, 128, 34]
+OPAQUE = 255
+
+
+def read_pixels(png: bytes) -> NDArray[np.uint8]:
+    """Return a PNG as red, green, blue and opacity, read by Pillow."""
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGBA"))
+
+
+def test_signed_maps_are_blue_below_zero_and_vermilion_above() -> None:
+    """Zero is clear, no value is grey; x goes right, y up."""
+    field = np.array([[-1.0, 0.0], [0.5, np.nan]])  # [x, y]
+    shown = read_pixels(draw_diverging_map(field, 1.0))
+    assert shown.shape == (2, 2, 4)
+    top_left, top_right = shown[0]
+    lower_left, lower_right = shown[1]
+    assert top_left[3] == 0
+    assert top_right.tolist() == GREY
+    assert lower_left.tolist() == [*BLUE, OPAQUE]
+    assert lower_right.tolist() == [*VERMILION, round(OPAQUE * 0.5)]
+
+
+def test_values_beyond_the_limit_have_its_colour() -> None:
+    """Even an infinite value does."""
+    shown = read_pixels(draw_diverging_map(np.full((1, 1), np.inf), 1.0))
+    assert shown[0, 0].tolist() == [*VERMILION, OPAQUE]
+
+
+def test_opacity_of_magnitudes_grows_up_to_the_limit() -> None:
+    """Beyond the limit it stays full."""
+    magnitudes = np.linspace(0.0, 2.0, LEVELS + 1)[:, None]
+    shown = read_pixels(draw_sequential_map(magnitudes, 1.0))
+    opacity = shown[0, :, 3].astype(int)
+    assert opacity[0] == 0
+    assert (np.diff(opacity) >= 0).all()
+    assert (opacity[LEVELS // 2 :] == OPAQUE).all()
+
+
+def test_particles_are_discs_of_their_material() -> None:
+    """Discs lie at the places of the particles; those outside are not drawn."""
+    position = np.array([[0.25, 0.75], [0.75, 0.25], [1.5, 0.5]])
+    material = np.array([0, 3, 1])
+    unit_square = ((0.0, 1.0), (0.0, 1.0))
+    png = draw_materials(position, material, view=unit_square, spacing=0.1)
+    shown = read_pixels(png)
+    assert shown.shape == (SIDE, SIDE, 4)
+    near = SIDE // 4
+    far = 3 * SIDE // 4
+    assert shown[near, near].tolist() == [*BLUE, OPAQUE]
+    assert shown[far, far].tolist() == [*ORANGE, OPAQUE]
+    radius = 0.5 * 1.25 * 0.1 * SIDE
+    disc_area = math.pi * radius**2
+    covered = shown[..., 3].sum() / OPAQUE
+    assert covered == pytest.approx(2 * disc_area, rel=0.03)
+
+
+def test_arrows_point_along_their_velocity() -> None:
+    """The shaft is centred on its node; a short arrow is a dot."""
+    shaft, head = arrow_data(50.0, 50.0, 20.0, 0.0).split("M")[1:]
+    assert shaft == "40 50L60 50"
+    assert head.split("L")[1] == "60 50"
+    assert arrow_data(50.0, 50.0, 0.1, 0.0) == "M50 50h0"
+
+
+def test_histogram_shares_within_the_truths_range_are_those_of_numpy() -> None:
+    """The first and the last bin hold the values beyond that range."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    truth = rng.random(500)
+    guess = 3.0 * rng.random(500) - 1.0
+    edges, shares = histogram_shares(guess, truth)
+    assert edges[0] == truth.min()
+    assert edges[-1] == truth.max()
+    assert shares.sum() == pytest.approx(100.0)
+    counts, _ = np.histogram(guess, edges)
+    expected = 100.0 * counts / 500
+    np.testing.assert_allclose(shares[1:-1], expected[1:-1])
+    assert shares[0] > expected[0]
+    assert shares[-1] > expected[-1]
+
+
+def test_no_values_have_no_shares() -> None:
+    """Without nodes every bin is empty."""
+    _, shares = histogram_shares(np.array([]), np.array([]))
+    assert shares.sum() == 0.0

@@ -1,0 +1,40 @@
+"""Tables of text in Markdown."""
+
+from __future__ import annotations
+
+import re
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lagbench.figures.tables import escape, markdown
+
+ESCAPED = re.compile(r"\\([\\`*_\[\]<>|#&~$])")
+SPECIAL = re.compile(r"[`*_\[\]<>|#&~$]")
+
+letters = st.characters(codec="utf-8", exclude_categories=["Cc", "Zl", "Zp"])
+
+
+@given(st.text(letters))
+def test_escaping_only_adds_backslashes(text: str) -> None:
+    """Taking the backslashes away gives the text on one line."""
+    one_line = " ".join(text.split())
+    assert ESCAPED.sub(r"\1", escape(text)) == one_line
+
+
+@given(st.text(letters))
+def test_no_special_character_stands_bare(text: str) -> None:
+    """Without what is escaped no character has a meaning for Markdown."""
+    bare = re.sub(r"\\.", "", escape(text))
+    assert not SPECIAL.search(bare)
+
+
+def test_tables_set_numbers_flush_right() -> None:
+    """Whole columns of numbers are flush right, with thousands apart."""
+    rows = [(1234, "`a_b`"), (5, "c_d")]
+    assert markdown(("n", "`code`|"), rows).splitlines() == [
+        r"| n | \`code\`\| |",
+        "| ---: | --- |",
+        "| 1,234 | `a_b` |",
+        r"| 5 | c\_d |",
+    ]

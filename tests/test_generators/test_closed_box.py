@@ -1,0 +1,282 @@
+"""The closed-box solver's physics on small boxes, and what it says when it fails."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from box_scenarios import (
+    ALL_LIDS,
+    FREE_SLIP,
+    INERT,
+    NO_SLIP,
+    after,
+    box,
+    loaded,
+    parameters,
+    scenario,
+)
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.generators.draws import quantise
+from lagbench.generators.solver import Device
+from lagbench.generators.split import ClosedBoxParameters, InitialState
+
+
+def with_velocity(
+    state: InitialState, velocity: NDArray[np.float64], affine: NDArray[np.float64]
+) -> InitialState:
+    """Return a state with other velocities, rounded as states must be."""
+    return dataclasses.replace(
+        state, velocity=quantise(velocity), affine=quantise(affine)
+    )
+
+
+def cells_of_vortex(
+    constants: ClosedBoxParameters, state: InitialState
+) -> tuple[Any, Any]:
+    """Return velocity and gradient of u = sin kx cos ky, v = -cos kx sin ky, k =
+    pi/L.
+    """
+    low, high = box(constants)
+    k = np.pi / (high - low)
+    x, y = k * (state.position - low).T
+    velocity = np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y)], axis=1)
+    straight = np.cos(x) * np.cos(y)
+    across = np.sin(x) * np.sin(y)
+    matrix = np.array([[straight, -across], [across, -straight]])
+    gradient = k * matrix.transpose(2, 0, 1)
+    return velocity, gradient
+
+
+def test_a_regular_lattice_stays_at_rest() -> None:
+    """Nine particles per cell, evenly spaced: density and J are 1 everywhere and
+    nothing moves.
+    """
+    state = scenario(NO_SLIP, jitter=0.0)
+    result = after(NO_SLIP, [state], 400)
+    np.testing.assert_allclose(result["position"][0], state.position, rtol=0, atol=2e-5)
+    assert np.abs(result["velocity"]).max() < 2e-5
+    np.testing.assert_allclose(result["jacobian"], 1.0, rtol=0, atol=2e-5)
+
+
+def test_transfers_conserve_momentum() -> None:
+    """Without pressure, viscosity and shift nothing changes the momentum of a patch off
+    the walls.
+    """
+    state = scenario(INERT, seed=1, speed=0.3, viscosity=0.0)
+    patch = np.abs(state.position - 0.5).max(axis=1) < 0.15
+    velocity = state.velocity * patch[:, None]
+    affine = state.affine * patch[:, None, None]
+    state = with_velocity(state, velocity, affine)
+    before = state.velocity.sum(axis=0)
+    result = after(INERT, [state], 4)
+    moved = result["velocity"][0].astype(np.float64)
+    assert np.abs(moved - state.velocity).max() > 0.05
+    tolerance = 1e-6 * np.abs(state.velocity).sum()
+    np.testing.assert_allclose(moved.sum(axis=0), before, rtol=0, atol=tolerance)
+
+
+def test_a_vortex_decays_as_navier_stokes_says() -> None:
+    """The free-slip vortex sin kx cos ky is a solution with amplitude exp(-2 nu k^2
+    t).
+    """
+    exact = {"velocity_relaxation": 0.0, "density_coupling": 0.002, "shift": 0.002}
+    constants = parameters(particles=4900, grid=32, dt=2e-3, no_slip=False, **exact)
+    state = scenario(constants, seed=2, viscosity=5e-3)
+    shape, gradient = cells_of_vortex(constants, state)
+    state = with_velocity(state, 0.05 * shape, 0.05 * gradient)
+    solver = loaded(constants, [state])
+    solver.advance(2000)
+    moved = dataclasses.replace(state, position=solver.position()[0])
+    shape, _ = cells_of_vortex(constants, moved)
+    amplitude = (solver.velocity()[0] * shape).sum() / (shape**2).sum()
+    low, high = box(constants)
+    wave_number = np.pi / (high - low)
+    time = 2000 * 2e-3
+    expected = 0.05 * np.exp(-2.0 * 5e-3 * wave_number**2 * time)
+    assert amplitude == pytest.approx(expected, rel=0.003)
+
+
+def test_energy_falls_when_the_lid_rests() -> None:
+    """Walls at rest do no work: kinetic energy falls from every 25 substeps to the
+    next.
+    """
+    constants = parameters(particles=2500, grid=32, dt=2e-3)
+    state = scenario(constants, seed=3, viscosity=1e-3)
+    shape, gradient = cells_of_vortex(constants, state)
+    low, high = box(constants)
+    phase = np.pi * (state.position - low) / (high - low)
+    envelope = np.sin(phase).prod(axis=1)
+    velocity = 0.1 * envelope[:, None] * shape
+    moving = with_velocity(state, velocity, 0.0 * gradient)
+    solver = loaded(constants, [moving])
+    energies = []
+    for _ in range(24):
+        solver.advance(25)
+        energies.append((solver.velocity().astype(np.float64) ** 2).sum())
+    assert np.all(np.diff(energies) < 0.0)
+    assert energies[-1] < 0.9 * energies[0]
+
+
+def test_jacobian_stays_near_one() -> None:
+    """Away from the lid's corners J stays within 2 % while the lid drives the flow."""
+    constants = parameters(particles=2500, grid=32, dt=2e-3)
+    state = scenario(constants, seed=4, walls=(0.0, 0.0, 0.0, 0.1))
+    solver = loaded(constants, [state])
+    solver.advance(2000)
+    x, y = solver.position()[0].T
+    jacobian = solver.jacobian()[0]
+    low, high = box(constants)
+    reach = 5.0 / constants.grid
+    is_at_side = np.abs(x - 0.5) > 0.5 - low - reach
+    corner = (y > high - reach) & is_at_side
+    assert np.abs(jacobian[~corner] - 1.0).max() < 0.02
+    health = solver.health()[0]
+    assert health.finite
+    assert (
+        health.jacobian_min <= jacobian.min() <= jacobian.max() <= health.jacobian_max
+    )
+    assert np.abs(solver.velocity()).max() <= health.max_speed <= 0.12
+
+
+@pytest.mark.parametrize(
+    "constants", [NO_SLIP, FREE_SLIP], ids=["no slip", "free slip"]
+)
+@pytest.mark.parametrize(
+    ("turn", "walls_from"),
+    [
+        # by 90 degrees: left, right <- top, bottom
+        ([[0.0, -1.0], [1.0, 0.0]], (3, 2, 0, 1)),
+        # x -> 1 - x: left and right change places
+        ([[-1.0, 0.0], [0.0, 1.0]], (1, 0, 2, 3)),
+    ],
+    ids=["turned", "flipped"],
+)
+def test_no_direction_is_special(
+    constants: ClosedBoxParameters, turn: list[list[float]], walls_from: tuple[int, ...]
+) -> None:
+    """A turned or mirrored box, its moving walls included, evolves into the turned or
+    mirrored result.
+    """
+    matrix = np.array(turn)
+
+    def change(state: InitialState) -> InitialState:
+        return dataclasses.replace(
+            state,
+            position=(state.position - 0.5) @ matrix.T + 0.5,
+            velocity=state.velocity @ matrix.T,
+            affine=matrix @ state.affine @ matrix.T,
+            wall_velocity=(state.wall_velocity @ matrix.T)[list(walls_from)],
+        )
+
+    walls = ALL_LIDS if constants.no_slip else (0.0, 0.0, 0.0, 0.0)
+    state = scenario(constants, seed=5, speed=0.2, walls=walls)
+    plain = after(constants, [state], 60)
+    turned = after(constants, [change(state)], 60)
+    position = plain["position"][0]
+    velocity = plain["velocity"][0]
+    image = change(dataclasses.replace(state, position=position, velocity=velocity))
+    turned_position = turned["position"][0]
+    turned_velocity = turned["velocity"][0]
+    np.testing.assert_allclose(turned_position, image.position, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(turned_velocity, image.velocity, rtol=0, atol=5e-5)
+
+
+def test_displaced_particles_stay_in_the_box() -> None:
+    """Offsets are added in float32; who would leave stands just inside the wall."""
+    solver = loaded(NO_SLIP, [scenario(NO_SLIP)])
+    before = solver.position()
+    offset = np.full_like(before, 2.0**-20)
+    offset[0, 0] = 5.0
+    solver.displace(offset)
+    np.testing.assert_array_equal(
+        solver.position()[0, 1:], before[0, 1:] + np.float32(2.0**-20)
+    )
+    high = box(NO_SLIP)[1]
+    assert high - 0.01 / NO_SLIP.grid < solver.position()[0, 0, 0] < high
+
+
+def test_sums_hold_every_particle_in_one_place() -> None:
+    """All 20,000 particles on one spot at nearly the largest speed: the nodes see
+    exactly that speed.
+    """
+    speed = 0.9 / (INERT.grid * INERT.dt)
+    everywhere = np.ones((INERT.particles, 2))
+    state = dataclasses.replace(
+        scenario(INERT, viscosity=0.0), position=0.5 * everywhere
+    )
+    state = with_velocity(state, speed * everywhere, 0.0 * state.affine)
+    nodes = after(INERT, [state], 1)["grid_velocity"][0]
+    np.testing.assert_allclose(nodes[19:22, 19:22], speed, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("device", "scenarios"), [(Device.CPU, 1), (Device.PARALLEL, 2)]
+)
+def test_a_blow_up_is_an_error(device: Device, scenarios: int) -> None:
+    """A substep beyond the viscous limit ends in an error that says where, when and
+    which bound.
+    """
+    state = scenario(NO_SLIP, seed=6, speed=0.4, walls=ALL_LIDS, viscosity=1.0)
+    solver = loaded(NO_SLIP, [state] * scenarios, device=device)
+    with pytest.raises(WorkFailedError) as caught:
+        solver.advance(400)
+    assert caught.value.where == "scenario 0, substeps 0 to 400"
+    assert "CFL" in str(caught.value.expected)
+    low, high = box(NO_SLIP)
+    assert low < solver.position().min() <= solver.position().max() < high
+
+
+def test_a_blow_up_names_the_scenario_and_leaves_the_others() -> None:
+    """Of two scenarios only the second is not finite; the solver can be loaded
+    again.
+    """
+    states = [scenario(NO_SLIP, seed=seed, speed=0.2) for seed in (7, 8)]
+    wild = [states[0], dataclasses.replace(states[1], viscosity=np.inf)]
+    solver = loaded(NO_SLIP, wild, device=Device.PARALLEL)
+    with pytest.raises(WorkFailedError, match="scenario 1, substeps 0 to 20"):
+        solver.advance(20)
+    assert [health.finite for health in solver.health()] == [True, False]
+    np.testing.assert_array_equal(
+        solver.position()[:1], after(NO_SLIP, [states[0]], 20)["position"]
+    )
+    solver.load(states)
+    solver.advance(20)
+    assert all(health.finite for health in solver.health())
+
+
+def test_states_outside_the_bounds_are_refused() -> None:
+    """Too fast, of another size, or with walls that cannot move: refused before the
+    first substep.
+    """
+    state = scenario(NO_SLIP)
+    walls = np.zeros((4, 2))
+    walls[0, 0] = 0.1
+    with pytest.raises(WorkFailedError, match="abs"):
+        loaded(NO_SLIP, [dataclasses.replace(state, velocity=state.velocity + 100.0)])
+    with pytest.raises(UsageError, match="wrong shape"):
+        loaded(NO_SLIP, [dataclasses.replace(state, position=state.position[1:])])
+    for odd in (
+        {"velocity": state.velocity[1:]},
+        {"affine": state.velocity},
+        {"material": None},
+        {"material": state.material + 9},
+        {"material": state.material.astype(float)},
+        {"position": state.position.astype(str)},
+        {"position": state.position + 5.0},
+        {"area": 0.0},
+        {"area": None},
+    ):
+        with pytest.raises(UsageError):
+            loaded(NO_SLIP, [dataclasses.replace(state, **odd)])
+    across = dataclasses.replace(state, wall_velocity=walls)
+    for constants, moving in (
+        (NO_SLIP, across),
+        (FREE_SLIP, scenario(FREE_SLIP, walls=(0, 0, 0, 0.1))),
+    ):
+        with pytest.raises(UsageError, match="slide along"):
+            loaded(constants, [moving])

@@ -1,0 +1,52 @@
+"""The frame counts of fluid full follow the rule that datasets.yaml states."""
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenario_draws import turn
+
+from lagbench.data.registry import Size, load
+from lagbench.generators.batch import ScenarioBatch, SimulationJob
+from lagbench.generators.solver import Device
+
+FIXED = (0, 26)
+
+
+def _share_left(size: Size, scenario: int) -> float:
+    """Return the mean kinetic energy over frames 270-299 over the greatest of any
+    frame.
+    """
+    job = SimulationJob(
+        size=size, scenarios=(scenario,), root=Path("unused"), device=Device.CPU
+    )
+    batch = ScenarioBatch(job, lambda _: None, frames=[300])
+    energy = [
+        float((batch.frame(i)[1].astype(np.float64) ** 2).sum())
+        for i, _ in batch.recordings()
+    ]
+    return float(np.mean(energy[270:]) / max(energy))
+
+
+def test_counts_sum_to_the_thesis() -> None:
+    """19,200 frames in the first 40 scenarios (§4.3), 600 each in scenarios 0 and 26
+    (Table 4.8).
+    """
+    size = load().size("fluid", "full")
+    assert sum(size.frame_count(i) for i in range(40)) == 19_200
+    assert [size.frame_count(i) for i in FIXED] == [600, 600]
+
+
+@pytest.mark.slow
+def test_longer_scenarios_are_those_that_still_move() -> None:
+    """More frames never go with a smaller share of kinetic energy left; a third of
+    train in turn.
+    """
+    size = load().size("fluid", "full")
+    known = [i for i in size.subsets["train"] if i not in FIXED]
+    # other neighbours at every turn
+    judged = random.Random(turn()).sample(known, len(known) // 3)
+    ranked = sorted(judged, key=lambda i: _share_left(size, i), reverse=True)
+    counts = [size.frame_count(i) for i in ranked]
+    assert counts == sorted(counts, reverse=True)

@@ -1,0 +1,273 @@
+"""The free-surface solver as a caller sees it: closed forms, limits, errors."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from free_surface_scenarios import Part, parameters, run, scenario, start
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.generators.free_surface import FreeSurface, courant
+from lagbench.generators.shapes import Disc, Rectangle
+from lagbench.generators.solver import Device
+from lagbench.generators.split import InitialState, Material
+
+CONSTANTS = parameters()
+WEIGHTLESS = parameters(gravity=0.0)
+LOW = CONSTANTS.wall / CONSTANTS.grid
+DISC = Disc(0.12)
+
+
+def ball(
+    material: Material, velocity: tuple[float, float] = (0.0, 0.0), height: float = 0.6
+) -> InitialState:
+    """One disc in mid-air."""
+    return scenario(CONSTANTS, Part(material, DISC, (0.5, height), velocity))
+
+
+def angular_momentum(
+    position: np.ndarray, velocity: np.ndarray, affine: np.ndarray, dx: float
+) -> float:
+    """Sum of r x v and of the APIC part dx^2/4 (C_yx - C_xy), per unit particle
+    mass.
+    """
+    x, y = position.astype(np.float64).T
+    u, v = velocity.astype(np.float64).T
+    c = affine.astype(np.float64)
+    orbital = x * v - y * u
+    spin = c[:, 1, 0] - c[:, 0, 1]
+    return float((orbital + 0.25 * dx * dx * spin).sum())
+
+
+def mean_height(solver: FreeSurface) -> float:
+    """Return the mean height of the first scenario's particles [length]."""
+    height = solver.position()[0, :, 1].astype(np.float64)
+    return float(height.mean())
+
+
+def total_momentum(solver: FreeSurface) -> NDArray[np.float64]:
+    """Return the sum of velocities of the first scenario, per unit particle mass."""
+    velocity = solver.velocity()[0].astype(np.float64)
+    return np.asarray(velocity.sum(axis=0))
+
+
+def total_spin(solver: FreeSurface, dx: float) -> float:
+    """Return the angular momentum of the first scenario, per unit particle mass."""
+    position = solver.position()[0]
+    velocity = solver.velocity()[0]
+    affine = solver.affine()[0]
+    return angular_momentum(position, velocity, affine, dx)
+
+
+@pytest.mark.parametrize("material", Material)
+def test_free_flight_is_a_parabola(material: Material) -> None:
+    """A body in the air has mean velocity v + g t and mean height y + v t + g t^2 /
+    2.
+    """
+    solver = start(CONSTANTS, [ball(material, (0.25, 0.5))])
+    y = mean_height(solver)
+    substeps = 180
+    solver.advance(substeps)
+    t = substeps * CONSTANTS.dt
+    vx, vy = solver.velocity()[0].astype(np.float64).mean(axis=0)
+    assert abs(vx - 0.25) <= 2e-5
+    assert abs(vy - (0.5 - 2.5 * t)) <= 2e-5
+    # Symplectic Euler: position lags by half a substep of acceleration.
+    expected = y + 0.5 * t - 0.5 * 2.5 * t * (t + CONSTANTS.dt)
+    assert abs(mean_height(solver) - expected) <= 2e-5
+
+
+@pytest.mark.parametrize("material", Material)
+def test_momentum_and_spin_are_conserved(material: Material) -> None:
+    """Without gravity and walls, linear and angular momentum stay what they were."""
+    spin = 3.0
+    state = scenario(WEIGHTLESS, Part(material, DISC, (0.5, 0.5)))
+    x, y = (state.position - 0.5).T
+    rotation = spin * np.stack([-y, x], axis=1)
+    gradient = np.array([[0.0, -spin], [spin, 0.0]])
+    turning = dataclasses.replace(
+        state,
+        velocity=rotation + np.array([0.1, 0.2]),
+        affine=np.broadcast_to(gradient, (len(x), 2, 2)),
+    )
+    solver = start(WEIGHTLESS, [turning])
+    dx = 1 / WEIGHTLESS.grid
+    momentum = total_momentum(solver)
+    before = total_spin(solver, dx)
+    solver.advance(100)
+    after = total_spin(solver, dx)
+    np.testing.assert_allclose(total_momentum(solver), momentum, rtol=1e-4)
+    assert abs(after - before) <= 2e-3 * abs(before)
+
+
+def test_energy_of_a_moving_body_by_hand() -> None:
+    """Kinetic m v^2/2, gravitational m g h, elastic 0 at the start."""
+    state = ball(Material.JELLY, (0.5, -1.0))
+    energy = start(CONSTANTS, [state]).energy()
+    height = state.position[:, 1].mean() - LOW
+    kinetic = 0.5 * state.area * 1.25
+    gravitational = state.area * 2.5 * height
+    assert energy.kinetic[0] == pytest.approx(kinetic)
+    assert energy.gravitational[0] == pytest.approx(gravitational, rel=1e-3)
+    assert energy.elastic[0] == pytest.approx(0.0, abs=1e-12)
+    total = energy.kinetic[0] + energy.gravitational[0]
+    assert energy.total[0] == pytest.approx(total)
+
+
+@pytest.mark.parametrize("material", Material)
+def test_compression_stores_energy(material: Material) -> None:
+    """An impact turns kinetic into elastic energy; nothing is gained."""
+    falling = Part(material, DISC, (0.5, LOW + 0.16), (0.0, -2.0))
+    solver = start(WEIGHTLESS, [scenario(WEIGHTLESS, falling)])
+    before = solver.energy().total[0]
+    solver.advance(45)
+    energy = solver.energy()
+    assert energy.elastic[0] > 0.002 * before
+    assert energy.total[0] <= before * 1.0001
+
+
+def test_friction_decelerates_by_mu_g() -> None:
+    """A block that slides on the floor loses mu g of speed per second, and keeps it
+    without friction.
+    """
+    decelerations = {}
+    for friction in (0.0, 0.3):
+        block = Part(Material.ROPE, Rectangle(0.3, 0.1), (0.3, LOW + 0.065))
+        state = scenario(CONSTANTS, block, friction=friction)
+        solver = start(CONSTANTS, [state])
+        solver.advance(600)
+        resting = solver.position()[0].astype(np.float64)
+        pushed = state.velocity + np.array([0.6, 0.0])
+        solver.load([dataclasses.replace(state, position=resting, velocity=pushed)])
+        solver.advance(60)
+        early = solver.velocity()[0, :, 0].mean()
+        solver.advance(180)
+        late = solver.velocity()[0, :, 0].mean()
+        decelerations[friction] = (early - late) / (180 * CONSTANTS.dt)
+    assert abs(decelerations[0.0]) <= 1e-4
+    assert decelerations[0.3] == pytest.approx(0.3 * 2.5, rel=0.1)
+
+
+def test_walls_hold_and_health_tells() -> None:
+    """Nothing leaves the box; health reports the extremes of the last advance."""
+    state = scenario(CONSTANTS, Part(Material.LIQUID, DISC, (0.25, 0.25), (-2.0, -2.0)))
+    solver = start(CONSTANTS, [state])
+    assert solver.health()[0].max_speed == 2.0
+    solver.advance(120)
+    health = solver.health()[0]
+    assert health.finite
+    assert 2.0 < health.max_speed < 1.0 / (CONSTANTS.grid * CONSTANTS.dt)
+    assert 0.5 <= health.jacobian_min < 0.99
+    assert health.jacobian_max == 1.0
+    assert solver.position().min() >= np.float32(LOW)
+    assert solver.position().max() <= np.float32(1.0 - LOW)
+
+
+def test_displace_moves_and_keeps_in_the_box() -> None:
+    """Offsets are added in float32 and clamped just inside the walls."""
+    solver = start(CONSTANTS, [ball(Material.LIQUID)])
+    before = solver.position()
+    offset = np.zeros_like(before)
+    offset[0, 0] = 2.0**-20, -(2.0**-20)
+    offset[0, 1] = -5.0, 5.0
+    solver.displace(offset)
+    after = solver.position()
+    np.testing.assert_array_equal(after[0, 0], before[0, 0] + offset[0, 0])
+    np.testing.assert_allclose(after[0, 1], [LOW, 1.0 - LOW], atol=1e-4)
+    np.testing.assert_array_equal(after[0, 2:], before[0, 2:])
+    solver.advance(5)
+
+
+def test_runaway_particle_is_reported() -> None:
+    """Speeds beyond one cell per substep name the scenario, the substeps and the
+    bound.
+    """
+    bound = 1.0 / (CONSTANTS.grid * CONSTANTS.dt)
+    body = ball(Material.LIQUID)  # gravity takes it past the bound
+    velocity = np.full_like(body.velocity, (0.0, 1e-3 - bound))
+    falling = dataclasses.replace(body, velocity=velocity)
+    states = [ball(Material.SNOW), falling, ball(Material.JELLY)]
+    solver = start(CONSTANTS, states, device=Device.PARALLEL)
+    with pytest.raises(
+        WorkFailedError, match=r"scenario 1, substeps 0 to 60(?s:.*)CFL"
+    ):
+        solver.advance(60)
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize("device", [Device.CPU, Device.PARALLEL])
+def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None:
+    """A corrupt velocity neither crashes the process nor passes unseen."""
+    solver = start(CONSTANTS, [ball(Material.JELLY)], device=device)
+    carried = solver._kernels.carried.to_numpy()
+    carried[0, 7, :2] = poison
+    solver._kernels.carried.from_numpy(carried)
+    with pytest.raises(WorkFailedError, match="blew up") as caught:
+        solver.advance(20)
+    names_bound = "every number is finite" in str(caught.value.expected)
+    names_value = "NaN or an infinite number" in str(caught.value.got)
+    assert names_bound == names_value
+    assert "e+38" not in str(caught.value.got)
+    assert solver.position().min() >= np.float32(LOW)
+
+
+def test_states_that_do_not_fit_are_refused() -> None:
+    """Another count of scenarios or particles, NaN and speeds beyond the CFL bound are
+    errors.
+    """
+    solver = start(CONSTANTS, [ball(Material.LIQUID)])
+    good = ball(Material.LIQUID)
+    with pytest.raises(UsageError, match="number of scenarios"):
+        solver.load([good, good])
+    with pytest.raises(UsageError, match="shape of position"):
+        solver.load([dataclasses.replace(good, position=good.position[:-1])])
+    nowhere = dataclasses.replace(good, position=good.position * np.nan)
+    fast = dataclasses.replace(good, velocity=good.velocity + 100.0)
+    for state in (nowhere, fast):
+        with pytest.raises(WorkFailedError):
+            solver.load([state])
+
+
+def test_courant_numbers_by_hand() -> None:
+    """Liquid: sqrt(30) 128/1200; snow: sqrt(5 E (1 - nu) / ((1 + nu)(1 - 2 nu)))
+    64/1200.
+    """
+    fluid = parameters(grid=128, dt=1 / 1200, liquid_modulus=30.0)
+    assert courant(fluid)[Material.LIQUID] == pytest.approx(0.58424, abs=1e-5)
+    both = courant(parameters(grid=64, dt=1 / 1200))
+    sound_speed = np.sqrt(5 * 40 * 0.8 / (1.2 * 0.6))
+    assert both[Material.SNOW] == pytest.approx(sound_speed * 64 / 1200)
+    assert max(both.values()) <= 0.8
+
+
+def test_jacobian_of_liquid_and_of_solids() -> None:
+    """Liquid reports its J within its bounds, solids the determinant of F."""
+    falling = (0.0, -2.0)
+    drop = Part(Material.LIQUID, DISC, (0.25, 0.2), falling)
+    rope = Part(Material.ROPE, DISC, (0.75, 0.2), falling)
+    state = scenario(CONSTANTS, drop, rope)
+    solver = start(CONSTANTS, [state])
+    solver.advance(60)
+    jacobian = solver.jacobian()[0]
+    is_liquid = state.material == Material.LIQUID
+    ratio = solver.volume_ratio()[0, is_liquid]
+    np.testing.assert_array_equal(jacobian[is_liquid], ratio)
+    deformation = solver.deformation()[0, ~is_liquid].astype(np.float64)
+    determinant = np.linalg.det(deformation)
+    np.testing.assert_allclose(jacobian[~is_liquid], determinant, atol=1e-6)
+    assert determinant.min() < 0.99
+
+
+def test_two_bodies_in_touch_share_the_grid() -> None:
+    """A liquid that falls on jelly stops above it: the bodies do not pass through each
+    other.
+    """
+    below = Part(Material.JELLY, Rectangle(0.86, 0.2), (0.5, LOW + 0.11))
+    above = Part(Material.LIQUID, Rectangle(0.5, 0.1), (0.5, LOW + 0.32))
+    state = scenario(CONSTANTS, below, above)
+    position = run(CONSTANTS, [state], 600)[0][0]
+    jelly = state.material == Material.JELLY
+    assert position[jelly, 1].mean() < position[~jelly, 1].mean() - 0.1

@@ -1,0 +1,180 @@
+"""The free-surface solver's bits: drivers, orders of particles and NumPy agree
+exactly.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from free_surface_scenarios import Part, parameters, run, scenario, snapshot, start
+from numpy.typing import NDArray
+from reference_free_surface import FreeSurfaceReference
+
+from lagbench.generators.shapes import Disc, Rectangle
+from lagbench.generators.solver import Device
+from lagbench.generators.split import InitialState, Material
+from lagbench.work.machine import available_cores
+
+CONSTANTS = parameters()
+SQUARE = Rectangle(0.2, 0.2)
+
+
+def falling(material: Material, friction: float = 0.0) -> InitialState:
+    """Two bodies that hit opposite corners at once and come apart."""
+    low = Part(material, SQUARE, (0.2, 0.18), (-1.5, -1.5))
+    high = Part(material, Disc(0.1), (0.8, 0.8), (2.0, 1.0))
+    seed = int(material)
+    return scenario(CONSTANTS, low, high, seed=seed, friction=friction, spin=4.0)
+
+
+def cornered(gap: float, high: bool) -> InitialState:
+    """One resting square of liquid that keeps a gap from two walls [cells]."""
+    centre = (CONSTANTS.wall + gap) / CONSTANTS.grid + 0.1
+    if high:
+        centre = 1.0 - centre
+    square = Part(Material.LIQUID, SQUARE, (centre, centre))
+    return scenario(CONSTANTS, square, spin=4.0)
+
+
+MIXED = scenario(
+    CONSTANTS,
+    Part(Material.LIQUID, SQUARE, (0.2, 0.35), (1.0, -2.0)),
+    Part(Material.SNOW, Disc(0.1), (0.45, 0.2), (0.0, -1.0)),
+    Part(Material.JELLY, Disc(0.1), (0.7, 0.2), (-1.0, -1.0)),
+    Part(Material.ROPE, Rectangle(0.6, 0.06, (0.8, 0.6)), (0.5, 0.6), (0.5, 0.5)),
+    friction=0.3,
+    seed=9,
+)
+NAMED = {m.name.lower(): falling(m) for m in Material}
+NAMED |= {"snow with friction": falling(Material.SNOW, friction=0.3), "all four": MIXED}
+CASES = [pytest.param(state, id=name) for name, state in NAMED.items()]
+
+
+def arrays_of(reference: FreeSurfaceReference) -> list[NDArray[np.float32]]:
+    """Return the arrays of the state in the order of a snapshot."""
+    shape = (CONSTANTS.particles, 2, 2)
+    affine = np.stack(reference.affine, axis=1).reshape(shape)
+    deformation = np.stack(reference.deformation, axis=1).reshape(shape)
+    return [
+        reference.position,
+        reference.velocity,
+        affine,
+        deformation,
+        reference.ratio,
+    ]
+
+
+@pytest.mark.parametrize("state", CASES)
+def test_numpy_gives_the_same_bits(state: InitialState) -> None:
+    """An independent float32 implementation agrees in every bit over 400 substeps,
+    walls included.
+    """
+    solver = start(CONSTANTS, [state])
+    reference = FreeSurfaceReference(CONSTANTS, state)
+    for substeps in (1, 9, 90, 300):
+        solver.advance(substeps)
+        reference.advance(substeps)
+        expected = arrays_of(reference)
+        assert {array.dtype for array in expected} == {np.dtype(np.float32)}
+        computed = [array[0] for array in snapshot(solver)]
+        np.testing.assert_equal(computed, expected)
+
+
+@pytest.mark.parametrize("material", Material)
+def test_scenarios_of_these_tests_reach_walls(material: Material) -> None:
+    """The comparisons cover mirrored nodes: at least three walls are hit within 400
+    substeps.
+    """
+    solver = start(CONSTANTS, [falling(material)])
+    near = (CONSTANTS.wall + 1.5) / CONSTANTS.grid
+    touched = np.zeros(4, bool)
+    for _ in range(40):
+        solver.advance(10)
+        position = solver.position()[0]
+        low_gap = position.min(axis=0)
+        high_gap = 1.0 - position.max(axis=0)
+        touched |= np.concatenate([low_gap, high_gap]) < near
+    assert touched.sum() >= 3
+
+
+@pytest.mark.parametrize(
+    "threads",
+    [
+        1,
+        pytest.param(
+            2, marks=pytest.mark.skipif(available_cores() < 2, reason="one processor")
+        ),
+    ],
+)
+@pytest.mark.parametrize("state", CASES)
+def test_parallel_driver_gives_the_same_bits(state: InitialState, threads: int) -> None:
+    """Atomic adds from any number of threads, over the whole grid, change no bit in 400
+    substeps.
+    """
+    serial = run(CONSTANTS, [state], 400)
+    parallel = run(CONSTANTS, [state], 400, device=Device.PARALLEL, threads=threads)
+    np.testing.assert_equal(parallel, serial)
+
+
+@pytest.mark.parametrize("high", [False, True])
+@pytest.mark.parametrize("gap", [0.6, 1.0, 1.6])
+def test_rows_beyond_a_wall_are_never_stale(gap: float, high: bool) -> None:
+    """Nodes that walls mirror are cleared even if no particle touches them.
+
+    The serial driver visits only nodes near particles. Here a first scenario fills the
+    rows beyond two walls; the second lies near these walls without touching those rows.
+    """
+    state = cornered(gap, high)
+    parallel = run(CONSTANTS, [state], 20, device=Device.PARALLEL, threads=1)
+    run(CONSTANTS, [cornered(0.05, high)], 5)
+    serial = run(CONSTANTS, [state], 20)
+    np.testing.assert_equal(serial, parallel)
+
+
+def test_batched_scenarios_do_not_touch_each_other() -> None:
+    """Scenarios of other materials, areas and frictions in one batch equal each one
+    alone.
+    """
+    states = [falling(Material.LIQUID), falling(Material.SNOW, friction=0.3), MIXED]
+    together = run(CONSTANTS, states, 200, device=Device.PARALLEL)
+    for index, state in enumerate(states):
+        member = [array[index : index + 1] for array in together]
+        alone = run(CONSTANTS, [state], 200)
+        np.testing.assert_equal(member, alone)
+
+
+@pytest.mark.parametrize("state", CASES)
+def test_order_of_particles_does_not_matter(state: InitialState) -> None:
+    """Permuted particles give permuted results, bit for bit, over 400 substeps."""
+    order = np.random.default_rng(4).permutation(CONSTANTS.particles)
+    permuted = dataclasses.replace(
+        state,
+        position=state.position[order],
+        velocity=state.velocity[order],
+        affine=state.affine[order],
+        material=state.material[order],
+    )
+    expected = [array[:, order] for array in run(CONSTANTS, [state], 400)]
+    np.testing.assert_equal(run(CONSTANTS, [permuted], 400), expected)
+
+
+def test_pauses_do_not_matter() -> None:
+    """Reading out between substeps changes nothing: 7 + 93 substeps are 100."""
+    paused = run(CONSTANTS, [MIXED], 7, 0, 93)
+    straight = run(CONSTANTS, [MIXED], 100)
+    np.testing.assert_equal(paused, straight)
+
+
+def test_a_solver_forgets_its_last_scenario() -> None:
+    """Loading again starts from the new state only: no field carries over, NumPy
+    says.
+    """
+    run(CONSTANTS, [falling(Material.LIQUID)], 300)
+    again = start(CONSTANTS, [MIXED])
+    reference = FreeSurfaceReference(CONSTANTS, MIXED)
+    again.advance(100)
+    reference.advance(100)
+    computed = [array[0] for array in snapshot(again)]
+    np.testing.assert_equal(computed, arrays_of(reference))

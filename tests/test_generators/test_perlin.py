@@ -1,0 +1,176 @@
+"""Jets, Perlin noise and the stream function against numbers from other routes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+
+from lagbench.generators import curl_noise, draws, noise
+
+LOW = 0.0375
+HIGH = 0.9625
+NUMBERS = st.floats(-2, 2, allow_subnormal=False)
+
+
+def points(count: int, low: float = 0.0, high: float = 1.0) -> NDArray[np.float64]:
+    """Return reproducible points of a square."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    return low + (high - low) * rng.random((count, 2))
+
+
+def noise_by_hand(x: float, y: float, lattice: NDArray[np.float64]) -> float:
+    """Perlin noise as thesis Eqs. 5.40 and 5.41 spell it, one point at a time."""
+    i = min(int(x), len(lattice) - 2)
+    j = min(int(y), len(lattice) - 2)
+
+    def dot(k: int, m: int) -> float:
+        slope = lattice[i + k, j + m]
+        return float(slope[0] * (x - i - k) + slope[1] * (y - j - m))
+
+    def fade(t: float) -> float:
+        return 6 * t**5 - 15 * t**4 + 10 * t**3
+
+    def lerp(t: float, a: float, b: float) -> float:
+        return a + t * (b - a)
+
+    u = fade(x - i)
+    w = fade(y - j)
+    left = lerp(w, dot(0, 0), dot(0, 1))
+    right = lerp(w, dot(1, 0), dot(1, 1))
+    return lerp(u, left, right)
+
+
+def psi_by_hand(
+    position: NDArray[np.float64], lattice: NDArray[np.float64], scale: float
+) -> float:
+    """The windowed stream function at one point, from its definition."""
+    frequency = len(lattice) - 1
+    x, y = (position - LOW) / (HIGH - LOW)
+    value = scale * (HIGH - LOW) * noise_by_hand(x * frequency, y * frequency, lattice)
+    for wall in (x, 1 - x, y, 1 - y):
+        t = 2 * frequency * wall
+        if t < 1:
+            value *= (15 * t - 10 * t**3 + 3 * t**5) / 8
+    return float(value)
+
+
+def lattice_of(frequency: int) -> NDArray[np.float64]:
+    """Return the gradients of a test lattice."""
+    rng = draws.generator("curl-noise", "test", 1, frequency)
+    return np.asarray(noise.gradients(rng, frequency))
+
+
+def stream(position: NDArray[np.float64], lattice: NDArray[np.float64]) -> noise.Jet:
+    """Return the stream function of scale 0.01 and its derivatives."""
+    return curl_noise.stream_function(position, lattice, low=LOW, high=HIGH, scale=0.01)
+
+
+@given(st.lists(NUMBERS, min_size=1, max_size=6), NUMBERS, NUMBERS)
+def test_jets_differentiate_polynomials(
+    coefficients: list[float], x: float, y: float
+) -> None:
+    """The Hessian of p(x y) follows from p' and p'' by hand (chain rule)."""
+    jet_x, jet_y = noise.coordinates(np.array([[x, y]]))
+    p = (jet_x * jet_y).polynomial(*coefficients)
+    exact = Polynomial(coefficients)
+    first = exact.deriv(1)(x * y)
+    second = exact.deriv(2)(x * y)
+    expected = [
+        exact(x * y),
+        y * first,
+        x * first,
+        y * y * second,
+        first + x * y * second,
+        x * x * second,
+    ]
+    terms = (p.value, p.x, p.y, p.xx, p.xy, p.yy)
+    derivatives = [term[0] for term in terms]
+    assert derivatives == pytest.approx(expected, rel=1e-9, abs=1e-9)
+
+
+def test_noise_is_zero_with_the_drawn_slope_at_every_node() -> None:
+    """Gradient noise: value 0 and gradient g at the nodes, the far corner included."""
+    lattice = lattice_of(3)
+    node = np.array(list(np.ndindex(4, 4)), dtype=np.float64)
+    field = noise.noise(*noise.coordinates(node), lattice)
+    np.testing.assert_allclose(field.value, 0.0, atol=1e-15)
+    slope = np.stack([field.x, field.y], -1)
+    np.testing.assert_allclose(slope, lattice.reshape(-1, 2), atol=1e-14)
+    large = lattice_of(13).reshape(-1, 2)  # unit vectors, no two alike
+    np.testing.assert_allclose(np.hypot(*large.T), 1.0, rtol=3e-16)
+    assert len(np.unique(large, axis=0)) == 14 * 14
+
+
+@given(st.floats(0.0, 5.0), st.floats(0.0, 5.0))
+def test_noise_equals_the_thesis_formula(x: float, y: float) -> None:
+    """The vectorised jet and a scalar transcription of Eqs. 5.40 and 5.41 agree."""
+    lattice = lattice_of(5)
+    point = noise.coordinates(np.array([[x, y]]))
+    field = noise.noise(*point, lattice)
+    expected = noise_by_hand(x, y, lattice)
+    assert field.value[0] == pytest.approx(expected, abs=1e-13)
+
+
+def test_ramp_joins_one_with_two_derivatives() -> None:
+    """Bridson's ramp: 0 with slope 15/8 at 0; 1 with slope and curvature 0 from 1
+    on.
+    """
+    t = np.array([[0.0, 0.0], [1.0 - 1e-9, 0.0], [1.0, 0.0], [7.0, 0.0]])
+    along_x, _ = noise.coordinates(t)
+    ramp = noise.ramp(along_x)
+    np.testing.assert_allclose(ramp.value, [0.0, 1.0, 1.0, 1.0], atol=1e-15)
+    np.testing.assert_allclose(ramp.x, [1.875, 0.0, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(ramp.xx, [0.0, 0.0, 0.0, 0.0], atol=1e-7)
+
+
+@pytest.mark.parametrize("frequency", [1, 2, 4, 13])
+def test_flow_is_the_rotated_gradient_by_numerical_differentiation(
+    frequency: int,
+) -> None:
+    """Velocity: u = dpsi/dy and v = -dpsi/dx of the formula, differenced over 2e-6."""
+    lattice = lattice_of(frequency)
+    step = 1e-6
+    position = points(60, LOW + 0.001, HIGH - 0.001)
+    psi = stream(position, lattice)
+    for term, offset in zip((psi.x, psi.y), np.eye(2) * step, strict=True):
+        above = np.array([psi_by_hand(p + offset, lattice, 0.01) for p in position])
+        below = np.array([psi_by_hand(p - offset, lattice, 0.01) for p in position])
+        slope = (above - below) / (2 * step)
+        np.testing.assert_allclose(term, slope, atol=2e-9 * frequency)
+
+
+@pytest.mark.parametrize("frequency", [1, 4, 13])
+def test_hessian_by_numerical_differentiation(frequency: int) -> None:
+    """The second derivatives are the differences of the first."""
+    lattice = lattice_of(frequency)
+    step = 1e-6
+    position = points(200, LOW + 0.001, HIGH - 0.001)
+    here = stream(position, lattice)
+    tolerance = 2e-5 * frequency**2
+    rows = ((here.xx, here.xy), (here.xy, here.yy))
+    for (along_x, along_y), offset in zip(rows, np.eye(2) * step, strict=True):
+        after = stream(position + offset, lattice)
+        before = stream(position - offset, lattice)
+        slope_x = (after.x - before.x) / (2 * step)
+        slope_y = (after.y - before.y) / (2 * step)
+        np.testing.assert_allclose(along_x, slope_x, atol=tolerance)
+        np.testing.assert_allclose(along_y, slope_y, atol=tolerance)
+
+
+@pytest.mark.parametrize("frequency", [1, 4, 13])
+def test_no_flow_crosses_the_walls(frequency: int) -> None:
+    """The normal velocity is exactly 0 on each wall; the flow along it is not."""
+    along = LOW + (HIGH - LOW) * np.arange(101) / 100
+    lattice = lattice_of(frequency)
+    for wall in (LOW, HIGH):
+        upright = np.stack([np.full(101, wall), along], -1)
+        side = stream(upright, lattice)
+        floor = stream(upright[:, ::-1], lattice)
+        assert not side.y.any()
+        assert not floor.x.any()
+        assert np.abs(side.x).max() > 1e-4
+        assert np.abs(floor.y).max() > 1e-4

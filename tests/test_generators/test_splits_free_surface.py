@@ -1,0 +1,229 @@
+"""Fluid and multimaterial: bodies, their places and velocities against the thesis."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import math
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scenario_draws import SIZES, all_of, changed, digest, draw, neighbours, state_of
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from lagbench.data import registry
+from lagbench.errors import WorkFailedError
+from lagbench.generators import fluid, multimaterial
+from lagbench.generators.split import InitialState, Material
+
+DECLARED = [
+    (split, name)
+    for split in ("fluid", "multimaterial")
+    for name in registry.load().split(split).parameters
+]
+
+
+FAMILIES = ["falling-rectangle", "thrown", "falling-circle", "splash"]
+PAIRS = [
+    "liquid-snow",
+    "rope-snow",
+    "rope-liquid",
+    "snow-snow",
+    "rope-jelly",
+    "liquid-liquid",
+]
+
+
+def other_value(name: str, value: float) -> float:
+    """Return another value of a parameter with which bodies can still be drawn."""
+    # A gap shows by another verdict on a placement only; a J of liquid below 1 is
+    # refused.
+    special = {"gap": 0.1, "gap_cells": 2, "jacobian_max": 1.1}
+    if name in special:
+        return special[name]
+    if isinstance(value, int):
+        return value + 1
+    if name.endswith("_max"):
+        return 0.8 * value or -0.1
+    return 1.25 * value or 0.1
+
+
+@pytest.mark.parametrize(("split", "name"), DECLARED)
+def test_every_parameter_decides_bits(split: str, name: str) -> None:
+    """Another value in datasets.yaml gives another solver constant or another initial
+    state.
+    """
+    size = registry.load().size(split, "tiny")
+    other = changed(size, **{name: other_value(name, size.value(name))})
+    constants = importlib.import_module(size.generator).solver_parameters
+    if repr(constants(other)) != repr(constants(size)):
+        return
+    before = [digest(state_of(split, "tiny", i)) for i in size.scenarios]
+    after = [digest(draw(other, i)) for i in size.scenarios]
+    assert after != before
+
+
+@pytest.mark.parametrize("module", [fluid, multimaterial])
+def test_no_number_in_the_source_decides_bits(module: ModuleType) -> None:
+    """What is drawn has its ranges in datasets.yaml: the source holds 0, 1, 2, halves
+    and a limit.
+    """
+    tree = ast.parse(Path(str(module.__file__)).read_text())
+    numbers = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+            numbers.add(node.value)
+    assert numbers <= {0, 0.5, 1, 2, getattr(module, "_ATTEMPTS", 0)}
+
+
+@pytest.mark.parametrize(
+    ("split", "kind", "expected"),
+    [("fluid", "family", FAMILIES), ("multimaterial", "pair", PAIRS)],
+)
+def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None:
+    """The id modulo 4 or 6, in the order of Table 4.8, whose 0 and 26 are a rectangle
+    and a circle.
+    """
+    for size in SIZES:
+        entry = registry.load().size(split, size)
+        kinds = {}
+        for i in entry.scenarios:
+            kinds[i] = state_of(split, size, i).parameters[kind]
+            assert kinds[i] == expected[i % len(expected)]
+        if (split, size) != ("fluid", "tiny"):
+            test_kinds = {kinds[i] for i in entry.subsets["test"]}
+            assert test_kinds == set(expected)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
+    """Areas 0.04-0.06; velocities per family; a margin of 0.02 to every wall."""
+    (low, high), _ = registry.load().size("fluid", size).bounds
+    for state in all_of("fluid", size):
+        assert 0.04 <= state.area <= 0.06
+        assert low + 0.02 - 1e-5 <= state.position.min()
+        assert state.position.max() <= high - 0.02 + 1e-5
+        assert (state.material == Material.LIQUID).all()
+        family = state.parameters["family"]
+        velocity = state.velocity
+        if family == "thrown":
+            assert (velocity >= [1.0, 0.0]).all()
+            assert (velocity <= [2.0, 1.0]).all()
+        elif family != "splash":
+            assert np.abs(velocity).max() <= 0.3
+            assert velocity[:, 1].max() <= 0.0
+            assert state.position[:, 1].min() >= 0.35
+        if family != "splash":
+            assert (velocity == velocity[0]).all()
+
+
+def test_fluid_bodies_cover_their_area_in_one_piece() -> None:
+    """Particles within 1.8 spacings of each other form one piece; the cells they occupy
+    count right.
+    """
+    for state in all_of("fluid")[:16]:
+        spacing = math.sqrt(state.area / len(state.position))
+        tree = cKDTree(state.position)
+        pairs = tree.sparse_distance_matrix(tree, 1.8 * spacing)
+        piece_count, _ = connected_components(pairs)
+        assert piece_count == 1
+        cell = 1.6 * spacing
+        cells = np.unique(np.floor(state.position / cell), axis=0)
+        # Occupied cells overcount by about half the outline's: 5 to 30 % here.
+        assert 1.0 < len(cells) * cell**2 / state.area < 1.3
+
+
+def test_fluid_splash_has_blobs_and_noise() -> None:
+    """Neighbours share their blob's velocity; their difference is the noise, N(0,
+    0.5).
+    """
+    differences = []
+    speeds = []
+    for state in all_of("fluid")[3::4]:
+        _, nearest = neighbours(state.position, 60)
+        differences.append(state.velocity - state.velocity[nearest[:, 1]])
+        speeds.append(state.velocity[nearest].mean(axis=1) - [0.0, 0.5])
+    # Variance of a difference of two: 2 x 0.25, plus a little of the blend.
+    deviation = np.std(np.concatenate(differences))
+    assert deviation == pytest.approx(math.sqrt(0.5), rel=0.03)
+    # Where discs of N(0, 0.7) meet, their velocities are blended.
+    assert 0.3 < np.std(np.concatenate(speeds)) < 0.8
+
+
+def halves(
+    state: InitialState, size: registry.Size
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Split a state's particles into its two bodies by their recorded areas."""
+    first = float(state.parameters["first_area"])
+    first_count = round(size.particles * first / state.area)
+    return state.position[:first_count], state.position[first_count:]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_multimaterial_bodies_keep_apart(size: str) -> None:
+    """No particle of one body within 0.038 of the other's; both inside the margin."""
+    entry = registry.load().size("multimaterial", size)
+    (low, high), _ = entry.bounds
+    for state in all_of("multimaterial", size):
+        first, second = halves(state, entry)
+        gaps, _ = neighbours(second, 1, among=first)
+        assert gaps.min() > 0.038
+        assert low + 0.02 - 1e-5 <= state.position.min()
+        assert state.position.max() <= high - 0.02 + 1e-5
+
+
+def test_multimaterial_shares_particles_and_areas() -> None:
+    """Materials change where the first body's share ends; a rope is 0.05 wide."""
+    entry = registry.load().size("multimaterial", "full")
+    for state in all_of("multimaterial"):
+        first, second = halves(state, entry)
+        words = str(state.parameters["pair"]).split("-")
+        expected = [Material[word.upper()] for word in words]
+        assert (state.material[: len(first)] == expected[0]).all()
+        assert (state.material[len(first) :] == expected[1]).all()
+        areas = [
+            float(state.parameters[f"{name}_area"]) for name in ("first", "second")
+        ]
+        assert math.fsum(areas) == pytest.approx(state.area)
+        for word, area, body in zip(words, areas, (first, second), strict=True):
+            if word == "rope":
+                narrow, wide = np.linalg.eigvalsh(np.cov(body.T, bias=True))
+                assert math.sqrt(12 * narrow) == pytest.approx(0.05, rel=0.04)
+                assert 0.54 < math.sqrt(12 * wide) < 0.76
+                assert 0.55 * 0.05 <= area <= 0.75 * 0.05
+            else:
+                assert 0.045 <= area <= 0.06
+        if "jelly" in words:
+            assert state.parameters["second_shape"] == "disc"
+
+
+def test_multimaterial_bodies_move_towards_one_point() -> None:
+    """v_1 - v_2 = rate (c_2 - c_1): the common point drops out. Walls brake where no
+    body is liquid.
+    """
+    for state in all_of("multimaterial"):
+        dry = "liquid" not in str(state.parameters["pair"])
+        friction = 0.05 if dry else 0.0
+        assert state.friction == friction
+        assert state.parameters["friction"] == friction
+        p = {}
+        for name, value in state.parameters.items():
+            if not isinstance(value, str):
+                p[name] = float(value)
+        for axis in ("x", "y"):
+            approach = p[f"first_velocity_{axis}"] - p[f"second_velocity_{axis}"]
+            apart = p[f"second_centre_{axis}"] - p[f"first_centre_{axis}"]
+            assert approach == pytest.approx(p["attraction"] * apart, abs=4 * 2.0**-20)
+        assert np.abs(state.velocity).max() < 2.5
+
+
+def test_multimaterial_gives_up_when_there_is_no_room() -> None:
+    """Bodies that cannot lie side by side are an error, not an endless search."""
+    tiny = registry.load().size("multimaterial", "tiny")
+    size = changed(tiny, area_min=0.45, area_max=0.45)
+    with pytest.raises(WorkFailedError):
+        draw(size, 5)

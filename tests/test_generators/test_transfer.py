@@ -1,0 +1,136 @@
+"""B-spline weights against SciPy, and the exactness and range of the fixed-point
+sums.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.interpolate import BSpline
+
+from lagbench.generators import backend, transfer
+from lagbench.generators.solver import Device
+
+DX = 1.0 / 32.0
+
+
+@ti.kernel
+def evaluate_stencil(  # type: ignore[no-untyped-def] # noqa: ANN201
+    x: ti.types.ndarray(),  # type: ignore[valid-type]
+    rows: ti.types.ndarray(),  # type: ignore[valid-type]
+    base: ti.types.ndarray(),  # type: ignore[valid-type]
+):
+    for p in range(x.shape[0]):
+        row = transfer.stencil(ti.Vector([x[p, 0], x[p, 1], 0.0, 0.0]), 32.0, 33)
+        base[p] = ti.bit_cast(row[0][3], ti.i32)
+        for i, j in ti.static(ti.ndrange(3, 4)):
+            rows[p, i, j] = row[i][j]
+
+
+@ti.kernel
+def evaluate(  # type: ignore[no-untyped-def] # noqa: ANN201
+    value: ti.types.ndarray(),  # type: ignore[valid-type]
+    fixed: ti.types.ndarray(),  # type: ignore[valid-type]
+    out: ti.types.ndarray(),  # type: ignore[valid-type]
+):
+    for p in range(value.shape[0]):
+        fixed[p] = transfer.to_fixed(value[p])
+        out[p, 0] = transfer.bounded(value[p], -1.0, 2.0)
+        out[p, 1] = transfer.largest(value[p], 1.0)
+
+
+@pytest.fixture(autouse=True)
+def taichi_runtime() -> None:
+    """Start Taichi as the solver does."""
+    backend.start(Device.CPU)
+
+
+def test_weights_are_the_quadratic_b_spline() -> None:
+    """Each weight is a product of SciPy's B-splines; moments are 1, 0 and dx^2/4; the
+    rest fits.
+    """
+    count = 500
+    unit = np.random.default_rng(0).random((count, 2))
+    x = (unit * 0.9 + 0.05).astype(np.float32)
+    rows = np.zeros((count, 3, 4), np.float32)
+    base = np.zeros(count, np.int32)
+    evaluate_stencil(x, rows, base)
+
+    # distance of each of the three nodes per axis [cells], shape [point, 3, 2]
+    node = np.stack(np.divmod(base, 33), axis=-1)
+    nodes = node[:, None, :] + np.arange(3)[None, :, None]
+    scaled = x[:, None, :].astype(np.float64) / DX
+    distance = nodes - scaled
+    assert np.abs(distance).max() <= 1.5
+
+    knots = [-1.5, -0.5, 0.5, 1.5]
+    basis = BSpline.basis_element(knots, extrapolate=False)
+    spline = basis(distance)
+    expected = spline[:, :, None, 0] * spline[:, None, :, 1]
+    weight = rows[:, :, :3]
+    np.testing.assert_allclose(weight, expected, rtol=0, atol=2e-6)
+    total = weight.sum(axis=(1, 2))
+    np.testing.assert_allclose(total, 1.0, rtol=0, atol=1e-6)
+    for axis in range(2):
+        along = weight.sum(axis=2 - axis)
+        offset = distance[:, :, axis]
+        first_moment = (along * offset).sum(axis=1)
+        second_moment = (along * offset**2).sum(axis=1)
+        np.testing.assert_allclose(first_moment, 0.0, rtol=0, atol=4e-6)
+        np.testing.assert_allclose(second_moment, 0.25, rtol=0, atol=4e-6)
+        stated_offset = rows[:, axis + 1, 3]
+        np.testing.assert_allclose(stated_offset, -offset[:, 1], rtol=0, atol=1e-6)
+
+
+def test_fixed_point_is_numpys_rint() -> None:
+    """Any float32 within the range becomes the integer that NumPy rounds to: halves to
+    the even one.
+    """
+    by_hand = {
+        0.5: 0,
+        1.5: 2,
+        2.5: 2,
+        -0.5: 0,
+        -1.5: -2,
+        3.0: 3,
+        1e-30: 0,
+        0.75: 1,
+        -(2.0**50): -(2**50),
+        2.0**50: 2**50,
+    }
+    count = 20_000
+    rng = np.random.default_rng(1)
+    mantissa = rng.random(count) - 0.5
+    exponent = rng.integers(-5, 51, count)
+    drawn = mantissa * 2.0**exponent
+    value = np.concatenate([list(by_hand), drawn]).astype(np.float32)
+    fixed = np.zeros(len(value), np.int64)
+    bounds = np.zeros((len(value), 2), np.float32)
+    evaluate(value, fixed, bounds)
+    assert fixed[: len(by_hand)].tolist() == list(by_hand.values())
+    expected = np.rint(value.astype(np.float64))
+    np.testing.assert_array_equal(fixed, expected.astype(np.int64))
+
+
+def test_bounds_and_extremes_meet_nan() -> None:
+    """What is not a number becomes the lower bound as a position, and stays visible as
+    an extreme.
+    """
+    value = np.array([-3.0, 0.5, 7.0, np.nan, np.inf], np.float32)
+    out = np.zeros((5, 2), np.float32)
+    evaluate(value, np.zeros(5, np.int64), out)
+    np.testing.assert_array_equal(out[:, 0], [-1.0, 0.5, 2.0, -1.0, 2.0])
+    np.testing.assert_array_equal(out[:, 1], [1.0, 1.0, 7.0, np.nan, np.inf])
+
+
+@given(particles=st.integers(1, 2**22), bound=st.floats(1e-6, 1e6))
+def test_sums_cannot_overflow(particles: int, bound: float) -> None:
+    """The scale is a power of two, N bounds fit in 62 bits, and one step is far below
+    float32's.
+    """
+    scale = transfer.fixed_point_scale(particles, bound)
+    assert np.frexp(scale)[0] == 0.5
+    assert scale * bound <= 2.0**50
+    assert scale * bound * particles <= 2.0**62
+    assert 1.0 / scale <= bound * 2.0**-38

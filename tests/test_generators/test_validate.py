@@ -1,0 +1,348 @@
+"""Ghia's tables, the diagnostics, the experiment's checks and the validate command."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from box_scenarios import compiled
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from lagbench.errors import UsageError
+from validation import __main__, diagnostics, experiment
+from validation.experiment import Case, plan
+
+BOX = diagnostics.SquareBox(low=0.0625, high=0.9375, cells=35)
+
+
+def _tabulated(
+    reynolds: int, name: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ascending abscissae and values of one profile, walls included, misprints
+    left out.
+    """
+    lines = diagnostics.centre_lines(reynolds)
+    assert lines is not None
+    if name == "u":
+        points = np.array(diagnostics.Y)
+        values = lines.u
+        lid = 1.0
+    else:
+        points = np.array(diagnostics.X)
+        values = lines.v
+        lid = 0.0
+    is_number = ~np.isnan(values)
+    # the tables begin at the lid
+    abscissae = np.concatenate([[0.0], points[is_number][::-1], [1.0]])
+    profile = np.concatenate([[0.0], values[is_number][::-1], [lid]])
+    return abscissae, profile
+
+
+@pytest.mark.parametrize("name", ["u", "v"])
+@pytest.mark.parametrize("reynolds", diagnostics.REYNOLDS)
+def test_tabulated_profiles_have_no_slips(reynolds: int, name: str) -> None:
+    """Mass is conserved in a closed box: each tabulated profile integrates to nearly 0.
+
+    A wrong sign or first digit among the widely spaced points would move the integral
+    by 0.01. Among the points 0.008 apart, each lies within 0.006 of a spline through
+    the others.
+    """
+    abscissae, values = _tabulated(reynolds, name)
+    whole = CubicSpline(abscissae, values)
+    assert abs(whole.integrate(0.0, 1.0)) < 0.004
+    gaps = abscissae[2:] - abscissae[:-2]
+    crowded = np.flatnonzero(gaps < 0.017) + 1
+    assert len(crowded) >= 3
+    for i in crowded:
+        others = np.arange(len(values)) != i
+        spline = CubicSpline(abscissae[others], values[others])
+        assert abs(spline(abscissae[i]) - values[i]) < 0.006
+
+
+def test_misprints_are_left_out() -> None:
+    """The two misprints are NaN, everything else is a number, and Re 7 is not
+    tabulated.
+
+    Differences 3 and 4 beside a NaN: RMSE sqrt(25/2), maximum 4.
+    """
+    missing = set()
+    for reynolds in diagnostics.REYNOLDS:
+        lines = diagnostics.centre_lines(reynolds)
+        for name in ("u", "v"):
+            is_missing = np.isnan(getattr(lines, name))
+            for index in np.flatnonzero(is_missing):
+                missing.add((reynolds, name, int(index)))
+    assert missing == {
+        (400, "v", diagnostics.X.index(0.9063)),
+        (3200, "u", diagnostics.Y.index(0.4531)),
+    }
+    assert diagnostics.centre_lines(7.0) is None
+    measured = np.array([3.0, 9.0, -4.0])
+    reference = np.array([0.0, np.nan, 0.0])
+    deviation = diagnostics.deviation(measured, reference)
+    assert deviation.rmse == pytest.approx(math.sqrt(12.5))
+    assert deviation.maximum == 4.0
+
+
+def test_occupancy_counts_every_particle_once() -> None:
+    """One particle in each cell's middle gives all ones; one outside counts in the
+    nearest cell.
+    """
+    x, y = np.meshgrid(BOX.nodes, BOX.nodes, indexing="ij")
+    middles = np.stack([x.ravel(), y.ravel()], axis=-1)
+    assert np.all(diagnostics.occupancy(middles, BOX) == 1)
+    counts = diagnostics.occupancy(np.array([[0.0, 1.0]]), BOX)
+    assert counts[0, -1] == 1
+    assert counts.sum() == 1
+    # of 35 x 35 cell centres 2 x 5 x 5 lie in the lid's corners
+    corners = middles[diagnostics.lid_corners(middles, BOX)]
+    assert len(corners) == 50
+    assert corners[:, 1].min() > 0.5
+
+
+def _nodal(u: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([u, v], axis=-1)
+
+
+def test_grid_rates_of_rotation_and_expansion() -> None:
+    """Rigid rotation at rate 3 has vorticity 6 and no divergence; v = 2 x expands at
+    4.
+    """
+    x, y = np.meshgrid(BOX.nodes - 0.5, BOX.nodes - 0.5, indexing="ij")
+    turning = diagnostics.grid_rates(_nodal(-3.0 * y, 3.0 * x), BOX.spacing)
+    assert turning.vorticity == pytest.approx(6.0)
+    assert turning.divergence == pytest.approx(0.0, abs=1e-12)
+    expanding = diagnostics.grid_rates(_nodal(2.0 * x, 2.0 * y), BOX.spacing)
+    assert expanding.divergence == pytest.approx(4.0)
+    assert math.isnan(diagnostics.grid_rates(np.zeros((5, 5, 2)), 0.1).ratio)
+
+
+def test_energies() -> None:
+    """Two particles of mass 2 at speeds 3 and 4: E = 25; a displacement counts per
+    frame.
+    """
+    velocity = np.array([[3.0, 0.0], [0.0, -4.0]])
+    assert diagnostics.kinetic_energy(velocity, 2.0) == 25.0
+    assert diagnostics.displacement_energy(velocity + 1.0, np.ones((2, 2)), 2.0) == 25.0
+
+
+@pytest.mark.parametrize("cells", [34, 35])
+def test_profiles_reproduce_a_polynomial_flow(cells: int) -> None:
+    """Splines return u = 4 U x (1 - x) y^3 and v = 16 U y (1 - y) x (1 - x)(1 - 2 x),
+    both cubic.
+
+    The middle lies on a node for 35 cells and between nodes for 34.
+    """
+    box = diagnostics.SquareBox(low=0.06, high=0.94, cells=cells)
+    s = (box.nodes - box.low) / box.width
+    x, y = np.meshgrid(s, s, indexing="ij")
+    u = 4.0 * x * (1.0 - x) * y**3
+    v = 16.0 * y * (1.0 - y) * x * (1.0 - x) * (1.0 - 2.0 * x)
+    profiles = diagnostics.extract(0.2 * _nodal(u, v), box, 0.2)
+    lines = profiles.at_reference_points()
+    heights = np.array(diagnostics.Y)
+    abscissae = np.array(diagnostics.X)
+    expected_v = 4.0 * abscissae * (1 - abscissae) * (1 - 2 * abscissae)
+    assert lines.u == pytest.approx(heights**3, abs=1e-12)
+    assert lines.v == pytest.approx(expected_v, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("case", "grid", "low", "particles", "dt"),
+    [
+        (Case.CAVITY, 40, 0.0625, 8192, 2e-3),
+        (Case.CAVITY, 80, 0.05625, 32768, 1e-3),
+        (Case.CAVITY, 56, 0.0625, 16056, 2e-3 * 40 / 56),
+        (Case.CURL_NOISE, 40, 0.0375, 8096, 2e-3),
+    ],
+)
+def test_plan_scales_the_full_size(
+    case: Case, grid: int, low: float, particles: int, dt: float
+) -> None:
+    """The box stays within half a cell, dt shrinks with dx, particles per cell stay."""
+    reynolds = 400.0 if case is Case.CAVITY else None
+    settings = plan(case, reynolds=reynolds, grid=grid, substeps=1)
+    box = diagnostics.box_of(experiment.solver_parameters(settings))
+    assert box.low == pytest.approx(low)
+    assert settings.particles == particles
+    assert settings.dt == pytest.approx(dt)
+    assert settings.frame_substeps == round(0.1 / dt)
+
+
+def test_cavity_state_has_the_reynolds_number() -> None:
+    """The viscosity is U L / Re, the top wall alone moves, the fluid is at rest and
+    fills the box evenly.
+    """
+    settings = plan(Case.CAVITY, reynolds=400.0, substeps=1, lid_speed=0.125, seed=3)
+    state = experiment.initial_state(settings)
+    assert state.viscosity == pytest.approx(0.125 * 0.875 / 400.0)
+    assert state.wall_velocity.tolist() == [[0, 0], [0, 0], [0, 0], [0.125, 0]]
+    assert not state.velocity.any()
+    assert diagnostics.occupancy(state.position, BOX).min() >= 4
+
+
+def test_curl_noise_state_is_divergence_free_and_stays_inside() -> None:
+    """The trace of C is 0 to its rounding, and no particle flows through a wall."""
+    settings = plan(Case.CURL_NOISE, substeps=1, frequency=5)
+    state = experiment.initial_state(settings)
+    trace = state.affine[:, 0, 0] + state.affine[:, 1, 1]
+    assert np.abs(trace).max() <= 2.0**-20
+    assert state.viscosity == 0.0
+    viscous = experiment.initial_state(
+        plan(Case.CURL_NOISE, substeps=1, frequency=5, reynolds=1000.0)
+    )
+    speed = np.sqrt(np.mean(np.sum(state.velocity**2, axis=-1)))
+    assert viscous.viscosity == pytest.approx(speed * 0.925 / 1000.0)
+
+
+@pytest.mark.parametrize(
+    ("case", "settings", "words"),
+    [
+        (Case.CAVITY, {}, "Reynolds"),
+        (Case.CAVITY, {"reynolds": -1.0}, "positive"),
+        (Case.CAVITY, {"reynolds": math.nan}, "positive"),
+        (Case.CAVITY, {"reynolds": 0.5}, "too viscous"),
+        (Case.CAVITY, {"reynolds": 100.0, "grid": 8}, "grid is too small"),
+        (
+            Case.CAVITY,
+            {"reynolds": 100.0, "particles": 1224},
+            "fewer particles than cells",
+        ),
+        (Case.CAVITY, {"reynolds": 100.0, "dt": 0.1}, "sound"),
+        (Case.CAVITY, {"reynolds": 100.0, "lid_speed": 2.0}, "lid"),
+        (Case.CAVITY, {"reynolds": 100.0, "lid_off_after": 10}, "lid stops"),
+        (Case.CAVITY, {"reynolds": 100.0, "frequency": 4}, "stirring"),
+        (Case.CAVITY, {"reynolds": 100.0, "substeps": 0}, "nothing to simulate"),
+        (Case.CURL_NOISE, {"lid_speed": 0.1}, "no lid"),
+        (Case.CURL_NOISE, {"frequency": 30}, "frequency"),
+    ],
+)
+def test_plan_refuses_what_cannot_work(
+    case: Case, settings: dict[str, Any], words: str
+) -> None:
+    """Every refusal is a usage error that says what is wrong and what was expected."""
+    with pytest.raises(UsageError, match=words) as caught:
+        plan(case, **{"substeps": 10, **settings})
+    assert "expected" in str(caught.value)
+
+
+@pytest.fixture(autouse=True)
+def compile_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every experiment take the solver that is there."""
+    monkeypatch.setattr(experiment, "build", compiled)
+
+
+def _arguments(folder: Path, *more: str) -> list[str]:
+    """Return the options of a cavity on 16 x 16 cells, 1,311 particles."""
+    base = ["--case", "cavity", "--re", "100", "--grid", "16", "--substeps", "300"]
+    return [*base, "--json", str(folder / "result.json"), *more]
+
+
+def test_validate_reports_what_it_measured(tmp_path: Path) -> None:
+    """Ghia's points with his values, errors that follow from them, checks, energy that
+    grows.
+
+    All but the timing is equal in a second run, to the byte; the picture is one.
+    """
+    texts = []
+    for _ in range(2):
+        assert (
+            __main__.main(
+                _arguments(tmp_path, "--profiles", str(tmp_path / "profiles.png"))
+            )
+            == 0
+        )
+        assert (tmp_path / "profiles.png").read_bytes().startswith(b"\x89PNG")
+        found = json.loads((tmp_path / "result.json").read_text())
+        assert found.pop("timing")["particle_substeps_per_second"] > 0.0
+        texts.append(json.dumps(found))
+    assert texts[0] == texts[1]
+    lines = found["centre_lines"]
+    assert [point["y"] for point in lines["u"]] == list(diagnostics.Y)
+    assert lines["v"][0]["ghia"] == -0.05906
+    squares = [(point["u"] - point["ghia"]) ** 2 for point in lines["u"]]
+    assert found["ghia"]["u_rmse"] == pytest.approx(math.sqrt(sum(squares) / 15))
+    assert found["empty_cells"] == 0
+    assert (
+        found["jacobian"]["min"] <= found["jacobian"]["min_outside_lid_corners"] <= 1.0
+    )
+    assert found["kinetic_energy"]["substep"] == list(range(0, 301, 20))
+    assert found["kinetic_energy"]["value"] == sorted(found["kinetic_energy"]["value"])
+    assert [check["substep"] for check in found["checks"]] == [300]
+
+
+def test_validate_stops_the_lid_where_nothing_is_tabulated(tmp_path: Path) -> None:
+    """The energy falls once the lid stops; at Re 250 there is no table, so errors are
+    null.
+    """
+    arguments = [
+        *_arguments(tmp_path),
+        "--re",
+        "250",
+        "--substeps",
+        "600",
+        "--lid-off-after",
+        "300",
+    ]
+    assert __main__.main(arguments) == 0
+    found = json.loads((tmp_path / "result.json").read_text())
+    energy = dict(
+        zip(
+            found["kinetic_energy"]["substep"],
+            found["kinetic_energy"]["value"],
+            strict=True,
+        )
+    )
+    assert energy[600] < 0.95 * energy[300]
+    assert found["largest_rise_after_lid_off"] < 0.0
+    assert found["ghia"] is None
+    assert found["centre_lines"]["u"][0]["ghia"] is None
+
+
+def test_validate_curl_noise(tmp_path: Path) -> None:
+    """Most of the energy is left after ten frames, and divergence is small against
+    vorticity.
+    """
+    target = tmp_path / "curl.json"
+    options = [
+        "--case",
+        "curl-noise",
+        "--grid",
+        "20",
+        "--frequency",
+        "2",
+        "--substeps",
+        "500",
+    ]
+    assert __main__.main([*options, "--json", str(target)]) == 0
+    found = json.loads(target.read_text())
+    assert found["centre_lines"] is None
+    assert 0.5 < found["energy_retention"] < 1.1
+    assert found["divergence_over_vorticity"] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--grid", "4"], "grid is too small"),
+        (["--particles", "100"], "fewer particles than cells"),
+        (["--profiles", "curve.txt"], "not a picture format"),
+        (["--json", "/proc/none/result.json"], "cannot be written"),
+        (["--frequency", "3"], "stirring"),
+    ],
+)
+def test_validate_refuses_bad_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+) -> None:
+    """Exit code 2, the reason on stderr without a traceback, no file written."""
+    assert __main__.main([*_arguments(tmp_path), *options]) == 2
+    told = capsys.readouterr()
+    assert words in told.err
+    assert "Traceback" not in told.err
+    assert told.out == ""
+    assert not list(tmp_path.iterdir())

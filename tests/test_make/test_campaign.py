@@ -1,0 +1,239 @@
+"""What a generation checks, what it compares with datasets.yaml, and what it then
+leaves.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+from rewritten_files import forge
+
+from lagbench.data import checksums
+from lagbench.data.manifest import Manifest, read_manifest, write_manifest
+from lagbench.data.registry import Measured, Registry
+from lagbench.errors import DataError
+from lagbench.generators.record import measured_values
+from lagbench.make import painting
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.verify import verify
+from lagbench.work.progress import Progress
+
+Copy = Callable[[], Path]
+
+
+def manifest_of(root: Path) -> Manifest:
+    """Return the manifest of the tiny data set."""
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
+    assert manifest is not None
+    return manifest
+
+
+def with_measured(registry: Registry, values: Measured) -> Registry:
+    """Return a registry with other measured values of the tiny data set."""
+    return Registry(registry.splits, {SPLIT: {SIZE: values}})
+
+
+@pytest.fixture
+def right(generated: GenerationResult) -> Measured:
+    """What datasets.yaml says about the generated data set once it is recorded."""
+    values: Measured = measured_values(manifest_of(generated.root))
+    return values
+
+
+def card_of(root: Path) -> str:
+    """Return the text of the data set's card."""
+    return (root / SPLIT / SIZE / "v2" / "README.md").read_text()
+
+
+def test_all_hashes_are_compared(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Equal scenarios are not enough to be equal to datasets.yaml; an id without a hash
+    equals nothing.
+    """
+    without_two = dict(right.scenario_sha256)
+    del without_two[2]
+    root = copied()
+    changes = (
+        ({"dataset_sha256": "0" * 64}, "the data set"),
+        ({"subset_sha256": {"train": "0" * 64}}, "train"),
+        ({"scenario_sha256": without_two}, "scenarios 2"),
+    )
+    for change, place in changes:
+        registry = with_measured(unmeasured, right.model_copy(update=change))
+        with pytest.raises(DataError) as caught:
+            generate(SPLIT, SIZE, root=root, registry=registry)
+        assert place in str(caught.value.where)
+        assert caught.value.exit_code == 4
+
+
+def test_equal_hashes_are_told(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """All hashes hold: the verdict says so and nothing is simulated."""
+    result = generate(
+        SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right)
+    )
+    assert (result.verdict, result.simulated) == ("equal to datasets.yaml", ())
+
+
+def test_a_forged_file_is_made_anew(
+    copied: Copy, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """Without a recorded hash the manifest's counts: a file that agrees with itself is
+    not adopted.
+    """
+    root = copied()
+    forge(root / SPLIT / SIZE / "v2" / "test" / "0003.nc")
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    assert result.simulated == (3,)
+    assert result.dataset_sha256 == generated.dataset_sha256
+
+
+def test_another_machine_is_tolerance_until_its_hashes_are_found_equal(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Without a recorded hash nothing shows that the bits are equal; the card says it
+    too.
+    """
+    root = copied()
+    manifest = manifest_of(root)
+    environment = {**manifest.environments[0], "machine": "aarch64"}
+    write_manifest(root, manifest.model_copy(update={"environments": (environment,)}))
+    generate(SPLIT, SIZE, root=root, registry=unmeasured)
+    assert manifest_of(root).identity == "tolerance"
+    assert "tolerance" in card_of(root)
+    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
+    assert manifest_of(root).identity == "bitwise"
+    assert "same bits on every" in card_of(root)
+
+
+def test_other_bits_of_another_machine_are_kept_and_told(
+    tmp_path: Path,
+    unmeasured: Registry,
+    right: Measured,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An ARM CPU whose bits differ: tolerance in manifest and card, no error, nothing
+    simulated twice.
+    """
+    wrong = {**right.scenario_sha256, 4: "0" * 16}
+    registry = with_measured(
+        unmeasured, right.model_copy(update={"scenario_sha256": wrong})
+    )
+    options = {"root": tmp_path, "scenarios": "4", "workers": 1, "registry": registry}
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    first = generate(SPLIT, SIZE, **options)  # type: ignore[arg-type]
+    assert first.simulated == (4,)
+    assert "tolerance" in first.verdict
+    assert manifest_of(tmp_path).identity == "tolerance"
+    assert "tolerance" in card_of(tmp_path)
+    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    verify(SPLIT, SIZE, root=tmp_path, registry=registry).check()
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+    assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
+    # A broken promise is never tolerated: bitwise still, and no card says more.
+    with pytest.raises(DataError, match="have another hash"):
+        generate(SPLIT, SIZE, force=True, **options)  # type: ignore[arg-type]
+    root = tmp_path / "other"
+    with pytest.raises(DataError, match="1 of 1 scenarios have another hash") as caught:
+        generate(SPLIT, SIZE, **{**options, "root": root})  # type: ignore[arg-type]
+    assert caught.value.exit_code == 4
+    assert manifest_of(root).identity == "bitwise"
+    assert not (root / SPLIT / SIZE / "v2" / "README.md").exists()
+
+
+def test_wrong_statistics_are_mended(
+    copied: Copy, unmeasured: Registry, right: Measured
+) -> None:
+    """Where datasets.yaml says otherwise, the statistics of train are computed anew."""
+    root = copied()
+    manifest = manifest_of(root)
+    lie = {**manifest.statistics, "velocity_std": (1.0, 1.0)}
+    write_manifest(root, manifest.model_copy(update={"statistics": lie}))
+    generate(SPLIT, SIZE, root=root, registry=with_measured(unmeasured, right))
+    assert manifest_of(root).statistics == right.statistics
+
+
+def test_paths_of_a_manifest_are_not_published(
+    copied: Copy, unmeasured: Registry
+) -> None:
+    """A manifest that names a file elsewhere is written anew from the files."""
+    root = copied()
+    folder = root / SPLIT / SIZE / "v2"
+    path = folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    manifest["files"][3]["path"] = "../../../../../etc/passwd"
+    path.write_text(json.dumps(manifest))
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    for name in ("manifest.json", "croissant.json", "README.md"):
+        assert "passwd" not in (folder / name).read_text()
+
+
+def test_a_second_call_hashes_each_file_once_and_draws_nothing(
+    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bytes are read once, progress is told meanwhile, and cards that would be the same
+    stay.
+    """
+    root = copied()
+    read: Counter[str] = Counter()
+    news: list[Progress] = []
+
+    def counted(path: Path) -> str:
+        read[path.name] += 1
+        return checksums.file_sha256(path)
+
+    def refuse(*_: object) -> list[str]:
+        pytest.fail("pictures are drawn again")
+
+    for module in ("make.inventory", "data.manifest"):
+        monkeypatch.setattr(f"lagbench.{module}.file_sha256", counted)
+    monkeypatch.setattr(painting, "paint_pictures", refuse)
+    generate(SPLIT, SIZE, root=root, registry=unmeasured, dry_run=True)
+    read.clear()
+    generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
+    assert read == {f"{i:04d}.nc": 1 for i in range(5)}
+    checking = [state for state in news if state.stage == "checking"]
+    assert (checking[0].done, checking[-1].done, checking[-1].total) == (0, 5, 5)
+
+
+def test_values_are_hashed_once(
+    copied: Copy, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the first call of a copied folder; a dry run takes the manifest's word, later
+    calls the note.
+    """
+
+    def refuse(*_: object) -> str:
+        pytest.fail("values are hashed again")
+
+    root = copied()
+    calls = ((True, False), (False, True), (False, False))
+    for dry_run, may_hash in calls:
+        with monkeypatch.context() as patch:
+            if not may_hash:
+                patch.setattr("lagbench.make.inventory.check_scenario", refuse)
+            result = generate(
+                SPLIT, SIZE, root=root, registry=unmeasured, dry_run=dry_run
+            )
+        assert result.kept == (0, 1, 2, 3, 4)
+
+
+@pytest.mark.parametrize("name", ["README.md", "croissant.json", "pictures/frame.png"])
+def test_a_card_that_is_gone_or_changed_is_made_anew(
+    name: str, copied: Copy, unmeasured: Registry
+) -> None:
+    """Only cards that are there and the same are left alone."""
+    root = copied()
+    path = root / SPLIT / SIZE / "v2" / name
+    before = path.read_bytes()
+    path.unlink()
+    generate(SPLIT, SIZE, root=root, registry=unmeasured)
+    assert path.read_bytes() == before

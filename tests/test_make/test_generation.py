@@ -1,0 +1,594 @@
+"""Generation: what is written, what is resumed, and that workers and devices leave no
+trace.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import PAINT, SIZE, SPLIT
+from independent_hash import content_hash, dumps
+
+from lagbench.data import WALLS
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, load
+from lagbench.data.scenario import check_scenario, read_scenario
+from lagbench.errors import DataError, UsageError, WorkFailedError
+from lagbench.generators.batch import (
+    draw_initial_state,
+    start_frame,
+    substep_count,
+)
+from lagbench.generators.draws import generator
+from lagbench.generators.simulate import active_frames, draw_perturbation
+from lagbench.make import painting
+from lagbench.make.card_files import PICTURES
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.plan import SECONDS_TO_START, estimate, select
+from lagbench.work.progress import Progress
+
+
+def folder_of(root: Path) -> Path:
+    """Return the folder of the tiny data set."""
+    return root / SPLIT / SIZE / "v2"
+
+
+def manifest_of(root: Path, split: str = SPLIT) -> Manifest:
+    """Return the manifest of a tiny data set."""
+    manifest = read_manifest(root, split, SIZE, 2)
+    assert manifest is not None
+    return manifest
+
+
+def contents(root: Path) -> dict[str, bytes]:
+    """Return name and bytes of every scenario file."""
+    return {
+        path.name: path.read_bytes() for path in sorted(folder_of(root).glob("*/*.nc"))
+    }
+
+
+def test_everything_is_there_and_hashed(generated: GenerationResult) -> None:
+    """Five files, whose data set hash follows by h5py and hashlib from the rules of the
+    design.
+    """
+    subsets = {}
+    for subset in ("train", "valid", "test"):
+        paths = sorted((generated.folder / subset).glob("*.nc"))
+        lines = "".join(f"{path.stem} {content_hash(path)}\n" for path in paths)
+        subsets[subset] = hashlib.sha256(lines.encode()).hexdigest()
+    whole = dumps({"split": SPLIT, "size": SIZE, "major": 2, "subsets": subsets})
+    assert generated.dataset_sha256 == hashlib.sha256(whole).hexdigest()
+    assert generated.simulated == (0, 1, 2, 3, 4)
+    assert (generated.kept, generated.missing, generated.complete) == ((), (), True)
+    assert "nothing to compare with" in generated.verdict
+    # Beside the scenarios stand manifest, cards, pictures, the lock and the notes; no
+    # temporary file.
+    files = [path for path in generated.folder.rglob("*") if path.is_file()]
+    names = {str(path.relative_to(generated.folder)) for path in files}
+    scenarios = {
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    }
+    cards = {
+        "manifest.json",
+        "README.md",
+        "croissant.json",
+        "pictures/frame.png",
+        "pictures/scenarios.png",
+    }
+    assert names == scenarios | cards | {".lock", ".verified.json"}
+
+
+def test_a_file_holds_what_its_scenario_says(
+    generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """Frame 0 is the initial state drawn from the stated seed; parameters are those of
+    the registry.
+    """
+    size = unmeasured.size(SPLIT, SIZE)
+    with read_scenario(generated.folder / "test" / "0003.nc") as file:
+        header = file.header
+        first = file.read("position", 0)
+        material = file.read("material")
+        velocity = file.read("velocity", 0)
+    state = draw_initial_state(size, 3)
+    np.testing.assert_array_equal(first, state.position.astype(np.float32))
+    np.testing.assert_array_equal(velocity, state.velocity.astype(np.float32))
+    np.testing.assert_array_equal(material, state.material)
+    words = [int(word) for word in header.seed.split(", ")]
+    again = np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
+    assert again.random() == generator(SPLIT, SIZE, 2, 3).random()
+    assert header.parameters["frequency"] == 2
+    assert header.parameters["start_frame"] == 0
+    assert header.parameters["modulus"] == size.value("modulus")
+
+
+def test_cavity_files_hold_the_walls_of_every_frame(
+    tiny_split: Callable[..., GenerationResult],
+) -> None:
+    """Row f of ``wall_velocity`` is what the program says of frame f, counted from
+    where recording starts.
+    """
+    state = draw_initial_state(load().size("cavity", "tiny"), 3)
+    with read_scenario(tiny_split("cavity").folder / "test" / "0003.nc") as file:
+        walls = file.read("wall_velocity")
+        start = file.header.parameters["start_frame"]
+        assert "active_frames" not in file.header.parameters
+    assert start == state.start_frame
+    np.testing.assert_array_equal(walls, state.wall_velocity[-26:].astype(np.float32))
+    assert (
+        len(np.unique(walls[:, WALLS.index(str(state.parameters["wall"]))], axis=0))
+        > 13
+    )
+
+
+def test_active_frames_end_when_little_energy_is_left() -> None:
+    """Two frames given, six to predict: the last above 1 % counts, later peaks beyond
+    the horizon do not.
+    """
+    task = (
+        load()
+        .size("fluid", "tiny")
+        .task.model_copy(update={"input_frames": 2, "horizon": 6})
+    )
+    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.3, 0.1, 0.05, 0.02, 90.0], task) == 6
+    assert active_frames([1.0, 2.0, 1.0, 0.5, 0.0199, 0.1, 0.0199, 0.0, 0.5], task) == 4
+    assert active_frames([1.0, 0.001, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], task) == 0
+
+
+@pytest.mark.parametrize("split", ["fluid", "multimaterial"])
+def test_active_frames_stand_in_the_file_and_its_hash(
+    split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """They follow from the stored velocities; another number is another content
+    hash.
+    """
+    shutil.copytree(tiny_split(split).folder / "test", tmp_path / "test")
+    task = load().size(split, "tiny").task
+    for path in sorted((tmp_path / "test").glob("*.nc")):
+        with read_scenario(path) as file:
+            energy = (file.read("velocity").astype(np.float64) ** 2).sum(axis=(1, 2))
+            stated = file.header.parameters["active_frames"]
+        span = energy[: task.input_frames + task.horizon]
+        assert (
+            stated
+            == np.flatnonzero(span >= 0.01 * span.max())[-1] + 1 - task.input_frames
+        )
+        check_scenario(path)
+        with h5py.File(path, "r+") as raw:
+            raw.attrs.modify("active_frames", stated + 1)
+        with pytest.raises(DataError, match="attributes differ"):
+            check_scenario(path)
+
+
+def test_facts_of_the_manifest_follow_from_the_files(
+    generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """Energies are sums over the stored velocities; speed, CFL number and J stay in
+    their bounds.
+
+    The predictability limit is known for each predicted frame; after one frame it is
+    still near 2^-20.
+    """
+    horizon = unmeasured.size(SPLIT, SIZE).task.horizon
+    for entry in manifest_of(generated.root).files:
+        with read_scenario(generated.folder / entry.path) as file:
+            velocity = file.read("velocity").astype(np.float64)
+            mass = float(file.read("particle_mass"))
+        energy = 0.5 * mass * (velocity**2).sum(axis=(1, 2))
+        facts = entry.facts
+        last = energy[-1]
+        expected = {
+            "kinetic_energy_first": energy[0],
+            "kinetic_energy_last": last,
+            "kinetic_energy_mean": energy.mean(),
+            "energy_last_over_max": last / energy.max(),
+        }
+        for name, value in expected.items():
+            assert facts[name] == pytest.approx(value, rel=1e-12), name
+        assert facts["max_speed"] >= np.abs(velocity).max()
+        assert 0.0 < facts["cfl"] < 1.0
+        assert 0.9 < facts["jacobian_min"] <= 1.0 <= facts["jacobian_max"] < 1.1
+        assert len(entry.twin_floor) == (horizon if entry.subset == "test" else 0)
+        assert all(0.5 < floor * 2**20 < 2.0 for floor in entry.twin_floor[:1])
+        assert all(floor < 1e-4 for floor in entry.twin_floor)
+
+
+def test_the_perturbation_has_a_random_stream_of_its_own(unmeasured: Registry) -> None:
+    """Every coordinate moves by exactly 2^-20, up or down as often, not as the scenario
+    is drawn.
+    """
+    size = unmeasured.size(SPLIT, SIZE)
+    signs = draw_perturbation(size, 3) * 2**20
+    assert set(np.unique(signs)) == {-1.0, 1.0}
+    assert abs(signs.mean()) < 0.1
+    assert not np.array_equal(signs, draw_perturbation(size, 4) * 2**20)
+    plain = generator(SPLIT, SIZE, 2, 3).random((size.particles, 2))
+    assert not np.array_equal(signs > 0, plain >= 0.5)
+
+
+def test_resuming_makes_what_is_missing_or_wrong(
+    copied: Callable[[], Path], unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """A removed and a damaged scenario are made anew by one worker; then all bytes are
+    as before.
+    """
+    root = copied()
+    before = contents(root)
+    folder = folder_of(root)
+    (folder / "test" / "0003.nc").unlink()
+    damaged = folder / "train" / "0001.nc"
+    os.truncate(damaged, damaged.stat().st_size - 1000)
+    leftover = folder / "test" / ".0003.nc.99999.partial"
+    leftover.write_bytes(b"half a file")
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    assert (result.simulated, result.kept) == ((1, 3), (0, 2, 4))
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert contents(root) == before
+    assert not leftover.exists()
+
+
+def test_parts_complete_each_other(
+    tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """One subset first leaves complete: false and no data set hash; the rest gives the
+    whole hash.
+    """
+    part = generate(
+        SPLIT, SIZE, subset="test", root=tmp_path, workers=1, registry=unmeasured
+    )
+    assert (part.simulated, part.missing) == ((3, 4), (0, 1, 2))
+    assert (part.complete, part.dataset_sha256) == (False, None)
+    manifest = manifest_of(tmp_path)
+    assert (manifest.complete, manifest.statistics) == (False, {})
+    rest = generate(SPLIT, SIZE, root=tmp_path, workers=1, registry=unmeasured)
+    assert (rest.simulated, rest.kept) == ((0, 1, 2), (3, 4))
+    assert rest.dataset_sha256 == generated.dataset_sha256
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_force_simulates_what_is_there(
+    copied: Callable[[], Path],
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """With force a good scenario is written again, with the same bytes; compiled
+    kernels are kept.
+    """
+    root = copied()
+    kernels = tmp_path / "kernels"
+    monkeypatch.setenv("TI_OFFLINE_CACHE_FILE_PATH", str(kernels))
+    before = contents(root)
+    path = folder_of(root) / "valid" / "0002.nc"
+    stamp = path.stat().st_mtime_ns
+    result = generate(
+        SPLIT,
+        SIZE,
+        scenarios="2",
+        root=root,
+        workers=1,
+        force=True,
+        registry=unmeasured,
+    )
+    assert result.simulated == (2,)
+    assert path.stat().st_mtime_ns > stamp
+    assert contents(root) == before
+    assert any(entry.is_file() for entry in kernels.rglob("*"))
+
+
+def test_files_of_other_parameters_are_made_anew(
+    copied: Callable[[], Path], unmeasured_path: Path, tmp_path: Path
+) -> None:
+    """Whoever changes a parameter of an unreleased split does not keep files of the old
+    one.
+    """
+    text = unmeasured_path.read_text()
+    old = "velocity_relaxation: {value: 0.002"
+    assert old in text
+    (tmp_path / "own.yaml").write_text(
+        text.replace(old, "velocity_relaxation: {value: 0.003")
+    )
+    result = generate(
+        SPLIT, SIZE, root=copied(), dry_run=True, registry=load(tmp_path / "own.yaml")
+    )
+    assert (result.simulated, result.kept) == ((0, 1, 2, 3, 4), ())
+
+
+def test_a_dry_run_touches_nothing(
+    tmp_path: Path, unmeasured: Registry, generated: GenerationResult
+) -> None:
+    """It tells bytes (an upper bound, not by much), time and free disk, and makes no
+    folder.
+    """
+    result = generate(
+        SPLIT, SIZE, root=tmp_path / "new", dry_run=True, registry=unmeasured
+    )
+    real = sum(len(data) for data in contents(generated.root).values())
+    assert real < result.bytes_needed < 2 * real
+    assert result.bytes_free > result.bytes_needed
+    assert result.seconds_expected > 0.0
+    assert result.simulated == (0, 1, 2, 3, 4)
+    assert not (tmp_path / "new").exists()
+
+
+def test_progress_ends_at_its_total(tmp_path: Path, unmeasured: Registry) -> None:
+    """Substeps of the scenario and of its perturbed run are counted, none twice."""
+    news: list[Progress] = []
+    generate(
+        SPLIT,
+        SIZE,
+        scenarios="3",
+        root=tmp_path,
+        progress=news.append,
+        registry=unmeasured,
+    )
+    size = unmeasured.size(SPLIT, SIZE)
+    simulating = [state for state in news if state.stage == "simulating"]
+    assert simulating[0].total == 2 * substep_count(size, 3) == 2 * 25 * 12
+    assert [state.done for state in simulating] == sorted(
+        state.done for state in simulating
+    )
+    assert simulating[-1].done == simulating[-1].total
+    assert simulating[-1].scenarios_done == 1
+
+
+def test_batches_start_each_scenario_at_its_own_frame(
+    tmp_path: Path, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """Three cavities with programs and starts of their own: one batch and single runs,
+    equal hashes.
+    """
+    size = load().size("cavity", "tiny")
+    assert len({draw_initial_state(size, i).start_frame for i in range(3)}) == 3
+    batch = generate(
+        "cavity", "tiny", root=tmp_path, device="parallel", scenarios="0-2"
+    )
+    manifests = [
+        manifest_of(made.root, "cavity") for made in (tiny_split("cavity"), batch)
+    ]
+    single, together = (
+        [e.content_sha256 for e in m.files if e.scenario < 3] for m in manifests
+    )
+    assert single == together
+    assert len(single) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("split", ["curl-noise", "fluid", "multimaterial"])
+def test_parallel_driver_gives_the_same_data_set(
+    split: str, tmp_path: Path, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """The GPU's kernels with all scenarios in one batch agree to the bit with the
+    serial kernel.
+    """
+    together = generate(split, "tiny", root=tmp_path, device="parallel").dataset_sha256
+    assert together == tiny_split(split).dataset_sha256 is not None
+
+
+def test_selection_by_subset_and_id(unmeasured: Registry) -> None:
+    """Both narrow the choice; ids come back ascending and once."""
+    size = unmeasured.size("multimaterial", "full")
+    assert select(size, subset="valid,test") == tuple(range(48, 72))
+    assert select(size, subset=["extra"], scenarios="73,72") == (72, 73)
+    assert select(size, scenarios=[5, 3, 5]) == (3, 5)
+    assert [type(i) for i in select(size, scenarios=np.arange(3, 5))] == [int, int]
+    for no_ids in (3, [3.0], [None]):
+        with pytest.raises(UsageError):
+            select(size, scenarios=no_ids)  # type: ignore[arg-type]
+    assert len(select(size)) == 87
+
+
+def test_estimates_add_up(unmeasured: Registry) -> None:
+    """Bytes follow from frames and particles; time from substeps, never below the
+    longest scenario's.
+    """
+    size = unmeasured.size("fluid", "tiny")
+    expected = estimate(size, (0, 1))
+    assert expected.substeps == (31 * 5, 31 * 5)
+    assert expected.frames == 64
+    assert expected.bytes == 2 * (32 * 256 * 16 + 65536)
+    # all workers compile
+    one = expected.seconds(1) - SECONDS_TO_START
+    two = expected.seconds(2) - SECONDS_TO_START
+    assert one == pytest.approx(2 * two)
+    assert estimate(size, ()).seconds(1) == 0.0
+    assert expected.seconds(9) == expected.seconds(2)
+
+
+GENERATOR = """
+import os
+from pathlib import Path
+from lagbench.generators import cavity
+from lagbench.generators.cavity import solver_parameters, start_frame
+
+def initial_state(size, scenario, rng):
+    with Path(os.environ["DRAWS"]).open("a") as log:
+        log.write(f"{os.getpid()} {scenario}\\n")
+    return cavity.initial_state(size, scenario, rng)
+"""
+
+
+@pytest.fixture
+def draw_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file to which the module ``counted_cavity`` writes its draws, in any
+    process.
+    """
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    (modules / "counted_cavity.py").write_text(GENERATOR)
+    monkeypatch.syspath_prepend(modules)
+    log = tmp_path / "draws.txt"
+    log.touch()
+    monkeypatch.setenv("DRAWS", str(log))
+    return log
+
+
+@pytest.fixture
+def counted_registry() -> Registry:
+    """The cavity, drawn by a module that logs its draws."""
+    split = load().split("cavity").model_copy(update={"generator": "counted_cavity"})
+    return Registry({"cavity": split}, {})
+
+
+@pytest.mark.usefixtures("as_shipped")
+def test_each_scenario_is_drawn_once_in_the_worker_that_simulates_it(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Perturbed runs of test start from the same draw; the parent draws nothing."""
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", workers=1, registry=counted_registry
+    )
+    assert result.complete
+    lines = draw_log.read_text().splitlines()
+    processes = {line.split()[0] for line in lines}
+    drawn = sorted(int(line.split()[1]) for line in lines)
+    assert drawn == [0, 1, 2, 3, 4]
+    assert len(processes) == 1
+    assert str(os.getpid()) not in processes
+
+
+def test_planning_draws_no_scenario(
+    tmp_path: Path, draw_log: Path, counted_registry: Registry
+) -> None:
+    """Estimate, dry run and the count of substeps need the first frame alone."""
+    size = counted_registry.size("cavity", SIZE)
+    counts = [substep_count(size, scenario) for scenario in size.scenarios]
+    assert estimate(size, size.scenarios).substeps == tuple(counts)
+    result = generate(
+        "cavity", SIZE, root=tmp_path / "data", dry_run=True, registry=counted_registry
+    )
+    assert result.simulated == size.scenarios
+    assert draw_log.read_text() == ""
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+@pytest.mark.parametrize("tier", ["tiny", "mini"])
+def test_the_first_frame_is_that_of_the_whole_draw(split: str, tier: str) -> None:
+    size = load().size(split, tier)
+    for scenario in size.scenarios[:8]:
+        state = draw_initial_state(size, scenario)
+        assert start_frame(size, scenario) == state.start_frame
+
+
+def test_a_split_that_hides_its_first_frame_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late start without the function that tells of it would be planned too short."""
+    (tmp_path / "late_cavity.py").write_text(
+        "from lagbench.generators.cavity import initial_state, solver_parameters\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    size = load().size("cavity", SIZE)
+    late = size.model_copy(update={"generator": "late_cavity"})
+    with pytest.raises(UsageError) as caught:
+        draw_initial_state(late, 0)
+    assert caught.value.where == "late_cavity.initial_state, scenario 0"
+
+
+LOADED = """
+import sys
+from lagbench.make.generate import generate
+from lagbench.data.registry import load
+from pathlib import Path
+generate(sys.argv[1], sys.argv[2], root=sys.argv[3], registry=load(Path(sys.argv[4])))
+print(*(name for name in sys.modules if name.startswith("lagbench.figures.")))
+"""
+
+
+def test_a_generation_that_paints_nothing_loads_no_drawing_module(
+    copied: Callable[[], Path], unmeasured: Registry, unmeasured_path: Path
+) -> None:
+    """Where everything is there, the card's tables are formatted, and that is all."""
+    root = copied()
+    generate(SPLIT, SIZE, root=root, workers=1, registry=unmeasured)
+    command = [sys.executable, "-c", LOADED, SPLIT, SIZE, root, unmeasured_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["lagbench.figures.tables"]
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_a_root_that_is_a_file_is_refused_dry_or_not(
+    dry_run: bool, tmp_path: Path, unmeasured: Registry
+) -> None:
+    """A dry run does not promise what the real one cannot do: the same error, the same
+    exit code.
+    """
+    (tmp_path / "file").write_text("mine")
+    for root in (tmp_path / "file", tmp_path / "file" / "data"):
+        with pytest.raises(WorkFailedError, match="is a file") as caught:
+            generate(SPLIT, SIZE, root=root, dry_run=dry_run, registry=unmeasured)
+        assert str(tmp_path / "file") in str(caught.value)
+
+
+def test_a_registry_of_ones_own_is_all_that_counts(
+    tmp_path: Path, unmeasured: Registry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split that only the given registry knows is generated, drawn and described with
+    its own title.
+    """
+    monkeypatch.setattr(painting, "paint_pictures", PAINT)
+    described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
+    own = Registry({"own-noise": described}, {})
+    result = generate(
+        "own-noise", SIZE, scenarios="3", root=tmp_path, workers=1, registry=own
+    )
+    assert "# Noise of our own" in (result.folder / "README.md").read_text()
+    assert all((result.folder / name).stat().st_size > 1000 for name in PICTURES)
+
+
+WORKER = """
+import re, sys
+from pathlib import Path
+from lagbench.generators.batch import SimulationJob
+from lagbench.generators.simulate import simulate
+from lagbench.data.registry import load
+registry, split, scenario, root = sys.argv[1:]
+size = load(Path(registry)).size(split, "full")
+short = size.model_copy(update={"frames": 3, "parameters": {**size.parameters}})
+job = SimulationJob(size=short, scenarios=(int(scenario),), root=Path(root))
+simulate(job, lambda units: None)
+heavy = {"xarray", "pandas", "matplotlib", "torch", "dask", "scipy"}
+heavy &= sys.modules.keys()
+# ru_maxrss would be that of the test process, from which this one was forked.
+peak = re.search(r"VmHWM:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]
+print(peak, sorted(heavy))
+"""
+
+
+@pytest.mark.parametrize(
+    ("split", "scenario"), [("curl-noise", 50), ("multimaterial", 54), ("cavity", 50)]
+)
+def test_a_worker_stays_small(
+    split: str, scenario: int, unmeasured_path: Path, tmp_path: Path
+) -> None:
+    """Simulating and writing three frames of the full size takes at most 400 MB and no
+    heavy library.
+    """
+    command = [
+        sys.executable,
+        "-c",
+        WORKER,
+        str(unmeasured_path),
+        split,
+        str(scenario),
+        str(tmp_path),
+    ]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=300, check=True
+    )
+    kilobytes, heavy = done.stdout.splitlines()[-1].split(" ", 1)
+    assert int(kilobytes) <= 400_000
+    assert heavy == "[]"

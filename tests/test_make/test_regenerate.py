@@ -1,0 +1,49 @@
+"""Data made here have the hashes of datasets.yaml: the promise of
+docs/determinism.md.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from scenario_draws import turn
+
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import load
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.verify import verify
+
+SPLITS = tuple(load().splits)
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_tiny_is_made_to_the_bit(
+    split: str, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """All of tiny: scenario, subset and data set hashes, statistics and limit."""
+    size = load().size(split, "tiny")
+    measured = size.measured
+    assert measured is not None
+    result = tiny_split(split)
+    assert result.dataset_sha256 == measured.dataset_sha256
+    manifest = read_manifest(result.root, split, "tiny", size.major)
+    assert manifest is not None
+    assert manifest.subset_sha256 == measured.subset_sha256
+    for name, row in measured.statistics.items():
+        assert tuple(manifest.statistics[name]) == row
+    assert manifest.mean_twin_floor() == measured.twin_floor
+    verified = verify(split, "tiny", root=result.root, complete=True)
+    verified.check()
+    assert verified.warnings == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("split", SPLITS)
+def test_one_scenario_is_made_to_the_bit(split: str, tmp_path: Path) -> None:
+    """One scenario, of mini or of full, another one after every commit."""
+    name = ("mini", "full")[(turn() + SPLITS.index(split)) % 2]
+    size = load().size(split, name)
+    scenario = size.scenarios[turn() // 2 % len(size.scenarios)]
+    result = generate(split, name, scenarios=(scenario,), root=tmp_path)
+    assert result.simulated == (scenario,)
+    assert result.verdict == "what is there is equal to datasets.yaml"

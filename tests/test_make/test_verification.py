@@ -1,0 +1,407 @@
+"""Verification: what is right passes, and whatever is not is named."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import netCDF4
+import numpy as np
+import pytest
+from conftest import SIZE, SPLIT
+from hypothesis import given
+from hypothesis import strategies as st
+from rewritten_files import forge, mend_manifest
+from typer.testing import CliRunner
+
+from lagbench.__main__ import app
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, load
+from lagbench.data.scenario import check_scenario
+from lagbench.errors import DataError, UsageError
+from lagbench.generators.record import measured_values, replace_measured
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.verify import evenly_spaced, verify
+
+Copy = Callable[[], Path]
+
+
+def file_of(root: Path, scenario: str = "test/0003") -> Path:
+    """Return the path of a scenario file."""
+    return root / SPLIT / SIZE / "v2" / f"{scenario}.nc"
+
+
+def manifest_of(root: Path) -> Manifest:
+    """Return the manifest of the tiny data set."""
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
+    assert manifest is not None
+    return manifest
+
+
+def told_otherwise(measured: Registry, **update: Any) -> Registry:
+    """Return a registry with some other hashes of the tiny data set."""
+    own = measured.size(SPLIT, SIZE).measured
+    assert own is not None
+    for name, value in update.items():
+        if isinstance(value, dict):
+            update[name] = {**getattr(own, name), **value}
+    return Registry(measured.splits, {SPLIT: {SIZE: own.model_copy(update=update)}})
+
+
+@pytest.fixture
+def measured(
+    generated: GenerationResult, unmeasured_path: Path, tmp_path: Path
+) -> Registry:
+    """A registry that holds the hashes of the generated data set."""
+    values = measured_values(manifest_of(generated.root))
+    path = tmp_path / "measured.yaml"
+    path.write_text(
+        replace_measured(unmeasured_path.read_text(), {SPLIT: {SIZE: values}})
+    )
+    return load(path)
+
+
+def test_what_was_generated_passes(
+    generated: GenerationResult, measured: Registry, unmeasured: Registry
+) -> None:
+    """Every subset is there and equal to datasets.yaml, as is the whole; without a hash
+    none claims that.
+    """
+    result = verify(SPLIT, SIZE, root=generated.root, registry=measured, complete=True)
+    assert [
+        (r.name, r.present, r.missing, r.wrong, r.extra) for r in result.subsets
+    ] == [
+        ("train", 2, (), (), ()),
+        ("valid", 1, (), (), ()),
+        ("test", 2, (), (), ()),
+    ]
+    assert {report.verdict for report in result.subsets} == {"equal to datasets.yaml"}
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert (result.problems, result.warnings, result.identity) == ((), (), "bitwise")
+    result.check()
+    result = verify(SPLIT, SIZE, root=generated.root, registry=unmeasured)
+    assert result.verdict == "no hash in datasets.yaml yet"
+    result.check()
+
+
+def test_a_missing_file_is_a_warning_unless_all_are_wanted(
+    copied: Copy, measured: Registry
+) -> None:
+    """Half a data set may be right, none is not; with complete a fault of exit code 4
+    names the ids.
+    """
+    root = copied()
+    file_of(root).unlink()
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert result.warnings == ("test lacks 3",)
+    assert [report.verdict for report in result.subsets] == [
+        *["equal to datasets.yaml"] * 2,
+        "incomplete",
+    ]
+    result.check()
+    with pytest.raises(DataError) as caught:
+        verify(SPLIT, SIZE, root=root, registry=measured, complete=True).check()
+    assert "missing: test 3" in str(caught.value)
+    assert "lagbench generate --split curl-noise --size tiny" in str(caught.value)
+    assert caught.value.exit_code == 4
+    with pytest.raises(DataError, match="nothing is generated"):
+        verify(SPLIT, SIZE, root=root / "none", registry=measured).check()
+
+
+def flipped(variable: str) -> Callable[[Path], None]:
+    """Return what flips one bit in the midst of a stored chunk of a variable."""
+
+    def change(path: Path) -> None:
+        with h5py.File(path) as file:
+            chunk = file[variable].id.get_chunk_info(0)
+        data = bytearray(path.read_bytes())
+        data[chunk.byte_offset + chunk.size // 2] ^= 0b100
+        path.write_bytes(bytes(data))
+
+    return change
+
+
+def rewritten(path: Path) -> None:
+    """Change a value by a library, which leaves a healthy file."""
+    with h5py.File(path, "r+") as file:
+        file["velocity"][7, 11, 0] += np.float32(1e-6)
+
+
+def described(**attributes: object) -> Callable[[Path], None]:
+    """Return what changes how readers understand positions, though no stored value
+    changes.
+    """
+
+    def change(path: Path) -> None:
+        with netCDF4.Dataset(path, "r+") as file:
+            file["position"].setncatts(attributes)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("harm", "words"),
+    [
+        *(
+            (flipped(name), f"0003.nc, variable '{name}'")
+            for name in ("position", "velocity", "material")
+        ),
+        (
+            lambda path: os.truncate(path, path.stat().st_size - 1024),
+            "damaged or not one of lagbench",
+        ),
+        (rewritten, "variable 'velocity'"),
+        (described(scale_factor=2.0), "(?s)variable 'position'.*scale_factor"),
+        (described(units="m"), "(?s)variable 'position'.*units"),
+        (
+            lambda path: shutil.copy(path.with_name("0004.nc"), path),
+            "a file holds another scenario",
+        ),
+    ],
+)
+def test_harm_is_named(
+    harm: Callable[[Path], object], words: str, copied: Copy, measured: Registry
+) -> None:
+    """A bit flipped, a file cut, changed, to be read otherwise, or of another scenario:
+    exit code 4.
+    """
+    root = copied()
+    harm(file_of(root))
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert [report.wrong for report in result.subsets] == [(), (), (3,)]
+    with pytest.raises(DataError, match=words) as caught:
+        result.check()
+    assert "test/0003.nc" in str(caught.value)
+    assert caught.value.exit_code == 4
+
+
+def test_a_forger_who_mends_the_file_is_caught(
+    copied: Copy, measured: Registry, unmeasured: Registry
+) -> None:
+    """A file that agrees with itself is held against datasets.yaml, where there is none
+    the manifest.
+    """
+    root = copied()
+    path = file_of(root)
+    content = forge(path)
+    assert check_scenario(path) == content
+    for registry in (measured, unmeasured):
+        with pytest.raises(DataError, match="another content hash") as caught:
+            verify(SPLIT, SIZE, root=root, registry=registry).check()
+        assert caught.value.exit_code == 4
+        assert "test/0003.nc" in str(caught.value)
+        assert content in str(caught.value)
+    mend_manifest(path.parents[1] / "manifest.json", 3, path, content)
+    with pytest.raises(DataError, match="another content hash"):
+        verify(SPLIT, SIZE, root=root, registry=measured).check()
+
+
+def test_a_forger_who_keeps_the_stored_hashes_is_caught(
+    copied: Copy, measured: Registry
+) -> None:
+    """Only the packed bytes and the manifest's word for them changed: generate hashes
+    the values.
+    """
+    root = copied()
+    path = file_of(root, "train/0000")
+    content = manifest_of(root).files[0].content_sha256
+    with h5py.File(path, "r+") as file:
+        file["position"][:] = 0.5
+    mend_manifest(path.parents[1] / "manifest.json", 0, path, content)
+    result = generate(SPLIT, SIZE, root=root, workers=1, registry=measured)
+    assert (result.simulated, result.kept) == ((0,), (1, 2, 3, 4))
+    verify(SPLIT, SIZE, root=root, registry=measured).check()
+
+
+def change_manifest(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change the manifest of the tiny data set as a text editor would."""
+    path = file_of(root).parents[1] / "manifest.json"
+    told = json.loads(path.read_text())
+    change(told)
+    path.write_text(json.dumps(told))
+
+
+def test_statistics_and_twin_floor_of_the_manifest_are_compared(
+    copied: Copy, measured: Registry
+) -> None:
+    """They follow from files that are right: another value is the manifest's fault and
+    a warning.
+    """
+    root = copied()
+    change_manifest(
+        root, lambda told: told["statistics"].update(velocity_std=[1.0, 1.0])
+    )
+    change_manifest(
+        root, lambda told: told["files"][4]["twin_floor"].__setitem__(3, 0.5)
+    )
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert [line for line in result.warnings if "velocity_std" in line]
+    assert [line for line in result.warnings if "twin_floor" in line]
+    result.check()
+
+
+@pytest.mark.parametrize("machine", ["aarch64", "x86_64"])
+def test_other_bits_of_other_machines_are_warnings(
+    machine: str, copied: Copy, measured: Registry
+) -> None:
+    """Files of a machine that promises no equal bits pass with a warning; those of one
+    that does fail.
+    """
+    wrong: dict[str, Any] = {
+        "scenario_sha256": {4: "0" * 16},
+        "subset_sha256": {"test": "0" * 64},
+    }
+    root = copied()
+    registry = told_otherwise(measured, **wrong, dataset_sha256="0" * 64)
+    change_manifest(root, lambda told: told.update(identity="tolerance"))
+    change_manifest(
+        root,
+        lambda told: told["environments"][0].update(machine=machine, system="Linux"),
+    )
+    result = verify(SPLIT, SIZE, root=root, registry=registry)
+    if machine == "x86_64":
+        with pytest.raises(DataError, match="another content hash"):
+            result.check()
+        return
+    assert (result.problems, result.identity) == ((), "tolerance")
+    assert any(
+        "scenarios 4 have other bits than datasets.yaml" in line
+        for line in result.warnings
+    )
+    assert "tolerance" in result.verdict
+    result.check()
+    forge(file_of(root, "test/0004"))
+    with pytest.raises(DataError, match="another content hash"):
+        verify(SPLIT, SIZE, root=root, registry=registry).check()
+
+
+def test_the_data_set_hash_is_compared_too(
+    generated: GenerationResult, measured: Registry
+) -> None:
+    """A registry whose scenario hashes hold but whose data set hash does not is
+    told.
+    """
+    registry = told_otherwise(
+        measured, dataset_sha256="0" * 64, subset_sha256={"train": "1" * 64}
+    )
+    result = verify(SPLIT, SIZE, root=generated.root, registry=registry)
+    assert result.verdict == "NOT that of datasets.yaml"
+    assert result.subsets[0].verdict == "NOT that of datasets.yaml"
+    with pytest.raises(DataError, match="data set hash"):
+        result.check()
+
+
+def test_strangers_and_a_lying_manifest_are_warnings(
+    copied: Copy, measured: Registry
+) -> None:
+    """Files of no scenario, a manifest that says otherwise, and one marked tolerance
+    are told.
+    """
+    root = copied()
+    file_of(root, "test/0099").write_bytes(b"mine")
+    change_manifest(root, lambda told: told.update(identity="tolerance"))
+    change_manifest(root, lambda told: told["files"][0].update(content_sha256="a" * 64))
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    text = "\n".join(result.warnings)
+    assert "test has files of no scenario: 0099.nc" in text
+    assert "identity: tolerance" in text
+    assert "other hashes of 0" in text
+    assert result.identity == "tolerance"
+    result.check()
+
+
+@pytest.mark.parametrize("damage", [None, "{"])
+def test_no_or_a_damaged_manifest_is_a_warning(
+    damage: str | None, copied: Copy, measured: Registry
+) -> None:
+    """The files speak for themselves."""
+    root = copied()
+    path = file_of(root).parents[1] / "manifest.json"
+    path.unlink() if damage is None else path.write_text(damage)
+    result = verify(SPLIT, SIZE, root=root, registry=measured)
+    assert "manifest" in result.warnings[0]
+    result.check()
+
+
+def test_simulating_anew_is_identical(
+    generated: GenerationResult, measured: Registry
+) -> None:
+    """First and last scenario, simulated anew, have the hashes of their files."""
+    result = verify(
+        SPLIT, SIZE, root=generated.root, regenerate=2, workers=2, registry=measured
+    )
+    assert result.regenerated == {0: "identical", 4: "identical"}
+    result.check()
+
+
+def test_simulating_anew_needs_no_file_but_a_hash(
+    tmp_path: Path, measured: Registry, unmeasured: Registry
+) -> None:
+    """A missing scenario is held against datasets.yaml; without a hash there is nothing
+    to compare.
+    """
+    wrong = told_otherwise(measured, scenario_sha256={2: "0" * 16})
+    words = {
+        "identical": measured,
+        "nothing to compare with": unmeasured,
+        "different": wrong,
+    }
+    for word, registry in words.items():
+        result = verify(
+            SPLIT, SIZE, root=tmp_path, scenarios="2", regenerate=1, registry=registry
+        )
+        assert result.regenerated == {2: word}
+    with pytest.raises(DataError, match="scenario 2 differs when simulated anew"):
+        result.check()
+
+
+@given(
+    st.lists(st.integers(0, 9999), min_size=1, unique=True).map(sorted),
+    st.integers(0, 80),
+)
+def test_evenly_spaced_ids(ids: list[int], count: int) -> None:
+    """As many distinct ids as asked for (or all), ascending, first and last included,
+    gaps alike.
+    """
+    chosen = evenly_spaced(ids, count)
+    assert len(chosen) == len(set(chosen)) == min(count, len(ids))
+    assert list(chosen) == sorted(chosen)
+    if len(chosen) > 1:
+        assert (chosen[0], chosen[-1]) == (ids[0], ids[-1])
+        places = [ids.index(i) for i in chosen]
+        gaps = [b - a for a, b in itertools.pairwise(places)]
+        assert max(gaps) - min(gaps) <= 1
+
+
+def test_fewer_than_no_scenario_anew_is_refused(tmp_path: Path) -> None:
+    """In Python and by the command, before anything is hashed."""
+    with pytest.raises(UsageError) as caught:
+        verify("fluid", "tiny", root=tmp_path, regenerate=-1)
+    assert caught.value.where == "--regenerate"
+    words = [
+        "verify",
+        "fluid",
+        "--size",
+        "tiny",
+        "--root",
+        str(tmp_path),
+        "--regenerate",
+        "-1",
+    ]
+    assert CliRunner().invoke(app, words).exit_code == 2
+
+
+def test_regeneration_needs_taichi(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Without Taichi the extra is named before anything is hashed."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(UsageError, match=r"pip install 'lagbench\[generate\]'"):
+        verify("fluid", "tiny", root=tmp_path, regenerate=1)

@@ -1,0 +1,356 @@
+"""Intervals, sign-flip test and ranks against SciPy, enumeration and closed forms."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from statsmodels.stats.multitest import multipletests
+
+from lagbench.errors import UsageError
+from lagbench.metrics import (
+    METRICS,
+    Score,
+    bootstrap_interval,
+    compare,
+    differ,
+    holm,
+    resample,
+    sign_flip_p,
+    standings,
+)
+from lagbench.metrics.significance import mean_loss
+
+DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
+
+
+def score_of(*values: float, metric: str = "vorticity_mse", first: int = 0) -> Score:
+    """Return a score with these values over consecutive scenarios."""
+    scenarios = tuple(range(first, first + len(values)))
+    x = np.array(values)
+    return Score(METRICS[metric], scenarios, (2,), x[:, None], x, (0,) * len(values))
+
+
+def enumerated(differences: list[float]) -> float:
+    """Return the p-value by going through all sign patterns."""
+    seen = abs(sum(differences))
+    signs = itertools.product((1, -1), repeat=len(differences))
+    sums = [
+        sum(s * d for s, d in zip(pattern, differences, strict=True))
+        for pattern in signs
+    ]
+    return sum(abs(total) >= seen for total in sums) / len(sums)
+
+
+@given(DIFFERENCES)
+def test_p_is_that_of_all_sign_patterns(differences: list[float]) -> None:
+    """The sums over two halves count what going through all 2^n patterns counts, ties
+    included.
+    """
+    assert sign_flip_p(differences) == enumerated(differences)
+
+
+def test_ties_by_rounding_count() -> None:
+    """0.1 + 0.2 - 0.3 is 5.6e-17, not 0: equal sums differ by rounding and are still
+    equal.
+    """
+    # |sum| of 0.1 0.2 0.3 -0.6 is 0 up to rounding: every pattern is as extreme
+    assert sign_flip_p([0.1, 0.2, 0.3, -0.6]) == 1.0
+    # 1, 2, 3 with signs: |sum| >= 6 in 2 of 8 patterns, whatever the scale
+    assert sign_flip_p([0.1, 0.2, 0.3]) == sign_flip_p([1.0, 2.0, 3.0]) == 0.25
+    for n in (
+        1,
+        2,
+        6,
+        13,
+        40,
+    ):  # of one sign only the pattern seen and its opposite are as extreme
+        assert sign_flip_p(np.linspace(1.0, 2.0, n)) == pytest.approx(
+            2.0 ** (1 - n), rel=1e-12
+        )
+
+
+def test_losses_that_no_p_value_fits() -> None:
+    """Nothing to compare, more than can be enumerated, and no numbers are refused, and
+    so is infinity.
+
+    It is no evidence: a p-value of 0 would be below the least there is.
+    """
+    for differences in ([], [1.0] * 41, [1.0, math.nan], [1.0, math.inf]):
+        with pytest.raises(UsageError):
+            sign_flip_p(differences)
+    plain = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    infinite = [1.0, 2.0, math.inf, 4.0, 5.0, 6.0]
+    for first, second in (
+        (plain, infinite),
+        (infinite, plain),
+        ([plain, infinite], [plain, plain]),
+    ):
+        with pytest.raises(UsageError):
+            differ(first, second)
+    with pytest.raises(UsageError):
+        bootstrap_interval(plain, minus=plain[:5])
+
+
+def test_interval_is_scipys_percentile_bootstrap() -> None:
+    """SciPy's percentiles about the mean, stretched by sqrt(n/(n-1)) and Student's
+    quantile.
+    """
+    x = np.random.default_rng(1).gamma(2.0, size=12)
+    low, high = bootstrap_interval(x)
+    options = {
+        "n_resamples": 20_000,
+        "method": "percentile",
+        "rng": np.random.default_rng(2),
+    }
+    theirs = scipy.stats.bootstrap((x,), np.mean, **options).confidence_interval
+    stretch = (
+        math.sqrt(12 / 11) * scipy.stats.t.ppf(0.975, 11) / scipy.stats.norm.ppf(0.975)
+    )
+    expected = [
+        x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)
+    ]
+    assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
+
+
+def test_the_two_way_bootstrap_of_a_closed_case() -> None:
+    """For value = a_s + b_i the variance is var(a)/S + var(b)/N, and so is that of the
+    draws.
+    """
+    seeds = np.array([0.0, 1.0, 5.0])
+    scenarios = np.array([1.0, 2.0, 4.0, 4.0, 9.0, 10.0])
+    found = resample(seeds[:, None] + scenarios)
+    parts = [np.var(seeds, ddof=1) / 3, np.var(scenarios, ddof=1) / 6]
+    assert found.mean == pytest.approx(2.0 + 5.0)
+    assert found.error**2 == pytest.approx(sum(parts))
+    assert np.var(found.deviations) == pytest.approx(sum(parts), rel=0.03)
+    # Satterthwaite: (v1 + v2)^2 / (v1^2 / 2 + v2^2 / 5)
+    assert found.freedom == pytest.approx(
+        sum(parts) ** 2 / (parts[0] ** 2 / 2 + parts[1] ** 2 / 5)
+    )
+
+
+def test_the_two_way_bootstrap_holds_what_it_promises() -> None:
+    """Of 300 draws of 3 seeds and 16 scenarios, 95 % of the intervals hold the true
+    mean.
+    """
+    rng = np.random.default_rng(5)
+    held = 0
+    for _ in range(300):
+        a = rng.normal(0, 0.3, (3, 1))
+        b = rng.normal(0, 1, 16)
+        rest = rng.normal(0, 0.3, (3, 16))
+        low, high = bootstrap_interval(a + b + rest)
+        held += low <= 0.0 <= high
+    assert held / 300 == pytest.approx(0.95, abs=0.04)
+
+
+def test_intervals_repeat_and_scale() -> None:
+    """The draws are seeded and depend on the number of scenarios alone; NaN values are
+    left out.
+
+    With one seed the scenarios alone are drawn, whichever way they are given; fewer
+    than four have no interval.
+    """
+    x = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]
+    low, high = bootstrap_interval(x)
+    assert (low, high) == bootstrap_interval(x) == bootstrap_interval([x])
+    assert bootstrap_interval(x, minus=[1.0] * 6) == pytest.approx(
+        (low - 1.0, high - 1.0)
+    )
+    assert bootstrap_interval([2 * v + 1 for v in x]) == pytest.approx(
+        (2 * low + 1, 2 * high + 1)
+    )
+    assert bootstrap_interval([*x[:2], math.nan, *x[2:]]) == (low, high)
+    assert low < np.mean(x) < high
+    for few in ([], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]):
+        assert all(math.isnan(bound) for bound in bootstrap_interval(few))
+
+
+def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
+    """Methods whose seeds alone scatter: Welch's test of their means, by SciPy.
+
+    Three equal seeds of each: SciPy's paired test over scenarios. One seed, weights
+    against weights: exact over scenarios; a missing scenario is left out, five claim
+    nothing.
+    """
+    a = np.array([1.0, 1.2, 1.5])
+    b = np.array([2.0, 2.6, 2.1, 2.9])
+    ours = differ(np.repeat(a[:, None], 12, axis=1), np.repeat(b[:, None], 12, axis=1))
+    assert ours == pytest.approx(scipy.stats.ttest_ind(a, b, equal_var=False).pvalue)
+    a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
+    ours = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
+    assert ours == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
+    assert differ(a, b) == differ([a], [b]) == sign_flip_p(a - b)
+    a[2] = math.nan
+    assert differ(a, b) == sign_flip_p(np.delete(a - b, 2))
+    assert math.isnan(differ(a[3:8], b[3:8]))
+    with pytest.raises(UsageError):
+        differ(a, b[:4])
+
+
+def test_seeds_of_one_method_seldom_differ() -> None:
+    """Two draws of 3 seeds of the same method: at most 5 % of 400 pairs differ, with
+    room for chance.
+    """
+    rng = np.random.default_rng(11)
+    told = 0
+    for _ in range(400):
+        scenario = rng.normal(0, 1, 16)
+        one, two = (
+            scenario + rng.normal(0, 0.2, (3, 1)) + rng.normal(0, 0.2, (3, 16))
+            for _ in range(2)
+        )
+        told += differ(one, two) < 0.05
+    assert told / 400 <= 0.05
+
+
+@pytest.mark.parametrize(
+    "p",
+    [
+        [0.03],
+        [0.0, 1.0],
+        [
+            0.04,
+            0.01,
+            0.03,
+            0.005,
+        ],  # the third is held up by the second: 0.06, 0.03, 0.06, 0.02
+        [0.2, 0.01, 0.01, 0.2, 1.0, 0.6],
+        np.random.default_rng(0).beta(0.5, 3.0, 9).tolist(),
+    ],
+)
+def test_holm_is_that_of_statsmodels(p: list[float]) -> None:
+    """The corrected p-values are those of statsmodels' step-down method, with ties, 0
+    and 1.
+    """
+    assert holm(p) == pytest.approx(multipletests(p, method="holm")[1].tolist())
+    # NaN is not counted as a comparison and stays
+    *others, claimed_none = holm([*p, math.nan])
+    assert others == holm(p)
+    assert math.isnan(claimed_none)
+
+
+def test_comparison_over_common_scenarios() -> None:
+    """Scenarios 1 to 6 are in both; a scenario that is NaN in one is left out."""
+    one = score_of(9.0, *range(1, 7))
+    two = score_of(*range(2, 8), 99.0, first=1)
+    found = compare(one, two)
+    assert (found.scenarios, found.difference, found.interval) == (
+        (1, 2, 3, 4, 5, 6),
+        -1.0,
+        (-1.0, -1.0),
+    )
+    assert (found.p, found.significant) == (2.0**-5, True)
+    assert compare(one, score_of(math.nan, 1.0)).scenarios == (1,)
+    # its smallest p would be 0.0625
+    five = compare(score_of(*[1.0] * 5), score_of(*[2.0] * 5))
+    assert math.isnan(five.p)
+    assert (five.significant, five.difference) == (False, -1.0)
+
+
+def test_direction_decides_who_is_better() -> None:
+    """A higher correlation and an energy ratio nearer 1 are smaller losses.
+
+    Nothing is won by divergence of its own, and metrics do not mix.
+    """
+    for metric, values, gain in (
+        ("vorticity_pearson", (0.9, 0.8), 0.1),
+        ("energy_ratio", (0.9, 1.3), 0.2),
+    ):
+        better = compare(*(score_of(v, v, metric=metric) for v in values))
+        assert better.difference == pytest.approx(-gain)
+    for metric, other in (
+        ("energy_true", "energy_true"),
+        ("vorticity_mse", "vorticity_mae"),
+    ):
+        with pytest.raises(UsageError):
+            compare(score_of(1.0, metric=metric), score_of(1.0, metric=other))
+
+
+def test_ranks_are_numbers_in_order() -> None:
+    """B differs from a in two scenarios only (p = 0.5): it cannot be told from the
+    leader; c and d can.
+
+    c and d win no scenario: p = 2/64 each, times the comparisons left: 3 and 2 of
+    three.
+    """
+    a = [float(v) for v in range(1, 10)]
+    scores = {
+        "d": score_of(*(v + 2.001 for v in a)),
+        "c": score_of(*(v + 2 for v in a)),
+    }
+    found = standings({**scores, "b": score_of(*a[:7], 8.5, 9.5), "a": score_of(*a)})
+    assert {name: place.rank for name, place in found.items()} == {
+        "a": 1,
+        "b": 2,
+        "c": 3,
+        "d": 4,
+    }
+    assert {name for name, place in found.items() if place.tied} == {"b"}
+    each = [found[name].p for name in "abcd"]
+    assert each == pytest.approx([math.nan, 0.5, 3 * 2.0**-8, 3 * 2.0**-8], nan_ok=True)
+
+
+def test_ranks_without_significance_or_values() -> None:
+    """With two scenarios nobody can be told from the leader; a method without a value
+    comes last.
+
+    Ranks follow the means that are shown: where a seed lacks the scenario in which the
+    other has 4, the mean over seeds, then scenarios, is 2.5; the mean over all values
+    would be 2 and lead.
+    """
+    scores = {
+        "x": score_of(1.0, 1.0),
+        "y": score_of(5.0, 5.0),
+        "none": score_of(math.nan, math.nan),
+    }
+    found = {
+        name: (place.rank, place.tied) for name, place in standings(scores).items()
+    }
+    assert list(found.items()) == [
+        ("x", (1, False)),
+        ("y", (2, True)),
+        ("none", (3, False)),
+    ]
+    gappy = [score_of(1.0, math.nan), score_of(1.0, 4.0)]
+    assert mean_loss(gappy) == 2.5
+    assert list(standings({"gappy": gappy, "even": [score_of(2.2, 2.2)]})) == [
+        "even",
+        "gappy",
+    ]
+
+
+def test_one_training_used_in_two_ways_is_paired() -> None:
+    """Seeds that scatter alike on both sides cancel: SciPy's t-test of the seeds'
+    differences is left.
+    """
+    gains = np.array([0.021, 0.014, 0.026])
+    scatter = np.array([0.2, 0.5, 0.35])
+    base = np.linspace(1.0, 2.0, 20)
+    ways = [
+        [score_of(*(base + shift)) for shift in scatter - by]
+        for by in (gains, 0 * gains)
+    ]
+    found = compare(*ways, paired=True)
+    assert found.p == pytest.approx(scipy.stats.ttest_1samp(-gains, 0.0).pvalue)
+    assert found.difference == pytest.approx(-gains.mean())
+    assert found.interval[0] < found.difference < found.interval[1] < 0.0
+    assert compare(*ways).p > 0.5
+
+
+def test_seeds_of_a_method_are_compared_together() -> None:
+    """Two seeds against one: means over seeds, number of seeds stated, p of the two-way
+    test.
+    """
+    *seeds, other = (score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0, 10.0))
+    found = compare(seeds, other)
+    values = [score.values for score in seeds]
+    assert (found.seeds, found.difference) == ((2, 1), pytest.approx(-9.5))
+    assert found.p == differ(values, other.values)
+    assert found.interval == bootstrap_interval(values, minus=other.values)

@@ -1,0 +1,424 @@
+"""Errors of particles, bodies and clouds against NumPy, SciPy, searches and numbers
+worked by hand.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from metric_flows import (
+    CONFIG,
+    Floats,
+    lattice,
+    measured,
+    pair_of,
+    pairs_of,
+    rollout,
+    scenario_of,
+)
+from numpy.testing import assert_allclose
+from scipy.optimize import linear_sum_assignment, minimize_scalar
+
+from lagbench.data.grid import Grid, Placement
+from lagbench.errors import ChecksFailedError, UsageError
+from lagbench.metrics import METRICS, aggregate, measure, select, tally
+from lagbench.metrics.bodies import rigid_residual
+from lagbench.metrics.frame import Bonds
+from lagbench.metrics.pointwise import HORIZONS, attribute_mse
+from lagbench.metrics.transport import sinkhorn_divergence, sliced_wasserstein2
+
+
+def test_errors_of_two_particles_by_hand() -> None:
+    """Errors (0.1, 0) and (0, -0.3): MSE = (0.01 + 0.09)/4 = 0.025, MAE = 0.4/4 =
+    0.1.
+    """
+    still = np.zeros((2, 2))
+    pair = pair_of(
+        [[0.4, 0.4], [0.6, 0.6]],
+        still,
+        still,
+        predicted_position=[[0.5, 0.4], [0.6, 0.3]],
+    )
+    assert measured(pair, "position_mse", "position_mae") == pytest.approx([0.025, 0.1])
+
+
+def test_velocity_is_a_frame_difference() -> None:
+    """Velocity errors come from positions of two frames: u = x(f) - x(f-1)."""
+    truth = rollout()
+    prediction = truth + 0.01 * np.arange(8)[:, None, None]
+    pairs = pairs_of(scenario_of(truth), truth, prediction)
+    # the first predicted frame moves by 0.02 against the last given frame of the truth
+    expected = [[v**2, v] for v in (0.02, *[0.01] * 5)]
+    assert_allclose(
+        [measured(pair, "velocity_mse", "velocity_mae") for pair in pairs], expected
+    )
+
+
+def test_attribute_error_equals_that_of_standardised_arrays() -> None:
+    """Eq. 4.16 over z-scores of all four attributes, with the means of Eq. 4.15 put
+    in.
+    """
+    rng = np.random.default_rng(0)
+    x, y = rng.random((2, 50, 2))
+    u, v = 0.01 * rng.standard_normal((2, 50, 2))
+    mean = np.array([0.5, 0.4, 0.001, -0.002])
+    std = np.array(CONFIG.attribute_std)
+    z, z_predicted = ((np.hstack(side) - mean) / std for side in ((x, u), (y, v)))
+    found = attribute_mse.measure(pair_of(x, u, v, predicted_position=y))
+    assert found == pytest.approx(np.mean((z - z_predicted) ** 2))
+
+
+def test_materials_have_errors_of_their_own() -> None:
+    """Jelly off by 0.2 and liquid exact: the jelly's MSE is 0.04, the liquid's 0, the
+    whole's 0.02.
+
+    Snow is not there, and where there is one material only its error is not listed
+    twice.
+    """
+    x = lattice(4)
+    material = [0, 1] * 8
+    y = x + 0.2 * np.array(material)[:, None] * (1, 1)
+    pair = pair_of(
+        x, 0 * x, 0 * x, predicted_position=y, material=material, materials=ALL
+    )
+    names = ("position_mse_jelly", "position_mse_liquid", "position_mse")
+    assert measured(pair, *names) == pytest.approx([0.04, 0.0, 0.02])
+    assert not METRICS["position_mse_snow"].applies(pair)
+    assert not METRICS["position_mse_liquid"].applies(pair_of(x, 0 * x, 0 * x))
+
+
+def test_average_and_end_over_horizons() -> None:
+    """Eqs. 4.17 and 4.18 over the rollout and its first frames; longer horizons do not
+    exist.
+    """
+    truth = rollout()
+    offset = np.zeros((8, 1, 2))
+    offset[2:, 0, 0] = 0.3 * np.arange(1, 7)
+    scenario = scenario_of(truth)
+    metrics = [
+        METRICS[name] for name in METRICS if name.startswith(("mse_", "attribute"))
+    ]
+    pieces = tally(
+        pairs_of(scenario, truth, truth + offset),
+        metrics,
+        scenario.config.predicted_frames,
+    )
+    scores = {
+        name: found.mean for name, found in aggregate(metrics, {7: pieces}).items()
+    }
+    # z-score of x: k; of u: 0.3 / 0.01 = 30; L = (k^2 + 30^2) / 4 for k = 1..6
+    expected = [(k**2 + 900) / 4 for k in range(1, 7)]
+    for end, frames in {"": 6, "_5": 5, "_1": 1}.items():
+        assert scores[f"mse_avg{end}"] == pytest.approx(np.mean(expected[:frames]))
+        assert scores[f"mse_end{end}"] == pytest.approx(expected[frames - 1])
+    assert {h for h in HORIZONS if f"mse_avg_{h}" in scores} == {1, 5}
+
+
+def test_rmse_is_the_root_of_the_frame_mean() -> None:
+    """Errors 3 and 4 in two frames: sqrt((9 + 16)/2) = 3.5355, not the mean 3.5; then
+    over scenarios.
+    """
+    truth = np.full((4, 3, 2), 0.5)
+    one = truth.copy()
+    two = truth.copy()
+    one[2] = 3.5
+    one[3] = 4.5
+    two[2:] = 1.5
+    scenario = scenario_of(truth, horizon=2)
+    metrics = [METRICS["position_mse"], METRICS["position_rmse"]]
+    frames = scenario.config.predicted_frames
+    tallies = {
+        i: tally(pairs_of(scenario, truth, p), metrics, frames)
+        for i, p in enumerate((one, two))
+    }
+    score = aggregate(metrics, tallies)["position_rmse"]
+    assert_allclose(score.values, [np.sqrt(12.5), 1.0])
+    assert score.mean == pytest.approx((np.sqrt(12.5) + 1.0) / 2)
+    assert_allclose(score.at(3), [4.0, 1.0])
+
+
+def test_what_cannot_be_measured_is_refused() -> None:
+    """A NaN position, which is counted; another number of particles, or a single given
+    frame.
+    """
+    x = lattice(4)
+    y = x.copy()
+    y[3, 1] = np.nan
+    with pytest.raises(ChecksFailedError, match="1 of 16 particles"):
+        pair_of(x, 0 * x, 0 * x, predicted_position=y)
+    with pytest.raises(UsageError):
+        pair_of(x, 0 * x, 0 * x[:9], predicted_position=x[:9])
+    with pytest.raises(UsageError):
+        scenario_of(x[None])
+
+
+ALL = ("liquid", "jelly", "snow", "rope")
+
+
+def turned(points: Floats, angle: float) -> Floats:
+    """Rotate points about the origin."""
+    cos = math.cos(angle)
+    sin = math.sin(angle)
+    return np.asarray(points @ np.array([[cos, sin], [-sin, cos]]))
+
+
+@given(st.floats(-math.pi, math.pi), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_rigid_motion_is_no_error(angle: float, dx: float, dy: float) -> None:
+    """A body that is turned and moved keeps its shape."""
+    x = 0.2 * lattice(5)
+    assert rigid_residual(x, turned(x, angle) + np.array([dx, dy])) < 1e-12
+
+
+@given(st.integers(0, 1000))
+def test_the_fit_is_the_best_of_all_angles(seed: int) -> None:
+    """No angle found by searching fits better than the closed form."""
+    rng = np.random.default_rng(seed)
+    t, p = rng.standard_normal((2, 6, 2))
+    t = t - t.mean(axis=0)
+    p = p - p.mean(axis=0)
+
+    def residual(angle: float) -> float:
+        return math.sqrt(np.mean(np.sum((turned(p, angle) - t) ** 2, axis=1)))
+
+    starts = np.linspace(-math.pi, math.pi, 13)
+    best = min(
+        minimize_scalar(residual, bounds=pair).fun
+        for pair in itertools.pairwise(starts)
+    )
+    assert rigid_residual(t, p) == pytest.approx(best, rel=1e-6)
+
+
+def test_rigid_residuals_by_hand() -> None:
+    """Corners (+-1, +-1) stretched to (+-3, +-1) are off by 2 each, however they are
+    turned.
+
+    Reflection is not a rigid motion; a point body fits anything of its size.
+    """
+    square = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
+    assert rigid_residual(square, turned(square * [3.0, 1.0], 0.7)) == pytest.approx(
+        2.0
+    )
+    body = np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])
+    assert rigid_residual(body, body * [-1.0, 1.0]) > 0.3
+    assert rigid_residual(np.zeros((3, 2)), np.ones((3, 2))) == 0.0
+
+
+def test_bodies_of_a_scenario_are_judged_apart() -> None:
+    """Jelly turned as a whole and rope stretched: only the rope has an error; the mean
+    is half of it.
+    """
+    jelly = 0.1 * lattice(4) + 0.2
+    rope = np.stack([np.linspace(0.5, 0.9, 16), np.full(16, 0.7)], axis=1)
+    longer = np.stack([np.linspace(0.4, 1.0, 16), np.full(16, 0.7)], axis=1)
+    truth = np.vstack([jelly, rope])
+    guess = np.vstack([turned(jelly, 0.3), longer])
+    kinds = {"material": [1] * 16 + [3] * 16, "materials": ALL}
+    pair = pair_of(truth, 0 * truth, 0 * truth, predicted_position=guess, **kinds)
+    # stretched about its middle by 1/2 of its own half length 0.2, uniform: 0.1 * rms
+    # of linspace(-1, 1, 16)
+    expected = 0.1 * math.sqrt(np.mean(np.linspace(-1, 1, 16) ** 2))
+    found = measured(pair, "shape_error_jelly", "shape_error_rope", "shape_error")
+    assert found == pytest.approx([0.0, expected, expected / 2])
+
+
+def test_bonds_of_a_chain_and_of_a_cloud() -> None:
+    """Five links of a chain, one torn to 2.5 times its length: 4 of 5 hold; at 2 times
+    all do.
+
+    The neighbours in a cloud are all pairs within the radius, once each; lone particles
+    have no bonds.
+    """
+    chain = np.stack([0.05 * np.arange(6), np.full(6, 0.5)], axis=1)
+    bonds = Bonds.within(0.075, chain)
+    torn = chain.copy()
+    stretched = chain.copy()
+    torn[3:, 0] += 1.5 * 0.05
+    stretched[3:, 0] += 0.99 * 0.05
+    assert len(bonds.pairs) == 5
+    assert bonds.intact_share(chain) == bonds.intact_share(stretched) == 1.0
+    assert bonds.intact_share(torn) == pytest.approx(0.8)
+    assert math.isnan(Bonds.within(0.01, chain).intact_share(chain))
+    x = np.random.default_rng(0).random((60, 2))
+    bonds = Bonds.within(0.2, x)
+    distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    expected = {(i, j) for i, j in np.argwhere(distance <= 0.2).tolist() if i < j}
+    assert {tuple(sorted(pair)) for pair in bonds.pairs.tolist()} == expected
+    assert len(bonds.pairs) == len(expected)
+
+
+def test_connectivity_speaks_of_prediction_and_truth() -> None:
+    """A prediction that scatters the jelly is torn, its truth is not.
+
+    Liquid and snow flow and break: they have no shape to keep.
+    """
+    x = 0.2 * lattice(6)
+    pair = pair_of(
+        x, 0 * x, 0 * x, predicted_position=4 * x, material=[1] * 36, materials=ALL
+    )
+    assert measured(pair, "connectivity", "connectivity_true") == [0.0, 1.0]
+    fluid = pair_of(x, 0 * x, 0 * x, material=[0] * 18 + [2] * 18, materials=ALL)
+    assert not any(
+        METRICS[name].applies(fluid)
+        for name in METRICS
+        if name.startswith(("shape", "connect"))
+    )
+
+
+SHIFT = st.floats(-0.5, 0.5, allow_subnormal=False)
+
+
+def cloud(seed: int, particles: int = 40) -> Floats:
+    """Draw particles in the unit box."""
+    return np.random.default_rng(seed).random((particles, 2))
+
+
+@given(st.integers(0, 99), SHIFT, SHIFT)
+def test_a_shift_is_told_by_its_length(seed: int, dx: float, dy: float) -> None:
+    """Shifted by s: every projection moves by s.d, and the mean of its square is |s|^2
+    / 2.
+    """
+    x = cloud(seed)
+    shifted = x + np.array([dx, dy])
+    assert sliced_wasserstein2(x, shifted) == pytest.approx(
+        math.hypot(dx, dy) / math.sqrt(2), abs=1e-6
+    )
+
+
+def test_a_scaled_cloud() -> None:
+    """Scaled by 1.5 about its middle: order is kept, W2^2 along d is 0.25
+    mean((r.d)^2).
+    """
+    x = cloud(0)
+    r = x - x.mean(axis=0)
+    expected = math.sqrt(0.25 * np.mean(np.sum(r**2, axis=1)) / 2)
+    assert sliced_wasserstein2(x, x.mean(axis=0) + 1.5 * r) == pytest.approx(
+        expected, rel=1e-5
+    )
+
+
+@given(st.integers(0, 99))
+def test_slices_never_exceed_the_exact_distance(seed: int) -> None:
+    """In the plane SW2^2 <= W2^2 / 2, W2 from an exact assignment; particle order does
+    not count.
+    """
+    x = cloud(seed)
+    y = cloud(seed + 1000)
+    cost = np.sum((x[:, None] - y[None]) ** 2, axis=-1)
+    rows, columns = linear_sum_assignment(cost)
+    sliced = sliced_wasserstein2(x, y)
+    assert sliced**2 <= cost[rows, columns].mean() / 2 + 1e-7
+    assert sliced == sliced_wasserstein2(x[::-1], y)
+    assert sliced_wasserstein2(x, x[::-1]) == 0.0
+
+
+def test_measured_at_frames_of_interest_and_the_last_only() -> None:
+    """Expected gaps elsewhere: frames 3 and 5 and the last, 7, are measured; of a full
+    box only that.
+    """
+    truth = rollout()
+    for placement, frames in {
+        Placement.NODES: [3, 5, 7],
+        Placement.CELL_CENTRES: [7],
+    }.items():
+        pairs = pairs_of(scenario_of(truth, grid=Grid(10, placement)), truth, truth)
+        assert [
+            pair.frame for pair in pairs if measure(pair, [METRICS["sliced_w2"]])
+        ] == frames
+
+
+def cloud_score(
+    shift: Floats, *, active: int | None, frames: int = 33
+) -> tuple[list[int], float]:
+    """Return the frames at which ``cloud_distance`` is measured, and its mean, for
+    shifted materials.
+    """
+    truth = rollout(frames=frames)
+    material = np.repeat([0, 2], [100, 300])
+    guess = truth + shift[material // 2]
+    task = {
+        "horizon": frames - 2,
+        "materials": ("liquid", "snow"),
+        "grid": Grid(10, Placement.NODES),
+    }
+    scenario = replace(
+        scenario_of(truth, material=material, **task), active_frames=active
+    )
+    metrics = [METRICS["cloud_distance"], METRICS["active_frames"]]
+    pairs = pairs_of(scenario, truth, guess)
+    found = aggregate(
+        metrics, {0: tally(pairs, metrics, scenario.config.predicted_frames)}
+    )
+    seen = [p.frame for p in pairs if "cloud_distance" in measure(p, metrics)]
+    assert found["active_frames"].mean == (frames - 2 if active is None else active)
+    return seen, found["cloud_distance"].mean
+
+
+@pytest.mark.parametrize(
+    ("active", "frames"),
+    [(None, [11, 21, 31]), (30, [11, 21, 31]), (29, [11, 21]), (9, [10]), (1, [2])],
+)
+def test_cloud_distance_stops_where_the_truth_rests(
+    active: int | None, frames: list[int]
+) -> None:
+    """Predicted frames 10, 20, ... (numbers 11, 21, ...) up to the last active one,
+    else that one.
+    """
+    assert cloud_score(np.zeros((2, 2)), active=active)[0] == frames
+
+
+def test_cloud_distance_asks_for_materials_not_for_particles() -> None:
+    """Particles that swap places cost nothing, materials that swap places do, by their
+    share.
+
+    A quarter shifted by 0.4, the rest by 0.2: (0.25 * 0.4 + 0.75 * 0.2) / sqrt(2).
+    """
+    _, shifted = cloud_score(np.array([[0.4, 0.0], [0.0, 0.2]]), active=None)
+    assert shifted == pytest.approx((0.25 * 0.4 + 0.75 * 0.2) / math.sqrt(2), rel=1e-5)
+    truth = rollout(frames=12)
+    material = np.arange(400) % 2
+    task = {
+        "horizon": 10,
+        "materials": ("liquid", "jelly"),
+        "grid": Grid(10, Placement.NODES),
+    }
+    scenario = scenario_of(truth, material=material, **task)
+
+    def distance(order: Floats) -> float:
+        return METRICS["cloud_distance"].measure(
+            pairs_of(scenario, truth, truth[:, order])[9]
+        )
+
+    rng = np.random.default_rng(0)
+    within = np.stack(
+        [rng.permutation(np.arange(kind, 400, 2)) for kind in (0, 1)], axis=1
+    ).ravel()
+    assert distance(within) == 0.0
+    assert distance(np.arange(400) ^ 1) > 0.01
+
+
+def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entropic transport debiased by its own terms leaves |s|^2 for a shift by s, 0 for
+    none.
+
+    It is measured when asked for only, and without its package the error has the
+    command that installs it.
+    """
+    assert "sinkhorn_pot" not in {metric.name for metric in select()}
+    assert "sinkhorn_pot" in {metric.name for metric in select(extras=("transport",))}
+    x = cloud(0)
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "ot", None)
+        with pytest.raises(UsageError, match=r"pip install 'lagbench\[transport\]'"):
+            sinkhorn_divergence(x, x)
+    pytest.importorskip("ot")
+    assert sinkhorn_divergence(x, x) == 0.0
+    near = sinkhorn_divergence(x, x + 0.1)
+    far = sinkhorn_divergence(x, x + 0.2)
+    assert [near, far] == pytest.approx([0.02, 0.08], rel=1e-3)

@@ -1,0 +1,541 @@
+"""The table of metrics entry by entry, and the way from frames to scores."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import pickle
+import re
+import sys
+from dataclasses import replace
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from metric_flows import CONFIG, Floats, pairs_of, rollout, scenario_of
+from numpy.testing import assert_allclose
+
+from lagbench.data.grid import Grid, Placement
+from lagbench.errors import UsageError, WorkFailedError
+from lagbench.metrics import (
+    FAMILIES,
+    METRICS,
+    Direction,
+    FramePair,
+    Metric,
+    Score,
+    Tally,
+    aggregate,
+    available,
+    bootstrap_interval,
+    measure,
+    score,
+    select,
+    snapshots,
+    tally,
+)
+from lagbench.metrics import table as table_module
+from lagbench.metrics.metric import FirstFrames, last
+
+ALL = select()
+MATERIAL = np.arange(400) // 200  # half liquid, half jelly
+KINDS = ("liquid", "jelly")
+
+
+@functools.cache
+def trajectories() -> tuple[Floats, Floats]:
+    """Return a truth and a prediction that drifts from it."""
+    truth = rollout()
+    noise = np.random.default_rng(5).standard_normal(truth.shape)
+    return truth, truth + 0.003 * np.arange(8)[:, None, None] * noise
+
+
+@functools.cache
+def pairs() -> list[FramePair]:
+    """Return their frame pairs."""
+    truth, prediction = trajectories()
+    return pairs_of(
+        scenario_of(truth, material=MATERIAL, materials=KINDS), truth, prediction
+    )
+
+
+def tallied(*pieces: FramePair) -> Tally:
+    """Measure frames, all of the rollout unless told otherwise."""
+    return tally(pieces or pairs(), ALL, CONFIG.predicted_frames)
+
+
+def same_bits(one: Tally, two: Tally) -> bool:
+    """Tell whether two tallies hold the same bytes."""
+    fields = ("total", "weight", "undefined")
+    return all(
+        getattr(one, name).tobytes() == getattr(two, name).tobytes() for name in fields
+    )
+
+
+def of_pearson(*values: float) -> Tally:
+    """Return a tally of correlations at frames 2, 3, ..."""
+    numbered = {f: {"vorticity_pearson": v} for f, v in enumerate(values, 2)}
+    return Tally.of(["vorticity_pearson"], list(numbered), numbered)
+
+
+@given(st.lists(st.integers(0, 6), max_size=4), st.randoms(use_true_random=False))
+def test_chunks_in_any_order_give_the_same_bits(
+    cuts: list[int], random: object
+) -> None:
+    """Frames cut anywhere, measured apart and added in any order, add up to the same
+    bytes.
+    """
+    edges = [0, *sorted(cuts), 6]
+    chunks = [
+        tally(pairs()[a:b], ALL, CONFIG.predicted_frames)
+        for a, b in itertools.pairwise(edges)
+    ]
+    random.shuffle(chunks)  # type: ignore[attr-defined]
+    assert same_bits(functools.reduce(Tally.__add__, chunks), tallied())
+
+
+@settings(max_examples=15)
+@given(st.randoms(use_true_random=False))
+def test_particle_order_changes_nothing(random: object) -> None:
+    """Truth and prediction permuted alike have the same scores, but for the rounding of
+    sums.
+    """
+    order = list(range(400))
+    random.shuffle(order)  # type: ignore[attr-defined]
+    truth, prediction = (x[:, order] for x in trajectories())
+    scenario = scenario_of(truth, material=MATERIAL[order], materials=KINDS)
+    permuted = tallied(*pairs_of(scenario, truth, prediction))
+    assert_allclose(permuted.total, tallied().total, rtol=1e-9, atol=1e-13)
+
+
+def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
+    """The truth's fields serve several predictions; from frame 5 on, given frame 4,
+    values are the same.
+    """
+    truth, prediction = trajectories()
+    scenario = scenario_of(truth, material=MATERIAL, materials=KINDS)
+    true = list(snapshots(scenario, truth[2:]))
+    for positions in (prediction, truth):
+        sides = zip(
+            CONFIG.predicted_frames,
+            true,
+            snapshots(scenario, positions[2:]),
+            strict=True,
+        )
+        shared = [FramePair(scenario, f, t, p) for f, t, p in sides]
+        assert same_bits(
+            tallied(*shared), tallied(*pairs_of(scenario, truth, positions))
+        )
+    late = (
+        next(iter(snapshots(scenario, x[5:], previous=x[4])))
+        for x in (truth, prediction)
+    )
+    assert measure(FramePair(scenario, 5, *late), ALL) == measure(pairs()[3], ALL)
+
+
+def test_undefined_frames_are_left_out_and_counted() -> None:
+    """Correlations 1, NaN, 0.6: mean 0.8 of two, one undefined; stable for one defined
+    frame.
+
+    One good frame, then 89 at rest without a correlation: one stable frame, not 90.
+    """
+    names = ("vorticity_pearson", "stable_frames")
+    found, stable = (
+        score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names
+    )
+    assert (found.mean, found.undefined) == (pytest.approx(0.8), (1,))
+    assert math.isnan(found.at(3)[0])
+    assert stable.mean == 1.0
+    still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *[math.nan] * 89)})
+    assert (still.mean, still.undefined) == (1.0, (89,))
+
+
+@pytest.mark.parametrize(
+    ("values", "mean", "undefined"),
+    [
+        # scenario 4 has no correlation: the mean is that of scenario 2, in id order
+        ({4: (math.nan, math.nan), 2: (0.5, 0.7)}, 0.6, (0, 2)),
+        # scenario means 0.6 and 1.0 of two and of one defined frame: 0.8, not (0.5 +
+        # 0.7 + 1.0) / 3
+        ({0: (0.5, 0.7), 1: (math.nan, 1.0)}, 0.8, (0, 1)),
+        ({0: (0.5, 0.7), 1: (0.8, math.nan), 2: (math.nan, math.nan)}, 0.7, (0, 1, 2)),
+    ],
+)
+def test_means_over_frames_come_before_those_over_scenarios(
+    values: dict[int, tuple[float, float]], mean: float, undefined: tuple[int, ...]
+) -> None:
+    """Undefined scenarios are left out; the interval is the bootstrap of the scenarios'
+    values.
+    """
+    found = score(
+        METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in values.items()}
+    )
+    assert (found.scenarios, found.undefined) == (tuple(sorted(values)), undefined)
+    assert found.mean == pytest.approx(mean)
+    np.testing.assert_equal(found.interval, bootstrap_interval(found.values))
+
+
+@pytest.mark.parametrize("holes", [0, 3])
+def test_means_of_many_frames_have_the_bits_of_one_at_a_time(holes: int) -> None:
+    """However many scenarios are reduced at once; 1201 frames are summed in blocks."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    values = 10.0 ** rng.uniform(-8, 8, (5, 1201))
+    values[0, :holes] = math.nan
+    found = score(
+        METRICS["vorticity_pearson"],
+        {i: of_pearson(*row) for i, row in enumerate(values)},
+    )
+    expected = [np.mean(row[~np.isnan(row)].copy()) for row in values]
+    np.testing.assert_array_equal(found.values, expected)
+
+
+def test_a_horizon_beyond_the_series_is_undefined() -> None:
+    """The mean of the first five of three frames does not exist; of the first two it
+    does.
+    """
+    found = [
+        first(np.arange(3.0))
+        for first in (FirstFrames(5), FirstFrames(2), FirstFrames(2, last))
+    ]
+    np.testing.assert_array_equal(found, [math.nan, 0.5, 1.0])
+
+
+def test_tallies_add() -> None:
+    """A worker that was taken for lost and comes back adds weight, not error.
+
+    Other frames or statistics are refused, and so is a value without a place.
+    """
+    twice = tallied() + tallied()
+    once = tallied()
+    for name in twice.names:
+        np.testing.assert_array_equal(twice.series(name), once.series(name))
+    with pytest.raises(UsageError):
+        of_pearson(0.1) + of_pearson(0.1, 0.2)
+    with pytest.raises(UsageError):
+        Tally.of(["vorticity_mse"], [2], {3: {"vorticity_mse": 1.0}})
+
+
+NAMES = sorted(METRICS)
+MEASURED = select(known=METRICS)  # Sinkhorn, optional and slow, has tests of its own
+LENGTHS = re.compile(
+    r"(1|%|nat|frame|(mass )?length(\^2)?(/frame(\^2)?)?|1/frame(\^2)?)"
+)
+SOURCES = re.compile(
+    r"Eqs?\. \d|Figs?\. \d|section \d|.* \(?(19|20)\d\d\b|docs/scoring\.md"
+)
+STATES = ("liquid", "jelly", "snow", "rope")
+
+
+@functools.cache
+def scores(size: float) -> dict[str, Score]:
+    """Score a rollout of all four materials whose error has this size."""
+    truth = rollout(frames=54, side=40, speed=0.002)
+    scattered = np.random.default_rng(7).standard_normal(truth.shape[1:])
+    step = truth[1:] - truth[:-1]
+    wrong = 0.4 * step + 0.0001 * scattered + [2e-4, 1e-4] + 0.01 * (truth[:-1] - 0.4)
+    error = np.concatenate(
+        [np.zeros((2, *truth.shape[1:])), np.cumsum(wrong[1:], axis=0)]
+    )
+    found: dict[str, Score] = {}
+    for placement in Placement:  # no one box is full and has a surface
+        task = {
+            "materials": STATES,
+            "horizon": 52,
+            "grid": Grid(20, placement),
+            "radius": 0.04,
+        }
+        scenario = scenario_of(truth, material=np.repeat(range(4), 400), **task)
+        pairs = pairs_of(scenario, truth, truth + size * error)
+        found = (
+            aggregate(
+                MEASURED, {0: tally(pairs, MEASURED, scenario.config.predicted_frames)}
+            )
+            | found
+        )
+    return found
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_metric_is_told(name: str) -> None:
+    """Name, family, unit, direction and source are well formed; the summary is one line
+    without a stop.
+    """
+    metric = METRICS[name]
+    assert metric.name == name
+    assert re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name)
+    assert metric in FAMILIES[metric.family]
+    assert LENGTHS.fullmatch(metric.unit), metric.unit
+    assert SOURCES.match(metric.source)
+    assert re.fullmatch(r"[A-Z0-9].{7,98}[^.]", metric.summary)
+    assert all(needed in METRICS for needed in metric.of)
+    assert (metric.direction is Direction.NONE) <= (metric.perfect is None)
+
+
+@pytest.mark.parametrize(
+    "name", [m.name for m in MEASURED if m.direction is not Direction.NONE]
+)
+def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(
+    name: str,
+) -> None:
+    """The truth as its own prediction gets exactly the perfect value: 0 or 1, and no
+    frame undefined.
+
+    The loss never falls while the error grows tenfold and more, and rises over all.
+    """
+    metric = METRICS[name]
+    found = scores(0.0)[name]
+    expected = metric.perfect if name != "stable_frames" else 52.0
+    assert (found.mean, found.undefined) == (expected, (0,))
+    losses = [metric.loss(scores(size)[name].mean) for size in (0.0, 0.1, 0.5, 2.5)]
+    assert losses == sorted(losses)
+    assert losses[-1] > losses[0]
+
+
+def test_the_tables_of_the_design_are_complete() -> None:
+    """Everything that design section 8 lists has an entry, and the rollout of these
+    tests has them all.
+    """
+    assert set(scores(0.1)) == {m.name for m in MEASURED}
+    assert not any(math.isnan(found.mean) for found in scores(0.1).values())
+    mse = scores(0.1)["vorticity_mse"]
+    assert (mse.per_frame.shape, mse.frames) == ((1, 52), tuple(range(2, 54)))
+    quantities = ("position", "velocity", "vorticity")
+    expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
+    expected |= {
+        f"vorticity_{name}"
+        for name in ("pearson", "kl", "kl_hist", "kl_hist_abs", "w1")
+    }
+    expected |= {
+        "energy_ratio",
+        "energy_retention",
+        "energy_error",
+        "momentum_error",
+        "divergence_rms",
+    }
+    expected |= {
+        "angular_momentum_error",
+        "density_rmse",
+        "sliced_w2",
+        "sinkhorn_pot",
+        "attribute_mse",
+    }
+    expected |= {"mse_avg", "mse_end", "stable_frames", "shape_error", "connectivity"}
+    expected |= {f"mse_avg_{h}" for h in (1, 5, 10, 20, 50)}
+    assert expected <= set(METRICS)
+    residual = {
+        n.removeprefix("vorticity_residual_")
+        for n in METRICS
+        if n.startswith("vorticity_residual_")
+    }
+    assert residual == {
+        "mean",
+        "std",
+        "max",
+        "slope",
+        "p05",
+        "p25",
+        "p50",
+        "p75",
+        "p95",
+    }
+    # Expected gaps are no scores: the rollout of the tallies has no rope, and no
+    # horizon of ten frames.
+    found = aggregate(ALL, {0: tallied()})
+    assert {"position_mse_jelly", "shape_error_jelly", "mse_avg_5"} <= set(found)
+    assert not {
+        "position_mse_rope",
+        "shape_error_rope",
+        "position_mse_snow",
+        "mse_avg_10",
+    } & set(found)
+
+
+OTHERS = Metric(
+    name="enstrophy_error",
+    family="vorticity",
+    unit="1/frame^2",
+    direction=Direction.LOWER,
+    perfect=0.0,
+    source="elsewhere",
+    summary="a metric of another package",
+    statistic=lambda pair: 1.0,
+)
+CLASHING = (replace(OTHERS, name="vorticity_mse", of=()),)
+NO_METRIC = ("vorticity",)
+NUMBER = 3
+ROOTLESS = (replace(OTHERS, statistic=None, of=("velocity_mse", "nothing_known")),)
+
+
+def with_entry_point(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    """Pretend that another package registers an object."""
+    point = EntryPoint(name="others", value=value, group=table_module.GROUP)
+    monkeypatch.setattr(table_module, "list_entry_points", lambda group: [point])
+
+
+def test_our_metrics_are_registered_as_those_of_others_are(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each family stands in the entry-point group, and loading it gives the same
+    objects.
+
+    A single metric of another package behind an entry point is scored like ours.
+    """
+    points = [
+        p
+        for p in entry_points(group="lagbench.metrics")
+        if p.value.startswith("lagbench.")
+    ]
+    assert {p.name: p.load() for p in points} == dict(FAMILIES)
+    assert {name: available()[name] for name in METRICS} == dict(METRICS)
+    with_entry_point(monkeypatch, f"{__name__}:OTHERS")
+    assert available()["enstrophy_error"] is OTHERS
+    metrics = select(["enstrophy_error"])
+    pieces = tally(pairs(), metrics, CONFIG.predicted_frames)
+    assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
+
+
+@pytest.mark.parametrize(
+    "name", ["CLASHING", "NO_METRIC", "NUMBER", "ROOTLESS", "leaving:METRICS"]
+)
+def test_a_bad_entry_point_is_named(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, name: str
+) -> None:
+    """A taken name, no metric, or one of statistics that nothing measures: refused, and
+    said where it is.
+
+    A module that would end the program, with exit code 0 and nothing done, is told
+    likewise.
+    """
+    (tmp_path / "leaving.py").write_text("raise SystemExit")
+    monkeypatch.syspath_prepend(tmp_path)
+    value = name if ":" in name else f"{__name__}:{name}"
+    with_entry_point(monkeypatch, value)
+    with pytest.raises(UsageError, match=r"others|nothing_known") as caught:
+        available()
+    assert ":" not in name or caught.value.where == f"entry point others = {name}"
+
+
+def test_selection_brings_what_a_metric_follows_from() -> None:
+    """RMSE needs MSE, the energy ratio both energies; unknown names list the nearest.
+
+    Neither a statistic nor a source of one, or a target without a value, is a mistake.
+    """
+    found = {m.name for m in select(["vorticity_rmse", "energy_ratio"])}
+    assert found == {
+        "vorticity_mse",
+        "vorticity_rmse",
+        "energy_predicted",
+        "energy_true",
+        "energy_ratio",
+    }
+    with pytest.raises(UsageError, match="did you mean 'vorticity_rmse'"):
+        select(["vorticity_rmsee"])
+    for changes in (
+        {"statistic": None, "of": ()},
+        {"direction": Direction.TARGET, "perfect": None},
+        {"direction": "sideways"},
+        {"of": "vorticity_mse"},
+        *({"name": name, "of": ()} for name in ("My metric", "", "skill", "Ω")),
+    ):
+        with pytest.raises(UsageError):
+            replace(OTHERS, **changes)
+    assert (
+        replace(OTHERS, direction="higher").direction is Direction.HIGHER
+    )  # as a package may write it
+
+
+class Refusing:
+    """What raises when it is asked for a number, as a tensor on a GPU's graph may."""
+
+    def __float__(self) -> float:
+        """Refuse."""
+        raise RuntimeError
+
+
+NO_NUMBERS = [
+    None,
+    "much",
+    "1.5",
+    np.zeros(3),
+    1j,
+    np.complex128(3),
+    10**400,
+    Refusing(),
+]
+STRANGE: list[tuple[str, Any]] = [
+    *(("statistic", lambda pair, value=value: value) for value in NO_NUMBERS),
+    ("statistic", lambda pair: sys.exit(0)),  # as one that parses arguments would
+    *(
+        ("defined", lambda pair, told=told: told)
+        for told in (None, "no", np.array([True, False]))
+    ),
+]
+
+
+@pytest.mark.parametrize(("what", "function"), STRANGE)
+def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> None:
+    """A metric of another package that gives something else is named, and where it
+    comes from, with any note.
+
+    Whether it is defined must be true or false: a forgotten return would leave out
+    every frame.
+    """
+    bad = replace(OTHERS, **{what: function})
+    with pytest.raises(WorkFailedError) as caught:
+        bad.measure(pairs()[0])
+    assert caught.value.where == f"{__name__}, enstrophy_error, frame 2"
+    caught.value.add_note("scenario 3")
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert again.where == f"{__name__}, enstrophy_error, frame 2, scenario 3"
+    assert all("scenario 3" in str(error) for error in (caught.value, again))
+
+
+def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
+    """As a ufunc or a partial, whose name is told too; what is not defined is NaN."""
+    bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
+    with pytest.raises(WorkFailedError, match="enstrophy_error"):
+        replace(OTHERS, statistic=bare).measure(pairs()[0])
+    assert math.isnan(
+        replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0])
+    )
+
+
+@pytest.mark.parametrize("what", ["applies", "series", "over_frames"])
+@pytest.mark.parametrize("left", [SystemExit(0), KeyError("mine")])
+def test_all_that_a_metric_does_is_told_with_its_name(
+    what: str, left: BaseException
+) -> None:
+    """Not its statistic alone; nothing of it ends the program."""
+
+    def fail(*_: object) -> Any:
+        raise left
+
+    bad: Any = replace(OTHERS, **{what: fail})
+    with pytest.raises((WorkFailedError, KeyError)) as caught:
+        aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
+    told = getattr(caught.value, "where", None) or caught.value.__notes__[0]
+    assert "enstrophy_error" in told
+
+
+@pytest.mark.parametrize("what", ["statistic", "defined"])
+def test_what_a_metric_raises_keeps_what_it_came_from(what: str) -> None:
+    """The error itself goes on, with metric and frame; a package's author sees the
+    first error too.
+    """
+
+    def fail(_: FramePair) -> float:
+        try:
+            return float({}["missing"])
+        except KeyError:
+            return [][0]
+
+    with pytest.raises(IndexError) as caught:
+        replace(OTHERS, **{what: fail}).measure(pairs()[0])
+    assert caught.value.__notes__ == ["in metric enstrophy_error, frame 2"]
+    assert isinstance(caught.value.__context__, KeyError)
+    assert not caught.value.__suppress_context__

@@ -1,0 +1,348 @@
+"""Vorticity errors and distributions against SciPy, closed forms and numbers worked by
+hand.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.fft
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from metric_flows import lattice, measured, pair_of, swirl
+from numpy.testing import assert_allclose
+
+from lagbench.metrics import METRICS, FramePair
+from lagbench.metrics.distributions import (
+    energy_spectrum,
+    histograms,
+    kl,
+    normalise,
+    wasserstein1,
+)
+from lagbench.metrics.vorticity import frames_before_fall, pearson, slope
+
+VALUES = arrays(
+    np.float64, 40, elements=st.floats(-1e3, 1e3).map(lambda v: round(v, 3))
+)
+
+
+def rotating_disc(scale: float, noise: float = 0.0) -> FramePair:
+    """Return a pair in which the prediction turns ``scale`` times as fast, with
+    noise.
+    """
+    x = lattice(30)
+    u = 0.01 * swirl(x)
+    v = scale * u + noise * np.random.default_rng(1).standard_normal(u.shape)
+    return pair_of(x, u, v)
+
+
+def test_a_scaled_flow_has_closed_errors() -> None:
+    """With omega_pred = 1.2 omega: RMSE = 0.2 rms(omega), r = 1, slope of the residual
+    0.2.
+
+    A prediction at rest has r = -omega: slope -1, no correlation. One that also turns
+    by Omega has residual 2 Omega wherever no wall is near.
+    """
+    pair = rotating_disc(1.2)
+    omega = pair.true_vorticity
+    laws = ("mse", "mae", "pearson", "residual_slope", "residual_mean")
+    found = measured(pair, *(f"vorticity_{law}" for law in laws))
+    expected = [
+        0.04 * np.mean(omega**2),
+        0.2 * np.mean(np.abs(omega)),
+        1.0,
+        0.2,
+        0.2 * np.mean(omega),
+    ]
+    assert found == pytest.approx(expected)
+    for still in (
+        rotating_disc(0.0),
+        flying(1e-3, 0.0),
+    ):  # at rest, or all by one vector
+        found = measured(still, "vorticity_residual_slope", "vorticity_pearson")
+        assert found == pytest.approx([-1.0, math.nan], nan_ok=True)
+    x = lattice(30)
+    u = 0.01 * swirl(x)
+    turn = 0.003 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1)
+    assert measured(pair_of(x, u, u + turn), "vorticity_residual_p50") == pytest.approx(
+        [0.006]
+    )
+
+
+def test_taylor_green_vorticity_follows_its_closed_form() -> None:
+    """Omega = 2 pi U sin(pi x) sin(pi y), damped as spline and central difference damp
+    a wave.
+    """
+    omega = rotating_disc(1.0).truth.fields.vorticity[2:-2, 2:-2]
+    wave = np.sin(np.pi * (np.arange(10) + 0.5) / 10)[2:-2]
+    # with k h = pi / 10: the quadratic spline keeps (sin(kh/2) / (kh/2))^3 along each
+    # axis, which is 0.98772, the difference sin(kh) / (kh) = 0.98363; in all 0.9596
+    damping = 0.98772**2 * 0.98363
+    assert_allclose(omega, damping * 0.02 * np.pi * np.outer(wave, wave), rtol=1e-3)
+
+
+def test_correlation_slope_and_residuals_are_scipys_and_numpys() -> None:
+    """Eq. 5.21 is scipy.stats.pearsonr, the slope that of linregress.
+
+    Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2. Mean, std,
+    greatest size and percentiles are those of r = predicted - true (Eq. 5.22).
+    """
+    pair = rotating_disc(0.7, noise=0.003)
+    x = pair.true_vorticity
+    y = pair.predicted_vorticity
+    r, tilt = measured(pair, "vorticity_pearson", "vorticity_residual_slope")
+    assert r == pytest.approx(scipy.stats.pearsonr(x, y).statistic, rel=1e-12)
+    assert tilt == pytest.approx(scipy.stats.linregress(x, y - x).slope, rel=1e-9)
+    assert pearson(
+        np.array([1.0, 2.0, 3.0]), np.array([1.0, 3.0, 2.0])
+    ) == pytest.approx(0.5)
+    assert slope(np.array([1.0, 2.0, 3.0]), np.array([2.0, 4.0, 6.0])) == pytest.approx(
+        2.0
+    )
+    residual = y - x
+    names = ("mean", "std", "max", "p05", "p25", "p50", "p75", "p95")
+    found = measured(pair, *(f"vorticity_residual_{name}" for name in names))
+    percentiles = [np.percentile(residual, q) for q in (5, 25, 50, 75, 95)]
+    expected = [residual.mean(), residual.std(), np.abs(residual).max(), *percentiles]
+    assert_allclose(found, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("constant", [0.0, 0.1, 1e9])
+def test_a_constant_field_has_no_correlation(constant: float) -> None:
+    """Pearson is NaN where either field is constant to rounding; SciPy says the same,
+    with a warning.
+    """
+    x = np.linspace(-1.0, 1.0, 30)
+    y = np.full(30, constant) * (1 + 1e-16)
+    assert np.isnan([pearson(x, y), pearson(y, x), slope(y, x)]).all()
+    with pytest.warns(scipy.stats.ConstantInputWarning):
+        assert math.isnan(scipy.stats.pearsonr(x, y).statistic)
+
+
+RELATIVE = [
+    f"vorticity_{name}"
+    for name in ("pearson", "residual_slope", "kl", "kl_hist", "kl_hist_abs")
+]
+FLIGHT = np.array([3.0, -5.0]) * 2.0**-10
+
+
+def flying(turn: float, predicted_turn: float) -> FramePair:
+    """Return particles at float32 positions that all fly by one vector, plus a swirl on
+    either side.
+    """
+    x = (
+        lattice(32)
+        + np.random.default_rng(3).integers(-4096, 4096, (1024, 2)) * 2.0**-20
+    )
+    sides = (
+        (x - FLIGHT - scale * swirl(x)).astype(np.float32)
+        for scale in (turn, predicted_turn)
+    )
+    return pair_of(x, *(x - before for before in sides))
+
+
+def test_a_body_that_only_flies_has_no_pattern_of_vorticity() -> None:
+    """What vorticity there is comes from the order of sums: its pattern says nothing,
+    errors are 0.
+    """
+    pair = flying(0.0, 0.0)
+    assert (pair.truth.velocity == FLIGHT).all()
+    assert 0.0 < np.abs(pair.true_vorticity).max() < 1e-14
+    assert np.isnan(measured(pair, *RELATIVE)).all()
+    assert measured(pair, "vorticity_mae", "vorticity_w1") == pytest.approx(
+        [0.0, 0.0], abs=1e-14
+    )
+    beside = measured(flying(0.0, 1e-3), *RELATIVE, "vorticity_mae")
+    assert np.isnan(beside[:-1]).all()
+    assert beside[-1] > 1e-3
+
+
+def test_the_least_swirl_that_positions_can_show_is_compared() -> None:
+    """A swirl of some twenty roundings of float32; the prediction's is twice as fast.
+
+    What counts is the speed at the compared nodes: a particle that is flung far away
+    hides no swirl.
+    """
+    r, tilt, *divergences = measured(flying(1e-6, 2e-6), *RELATIVE)
+    assert r == pytest.approx(1.0, abs=1e-3)
+    assert tilt == pytest.approx(1.0, abs=0.03)
+    assert np.isfinite(divergences).all()
+    x = lattice(32)
+    velocity = FLIGHT + 1e-3 * swirl(x)
+    place = x.copy()
+    speed = velocity.copy()
+    place[0] = speed[0] = 1e12
+    pair = pair_of(x, velocity, speed, predicted_position=place)
+    assert measured(pair, "vorticity_pearson")[0] > 0.9
+
+
+def test_fewer_than_sixteen_nodes_are_undefined() -> None:
+    """A blob of 4 x 4 cells with 2 x 2 differentiable nodes has no vorticity metrics,
+    and no divergence.
+    """
+    x = 0.3 + 0.4 * lattice(20)
+    u = 0.01 * swirl(x)
+    blob = replace(pair_of(x, u, u).scenario, area=0.16)
+    small = FramePair(blob, 2, blob.snapshot(x, x - u), blob.snapshot(x, x - 1.1 * u))
+    assert small.node_count == 4
+    fields = ("vorticity", "divergence")
+    names = [
+        name for name, m in METRICS.items() if m.statistic and name.startswith(fields)
+    ]
+    assert len(names) > 10
+    assert all(math.isnan(v) for v in measured(small, *names))
+    assert not math.isnan(METRICS["density_rmse"].measure(small))
+
+
+def test_divergences_are_scipys_entropy() -> None:
+    """Eqs. 5.23-5.25, per node and of NumPy's histogram: SciPy normalises its arguments
+    itself.
+
+    P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812. There are 64
+    bins over the truth's range, the outer ones open, half a count added to each.
+    """
+    pair = rotating_disc(1.3, noise=0.002)
+    p, q = (np.abs(w) + 1e-10 for w in (pair.true_vorticity, pair.predicted_vorticity))
+    assert measured(pair, "vorticity_kl") == pytest.approx(
+        [scipy.stats.entropy(p, q)], rel=1e-9
+    )
+    p = normalise(np.array([-1.0, 3.0]))
+    q = normalise(np.array([2.0, -2.0]))
+    assert kl(p, q) == pytest.approx(0.130812, abs=1e-6)
+    for name, of in (
+        ("vorticity_kl_hist", np.asarray),
+        ("vorticity_kl_hist_abs", np.abs),
+    ):
+        x = of(pair.true_vorticity)
+        y = of(pair.predicted_vorticity)
+        edges = np.linspace(x.min(), x.max(), 65)
+        edges[0] = -np.inf
+        edges[-1] = np.inf
+        p, q = (np.histogram(w, edges)[0] + 0.5 for w in (x, y))
+        assert measured(pair, name) == pytest.approx(
+            [scipy.stats.entropy(p, q)], rel=1e-9
+        )
+
+
+def test_values_on_an_edge_belong_to_the_bin_above() -> None:
+    """Truth 0..64 has edges at whole numbers: one value per bin, two in the last; 3
+    falls into bin 3.
+
+    Where the truth has no range there are no bins.
+    """
+    p, q = histograms(np.arange(65.0), np.full(65, 3.0))  # type: ignore[misc]
+    assert_allclose(p * 97, [1.5] * 63 + [2.5])
+    assert_allclose(q * 97, [0.5] * 3 + [65.5] + [0.5] * 60)
+    assert histograms(np.ones(20), np.arange(20.0)) is None
+    x = lattice(30)
+    assert math.isnan(
+        measured(pair_of(x, 0 * x, 0.01 * swirl(x)), "vorticity_kl_hist")[0]
+    )
+
+
+@given(VALUES, VALUES)
+def test_wasserstein_is_scipys(x: np.ndarray, y: np.ndarray) -> None:
+    """The mean distance of order statistics is scipy.stats.wasserstein_distance."""
+    assert wasserstein1(x, y) == pytest.approx(
+        scipy.stats.wasserstein_distance(x, y), rel=1e-9, abs=1e-9
+    )
+
+
+def test_wasserstein_grows_where_the_histogram_saturates() -> None:
+    """Ten and a hundred times too fast fall into the same open bins; W1 tells them
+    apart.
+
+    How much rotation there is does not change in a mirror, where it is does.
+    """
+    near = rotating_disc(10.0)
+    far = rotating_disc(100.0)
+    names = ("vorticity_kl_hist", "vorticity_w1")
+    (kl_near, w_near), (kl_far, w_far) = (
+        measured(pair, *names) for pair in (near, far)
+    )
+    assert kl_far < 1.2 * kl_near
+    assert w_far > 5 * w_near
+    values = np.array([0.1, 0.4, 0.2, 0.8, 0.3, 0.7] * 5)
+    assert kl(*histograms(values, values[::-1])) == 0.0  # type: ignore[misc]
+    assert wasserstein1(values, values[::-1]) == 0.0
+    assert kl(normalise(values), normalise(values[::-1])) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("correlations", "frames"),
+    [
+        ([0.99, 0.96, 0.94, 0.99], 2.0),
+        ([0.99, math.nan, 0.5], 1.0),
+        ([0.95, 0.95], 2.0),
+        ([0.1], 0.0),
+        ([0.99, math.nan], 1.0),
+        ([math.nan] * 4, math.nan),  # neither stable nor unstable
+    ],
+)
+def test_stable_frames_by_hand(correlations: list[float], frames: float) -> None:
+    """Frames before the first value under 0.95; undefined ones do not count, the
+    threshold itself holds.
+    """
+    np.testing.assert_equal(frames_before_fall(np.array(correlations)), frames)
+
+
+def test_nrmse_is_the_ratio_of_sums_over_frames() -> None:
+    """MSE 1, 9 over mean squares 4, 16: sqrt(10 / 20); the frame in which the truth
+    rests counts too.
+
+    A flow turning ``s`` times as fast is off by |s - 1| of its own strength, whatever
+    that is.
+    """
+    metric = METRICS["vorticity_nrmse"]
+    names = ("vorticity_mse", "vorticity_square_true")
+    cases = [
+        (np.array([1.0, 9.0]), np.array(square), math.sqrt(0.5))
+        for square in ([4, 16], [20, 0])
+    ]
+    for scale in (0.0, 1.0, 1.5, -1.0):
+        cases.append(
+            (
+                *np.array(measured(rotating_disc(scale), *names))[:, None],
+                abs(scale - 1.0),
+            )
+        )
+    for mse, square, error in cases:
+        assert metric.over_frames(metric.series(mse, square)) == pytest.approx(
+            error, abs=1e-12
+        )
+
+
+def test_the_spectrum_is_scipys_cosine_transform() -> None:
+    """Shell sums of squared DCT-II coefficients (orthonormal) of both components."""
+    velocity = np.random.default_rng(2).standard_normal((9, 12, 2))
+    power = np.sum(scipy.fft.dctn(velocity, axes=(0, 1), norm="ortho") ** 2, axis=-1)
+    shell = np.rint(np.hypot(*np.meshgrid(np.arange(9), np.arange(12), indexing="ij")))
+    expected = [power[shell == k].sum() for k in range(1, 9)]
+    assert_allclose(energy_spectrum(velocity), expected, rtol=1e-12)
+
+
+def test_the_spectrum_forgives_place_and_punishes_smoothing() -> None:
+    """A mirrored flow has the same energy at every scale; one that lost its small
+    eddies has not.
+
+    Ten times the speed is a hundred times the energy in every shell, two decades; rest
+    counts six.
+    """
+    for scale, decades in {1.0: 0.0, 10.0: 2.0, 0.1: 2.0, 0.0: 6.0}.items():
+        pair = replace(rotating_disc(scale), frame=3)
+        assert measured(pair, "spectrum_error") == pytest.approx([decades], abs=1e-9)
+    rng = np.random.default_rng(4)
+    x = lattice(40)
+    u = 0.01 * swirl(x) + 0.003 * rng.standard_normal(x.shape)
+    mirrored = u.reshape(40, 40, 2)[::-1].reshape(-1, 2) * [-1.0, 1.0]
+    smooth = 0.01 * swirl(x)
+    sides = (pair_of(x, u, v, frames_of_interest=(2,)) for v in (mirrored, smooth))
+    errors = [measured(replace(pair, frame=2), "spectrum_error")[0] for pair in sides]
+    assert errors[0] < 1e-9
+    assert errors[1] > 0.5

@@ -1,0 +1,179 @@
+"""Score files of strangers: self-contained, bounded, and read in a child process
+first.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from made_up import SCORES, BoardBench, copied
+
+from lagbench.board.check import check_board
+from lagbench.errors import UnreadableFileError
+from lagbench.scoring import score_file_checks as isolation
+from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
+
+PACKAGE = Path(isolation.__file__).parents[2]
+
+
+@pytest.fixture
+def own(home: Path, tmp_path: Path) -> BoardBench:
+    """A copy of the leaderboard that the test may damage."""
+    return copied(home, tmp_path, without=["damped"])
+
+
+def hostile(path: Path, kind: str, secret: Path) -> None:
+    """Make a valid score file one that reaches outside, unpacks to gigabytes, or has
+    other insides.
+    """
+    with h5py.File(path, "r+") as file:
+        preview = file["preview"]
+        film = preview["film"]
+        shape = film.shape
+        attributes = {name: film.attrs[name] for name in ("scale_factor", "add_offset")}
+        if kind.startswith("best floor "):
+            file.attrs["best_floor"] = kind.removeprefix("best floor ")
+            file.require_dataset("best_floor_value", file["scenario"].shape, "f8")[
+                ...
+            ] = 9.0
+            return
+        if kind == "infinite":
+            file["value"][0, 0, 0] = np.inf
+            return
+        if kind == "extra group":
+            file.create_group("more")
+            return
+        if kind == "packed twice":
+            plist = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+            plist.set_chunk((64,))
+            plist.set_deflate(9)
+            plist.set_deflate(9)
+            h5py.h5d.create(
+                file.id,
+                b"twice",
+                h5py.h5t.NATIVE_FLOAT,
+                h5py.h5s.create_simple((64,)),
+                plist,
+            )
+            return
+        if kind == "bomb":
+            options = {
+                "dtype": "f4",
+                "compression": "gzip",
+                "chunks": (1 << 20,),
+                "fillvalue": 0,
+            }
+            file.create_dataset("bomb", (1 << 30,), **options)
+            return
+        del preview["film"]
+        if kind == "external link":
+            preview["film"] = h5py.ExternalLink(str(secret), "/film")
+        elif kind == "soft link":
+            preview["film"] = h5py.SoftLink("/value")
+        elif kind == "external storage":
+            size = int(np.prod(shape)) * 2
+            made = preview.create_dataset(
+                "film", shape, "u2", external=[(str(secret), 0, size)]
+            )
+            made.attrs.update(attributes)
+        elif kind == "virtual":
+            layout = h5py.VirtualLayout(shape, "u2")
+            layout[...] = h5py.VirtualSource(str(secret), "film", shape)
+            preview.create_virtual_dataset("film", layout)
+        elif kind == "strings":
+            preview.create_dataset("film", shape, h5py.string_dtype())
+        elif kind == "another type":
+            preview.create_dataset("film", shape, "f8")
+        elif kind == "another shape":
+            preview.create_dataset("film", (2, 1, 1, 2), "u2")
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *(
+            "external link",
+            "soft link",
+            "external storage",
+            "virtual",
+            "bomb",
+            "extra group",
+            "strings",
+        ),
+        *("infinite", "another type", "another shape", "packed twice"),
+        # it would stand in for the submission itself, another's file, or count though
+        # it must not
+        *("best floor submission", "best floor theirs.nc", "best floor coarse-solver"),
+    ],
+)
+def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
+    """Nothing outside the file is shown, nothing is unpacked to gigabytes, no shape or
+    name is believed.
+    """
+    secret = own.folder.parent / "secret"
+    secret.write_bytes(bytes(range(256)) * 400)
+    path = own.folder / SCORES / "noisy.nc"
+    hostile(path, kind, secret)
+    assert path.stat().st_size <= 1_000_000
+    with pytest.raises(UnreadableFileError):
+        read_score_file(path)
+    own.rehash("noisy")
+    result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
+    assert [finding.check for finding in result.findings] == ["score_file"]
+
+
+def use_child(monkeypatch: pytest.MonkeyPatch, folder: Path, program: str) -> None:
+    """Let the child run another program."""
+    (folder / "other_child.py").write_text(program)
+    monkeypatch.setenv("PYTHONPATH", f"{folder}:{PACKAGE}")
+    monkeypatch.setattr(isolation, "READ", "other_child.read")
+
+
+def test_the_child_is_limited_and_started_anew(
+    own: BoardBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It tells which file is damaged; a file that stops it costs that file only."""
+    good = own.folder / SCORES / "noisy.nc"
+    bad = own.folder / SCORES / "flipping.nc"
+    bad.write_bytes(bad.read_bytes()[:5000])
+    assert set(find_unreadable([good, bad, good])) == {bad}
+    program = "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
+    use_child(monkeypatch, own.folder.parent, program)
+    stopped = find_unreadable([good, bad, good])
+    assert set(stopped) == {bad}
+    assert "had to be stopped" in stopped[bad]
+
+
+def test_many_files_that_stop_the_child_are_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a few stops the rest is left unread, and every file has its finding."""
+    use_child(
+        monkeypatch, tmp_path, "open('starts', 'a').write('x'); import os; os.abort()"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(isolation, "MOST_STOPS", 2)
+    files = [tmp_path / f"{i}.nc" for i in range(9)]
+    found = find_unreadable(files)
+    assert Path("starts").read_text() == "xx"
+    assert list(found) == files
+    assert ["reading it had to be" in said for said in found.values()] == [True] * 2 + [
+        False
+    ] * 7
+    assert found[files[-1]] == isolation.UNREAD
+
+
+def test_waiting_files_share_one_deadline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Children that wait cost the time of all files once, not once each."""
+    use_child(monkeypatch, tmp_path, "import time; time.sleep(60)")
+    monkeypatch.setattr(isolation, "WALL_SECONDS", 0.5)
+    started = time.monotonic()
+    found = find_unreadable([tmp_path / f"{i}.nc" for i in range(9)])
+    assert time.monotonic() - started < 20.0
+    assert [said == isolation.UNREAD for said in found.values()] == [False] + [True] * 8

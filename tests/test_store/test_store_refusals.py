@@ -1,0 +1,124 @@
+"""What S3 refuses is said in words, to those who write and to those who read; nothing
+is left half done.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+from object_stores import files, machine
+from typer.testing import CliRunner
+
+import lagbench
+from lagbench.__main__ import app
+from lagbench.data.layout import CACHE_VARIABLE
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
+from lagbench.exchange import download
+from lagbench.make.generate import generate
+from lagbench.make.verify import verify
+from lagbench.store import copy
+
+Use = Callable[[str], object]
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Be a machine of its own, on which nothing arrives."""
+    monkeypatch.setattr(copy, "FRESH_SECONDS", 0.0)
+    folder = machine(monkeypatch, tmp_path / "cache")
+    yield folder
+    assert files(folder) == {}
+
+
+@pytest.fixture(params=["generate", "open_split", "verify", "download"])
+def use(request: pytest.FixtureRequest) -> Use:
+    """Something that is done with a root."""
+    if request.param == "open_split":
+        return lambda url: lagbench.open_split(SPLIT, size=SIZE, root=url)
+    if request.param == "download":
+        return lambda url: download(SPLIT, SIZE, root=url, or_generate=False)
+    action = {"generate": generate, "verify": verify}[request.param]
+    return lambda url: action(SPLIT, SIZE, root=url)
+
+
+def lacking_credentials(patch: pytest.MonkeyPatch) -> None:
+    """Have none, neither in variables nor in files."""
+    for name in ("AWS_SHARED_CREDENTIALS_FILE", "AWS_CONFIG_FILE"):
+        patch.setenv(name, "/nowhere/none")
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        patch.delenv(name)
+
+
+def wrong_credentials(patch: pytest.MonkeyPatch) -> None:
+    """Have a key that the server does not know."""
+    patch.setattr("moto.core.responses.settings.INITIAL_NO_AUTH_ACTION_COUNT", 0)
+    patch.setenv("AWS_ACCESS_KEY_ID", "wrong")
+
+
+REFUSALS: dict[
+    str, tuple[Callable[[pytest.MonkeyPatch], None], type[LagbenchError], str]
+] = {
+    "none": (
+        lacking_credentials,
+        WorkFailedError,
+        r"NoCredentials(.*\n)*.*AWS_ACCESS_KEY_ID",
+    ),
+    "wrong": (wrong_credentials, WorkFailedError, r"refuses\n(.*\n)*.*PermissionError"),
+    "no answer": (
+        lambda patch: patch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9"),
+        WorkFailedError,
+        r"does not answer(.*\n)*.*127\.0\.0\.1:9",
+    ),
+    "no s3fs": (
+        lambda patch: patch.setitem(sys.modules, "s3fs", None),
+        UsageError,
+        r"s3fs is not installed(.*\n)*.*lagbench\[s3\]",
+    ),
+}
+
+
+@pytest.mark.parametrize("why", REFUSALS)
+def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) -> None:
+    """No or wrong credentials, no answer, no library: what is missing, and where to put
+    it, is said.
+    """
+    harm, error, words = REFUSALS[why]
+    harm(monkeypatch)
+    with pytest.raises(error, match=words):
+        use(s3)
+
+
+def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
+    """The bucket is named; a scheme that fsspec does not know is a usage error."""
+    with pytest.raises(
+        DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"
+    ):
+        use("s3://elsewhere/data")
+    with pytest.raises(UsageError, match="no such kind of address"):
+        use("nonsense://data/x")
+
+
+@pytest.mark.parametrize("root", ["http://host/data", "nonsense://data/x"])
+def test_where_nothing_can_be_written_nothing_is_kept(
+    root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The address is judged before its working copy is made."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    for dry_run in (True, False):
+        with pytest.raises(UsageError):
+            generate(SPLIT, SIZE, root=root, dry_run=dry_run)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_line_says_it_too(s3: str) -> None:
+    """A message and the exit code of its kind, no traceback."""
+    for name, code in (("s3://elsewhere/data", 4), ("nonsense://data/x", 2)):
+        done = CliRunner().invoke(
+            app, ["generate", SPLIT, "--size", SIZE, "--root", name]
+        )
+        assert (done.exit_code, type(done.exception)) == (code, SystemExit)
+        assert "fix: " in done.stderr or "expected: " in done.stderr

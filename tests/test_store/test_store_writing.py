@@ -1,0 +1,341 @@
+"""Generation into a store: the same objects, whole, the manifest last; machines that
+come and go.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import SIZE, SPLIT
+from object_stores import files, fill, machine, objects, put, remove
+
+from lagbench.atomic import write_atomically
+from lagbench.data.checksums import file_sha256
+from lagbench.data.layout import url_of
+from lagbench.data.local import resolve_root
+from lagbench.data.manifest import read_manifest
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, WorkFailedError
+from lagbench.exchange import download
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.store import publication
+from lagbench.store.objects import Objects
+
+FOLDER = f"{SPLIT}/{SIZE}/v2"
+MANIFEST = f"{FOLDER}/manifest.json"
+Fill = Callable[[str], str]
+Run = Callable[..., GenerationResult]
+Wrote = list[tuple[str, dict[str, bytes]]]
+
+
+@pytest.fixture(params=("file", "s3"))
+def url(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> str:
+    """An empty store of each kind that can be written to, and a machine of its own."""
+    machine(monkeypatch, tmp_path / "cache")
+    if request.param == "file":
+        return (tmp_path / "store").as_uri()
+    return f"{request.getfixturevalue('s3')}/{uuid.uuid4().hex}"
+
+
+@pytest.fixture
+def full(url: str, generated: GenerationResult) -> str:
+    """A store that holds the tiny data set."""
+    fill(url, generated.root)
+    return url
+
+
+@pytest.fixture
+def run(unmeasured: Registry) -> Run:
+    """Generate into a store."""
+    return lambda url, **options: generate(
+        SPLIT, SIZE, root=url, registry=unmeasured, workers=1, **options
+    )
+
+
+@pytest.fixture
+def simulated_here(generated: GenerationResult) -> Fill:
+    """Fill the working copy of a store as a simulation would, so that tests need not
+    simulate.
+    """
+
+    def fill(url: str) -> str:
+        shutil.copytree(generated.root, resolve_root(url), dirs_exist_ok=True)
+        return url
+
+    return fill
+
+
+@pytest.fixture
+def wrote(monkeypatch: pytest.MonkeyPatch) -> Wrote:
+    """Every object that is put, in order, with all that is in the store then."""
+    seen: Wrote = []
+
+    def listened(
+        first: Callable[[Objects, str, Any], None],
+    ) -> Callable[[Objects, str, Any], None]:
+        def put(store: Objects, name: str, given: Any) -> None:
+            first(store, name, given)
+            seen.append((name, objects(store.url)))
+
+        return put
+
+    for method in (Objects.put, Objects.write):
+        monkeypatch.setattr(Objects, method.__name__, listened(method))
+    return seen
+
+
+def fail_after(
+    monkeypatch: pytest.MonkeyPatch, count: int, error: BaseException
+) -> None:
+    """Let a machine end when it has put so many scenarios."""
+    put = Objects.put
+    left = iter(range(count))
+
+    def failing(store: Objects, name: str, source: Path) -> None:
+        if name.endswith(".nc") and next(left, None) is None:
+            raise error
+        put(store, name, source)
+
+    monkeypatch.setattr(Objects, "put", failing)
+
+
+def named(data: bytes) -> list[str]:
+    """Return the paths that a manifest names."""
+    return [entry["path"] for entry in json.loads(data)["files"]]
+
+
+def test_another_machine_ends_what_one_began(
+    url: str,
+    run: Run,
+    simulated_here: Fill,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It simulates only what is missing, and the objects are those of a plain
+    generation, all of them.
+    """
+    simulated_here(url)
+    with monkeypatch.context() as patch:
+        fail_after(patch, 4, KeyboardInterrupt())
+        with pytest.raises(KeyboardInterrupt):
+            run(url)
+    begun = objects(url)
+    assert sorted(begun) == sorted(
+        [MANIFEST, *(f"{FOLDER}/{path}" for path in named(begun[MANIFEST]))]
+    )
+    assert len(begun) == 5
+    machine(monkeypatch, tmp_path / "second")
+    result = run(url)
+    assert (len(result.simulated), len(result.kept), result.complete) == (1, 4, True)
+    assert objects(url) == files(generated.root)
+    assert url_of(result.root) == url
+
+
+def test_what_is_there_is_neither_simulated_nor_fetched(
+    full: str, run: Run, generated: GenerationResult, wrote: Wrote
+) -> None:
+    """A second machine adds nothing, and has nothing but the manifest afterwards."""
+    before = objects(full)
+    result = run(full)
+    assert (result.simulated, result.kept, result.missing) == ((), (0, 1, 2, 3, 4), ())
+    assert result.dataset_sha256 == generated.dataset_sha256
+    assert (objects(full), wrote, [*files(result.root)]) == (before, [], [MANIFEST])
+
+
+def test_the_manifest_comes_last(
+    url: str,
+    run: Run,
+    simulated_here: Fill,
+    wrote: Wrote,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At no time does it name an object that is not there; after the cards it is put
+    once more.
+    """
+    monkeypatch.setattr(publication, "MANIFEST_SECONDS", 0.0)
+    run(simulated_here(url))
+    names = [name for name, _ in wrote]
+    assert names[:5] == [
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    ]
+    assert names[-3:] == ["croissant.json", "README.md", "manifest.json"]
+    for _, there in wrote:
+        assert {*named(there.get("manifest.json", b'{"files": []}'))} <= there.keys()
+
+
+def test_a_fault_in_the_middle_leaves_whole_objects(
+    url: str, run: Run, simulated_here: Fill, generated: GenerationResult, wrote: Wrote
+) -> None:
+    """The manifest names what had been put; the next call puts the rest and nothing
+    twice.
+    """
+    simulated_here(url)
+    with pytest.MonkeyPatch.context() as patch:
+        fail_after(patch, 2, WorkFailedError("the store does not answer or fails"))
+        with pytest.raises(WorkFailedError):
+            run(url)
+    assert named(objects(url)[MANIFEST]) == ["train/0000.nc", "train/0001.nc"]
+    wrote.clear()
+    run(url)
+    assert [name for name, _ in wrote][:3] == [
+        "valid/0002.nc",
+        "test/0003.nc",
+        "test/0004.nc",
+    ]
+    assert objects(url) == files(generated.root)
+
+
+def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
+    full: str, run: Run, generated: GenerationResult, simulated_here: Fill, wrote: Wrote
+) -> None:
+    """The manifest lets go of it, then it is put, then it is named again.
+
+    Objects that no manifest names are put again, with a manifest.
+    """
+    put(full, f"{FOLDER}/train/0001.nc", b"half")
+    run(simulated_here(full))
+    assert objects(full) == files(generated.root)
+    (first, there), (second, _), *_, (last, _) = wrote
+    assert (first, second, last) == ("manifest.json", "train/0001.nc", "manifest.json")
+    assert "train/0001.nc" not in named(there["manifest.json"])
+    put(full, MANIFEST, b"{}")
+    run(full)
+    assert objects(full) == files(generated.root)
+
+
+def test_two_writers_do_no_harm(
+    url: str,
+    run: Run,
+    simulated_here: Fill,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Two machines write different scenarios at once: the last manifest names what both
+    have put.
+    """
+    simulated_here(url)
+    put_first = Objects.put
+
+    def meanwhile(store: Objects, name: str, source: Path) -> None:
+        monkeypatch.setattr(Objects, "put", put_first)
+        machine(monkeypatch, tmp_path / "second")
+        simulated_here(url)
+        leave_only(resolve_root(url), "test", "valid")
+        run(url, subset="valid,test")
+        machine(monkeypatch, tmp_path / "cache")
+        store.put(name, source)
+
+    leave_only(resolve_root(url), "train")
+    monkeypatch.setattr(Objects, "put", meanwhile)
+    run(url, subset="train")
+    everything = named((generated.folder / "manifest.json").read_bytes())
+    assert sorted(named(objects(url)[MANIFEST])) == sorted(everything)
+    result = run(url)
+    assert (result.simulated, result.complete) == ((), True)
+    found = objects(url)
+    wanted = files(generated.root)
+    assert all(
+        found[name] == data for name, data in wanted.items() if name.endswith(".nc")
+    )
+
+
+def leave_only(root: Path, *subsets: str) -> None:
+    """Leave a working copy some subsets, and a manifest of them."""
+    manifest = json.loads((root / MANIFEST).read_bytes())
+    for entry in manifest["files"]:
+        if entry["subset"] not in subsets:
+            (root / FOLDER / entry["path"]).unlink()
+    manifest["files"] = [
+        entry for entry in manifest["files"] if entry["subset"] in subsets
+    ]
+    (root / MANIFEST).write_text(json.dumps(manifest))
+
+
+def test_a_dry_run_only_looks(full: str, run: Run) -> None:
+    """It counts what the store holds and puts nothing there."""
+    remove(full, f"{FOLDER}/valid/0002.nc")
+    before = objects(full)
+    result = run(full, dry_run=True)
+    assert (result.simulated, result.kept) == ((2,), (0, 1, 3, 4))
+    assert (objects(full), files(result.root)) == (before, {})
+
+
+def test_a_file_that_changed_is_not_put(
+    url: str, run: Run, simulated_here: Fill
+) -> None:
+    """What the manifest says of a file holds for the object, or there is none."""
+    simulated_here(url)
+    path = resolve_root(url) / FOLDER / "train/0000.nc"
+    data = path.read_bytes()
+    write_atomically(path, data[:-9] + bytes([data[-9] ^ 1]) + data[-8:])
+    with pytest.raises(DataError):
+        run(url, scenarios="3")
+    assert f"{FOLDER}/train/0000.nc" not in objects(url)
+
+
+def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
+    """What a mirror has arrives there with its manifest; a second call fetches
+    nothing.
+    """
+    (resolve_root(url) / "own").mkdir(parents=True)
+    shutil.copy(original.folder / "split.yaml", resolve_root(url) / "own")
+    result = download("own", root=url, mirror=original.folder.parent.as_uri())
+    assert (result.downloaded, result.complete) == ((0, 1, 2, 3), True)
+    there = {
+        name.removeprefix("own/full/v1/"): data for name, data in objects(url).items()
+    }
+    manifest = there.pop("manifest.json")
+    assert named(manifest) == [
+        "train/0000.nc",
+        "train/0001.nc",
+        "valid/0002.nc",
+        "test/0003.nc",
+    ]
+    assert there == {
+        name: (original.folder / "full/v1" / name).read_bytes()
+        for name in named(manifest)
+    }
+    again = download("own", root=url, mirror="file:///nowhere")
+    assert (again.downloaded, again.kept) == ((), (0, 1, 2, 3))
+
+
+def test_what_was_made_anew_is_not_fetched_back(
+    full: str, unmeasured: Registry, simulated_here: Fill
+) -> None:
+    """A file of other bytes replaces the object, and no old one comes over it."""
+    simulated_here(full)
+    size = unmeasured.size(SPLIT, SIZE)
+    root = resolve_root(full)
+    path = root / FOLDER / "train/0000.nc"
+    path.write_bytes(path.read_bytes() + b"\0")
+    manifest = read_manifest(root, SPLIT, SIZE, 2)
+    with publication.publish(size, root) as store:
+        assert store is not None
+        assert manifest is not None
+        first = manifest.files[0]
+        new = first.model_copy(
+            update={"bytes": first.bytes + 1, "file_sha256": file_sha256(path)}
+        )
+        store.put_files(
+            manifest.model_copy(update={"files": (new, *manifest.files[1:])}),
+            at_once=True,
+        )
+        store.fetch(size.scenarios)
+    assert objects(full)[f"{FOLDER}/train/0000.nc"] == path.read_bytes()
+    assert path.stat().st_size == new.bytes
+    assert named(objects(full)[MANIFEST])[0] == "train/0000.nc"

@@ -1,0 +1,331 @@
+"""Claims from scores, the thesis's numbers, and the small mathematics of
+reproduction.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reproduce_bench import a_method, made_up_results
+from scipy.stats import kendalltau
+
+from lagbench.data.registry import load
+from lagbench.metrics import METRICS, Score
+from lagbench.scoring.score_file import read_statistics
+from studies.result_tables import kendall_tau
+from studies.thesis import published as thesis
+from studies.thesis.cases import scenario_of
+from studies.thesis.claims import (
+    CLAIMS,
+    Claim,
+    Verdict,
+    answer,
+    claim_rows,
+    compare_models,
+    leading_references,
+)
+from studies.thesis.drawing import SMOOTHED, loss_over_steps, smooth
+from studies.thesis.split_results import Method, ScoredTraining, Sources, SplitResults
+from studies.thesis.tables import (
+    cubic_errors,
+    cubic_vorticity,
+    rollout_table,
+)
+
+FIRST = Claim(question="", first="supergat", rivals=thesis.OPERATORS[1:])
+
+
+def six(**better: list[float]) -> SplitResults:
+    """Return six operators at 0.5 in eight scenarios, some replaced."""
+    return made_up_results(
+        {name: better.get(name, [0.5] * 8) for name in thesis.OPERATORS}
+    )
+
+
+def test_a_comparison_can_be_counted_by_hand() -> None:
+    """Better by 0.1 in 8 of 8 scenarios: the exact test gives 2 / 2^8, whichever comes
+    first.
+    """
+    results = made_up_results({"gns": [0.1] * 8, "gat": [0.2] * 8})
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
+    assert (row.means, row.win_count, row.seed_counts) == (
+        pytest.approx((0.1, 0.2)),
+        8,
+        (1, 1),
+    )
+    assert row.p == row.test.p == 2 / 2**8
+    assert row.verdict is Verdict.BETTER
+    (turned,) = compare_models(results, "gat", ["gns"], ["position_rmse"])
+    assert turned.verdict is Verdict.WORSE
+    assert turned.win_count == 0
+    assert turned.p == row.p
+    # Directions come from the metrics table; at a frame the values of that frame are
+    # compared.
+    results = made_up_results({"gns": [0.9] * 8, "gat": [0.5] * 8})
+    (row,) = compare_models(results, "gns", ["gat"], ["vorticity_pearson"], frame=54)
+    assert row.verdict is Verdict.BETTER
+    assert row.win_count == 8
+    assert row.frame == 54
+
+
+def test_an_undecided_comparison_claims_nothing() -> None:
+    """Mixed signs leave a question open; fewer than six scenarios give no p-value at
+    all.
+    """
+    results = made_up_results({"gns": [0.1, 0.3] * 4, "gat": [0.2] * 8})
+    (mixed,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
+    assert mixed.verdict is Verdict.OPEN
+    (few,) = compare_models(
+        made_up_results({"gns": [0.1] * 5, "gat": [0.9] * 5}),
+        "gns",
+        ["gat"],
+        ["position_rmse"],
+    )
+    assert few.verdict is Verdict.FEW
+    assert math.isnan(few.p)
+
+
+def test_first_place_takes_all_rivals() -> None:
+    """Better than all five after correction (5 x 2 / 2^8 < 5 %): yes; a tie or a loss:
+    counted.
+    """
+    rows = claim_rows(FIRST, six(supergat=[0.1] * 8))
+    assert {row.second for row in rows} == set(FIRST.rivals)
+    assert {row.p for row in rows} == {5 * 2 / 2**8}
+    assert answer(rows) == "yes"
+    tied = claim_rows(FIRST, six(supergat=[0.1] * 8, gns=[0.05, 0.16] * 4))
+    assert {row.second for row in tied if row.verdict is Verdict.OPEN} == {"gns"}
+    assert answer(tied) not in ("yes", "no")
+    last = claim_rows(FIRST, six(supergat=[0.9] * 8))
+    assert {row.verdict for row in last} == {Verdict.WORSE}
+
+
+@pytest.mark.parametrize(
+    ("without", "expected"), [(0.9, "yes"), (0.1, "no"), (0.5, "open")]
+)
+def test_a_loss_is_judged_by_the_model_without_it(
+    without: float, expected: str
+) -> None:
+    """The claim on the vorticity loss compares GNS with its ablation, by the ranking
+    metric first.
+    """
+    (claim,) = (claim for claim in CLAIMS if claim.rivals == ("gns-novorticity",))
+    results = made_up_results({"gns": [0.5] * 8, "gns-novorticity": [without] * 8})
+    rows = claim_rows(claim, results)
+    assert answer(rows) == expected
+    assert rows[0].metric == results.ranking
+    assert {row.metric for row in rows} == {
+        results.ranking,
+        *claim.metrics,
+        *claim.at_key_frame,
+    }
+
+
+def test_seeds_that_only_one_has_do_not_count() -> None:
+    """Two models are compared over common seeds; where there are none, over all."""
+    results = made_up_results({})
+    results.methods["gns"] = a_method("gns", [0.5] * 8, [99.0] * 8)
+    results.methods["gat"] = a_method("gat", [0.9] * 8)
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
+    assert row.means == pytest.approx((0.5, 0.9))
+    (only,) = results.methods["gat"].trainings
+    results.methods["gat"] = Method(name="gat", trainings=(replace(only, seed=7),))
+    (row,) = compare_models(results, "gns", ["gat"], ["position_rmse"])
+    assert row.seed_counts == (2, 1)
+
+
+def test_skill_is_measured_from_the_best_naive_baseline() -> None:
+    """Skill is 1 - score / score of the naive baseline of least error."""
+    scores = {"gns": 0.1, "gat": 0.9, "persistence": 0.5, "constant-velocity": 2.0}
+    results = made_up_results({name: [score] * 8 for name, score in scores.items()})
+    assert results.best_naive == "persistence"
+    assert results.skill("gns") == pytest.approx(0.8)
+    assert results.skill("gat") == pytest.approx(-0.8)
+    assert results.skill("persistence") == 0.0
+    rows = claim_rows(Claim(question="", first=""), results)
+    assert {row.second: row.verdict for row in rows} == {
+        "gns": Verdict.WORSE,
+        "gat": Verdict.BETTER,
+    }
+    del results.methods["gns"]
+    ahead = leading_references([results])
+    assert results.ranking in {row[1] for row in ahead.rows}
+    assert {row[2] for row in ahead.rows} <= set(results.references)
+    equal = made_up_results({"gns": [0.5] * 8, "constant-velocity": [0.5] * 8})
+    assert leading_references([equal]).rows == ()
+
+
+@pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.question[:30])
+def test_every_claim_asks_what_can_be_answered(claim: Claim) -> None:
+    """Its metrics are of the table; where nobody has an entry there are no rows, and no
+    answer.
+    """
+    assert {*claim.metrics, *claim.at_key_frame} <= METRICS.keys()
+    for models in ({}, {"gns-short": [0.5] * 8}):
+        rows = claim_rows(claim, made_up_results(models))
+        assert rows == []
+        assert answer(rows) == ""
+
+
+def test_seeds_become_a_mean_per_scenario() -> None:
+    """The score of two seeds is their mean per scenario; the spread is the sample
+    deviation of means.
+    """
+    method = a_method("gns", [1.0, 3.0], [3.0, 5.0])
+    assert method.scores["position_rmse"].values.tolist() == [2.0, 4.0]
+    # the means are 2 and 4
+    assert method.spread("position_rmse") == pytest.approx(math.sqrt(2.0))
+    assert method.at("position_rmse", 54, 1) == 4.0
+    assert math.isnan(method.at("no_metric", 54))
+    assert math.isnan(a_method("gns", [1.0]).spread("position_rmse"))
+    partly = a_method("gns", [1.0, math.nan], [3.0, 5.0])
+    assert partly.scores["position_rmse"].values.tolist() == [2.0, 5.0]
+
+
+def test_orders_agree_as_scipy_says() -> None:
+    """Kendall's tau of random rankings without ties."""
+    draw = np.random.default_rng(1)
+    for count in (2, 3, 6):
+        one, two = draw.random((2, count))
+        assert kendall_tau(one, two) == pytest.approx(kendalltau(one, two).statistic)
+
+
+def test_printed_parameters_follow_from_the_widths() -> None:
+    """Every printed parameter count of Tables 4.2 to 4.5 is that of dense layers 10,000
+    -> ... -> 10,000.
+    """
+    for study in thesis.MLP_STUDIES:
+        widths = (10_000, *study.widths, 10_000)
+        assert study.parameters == sum(a * b + b for a, b in pairwise(widths)), study
+    assert [study.table for study in thesis.MLP_STUDIES].count("4.3") == 6
+    assert len(thesis.MLP_STUDIES) == 19
+
+
+def test_printed_errors_agree_with_each_other() -> None:
+    """In Table 5.4 RMSE is the root of MSE, MAE the smaller; Table 4.7 swaps columns of
+    4.8.
+    """
+    for row in thesis.TABLE_5_4.values():
+        assert row["rmse"] == pytest.approx(math.sqrt(row["mse"]), rel=4e-3)
+        assert row["mae"] < row["rmse"]
+    swapped = thesis.TABLE_4_7
+    (right,) = (
+        row for row in thesis.TABLE_4_8["fluid"] if row.scenario == swapped.scenario
+    )
+    for name in ("mlp", "lstm-mlp"):
+        i = thesis.FRAME_MODELS.index(name)
+        assert right.average[i] == swapped.end[i]
+        assert right.end[i] == swapped.average[i]
+
+
+def test_scenes_stand_for_their_own_kind() -> None:
+    """Family (id % 4) or pair (id % 6) is the thesis's; T0 is the first."""
+    registry = load()
+    for split, scene_count in (("fluid", 4), ("multimaterial", 6)):
+        for name in ("full", "mini"):
+            size = registry.size(split, name)
+            for row in thesis.TABLE_4_8[split]:
+                scenario = scenario_of(size, row.scenario)
+                assert scenario in size.subsets["test"]
+                assert scenario is not None
+                assert scenario % scene_count == row.scenario % scene_count
+    cavity = registry.size("cavity", "mini")
+    assert scenario_of(cavity, 0) == min(cavity.subsets["test"])
+    assert scenario_of(cavity, 1000) is None
+
+
+@pytest.mark.parametrize(("spin", "strain"), [(0.3, 0.0), (-0.2, 0.5)])
+def test_interpolation_finds_the_vorticity_of_a_linear_flow(
+    spin: float, strain: float
+) -> None:
+    """U = (s x - w y, w x - s y) has vorticity 2 w everywhere inside the hull."""
+    position = np.random.default_rng(1).random((200, 2))
+    x, y = position.T
+    velocity = np.stack([strain * x - spin * y, spin * x - strain * y], axis=-1)
+    found = cubic_vorticity(position, velocity, ((0.3, 0.7), (0.2, 0.6)), cells=8)
+    assert found == pytest.approx(np.full((8, 8), 2 * spin), abs=1e-5)
+
+
+def test_errors_of_interpolated_fields() -> None:
+    """A field against itself is perfect; against twice itself the hand-worked values
+    hold.
+    """
+    truth = np.array([[1.0, -2.0], [3.0, np.nan]])
+    perfect = {
+        "mae": 0.0,
+        "mse": 0.0,
+        "rmse": 0.0,
+        "kl": 0.0,
+        "pearson": pytest.approx(1.0),
+    }
+    assert cubic_errors(truth, truth) == perfect
+    twice = cubic_errors(truth, 2 * truth)
+    # residuals 1, 2, 3; magnitudes in the same proportion, so that KL is 0
+    assert (twice["mae"], twice["mse"]) == pytest.approx((2.0, 14 / 3))
+    assert twice["kl"] == pytest.approx(0.0, abs=1e-9)
+    assert cubic_errors(truth, -truth)["pearson"] == pytest.approx(-1.0)
+    assert math.isnan(cubic_errors(truth, np.zeros((2, 2)))["pearson"])
+
+
+def test_losses_are_read_back_from_tensorboard(tmp_path: Path) -> None:
+    """What was logged comes back in the order of steps; no log gives no curve."""
+    tensorboard = pytest.importorskip("torch.utils.tensorboard")
+    writer = tensorboard.SummaryWriter(str(tmp_path / "tensorboard"))
+    for step in (10, 20, 30):
+        writer.add_scalar("loss/total", 1.0 / step, step)
+    writer.close()
+    curve = loss_over_steps(tmp_path)
+    assert curve.steps.tolist() == [10, 20, 30]
+    assert curve.loss == pytest.approx([0.1, 0.05, 1 / 30])
+    assert loss_over_steps(tmp_path, "vorticity").steps.size == 0
+    assert loss_over_steps(tmp_path / "none").steps.size == 0
+
+
+def test_smoothing_is_a_centred_mean() -> None:
+    """Each value is the mean of as many before it as after, fewer at both ends; lines
+    stay lines.
+    """
+    values = np.random.default_rng(2).random(60)
+    means = []
+    for i in range(60):
+        reach = min(SMOOTHED // 2, i, 59 - i)
+        means.append(values[i - reach : i + reach + 1].mean())
+    assert smooth(values) == pytest.approx(means)
+    assert smooth(np.arange(60.0)) == pytest.approx(np.arange(60.0))
+
+
+def test_a_table_of_rollouts_puts_ours_beside_theirs() -> None:
+    """Cells are ours / the thesis's, of the scenario that stands for the thesis's."""
+    results = SplitResults(Sources(board=None), "fluid", "full")
+    ids = tuple(sorted(results.size.subsets["test"]))
+    values = np.arange(len(ids), dtype=float)
+    none = np.empty((len(ids), 0))
+    scores = {
+        m: Score(METRICS[m], ids, (), none, values, (0,) * len(ids))
+        for m in ("mse_avg", "mse_end")
+    }
+    seed = ScoredTraining(seed=0, scores=scores, record={}, path=Path())
+    results.methods["mlp"] = Method(name="mlp", trainings=(seed,))
+    table = rollout_table(results, thesis.TABLE_4_8["fluid"])
+    circle = dict(zip(table.columns, table.rows[1], strict=True))
+    assert circle["thesis's id"] == "26"
+    assert circle["our id"] == "38"
+    assert circle["average, MLP"] == f"{ids.index(38)} / 2.127"
+    assert circle["average, LSTM"] == "- / 3.583"
+
+
+@pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
+def test_skill_equals_that_of_the_score_files(split: str) -> None:
+    """Every committed score file holds the best naive baseline of the same skill."""
+    board = Path(__file__).parents[2] / "leaderboard"
+    results = SplitResults(Sources(board=board), split, "mini")
+    assert results.models
+    for name, method in results.models.items():
+        stored = [read_statistics(held.path).skill() for held in method.trainings]
+        values = [skill.value for skill in stored if skill is not None]
+        assert results.skill(name) == pytest.approx(np.mean(values), abs=1e-4)

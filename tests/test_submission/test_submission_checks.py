@@ -1,0 +1,366 @@
+"""The checks: warnings, truth that is missing or changed, all issues together."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import h5py
+import numpy as np
+import pytest
+from bad_submissions import FAULTS
+from faulty import positions, rows, store
+from numpy.typing import ArrayLike
+from scenario_factory import make_key, write_scenario
+from submission_data import (
+    FRAMES,
+    GIVEN,
+    PARTICLES,
+    TESTS,
+    Bench,
+    make_bench,
+    small,
+    truth,
+)
+
+from lagbench.data.layout import NOTES_NAME
+from lagbench.data.registry import Registry
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
+from lagbench.make.generate import GenerationResult
+from lagbench.make.verify import verify
+from lagbench.scoring.score import score
+from lagbench.submission import Severity, ValidationResult, template, validate
+from lagbench.submission import truth as module
+from lagbench.submission.truth import Truth
+
+bench = small
+
+
+def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:
+    """Validate the valid file with other positions, all of them or those of a place."""
+    path = bench.copy("changed.nc")
+    with h5py.File(path, "r+") as file:
+        values = positions(file)
+        values[place] = new
+        store(file, values)
+    return bench.validate(path)
+
+
+def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
+    """One position of 1152 at x = 1.5: a warning with its place, exit code 0.
+
+    The wall is at 0.9375 and a solver cell is 0.125 wide: 1.06 passes, 1.07 does not.
+    """
+    result = changed(bench, 1.5, (1, 4, 9, 0))
+    flag = next(f for f in result.findings if f.check == "in_domain")
+    assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
+    assert flag.where == "first in scenario 4, frame 7, particle 9"
+    # 1 / (3 * 8 * 48) = 0.087 %
+    assert "0.09%" in flag.what
+    assert "0.562" in flag.got
+    for place, flagged in ((1.06, False), (1.07, True)):
+        assert (
+            "in_domain" in {f.check for f in changed(bench, place).warnings}
+        ) == flagged
+
+
+def test_jumps_are_flagged(bench: Bench) -> None:
+    """A particle that starts 15 steps away and stays there jumps once, before the first
+    predicted frame.
+
+    Particles permuted in the middle of the rollout jump too; a displacement that is
+    surely reached ends the search in the truth.
+    """
+    source = truth_of(bench)
+    everything = source.largest_displacement(4, enough=np.inf)
+    assert 0 < source.largest_displacement(4, enough=1e-9) <= everything
+    result = changed(bench, np.stack([truth(i)[4:, ::-1] for i in TESTS]), np.s_[:, 4:])
+    assert {f.check for f in result.findings} == {"max_displacement"}
+    assert [f.where.split(",")[1].strip() for f in result.warnings] == [
+        "from frame 6 to 7"
+    ] * 3
+    assert result.exit_code == 0
+    result = changed(
+        bench, source.given_frames(4)[-1, 9] + [15 * everything, 0.0], np.s_[1, :, 9]
+    )
+    assert [f.check for f in result.findings] == ["max_displacement"]
+    assert (
+        result.warnings[0].where
+        == f"scenario 4, from frame {GIVEN - 1} to {GIVEN}, particle 9"
+    )
+    assert result.exit_code == 0
+
+
+def test_the_limit_of_the_start_is_ten_displacements(bench: Bench) -> None:
+    """Scenarios moved by 0.9 and 1.1 times the limit at their first frame: the second
+    is flagged.
+    """
+    source = truth_of(bench)
+    limit = 10 * source.largest_displacement(3, enough=np.inf)
+    flagged: list[list[float]] = []
+    steps = np.diff(
+        np.concatenate([source.given_frames(3), truth(3)]).astype("f8"), axis=0
+    )
+    assert limit == pytest.approx(10 * np.sqrt((steps**2).sum(-1)).max())
+    for factor in (0.9, 1.1):
+        result = changed(
+            bench,
+            source.given_frames(3)[-1] + np.array([factor * limit, 0], np.float32),
+            0,
+        )
+        assert result.exit_code == 0
+        flagged.append(
+            [float(f.got) for f in result.warnings if f.check == "discontinuous_start"]
+        )
+    assert flagged == [[], [pytest.approx(1.1 * limit, rel=0.01)]]
+
+
+def test_a_sound_file_opens_the_truth_once(bench: Bench) -> None:
+    """Three scenarios whose first frames tell all that the checks ask: three
+    openings.
+    """
+    with mock.patch.object(
+        Truth, "open", autospec=True, side_effect=Truth.open
+    ) as opened:
+        result = bench.validate(bench.copy("sound.nc"))
+    assert result.exit_code == 0
+    assert [scenario for (_, scenario), _ in opened.call_args_list] == [3, 4, 5]
+
+
+def test_all_findings_are_reported_together(bench: Bench) -> None:
+    """No method, a missing scenario, a NaN and a stale hash in one run, in the order of
+    the checks.
+    """
+    path = rows(bench, "several", [3, 5], list(range(GIVEN, FRAMES)), [0, 2])
+    with h5py.File(path, "r+") as file:
+        file.attrs["dataset_sha256"] = "ab" * 32
+        file["position"][1, 2, 3, 0] = np.nan
+        del file.attrs["method"]
+    result = bench.validate(path)
+    assert [f.check for f in result.errors] == [
+        "format",
+        "dataset",
+        "scenarios",
+        "finite",
+    ]
+    assert (result.verdict, result.exit_code) == ("not valid", 4)
+
+
+def test_without_the_data_set_what_needs_no_truth_is_checked(
+    unmeasured: Registry, bench: Bench, tmp_path: Path
+) -> None:
+    """Two checks are skipped and give the command; for scoring that is an error of exit
+    code 4.
+
+    A registry that nobody measured cannot vouch: the check says so and does not reject.
+    """
+    elsewhere = replace(bench, root=tmp_path)
+    result = elsewhere.validate(bench.valid)
+    assert result.exit_code == 0
+    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
+    assert "lagbench generate --split cavity" in result.skipped["start"]
+    required = elsewhere.validate(bench.valid, require_truth=True)
+    assert required.exit_code == 4
+    with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
+        required.check()
+    result = validate(
+        bench.valid,
+        root=tmp_path,
+        registry=unmeasured,
+        isolated=False,
+    )
+    flag = next(f for f in result.findings if f.check == "dataset")
+    assert (flag.severity, "datasets.yaml" in flag.got) == (Severity.WARNING, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        (
+            "truncated_half",
+            UnreadableFileError,
+        ),
+        (
+            "stale_hash",
+            DataError,
+        ),
+        (
+            "one_nan",
+            ChecksFailedError,
+        ),
+    ],
+)
+def test_check_raises_the_error_of_the_exit_code(
+    bench: Bench, name: str, kind: type[Exception]
+) -> None:
+    """3, 4 and 1; a valid file raises nothing."""
+    with pytest.raises(kind, match=FAULTS[name].check):
+        bench.validate(FAULTS[name].make(bench)).check()
+    bench.validate(bench.valid).check()
+
+
+def test_findings_read_as_what_where_expected_got_fix(bench: Bench) -> None:
+    """The text of one, whole."""
+    path = rows(bench, "text", [3, 4, 5], [3, 5, 7, 9], np.s_[:, ::2])
+    assert str(bench.validate(path).errors[0]) == (
+        "error [frames] the frames are not those to predict\n"
+        "  where: coordinate 'frame'\n"
+        "  expected: 3-10 (absolute numbers, 8 of them)\n"
+        "  got: 3,5,7,9 (4)\n"
+        "  fix: store the frames 3 to 10, each once, ascending; "
+        "frame 0 is the first given one"
+    )
+
+
+@pytest.fixture
+def own(tmp_path: Path) -> Bench:
+    """A small data set of which a test may change files, and a valid submission."""
+    return make_bench(tmp_path)
+
+
+def truth_of(own: Bench) -> Truth:
+    """The test subset."""
+    return Truth(own.registry.size("cavity", "tiny"), own.root)
+
+
+def change(path: Path, *, keep_times: bool = False) -> None:
+    """Change one value of a file and nothing else."""
+    before = path.stat()
+    with h5py.File(path, "r+") as file:
+        file["position"][1, 2, 0] += 0.001
+    if keep_times:
+        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+@pytest.fixture
+def hashed() -> Iterator[mock.Mock]:
+    """What is called with every file whose values are hashed during a test."""
+    with mock.patch.object(
+        module, "check_scenario", side_effect=module.check_scenario
+    ) as listening:
+        yield listening
+
+
+@pytest.mark.parametrize(
+    "damage", ["cut", "another scenario", "one value, all attributes kept"]
+)
+def test_a_damaged_data_set_is_told_from_a_bad_submission(
+    own: Bench, damage: str
+) -> None:
+    """Exit code 4, naming the file and the command that mends it."""
+    path = truth_of(own).path(4)
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:3000])
+    elif damage == "another scenario":
+        write_scenario(
+            own.root,
+            make_key(4),
+            frames=FRAMES,
+            particles=PARTICLES,
+            seed="another",
+        )
+    else:
+        change(path)
+    result = own.validate(own.valid)
+    assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
+    assert (result.valid, result.verdict) == (False, "not judged")
+    assert str(path) in result.errors[0].where
+    command = "lagbench generate --split cavity --size tiny --subset test --root"
+    assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].fix
+    assert set(result.skipped) == {"start", "discontinuous_start", "max_displacement"}
+
+
+def test_a_change_after_the_check_is_seen(own: Bench, hashed: mock.Mock) -> None:
+    """What was noted counts for the bytes that were hashed, also where the times were
+    put back.
+    """
+    assert own.validate(own.valid).valid
+    path = truth_of(own).path(4)
+    change(path, keep_times=True)
+    hashed.reset_mock()
+    with pytest.raises(DataError) as caught:
+        truth_of(own).check()
+    assert (caught.value.exit_code, hashed.mock_calls) == (4, [mock.call(path)])
+
+
+def test_other_notes_count_for_nothing(
+    own: Bench, tmp_path: Path, hashed: mock.Mock
+) -> None:
+    """Values are hashed once; where a folder is copied with its notes its files are
+    hashed again.
+
+    So they are where the notes are damaged, which are written anew.
+    """
+    truth_of(own).check()
+    truth_of(own).check()
+    assert hashed.call_count == 3
+    root = tmp_path / "copy"
+    shutil.copytree(own.root, root)
+    Truth(own.registry.size("cavity", "tiny"), root).check()
+    assert hashed.call_count == 6
+    notes = truth_of(own).folder / NOTES_NAME
+    for text in (
+        "",
+        "[]",
+        "{",
+        '{"test/0004.nc": 1}',
+        '{"test/0004.nc": [1]}',
+        "[" * 10**5,
+    ):
+        notes.write_text(text)
+        truth_of(own).check()
+        assert set(json.loads(notes.read_text())) == {f"test/{i:04d}.nc" for i in TESTS}
+
+
+def test_another_data_set_of_its_own_right_is_refused(own: Bench) -> None:
+    """A file that agrees with itself, but not with datasets.yaml."""
+    size = truth_of(own).size
+    other = size.measured.model_copy(
+        update={"scenario_sha256": dict.fromkeys(TESTS, "0" * 16)}
+    )
+    with pytest.raises(DataError) as caught:
+        Truth(size.model_copy(update={"measured": other}), own.root).check()
+    assert caught.value.expected == "0" * 16
+
+
+def test_the_scorer_refuses_a_changed_truth(
+    copied: Callable[[], Path],
+    unmeasured: Registry,
+    tmp_path: Path,
+    generated: GenerationResult,
+) -> None:
+    """Of a data set that only its manifest records; generate and verify have noted what
+    they hashed.
+    """
+    assert (generated.folder / NOTES_NAME).is_file()
+    root = copied()
+    verify("curl-noise", "tiny", root=root, registry=unmeasured)
+    made = template(
+        "curl-noise",
+        "tiny",
+        output=tmp_path / "p.nc",
+        root=root,
+        registry=unmeasured,
+    )
+    score(
+        made.path,
+        root=root,
+        registry=unmeasured,
+        write=False,
+    )
+    change(Truth(unmeasured.size("curl-noise", "tiny"), root).path(4), keep_times=True)
+    with pytest.raises(DataError) as caught:
+        score(
+            made.path,
+            root=root,
+            registry=unmeasured,
+            write=False,
+        )
+    assert caught.value.exit_code == 4

@@ -1,0 +1,155 @@
+"""The child process: what becomes of a child that waits, crashes, or fails for our own
+reasons.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from submission_data import Bench, small
+
+from lagbench.errors import WorkFailedError
+from lagbench.submission import CHECKS, validation
+from lagbench.submission.issues import quote
+from lagbench.work.machine import run_in_child
+
+ROOM = {"seconds": 5.0, "wall": 600.0}
+
+JOBS = """
+import os, signal, sys, time
+
+def behave(how):
+    if not isinstance(how, str):
+        return how
+    if how == "sleep":
+        time.sleep(60)
+    elif how == "burn":
+        while True:
+            pass
+    elif how == "fill":
+        bytearray(1 << 40)
+    elif how == "exit":
+        os._exit(5)
+    elif how == "raise":
+        raise ValueError("a bug")
+    elif how:
+        os.kill(os.getpid(), getattr(signal, how))
+    return how
+"""
+
+
+bench = small
+
+
+@pytest.fixture
+def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A module ``jobs`` that children can import."""
+    (tmp_path / "jobs.py").write_text(JOBS)
+    monkeypatch.setenv(
+        "PYTHONPATH", f"{tmp_path}:{Path(validation.__file__).parents[2]}"
+    )
+
+
+@pytest.mark.usefixtures("jobs")
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        (
+            "burn",
+            "no end within the computing time",
+        ),
+        (
+            "fill",
+            "more than 768 MiB",
+        ),
+        (
+            "exit",
+            "exit code 0x5",
+        ),
+        (
+            "SIGABRT",
+            "crashed: Aborted",
+        ),
+        (
+            "SIGSEGV",
+            "crashed: Segmentation fault",
+        ),
+    ],
+)
+def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
+    """Two answers, then it ends; the last request is never reached."""
+    values, stopped = run_in_child(
+        "jobs.behave", ["", "", how, ""], seconds=1.0, wall=600.0
+    )
+    assert values == ["", ""]
+    assert said in str(stopped)
+
+
+@pytest.mark.usefixtures("jobs")
+def test_a_child_that_answers_waits_or_raises() -> None:
+    """What JSON can hold goes there and back, in the order of requests.
+
+    One that waits is stopped by the clock, since it computes nothing; an error is exit
+    code 5 with its last line.
+    """
+    asked = [None, 1.5, {"a": ["é", "\u2028", "line\nbreak"]}, True]
+    assert run_in_child("jobs.behave", asked, **ROOM) == (asked, None)
+    values, stopped = run_in_child(
+        "jobs.behave", ["", "sleep", ""], seconds=5.0, wall=4.0
+    )
+    assert values in ([], [""])  # on a busy machine it may not even have begun
+    assert stopped == "no end after 4 s"
+    with pytest.raises(WorkFailedError) as caught:
+        run_in_child("jobs.behave", ["raise"], **ROOM)
+    assert "ValueError: a bug" in str(caught.value.got)
+
+
+def test_what_stops_the_child_is_a_finding(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The check is `readable`, the exit code 3, and no other check counts as passed.
+
+    A terabyte that takes no room is not granted a day; waiting is granted far more than
+    computing.
+    """
+    monkeypatch.setattr(validation, "run_in_child", lambda *_, **__: ([], "a reason"))
+    result = bench.validate(bench.valid, isolated=True)
+    assert result.errors[0].got == "a reason"
+    assert (result.errors[0].check, result.exit_code, result.passed) == (
+        "readable",
+        3,
+        (),
+    )
+    assert set(result.skipped) == set(CHECKS) - {"readable"}
+    assert validation.WALL_SECONDS >= 100.0 * validation.CPU_SECONDS
+    path = bench.copy("sparse.nc")
+    with path.open("r+b") as stream:
+        stream.truncate(1 << 40)
+    assert validation.seconds_for(path) < 1.0
+
+
+def test_a_stray_module_in_the_current_folder_is_not_run(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Predictions may come with a numpy.py beside them."""
+    (tmp_path / "numpy.py").write_text("raise SystemExit(9)")
+    monkeypatch.chdir(tmp_path)
+    assert bench.validate(bench.valid, isolated=True).exit_code == 0
+
+
+def test_text_of_strangers_is_shown_escaped_and_short() -> None:
+    """Control characters never reach the terminal."""
+    assert quote("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
+    assert len(quote("x" * 10**6)) == 80
+    assert len(quote([16**5000])) < 80
+
+
+def test_the_document_names_every_check() -> None:
+    """docs/predictions.md and the code do not drift apart."""
+    text = (Path(__file__).parents[2] / "docs" / "predictions.md").read_text()
+    rows = [line.split("|") for line in text.splitlines() if line.startswith("| `")]
+    severities = {"error", "warning", "error, warning"}
+    assert [row[1].strip(" `") for row in rows if row[2].strip() in severities] == list(
+        CHECKS
+    )
