@@ -114,6 +114,8 @@ def test_the_mean_over_seeds() -> None:
         "gpu_hours": 0.0,
     }
     assert found == EntryBudget(track="equal compute", **means)
-    mixed = EntryBudget.mean_over_seeds("mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})])
+    mixed = EntryBudget.mean_over_seeds(
+        "mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})]
+    )
     assert mixed.track is None
     assert EntryBudget.mean_over_seeds("mini", [Budget(**one), None]) is None
