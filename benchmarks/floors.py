@@ -23,7 +23,7 @@ import numpy as np
 from lagbench.data.registry import Size, load
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import ReferenceScores, shipped
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 from lagbench.scoring.skill import best_reference
 
 FALLEN = 0.8
@@ -86,7 +86,7 @@ def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> 
     best = best_reference(
         {
             name: references[name].scores[ranking]
-            for name in COUNTING.intersection(references)
+            for name in NAIVE.intersection(references)
         }
     )
     for name, reference in references.items():
