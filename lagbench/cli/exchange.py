@@ -57,6 +57,10 @@ InputFramesOption = Annotated[
 HorizonOption = Annotated[
     int | None, option("--horizon N", "Frames to predict; all by default.")
 ]
+PeriodicOption = Annotated[
+    str | None,
+    option("--periodic AXES", "Axes of the box without walls, as in x,y or none."),
+]
 InterestOption = Annotated[
     str | None,
     option("--frames-of-interest FRAMES", "As in 15,25; the last one by default."),
@@ -211,6 +215,7 @@ def import_split(
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
     rescale: RescaleFlag = False,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
@@ -255,6 +260,7 @@ def adopt(
         int | None, option("--test N", "Trajectories for test; a tenth by default.")
     ] = None,
     bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
     rescale: RescaleFlag = False,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
@@ -305,6 +311,9 @@ def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them
                 "bad bounds", where="--bounds", expected=expected, got=said["bounds"]
             ) from None
         said["bounds"] = (left, right), (bottom, top)
+    if "periodic" in said:
+        names = said["periodic"]
+        said["periodic"] = () if names == "none" else tuple(names.split(","))
     if "frames_of_interest" in said:
         given = said["frames_of_interest"]
         said["frames_of_interest"] = parse_ids(

@@ -226,4 +226,4 @@ def test_fields_of_a_batch_are_those_of_its_frames() -> None:
 def test_a_period_is_a_whole_number_of_cells() -> None:
     with pytest.raises(UsageError) as caught:
         Grid(5, Placement.CELL_CENTRES, SOLID_CHANNEL)
-    assert caught.value.where == "axis z"
+    assert caught.value.where == "cells"
