@@ -39,7 +39,7 @@ from lagbench.errors import (
     WorkFailedError,
     check_regular,
 )
-from lagbench.submission.budget import Budget, budget_in
+from lagbench.submission.budget import Budget, parse_budget
 
 from .baseline import Baseline, Facts
 from .catalogue import find
@@ -134,7 +134,7 @@ class Checkpoint:
     @property
     def budget(self) -> Budget | None:
         """What the training took; None where that is not known."""
-        return budget_in(json.dumps(self.training.get("budget")))
+        return parse_budget(json.dumps(self.training.get("budget")))
 
 
 class _Read(BaseModel):

@@ -343,7 +343,7 @@ def _changes(
 
 
 def _spelled(value: object) -> str:
-    """Return a value in a line of YAML, quoted only where it would be read as something
+    """Return a value in a line of YAML, quote only where it would be read as something
     else.
     """
     plain = isinstance(value, str) and value.isascii() and value.isprintable()

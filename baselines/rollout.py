@@ -24,7 +24,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import UsageError
-from lagbench.metrics.aggregate import Tally, as_stored, score, tally
+from lagbench.metrics.aggregate import Tally, round_statistics, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, ranking_metric, select
 from lagbench.scoring.task import ScoredTask, load_scored_task
@@ -254,14 +254,14 @@ class Validation:
             for group in groups:
                 paths = [self.task.truth.path(i) for i in group]
                 given = scenario_batch(
-                    paths, slice(0, self.task.setting.input_frames)
+                    paths, slice(0, self.task.config.input_frames)
                 ).to(device)
                 for rollout in roll_out(
                     model, given, max(self.frames[i] for i in group)
                 ):
                     with self.task.opened(rollout.scenario) as truth:
                         scenario = truth.scenario
-                        frames = self.task.setting.predicted_frames
+                        frames = self.task.config.predicted_frames
                         predicted = snapshots(scenario, rollout.position.numpy())
                         states = zip(frames, predicted, truth.snapshots(), strict=False)
                         pairs = (
@@ -270,7 +270,7 @@ class Validation:
                         )
                         measured = tally(pairs, select([self.metric]), frames)
                         # rounded as score files hold them
-                        tallies[rollout.scenario] = as_stored(measured)
+                        tallies[rollout.scenario] = round_statistics(measured)
         found = score(METRICS[self.metric], tallies)
         if found is None:
             return math.nan
@@ -287,9 +287,9 @@ def validation_of(
         registry.size(facts.split, facts.size), root, subset="valid"
     )
     horizon = min(options.validation_frames or facts.horizon, facts.horizon)
-    task = replace(task, setting=replace(task.setting, horizon=horizon))
+    task = replace(task, config=replace(task.config, horizon=horizon))
     frames = {}
     for i in task.scenarios[: options.validation_scenarios]:
         with task.opened(i) as truth:
-            frames[i] = len(truth.scenario.active)
+            frames[i] = len(truth.scenario.moving_frames)
     return Validation(task=task, frames=frames, compiled=options.compile)

@@ -8,7 +8,7 @@ after Sanchez-Gonzalez et al. (2020) and thesis §§5.6-5.7. Training and rollou
 :meth:`GraphNetwork.step`. The network's last layer starts at zero: an untrained model
 with target acceleration keeps every velocity, and training starts from there.
 
-The loss has six terms of motion, density and flow (thesis Eqs. 5.29-5.35) in normalised
+The loss has six terms of motion, density and flow (thesis Eqs. 5.29-5.35) in normalise
 units, as in the thesis: accelerations, velocities and positions over their deviations
 in train; the grid's velocities too, so that vorticity and divergence have the unit
 1/length; density over that around a particle. Weights are applied by the trainer.
@@ -92,7 +92,7 @@ class LossNorm(enum.StrEnum):
 def mean_norm(
     error: Tensor, norm: LossNorm, count: Tensor | int | None = None
 ) -> Tensor:
-    """Return ``(1/N) sum_i ||e_i||_p`` of normalised errors, shape [..., component]
+    """Return ``(1/N) sum_i ||e_i||_p`` of normalise errors, shape [..., component]
     (Eqs. 5.29-5.34).
 
     0 is perfect; N counts particles or nodes, by default those of the array.

@@ -42,8 +42,8 @@ from lagbench.cli.output import spell_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
-from lagbench.metrics import METRICS, Direction, Setting, Tally, aggregate
-from lagbench.metrics.aggregate import as_stored
+from lagbench.metrics import METRICS, Direction, Tally, TaskConfig, aggregate
+from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.table import COUNTING, REFERENCES
@@ -53,10 +53,10 @@ from lagbench.scoring.card import (
     SUBMISSION,
     Preview,
     ScoreCard,
-    skill,
 )
 from lagbench.scoring.score_file import write_statistics
-from lagbench.scoring.stored import read_stored, reported_frames
+from lagbench.scoring.score_file_checks import read_score_file, reported_frames
+from lagbench.scoring.skill import compute_skill
 from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -184,7 +184,7 @@ def make_entry(size: Size, target: Path, number: int) -> None:
             ranking_metric=cards[0].ranking,
             files=files,
             metrics=summarise(
-                combine([read_stored(path).scores.tallies for path in paths])
+                combine([read_score_file(path).scores.tallies for path in paths])
             ),
         ),
     )
@@ -238,7 +238,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     return ScoreCard(
         header=header,
         predictions_sha256=f"{seed:064x}",
-        setting=Setting(
+        config=TaskConfig(
             grid=grid,
             input_frames=task.input_frames,
             horizon=task.horizon,
@@ -251,7 +251,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         ranking=ranking,
         tallies=tallies,
         scores=scores,
-        skill=skill([scores[SUBMISSION][ranking]], naive_scores),
+        skill=compute_skill([scores[SUBMISSION][ranking]], naive_scores),
         flags=(),
         warnings=(),
         preview=_preview(size, grid.nodes, rng),
@@ -273,7 +273,7 @@ def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) ->
     falling = np.array([metric.direction is Direction.HIGHER for metric in metrics])
     total[falling] = 1.0 / (1.0 + quality * share)
     ones = np.ones(total.shape, np.int64)
-    return as_stored(
+    return round_statistics(
         Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones)
     )
 

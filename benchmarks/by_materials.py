@@ -24,7 +24,7 @@ from lagbench.errors import LagbenchError, UsageError, suggest_name
 from lagbench.figures.tables import markdown
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import shipped
-from lagbench.scoring.stored import published
+from lagbench.scoring.score_file_checks import read_published_scores
 
 BOARD = Path(__file__).parent.parent / "leaderboard"
 
@@ -89,7 +89,7 @@ def read_values(size: Size, method: str, metric: str) -> NDArray[np.float64]:
         )
     seeds = []
     for path in seed_files:
-        scores = published(path).scores["submission"]
+        scores = read_published_scores(path).scores["submission"]
         seeds.append(scores[metric].values)
     return np.asarray(np.mean(seeds, axis=0))
 

@@ -29,7 +29,7 @@ from lagbench.data.grid import Grid, fields
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.metrics import FramePair, Scenario, snapshots
-from lagbench.scoring.flags import Trace, Tracer, copy_suspect, evidence
+from lagbench.scoring.flags import Trace, Tracer, analyse_error, judge_copying
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import Predictions, open_predictions
 
@@ -53,8 +53,8 @@ class CalibrationScenario:
     ) -> None:
         self.scenario = scenario
         self.other_positions = other_positions
-        self.first = scenario.setting.input_frames  # first predicted frame
-        self.horizon = scenario.setting.horizon
+        self.first = scenario.config.input_frames  # first predicted frame
+        self.horizon = scenario.config.horizon
         self.end = self.first + self.horizon
         self.positions = positions[: self.end + 2]
         self.truth = positions[self.first : self.end]
@@ -95,7 +95,7 @@ class CalibrationScenario:
         The field is that on the grid before absolute frame ``first``.
         """
         position, displacement = self.last_motion(first)
-        grid = self.scenario.setting.grid
+        grid = self.scenario.config.grid
         full = self.scenario.full
         velocity = fields(position, displacement, grid, full=full).velocity
         frames = []
@@ -217,7 +217,7 @@ def trace_prediction(test: CalibrationScenario, predicted: Floats) -> Trace:
     scenario = test.scenario
     tracer = Tracer(scenario)
     frames = zip(
-        scenario.setting.predicted_frames,
+        scenario.config.predicted_frames,
         snapshots(scenario, test.truth),
         snapshots(scenario, predicted),
         strict=True,
@@ -303,14 +303,14 @@ def main() -> int:
 def print_line(name: str, split: str, traces: Sequence[Trace]) -> list[list[float]]:
     """Print the line of a prediction; return its numbers by scenario."""
     numbers = [numbers_of(trace) for trace in traces]
-    flag = "raised" if copy_suspect(traces).raised else "-"
+    flag = "raised" if judge_copying(traces).raised else "-"
     print(f"{name:32s} {split:14s}{format_ranges(numbers)}  {flag}", flush=True)
     return numbers
 
 
 def numbers_of(trace: Trace) -> list[float]:
     """Return the numbers of one scenario, in the order of the columns."""
-    copy_evidence = evidence(trace)
+    copy_evidence = analyse_error(trace)
     numbers = [float(getattr(copy_evidence, column)) for column in COLUMNS]
     numbers.append(float(np.mean(trace.predicted_motion) / np.mean(trace.motion)))
     numbers.append(float(np.mean(trace.occupancy)))

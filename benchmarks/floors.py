@@ -3,7 +3,7 @@ Markdown.
 
     python benchmarks/floors.py [--data cavity/full ...] [--each]
 
-From the scores that the package ships (``python -m lagbench.scoring.record`` measures
+From the scores that the package ships (``python -m lagbench.scoring.measure_references`` measures
 them): for each data set and floor the ranking metric with its 95 % interval over test
 scenarios, the correlation of vorticity at frame 54 (tiny: the last), and the CPU time
 of a frame; the best floor is marked. Then, for the full boxes, the share of test
@@ -24,7 +24,7 @@ from lagbench.data.registry import Size, load
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import ReferenceScores, shipped
 from lagbench.references.table import COUNTING
-from lagbench.scoring.card import best_floor
+from lagbench.scoring.skill import best_reference
 
 FALLEN = 0.8
 SHARE = 0.75
@@ -83,7 +83,7 @@ def main() -> int:
 
 def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> None:
     ranking = ranking_metric(size)
-    best = best_floor(
+    best = best_reference(
         {
             name: references[name].scores[ranking]
             for name in COUNTING.intersection(references)

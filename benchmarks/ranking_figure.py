@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from lagbench.data.grid import Grid, Placement
-from lagbench.metrics import FramePair, Scenario, Setting, aggregate, select, tally
+from lagbench.metrics import FramePair, Scenario, TaskConfig, aggregate, select, tally
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
     """Return the pair of a true and a predicted frame."""
     position, velocity = truth
     predicted_position, predicted_velocity = prediction
-    setting = Setting(
+    config = TaskConfig(
         grid=Grid(40, placement),
         input_frames=2,
         horizon=1,
@@ -72,11 +72,11 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
     )
     given = np.stack([position - 2 * velocity, position - velocity])
     scenario = Scenario(
-        setting=setting,
+        config=config,
         given=given,
         material=np.zeros(len(position), np.int8),
         particle_mass=1.0 / len(position),
-        area=1.0 if setting.full_box else 0.12,
+        area=1.0 if config.full_box else 0.12,
     )
     true_snapshot = scenario.snapshot(position, position - velocity)
     predicted_snapshot = scenario.snapshot(
@@ -87,7 +87,7 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
 
 def format_scores(pair: FramePair) -> str:
     """Return the shown scores of a pair, one line each."""
-    names = SHOWN[Placement(pair.scenario.setting.grid.placement)]
+    names = SHOWN[Placement(pair.scenario.config.grid.placement)]
     metrics = select(names)
     scores = aggregate(metrics, {0: tally([pair], metrics, (2,))})
     lines = []
@@ -158,7 +158,7 @@ def splash(rng: np.random.Generator) -> dict[str, FramePair]:
 
 def draw_prediction(axes: Axes, pair: FramePair, limit: float) -> None:
     """Draw the vorticity of a full box, or the particles on a free surface."""
-    if pair.scenario.setting.full_box:
+    if pair.scenario.config.is_full_box:
         axes.imshow(
             pair.predicted_fields.vorticity.T,
             origin="lower",

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from lagbench.metrics.aggregate import Score, bootstrap_interval
 from lagbench.metrics.table import METRICS
-from lagbench.scoring.card import skill
+from lagbench.scoring.skill import compute_skill
 
 CASES = (
     (1.9, 0.6, 0.6, 0.3),
@@ -85,7 +85,7 @@ def main() -> int:
                         seed_factor = np.exp(log_seeds)
                     # shape [seed, scenario]
                     method = ratio * seed_factor[:, None] * method_factor
-                    estimate = skill(
+                    estimate = compute_skill(
                         [score_of(row) for row in method],
                         {"persistence": score_of(baseline)},
                     )

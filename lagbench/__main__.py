@@ -200,7 +200,7 @@ COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
     (data.verify, "verify --split cavity --size tiny --regenerate 2"),
     (exchange.download, "download --split cavity --size mini --from https://host/data"),
     (exchange.export, "export cavity --size mini --format gns-npz -o cavity-gns"),
-    (exchange.import_split, "import WaterDrop --format gns-npz --allow-pickle -o drop"),
+    (exchange.import_split, "import WaterDrop --format gns-npz -o drop"),
     (exchange.adopt, "adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1"),
     (scoring.template, "template cavity --size tiny -o predictions.nc"),
     (scoring.validate, "validate predictions.nc"),

@@ -38,15 +38,19 @@ def main() -> int:
         seconds = cpu_seconds() - started
         checks = sorted({finding.check for finding in result.errors})
         peak = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
-        good = (
+        is_recognised = (
             entry.check in checks
             and result.exit_code == entry.exit_code
             and seconds < 10
             and peak < 1000
         )
-        failures += not good
-        text = f"{name:28} {','.join(checks):24} exit {result.exit_code} {seconds:5.1f} s {peak:5.0f} MiB"
-        print(f"{text} {'ok' if good else 'NOT RECOGNISED'}")  # noqa: T201
+        verdict = "ok"
+        if not is_recognised:
+            verdict = "NOT RECOGNISED"
+            failures += 1
+        cost = f"{seconds:5.1f} s {peak:5.0f} MiB"
+        line = f"{name:28} {','.join(checks):24} exit {result.exit_code} {cost}"
+        print(f"{line} {verdict}")  # noqa: T201
     summary = f"{len(FAULTS)} faulty files, {failures} not recognised"
     print(f"{summary}; they lie in {target}")  # noqa: T201
     return 1 if failures else 0

@@ -33,7 +33,7 @@ from lagbench.board.model import (
 )
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS
-from lagbench.scoring.stored import reported_frames
+from lagbench.scoring.score_file_checks import reported_frames
 from lagbench.submission.task_checks import frames_to_predict
 
 Floats = NDArray[np.float64]

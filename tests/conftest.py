@@ -37,13 +37,18 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring import score as scored
 from lagbench.scoring.scenario import ScenarioScores
-from lagbench.scoring.score_file import StoredScores, read_statistics
-from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
+from lagbench.scoring.score_file import SubmissionStatistics, read_statistics
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
-from lagbench.submission.format import Anatomy
+from lagbench.submission.format import FileInfo
 from lagbench.submission.validation import validate
 from lagbench.work.pool import Pool
+from lagbench.work.progress import Meter
 from lagbench.work.run import ONE_THREAD
 
 # The same code gives the same verdict: what Hypothesis finds by chance is to be found
@@ -184,22 +189,36 @@ def references_once() -> Iterator[None]:
     def outcomes(
         task: ScoredTask,
         path: Path,
-        anatomy: Anatomy,
+        anatomy: FileInfo,
         metrics: Names,
-        floors: Names,
-        *others: Any,
+        references: Names,
+        workers: int | None,
+        scheduler: str | None,
+        meter: Meter,
     ) -> list[ScenarioScores]:
-        workers, scheduler, _ = others
-        if not floors or scheduler is not None or (workers or 1) > 1:
-            return OUTCOMES(task, path, anatomy, metrics, floors, *others)
+        options = {"workers": workers, "scheduler": scheduler, "meter": meter}
+        if not references or scheduler is not None or (workers or 1) > 1:
+            return OUTCOMES(
+                task, path, anatomy, metrics=metrics, references=references, **options
+            )
         files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        key = metrics, floors, repr((task.size, task.setting)), *map(file_sha256, files)
+        key = (
+            metrics,
+            references,
+            repr((task.size, task.config)),
+            *map(file_sha256, files),
+        )
         found = OUTCOMES(
-            task, path, anatomy, metrics, () if key in known else floors, *others
+            task,
+            path,
+            anatomy,
+            metrics=metrics,
+            references=() if key in known else references,
+            **options,
         )
         if key not in known:
             known[key] = {
-                one.scenario: {name: one.tallies[name] for name in floors}
+                one.scenario: {name: one.tallies[name] for name in references}
                 for one in found
             }
         return [
@@ -208,7 +227,7 @@ def references_once() -> Iterator[None]:
         ]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagbench.scoring.score._outcomes", outcomes)
+        patch.setattr("lagbench.scoring.score.score_scenarios", outcomes)
         yield
 
 
@@ -217,30 +236,30 @@ def stored_once() -> Iterator[None]:
     """Read score files of equal bytes once: commands read all of a board's, several
     times.
     """
-    known: dict[Hashable, Stored] = {}
+    known: dict[Hashable, ScoreFile] = {}
 
     @functools.cache
-    def statistics(_: str, path: Path) -> StoredScores:
+    def statistics(_: str, path: Path) -> SubmissionStatistics:
         stored = read_statistics(path)
         # no test of tables adds metrics
         object.__setattr__(stored, "scores", functools.cache(stored.scores))
         return stored
 
-    def read(path: Path, size: Size | None = None) -> Stored:
+    def read(path: Path, size: Size | None = None) -> ScoreFile:
         if (
             path.is_symlink()
             or not path.is_file()
             or path.stat().st_size > MAX_SCORE_BYTES
         ):
-            return read_stored(path, size)
+            return read_score_file(path, size)
         key = file_sha256(path), size and repr(size)
         if key not in known:
-            known[key] = read_stored(path, size)
+            known[key] = read_score_file(path, size)
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
         for module in READERS:
-            patch.setattr(f"lagbench.board.{module}.read_stored", read)
+            patch.setattr(f"lagbench.board.{module}.read_score_file", read)
         reader = "studies.thesis.split_results.read_statistics"
         patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
         yield
@@ -256,7 +275,7 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("scoring.score", "board.submit"):
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
     for module in READERS:
-        monkeypatch.setattr(f"lagbench.board.{module}.read_stored", read_stored)
+        monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
     monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
     monkeypatch.setattr(painting, "paint_pictures", PAINT)
 

@@ -1,6 +1,4 @@
-"""Readers of the two exchange formats that know only their description, and data to
-adopt.
-"""
+"""Readers of the two exchange formats that know only their description; test runs."""
 
 from __future__ import annotations
 
@@ -19,24 +17,29 @@ Trajectory = tuple[NDArray[Any], NDArray[Any]]
 def read_gns(path: Path) -> list[Trajectory]:
     """Read an npz file as the GNS programs do: every key in zip order, unpickled."""
     with np.load(path, allow_pickle=True) as file:
-        items = (
-            list(file["gns_data"])
-            if "gns_data" in file
-            else [file[key] for key in file.files]
-        )
-    return [(item[0], np.full(item[0].shape[1], item[1], dtype=int)) for item in items]
+        if "gns_data" in file:
+            items = list(file["gns_data"])
+        else:
+            items = [file[key] for key in file.files]
+    trajectories = []
+    for item in items:
+        position = item[0]
+        kinds = np.full(position.shape[1], item[1], dtype=int)
+        trajectories.append((position, kinds))
+    return trajectories
 
 
 def read_h5(path: Path) -> list[Trajectory]:
-    """Read an HDF5 file as LagrangeBench does: keys in order, the length of 00000 for
-    all.
-    """
+    """Read an HDF5 file as LagrangeBench does: the length of 00000 holds for all."""
+    trajectories = []
     with h5py.File(path) as file:
         length = file["00000/position"].shape[0]
-        return [
-            (file[key]["position"][:length], file[key]["particle_type"][:])
-            for key in file
-        ]
+        for key in file:
+            group = file[key]
+            position = group["position"][:length]
+            kinds = group["particle_type"][:]
+            trajectories.append((position, kinds))
+    return trajectories
 
 
 def read_metadata(folder: Path) -> dict[str, Any]:
@@ -47,21 +50,24 @@ def read_metadata(folder: Path) -> dict[str, Any]:
 def frame_statistics(
     trajectories: Sequence[Trajectory],
 ) -> dict[str, NDArray[np.float64]]:
-    """Compute vel_mean, vel_std, acc_mean, acc_std per frame over all particles, in one
-    go.
+    """Compute mean and deviation of velocity and acceleration, per frame.
+
+    They are taken over all particles at once.
     """
-    velocity = [
-        np.diff(position.astype(np.float64), axis=0) for position, _ in trajectories
-    ]
-    acceleration = [np.diff(v, axis=0) for v in velocity]
-    joined = {
-        "vel": np.concatenate([v.reshape(-1, 2) for v in velocity]),
-        "acc": np.concatenate([a.reshape(-1, 2) for a in acceleration]),
-    }
+    velocities = []
+    accelerations = []
+    for position, _ in trajectories:
+        velocity = np.diff(position.astype(np.float64), axis=0)
+        acceleration = np.diff(velocity, axis=0)
+        velocities.append(velocity.reshape(-1, 2))
+        accelerations.append(acceleration.reshape(-1, 2))
+    velocity = np.concatenate(velocities)
+    acceleration = np.concatenate(accelerations)
     return {
-        f"{name}_{what}": getattr(values, what)(axis=0)
-        for name, values in joined.items()
-        for what in ("mean", "std")
+        "vel_mean": velocity.mean(axis=0),
+        "vel_std": velocity.std(axis=0),
+        "acc_mean": acceleration.mean(axis=0),
+        "acc_std": acceleration.std(axis=0),
     }
 
 
@@ -73,11 +79,15 @@ def straight_runs(
     seed: int = 0,
     box: float = 1.0,
 ) -> list[NDArray[np.float32]]:
-    """Return trajectories of particles that fly straight inside a box, [frame,
-    particle, 2].
+    """Return trajectories of particles that fly straight inside a box.
+
+    Each has shape [frame, particle, 2].
     """
     rng = np.random.default_rng(seed)
-    start = 0.3 + 0.4 * rng.random((count, 1, particles, 2))
-    speed = min(0.02, 0.5 / frames) * (rng.random((count, 1, particles, 2)) - 0.5)
+    shape = (count, 1, particles, 2)
+    start = 0.3 + 0.4 * rng.random(shape)
+    largest_step = min(0.02, 0.5 / frames)
+    step = largest_step * (rng.random(shape) - 0.5)
     time = np.arange(frames)[None, :, None, None]
-    return list((box * (start + speed * time)).astype(np.float32))
+    position = box * (start + step * time)
+    return list(position.astype(np.float32))

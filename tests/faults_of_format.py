@@ -138,7 +138,12 @@ simple(
     "format",
     "tiny_chunks",
     lambda f: replace(
-        f, "position", DIMS, shape=(3, 8, 5000, 2), chunks=(1, 1, 1, 1), dtype="f4"
+        f,
+        "position",
+        DIMS,
+        shape=(3, 8, 5000, 2),
+        chunks=(1, 1, 1, 1),
+        dtype="f4",
     ),
     says="too many chunks",
 )
@@ -190,7 +195,14 @@ def external_storage(bench: Bench) -> Path:
     path = bench.copy("external_storage.nc")
     with h5py.File(path, "r+") as file:
         outside = [("/etc/passwd", 0, h5py.h5f.UNLIMITED)]
-        replace(file, "position", DIMS, shape=SHAPE, dtype="f4", external=outside)
+        replace(
+            file,
+            "position",
+            DIMS,
+            shape=SHAPE,
+            dtype="f4",
+            external=outside,
+        )
     return path
 
 

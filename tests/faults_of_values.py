@@ -11,8 +11,7 @@ import netCDF4
 import numpy as np
 from faulty import DIMS, SHAPE, built, fault, positions, replace, simple, store
 from numpy.typing import ArrayLike, NDArray
-from scenario_factory import frames_of
-from submission_data import FRAMES, GIVEN, PARTICLES, TESTS, Bench
+from submission_data import PARTICLES, Bench
 
 
 @fault("particles", says="47")
@@ -136,17 +135,6 @@ def _permuted(values: NDArray[np.float32]) -> ArrayLike:
     return values[:, :, np.random.Generator(np.random.PCG64(1)).permutation(PARTICLES)]
 
 
-def _last_given() -> NDArray[np.float32]:
-    """Return the last given frame of every scenario, shape [scenario, 1, particle,
-    2].
-    """
-    return np.stack([frames_of(i, FRAMES, PARTICLES)[GIVEN - 1 : GIVEN] for i in TESTS])
-
-
-def _displacements(values: NDArray[np.float32]) -> ArrayLike:
-    return np.diff(values, axis=1, prepend=values[:, :1])
-
-
 _value(
     "finite",
     "one_nan",
@@ -165,22 +153,6 @@ _value(
 _value("finite", "all_nan", _put(..., np.nan), "finite")
 _value("finite", "all_infinite", _put(..., -np.inf), "finite")
 _value("start", "particles_permuted", _permuted, "another order")
-_value("start", "x_and_y_swapped", lambda v: v[..., ::-1], "swapped")
-_value(
-    "start",
-    "standardised",
-    lambda v: (v - v.mean((1, 2), keepdims=True)) / v.std((1, 2), keepdims=True),
-    "standardised",
-)
-_value("start", "displacements", _displacements, "displacements")
-_value("start", "all_zero", np.zeros_like, "displacements")
-_value("start", "scenarios_mixed_up", lambda v: v[[1, 2, 0]], "of scenario")
-_value(
-    "start",
-    "frames_early",
-    lambda v: np.concatenate([_last_given(), v[:, :-1]], axis=1),
-    "shifted",
-)
 _value("in_domain", "huge_values", lambda v: v + np.float32(1e30), "far beyond")
 _value(
     "in_domain",

@@ -57,7 +57,10 @@ def simple(
             change(file)
         return path
 
-    FAULTS[name] = Fault(make, check, 4 if check == "dataset" else 1, says=says)
+    exit_code = 1
+    if check == "dataset":
+        exit_code = 4
+    FAULTS[name] = Fault(make, check, exit_code, says=says)
 
 
 def replace(
@@ -66,12 +69,11 @@ def replace(
     """Replace a variable by another of the same name, with dimension scales
     attached.
     """
-    attributes = (
-        {}
-        if name not in file
-        else {k: v for k, v in file[name].attrs.items() if k == "units"}
-    )
+    attributes = {}
     if name in file:
+        old_attributes = file[name].attrs
+        if "units" in old_attributes:
+            attributes["units"] = old_attributes["units"]
         del file[name]
     dataset = file.create_dataset(name, data=data, **options)
     dataset.attrs.update(attributes)
@@ -107,22 +109,25 @@ def built(
     middle.
     """
     path = bench.folder / f"{name}.nc"
-    numbers = {
-        "scenario": np.array(scenarios, np.int64),
-        "frame": np.array(frames, np.int64),
-    }
-    lengths = {d: len(n) for d, n in numbers.items()} | {
+    scenario_ids = np.array(scenarios, np.int64)
+    frame_numbers = np.array(frames, np.int64)
+    lengths = {
+        "scenario": len(scenario_ids),
+        "frame": len(frame_numbers),
         "particle": particles,
         "space": 2,
     }
     with netCDF4.Dataset(bench.valid) as valid, netCDF4.Dataset(path, "w") as file:
         for dim, length in lengths.items():
-            file.createDimension(dim, None if unlimited and dim == "frame" else length)
-        for dim, values in numbers.items():
-            file.createVariable(dim, "i8", (dim,))[:] = values
+            is_unlimited = unlimited and dim == "frame"
+            file.createDimension(dim, None if is_unlimited else length)
+        file.createVariable("scenario", "i8", ("scenario",))[:] = scenario_ids
+        file.createVariable("frame", "i8", ("frame",))[:] = frame_numbers
         position = file.createVariable("position", "f4", dims, zlib=True)
-        position[:] = np.full([lengths[d] for d in dims], 0.5, np.float32)
-        file.setncatts({n: valid.getncattr(n) for n in valid.ncattrs()})
+        shape = [lengths[dim] for dim in dims]
+        position[:] = np.full(shape, 0.5, np.float32)
+        attributes = {name: valid.getncattr(name) for name in valid.ncattrs()}
+        file.setncatts(attributes)
         yield path, file
 
 

@@ -30,7 +30,7 @@ from lagbench.data.yamlfile import format_yaml, read_yaml
 from lagbench.figures.report.report import write_report
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.submission import write
 
@@ -311,7 +311,10 @@ class BoardBench:
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [read_stored(self.folder / path).scores.tallies for path in entry.score_paths]
+        stored = [
+            read_score_file(self.folder / path).scores.tallies
+            for path in entry.score_paths
+        ]
         plain = {
             name: summary.model_dump()
             for name, summary in summarise(combine(stored)).items()

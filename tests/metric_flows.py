@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.grid import Grid
-from lagbench.metrics import METRICS, FramePair, Scenario, Setting, snapshots
+from lagbench.metrics import METRICS, FramePair, Scenario, TaskConfig, snapshots
 
 Floats = NDArray[np.float64]
 
-SETTING = Setting(
+CONFIG = TaskConfig(
     grid=Grid(10),
     input_frames=2,
     horizon=6,
@@ -54,17 +54,17 @@ def scenario_of(
     positions: Floats, *, material: ArrayLike | None = None, **changes: Any
 ) -> Scenario:
     """Return the scenario whose given frames are the first two; ``changes`` go to the
-    setting.
+    config.
     """
     kinds = (
         np.zeros(positions.shape[1], np.int8)
         if material is None
         else np.asarray(material, np.int8)
     )
-    setting = replace(SETTING, **changes)
+    config = replace(CONFIG, **changes)
     return Scenario(
-        setting=setting,
-        given=positions[: setting.input_frames],
+        config=config,
+        input_positions=positions[: config.input_frames],
         material=kinds,
         particle_mass=1.0 / positions.shape[1],
         area=1.0,
@@ -75,11 +75,11 @@ def pairs_of(scenario: Scenario, truth: Floats, prediction: Floats) -> list[Fram
     """Return the frame pairs of whole trajectories; the prediction's given frames are
     not read.
     """
-    first = scenario.setting.input_frames
+    first = scenario.config.input_frames
     sides = (
         snapshots(scenario, positions[first:]) for positions in (truth, prediction)
     )
-    numbered = zip(scenario.setting.predicted_frames, *sides, strict=True)
+    numbered = zip(scenario.config.predicted_frames, *sides, strict=True)
     return [FramePair(scenario, frame, t, p) for frame, t, p in numbered]
 
 

@@ -85,7 +85,15 @@ def make_bench(folder: Path) -> Bench:
     """
     folder.mkdir(parents=True, exist_ok=True)
     root = folder / "root"
-    keys = {i: make_key(i, split="cavity", size="tiny", subset="test") for i in TESTS}
+    keys = {
+        i: make_key(
+            i,
+            split="cavity",
+            size="tiny",
+            subset="test",
+        )
+        for i in TESTS
+    }
     hashes = {
         i: write_scenario(root, k, frames=FRAMES, particles=PARTICLES)[1]
         for i, k in keys.items()
@@ -121,7 +129,11 @@ def _registry(hashes: dict[int, str]) -> str:
     split = file["splits"]["cavity"]
     split["version"] = VERSION
     size = split["sizes"]["tiny"]
-    size["subsets"] = {"train": "0-1", "valid": 2, "test": "3-5"}
+    size["subsets"] = {
+        "train": "0-1",
+        "valid": 2,
+        "test": "3-5",
+    }
     size["frames"] = FRAMES
     size["parameters"]["particles"] = PARTICLES
     size["task"] |= {
@@ -129,7 +141,11 @@ def _registry(hashes: dict[int, str]) -> str:
         "horizon": HORIZON,
         "frames_of_interest": [5],
     }
-    subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
+    subsets = {
+        "train": "0" * 64,
+        "valid": "1" * 64,
+        "test": subset_hash(hashes),
+    }
     measured = {
         "dataset_sha256": dataset_hash("cavity", "tiny", 1, subsets),
         "subset_sha256": subsets,

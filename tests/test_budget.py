@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from lagbench.board.entry import EntryBudget
-from lagbench.submission.budget import MOST_VALIDATIONS, Budget, budget_in, track_of
+from lagbench.submission.budget import MOST_VALIDATIONS, Budget, parse_budget, track_of
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_texts_that_are_no_budget(text: str) -> None:
     """A track is not stated, hours are not negative, names printable; validations as
     many as entries hold.
     """
-    assert budget_in(text) is None
-    assert budget_in(json.dumps({"validations": VALIDATIONS[1:]})) is not None
+    assert parse_budget(text) is None
+    assert parse_budget(json.dumps({"validations": VALIDATIONS[1:]})) is not None
 
 
 def test_the_mean_over_seeds() -> None:

@@ -298,7 +298,7 @@ def test_floors_that_are_not_at_hand(scored: dict[str, Path], tmp_path: Path) ->
     """A floor goes second; a scores.nc holds the best one; a file that is empty is no
     submission.
     """
-    with pytest.raises(UsageError, match="give the floor last"):
+    with pytest.raises(UsageError, match="persistence"):
         compare("persistence", scored["still"])
     with pytest.raises(UsageError) as caught:
         compare(scored["still"] / "scores.nc", "analog")
@@ -442,7 +442,7 @@ def test_tables_show_floors_undefined_and_units(
     rows = {row[0].split()[0]: row for row in horizon.rows}
     assert list(rows)[:2] == ["skill", card.ranking]
     assert [column.replace("\n", "") for column in horizon.columns[2:]] == [
-        card.skill.floor
+        card.skill.reference
     ]
     assert rows["vorticity_pearson"][1].endswith("†")
     assert rows["vorticity_rmse"][0].endswith("[1/frame]")

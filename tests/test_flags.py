@@ -17,10 +17,10 @@ from lagbench.scoring.flags import (
     SHIFTS,
     Trace,
     Tracer,
-    below_twin_floor,
-    copy_suspect,
-    evidence,
-    physics,
+    analyse_error,
+    judge_copying,
+    judge_physics,
+    judge_predictability,
 )
 
 HORIZON = 6
@@ -64,7 +64,7 @@ def test_trace_of_an_offset_that_grows() -> None:
         trace.overlap[1:] * 1e4, [1.0, 3.0, 6.0, 10.0, 15.0], rtol=1e-9
     )
     assert math.isnan(trace.overlap[0])
-    found = evidence(trace)
+    found = analyse_error(trace)
     # cosine 1 throughout; the smallest ratio is 6/5; the last quarter is the last
     # frame: 6/1
     assert found.autocorrelation == pytest.approx(1.0)
@@ -83,7 +83,7 @@ def test_trace_finds_the_shift(shift: int) -> None:
     known = ~np.isnan(trace.shifted[shift])
     assert np.count_nonzero(known) == (HORIZON if shift < 0 else HORIZON - shift)
     np.testing.assert_allclose(trace.shifted[shift][known], 0.0, atol=1e-30)
-    found = evidence(trace)
+    found = analyse_error(trace)
     assert (found.shift, found.shift_gain) == (shift, 0.0)
 
 
@@ -125,7 +125,7 @@ def test_copy_suspect_by_hand(trace: Trace, reason: str | None) -> None:
     """Each kind of trace raises for its own reason, and honest growth for none; one
     scenario is enough.
     """
-    flag = copy_suspect([made([1, 2, 3, 4, 5, 6]), trace])
+    flag = judge_copying([made([1, 2, 3, 4, 5, 6]), trace])
     assert flag.raised == (reason is not None)
     if reason is not None:
         assert len(flag.reasons) == 1
@@ -141,23 +141,23 @@ def test_twin_floor_and_physics_by_hand() -> None:
     """
     twin = [1e-6, 1e-5, 1e-4, 0.5]
     persistence = np.array([0.01, 0.1, 0.5, 1.0])
-    flag = below_twin_floor(np.array([5e-7, 1e-3, 1e-2, 0.4]), persistence, twin)
+    flag = judge_predictability(np.array([5e-7, 1e-3, 1e-2, 0.4]), persistence, twin)
     assert flag.raised
     assert flag.evidence == {"frames_below": 1.0, "frames_compared": 3.0}
-    honest = below_twin_floor(np.array([5e-5, 1e-3, 1e-2, 0.4]), persistence, twin)
+    honest = judge_predictability(np.array([5e-5, 1e-3, 1e-2, 0.4]), persistence, twin)
     assert honest.raised is False
-    assert below_twin_floor(persistence, persistence, ()).raised is None
+    assert judge_predictability(persistence, persistence, ()).raised is None
     # as workers send it
     trace = pickle.loads(pickle.dumps(trace_of(rollout(), rollout(speed=0.012))))
     assert set(trace.shifted) == set(SHIFTS)
     rest = made([1, 2, 3])
     for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):
         assert (
-            physics([replace(rest, predicted_motion=factor * rest.motion)]).raised
+            judge_physics([replace(rest, predicted_motion=factor * rest.motion)]).raised
             == raised
         )
     wide = replace(rest, occupancy=2.0 * rest.occupancy)
-    assert "area" in physics([wide]).reasons[0]
+    assert "area" in judge_physics([wide]).reasons[0]
 
 
 def one_step(truth: Floats, n: int, h: int) -> Floats:
@@ -203,5 +203,5 @@ def test_copies_on_generated_data(bench: ScoreBench, predict: Predict) -> None:
                 tracer.add(FramePair(scenario, frame, true, predicted))
             traces.append(tracer.result())
     if predict is half_right:
-        assert [evidence(trace).exact for trace in traces] == [h // 2, h // 2]
-    assert copy_suspect(traces).raised == (predict not in (still, straight))
+        assert [analyse_error(trace).exact for trace in traces] == [h // 2, h // 2]
+    assert judge_copying(traces).raised == (predict not in (still, straight))

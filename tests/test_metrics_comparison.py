@@ -10,7 +10,6 @@ import pytest
 import scipy.stats
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.special import stdtrit
 from statsmodels.stats.multitest import multipletests
 
 from lagbench.errors import UsageError
@@ -25,7 +24,6 @@ from lagbench.metrics import (
     sign_flip_p,
     standings,
 )
-from lagbench.metrics.aggregate import quantiles, student_quantile
 from lagbench.metrics.significance import mean_loss
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
@@ -118,31 +116,6 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
         x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)
     ]
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
-
-
-def test_quantiles_are_numpys_and_scipys() -> None:
-    """Student's: for whole degrees of freedom, for whole ones but for rounding, and for
-    others.
-
-    Of samples: to the bit, ends and middle included.
-    """
-    for freedom in (
-        *range(3, 60),
-        500,
-        1000,
-        1001,
-        19.000000000000004,
-        2.5,
-        7.3,
-        np.inf,
-        np.nan,
-    ):
-        theirs = pytest.approx(stdtrit(freedom, 0.975), rel=1e-12, nan_ok=True)
-        assert student_quantile(freedom, 0.975) == theirs
-    for count in (2, 3, 101, 10_000):
-        values = np.random.default_rng(count).normal(size=count)
-        shares = (0.0, 0.025, 0.3, 0.5, 0.975, 1.0)
-        assert quantiles(values, shares) == np.quantile(values, shares).tolist()
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:

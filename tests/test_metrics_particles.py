@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from metric_flows import (
-    SETTING,
+    CONFIG,
     Floats,
     lattice,
     measured,
@@ -69,7 +69,7 @@ def test_attribute_error_equals_that_of_standardised_arrays() -> None:
     x, y = rng.random((2, 50, 2))
     u, v = 0.01 * rng.standard_normal((2, 50, 2))
     mean = np.array([0.5, 0.4, 0.001, -0.002])
-    std = np.array(SETTING.attribute_std)
+    std = np.array(CONFIG.attribute_std)
     z, z_predicted = ((np.hstack(side) - mean) / std for side in ((x, u), (y, v)))
     found = attribute_mse.measure(pair_of(x, u, v, predicted_position=y))
     assert found == pytest.approx(np.mean((z - z_predicted) ** 2))
@@ -108,7 +108,7 @@ def test_average_and_end_over_horizons() -> None:
     pieces = tally(
         pairs_of(scenario, truth, truth + offset),
         metrics,
-        scenario.setting.predicted_frames,
+        scenario.config.predicted_frames,
     )
     scores = {
         name: found.mean for name, found in aggregate(metrics, {7: pieces}).items()
@@ -133,7 +133,7 @@ def test_rmse_is_the_root_of_the_frame_mean() -> None:
     two[2:] = 1.5
     scenario = scenario_of(truth, horizon=2)
     metrics = [METRICS["position_mse"], METRICS["position_rmse"]]
-    frames = scenario.setting.predicted_frames
+    frames = scenario.config.predicted_frames
     tallies = {
         i: tally(pairs_of(scenario, truth, p), metrics, frames)
         for i, p in enumerate((one, two))
@@ -242,9 +242,9 @@ def test_bonds_of_a_chain_and_of_a_cloud() -> None:
     torn[3:, 0] += 1.5 * 0.05
     stretched[3:, 0] += 0.99 * 0.05
     assert len(bonds.pairs) == 5
-    assert bonds.share_held(chain) == bonds.share_held(stretched) == 1.0
-    assert bonds.share_held(torn) == pytest.approx(0.8)
-    assert math.isnan(Bonds.within(0.01, chain).share_held(chain))
+    assert bonds.intact_share(chain) == bonds.intact_share(stretched) == 1.0
+    assert bonds.intact_share(torn) == pytest.approx(0.8)
+    assert math.isnan(Bonds.within(0.01, chain).intact_share(chain))
     x = np.random.default_rng(0).random((60, 2))
     bonds = Bonds.within(0.2, x)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
@@ -353,7 +353,7 @@ def cloud_score(
     metrics = [METRICS["cloud_distance"], METRICS["active_frames"]]
     pairs = pairs_of(scenario, truth, guess)
     found = aggregate(
-        metrics, {0: tally(pairs, metrics, scenario.setting.predicted_frames)}
+        metrics, {0: tally(pairs, metrics, scenario.config.predicted_frames)}
     )
     seen = [p.frame for p in pairs if "cloud_distance" in measure(p, metrics)]
     assert found["active_frames"].mean == (frames - 2 if active is None else active)

@@ -40,7 +40,7 @@ def scores_of(truth: Floats, prediction: Floats) -> dict[str, Score]:
     pieces = tally(
         pairs_of(scenario, truth, prediction),
         metrics,
-        scenario.setting.predicted_frames,
+        scenario.config.predicted_frames,
     )
     return aggregate(metrics, {0: pieces})
 

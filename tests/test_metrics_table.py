@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from metric_flows import SETTING, Floats, pairs_of, rollout, scenario_of
+from metric_flows import CONFIG, Floats, pairs_of, rollout, scenario_of
 from numpy.testing import assert_allclose
 
 from lagbench.data.grid import Grid, Placement
@@ -66,7 +66,7 @@ def pairs() -> list[FramePair]:
 
 def tallied(*pieces: FramePair) -> Tally:
     """Measure frames, all of the rollout unless told otherwise."""
-    return tally(pieces or pairs(), ALL, SETTING.predicted_frames)
+    return tally(pieces or pairs(), ALL, CONFIG.predicted_frames)
 
 
 def same_bits(one: Tally, two: Tally) -> bool:
@@ -92,7 +92,7 @@ def test_chunks_in_any_order_give_the_same_bits(
     """
     edges = [0, *sorted(cuts), 6]
     chunks = [
-        tally(pairs()[a:b], ALL, SETTING.predicted_frames)
+        tally(pairs()[a:b], ALL, CONFIG.predicted_frames)
         for a, b in itertools.pairwise(edges)
     ]
     random.shuffle(chunks)  # type: ignore[attr-defined]
@@ -122,7 +122,7 @@ def test_snapshots_may_be_shared_and_begin_in_the_middle() -> None:
     true = list(snapshots(scenario, truth[2:]))
     for positions in (prediction, truth):
         sides = zip(
-            SETTING.predicted_frames,
+            CONFIG.predicted_frames,
             true,
             snapshots(scenario, positions[2:]),
             strict=True,
@@ -226,7 +226,7 @@ LENGTHS = re.compile(
     r"(1|%|nat|frame|(mass )?length(\^2)?(/frame(\^2)?)?|1/frame(\^2)?)"
 )
 SOURCES = re.compile(
-    r"Eqs?\. \d|Figs?\. \d|section \d|design section|design 2, section|LagrangeBench"
+    r"Eqs?\. \d|Figs?\. \d|section \d|.* \(?(19|20)\d\d\b|docs/scoring\.md"
 )
 STATES = ("liquid", "jelly", "snow", "rope")
 
@@ -253,7 +253,7 @@ def scores(size: float) -> dict[str, Score]:
         pairs = pairs_of(scenario, truth, truth + size * error)
         found = (
             aggregate(
-                MEASURED, {0: tally(pairs, MEASURED, scenario.setting.predicted_frames)}
+                MEASURED, {0: tally(pairs, MEASURED, scenario.config.predicted_frames)}
             )
             | found
         )
@@ -395,7 +395,7 @@ def test_our_metrics_are_registered_as_those_of_others_are(
     with_entry_point(monkeypatch, f"{__name__}:OTHERS")
     assert available()["enstrophy_error"] is OTHERS
     metrics = select(["enstrophy_error"])
-    pieces = tally(pairs(), metrics, SETTING.predicted_frames)
+    pieces = tally(pairs(), metrics, CONFIG.predicted_frames)
     assert aggregate(metrics, {0: pieces})["enstrophy_error"].mean == 1.0
 
 
@@ -517,7 +517,7 @@ def test_all_that_a_metric_does_is_told_with_its_name(
 
     bad: Any = replace(OTHERS, **{what: fail})
     with pytest.raises((WorkFailedError, KeyError)) as caught:
-        aggregate([bad], {0: tally(pairs(), [bad], SETTING.predicted_frames)})
+        aggregate([bad], {0: tally(pairs(), [bad], CONFIG.predicted_frames)})
     told = getattr(caught.value, "where", None) or caught.value.__notes__[0]
     assert "enstrophy_error" in told
 

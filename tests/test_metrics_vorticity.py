@@ -22,7 +22,7 @@ from lagbench.metrics.distributions import (
     energy_spectrum,
     histograms,
     kl,
-    normalised,
+    normalise,
     wasserstein1,
 )
 from lagbench.metrics.vorticity import frames_before_fall, pearson, slope
@@ -209,8 +209,8 @@ def test_divergences_are_scipys_entropy() -> None:
     assert measured(pair, "vorticity_kl") == pytest.approx(
         [scipy.stats.entropy(p, q)], rel=1e-9
     )
-    p = normalised(np.array([-1.0, 3.0]))
-    q = normalised(np.array([2.0, -2.0]))
+    p = normalise(np.array([-1.0, 3.0]))
+    q = normalise(np.array([2.0, -2.0]))
     assert kl(p, q) == pytest.approx(0.130812, abs=1e-6)
     for name, of in (
         ("vorticity_kl_hist", np.asarray),
@@ -268,7 +268,7 @@ def test_wasserstein_grows_where_the_histogram_saturates() -> None:
     values = np.array([0.1, 0.4, 0.2, 0.8, 0.3, 0.7] * 5)
     assert kl(*histograms(values, values[::-1])) == 0.0  # type: ignore[misc]
     assert wasserstein1(values, values[::-1]) == 0.0
-    assert kl(normalised(values), normalised(values[::-1])) > 0.1
+    assert kl(normalise(values), normalise(values[::-1])) > 0.1
 
 
 @pytest.mark.parametrize(

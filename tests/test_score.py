@@ -121,7 +121,7 @@ def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
             assert ("at" in entry) == found.metric.per_frame
     frames = said["task"]["frames"]
     assert frames == sorted(
-        {*standing.setting.frames_of_interest, standing.setting.predicted_frames[-1]}
+        {*standing.config.frames_of_interest, standing.config.predicted_frames[-1]}
     )
     assert list(said["rows"][SUBMISSION]["position_mse"]["at"]) == [
         str(frame) for frame in frames
@@ -136,7 +136,7 @@ def test_json_says_what_the_card_says(standing: ScoreCard) -> None:
     # At rest there is no correlation: null, every frame counted, in both scenarios.
     entry = said["rows"][SUBMISSION]["vorticity_pearson"]
     assert (entry["mean"], entry["values"]) == (None, [None, None])
-    assert entry["undefined"] == [standing.setting.horizon] * 2
+    assert entry["undefined"] == [standing.config.horizon] * 2
 
 
 def test_freezing_midway_leaves_frames_out(bench: ScoreBench, tmp_path: Path) -> None:

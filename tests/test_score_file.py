@@ -14,7 +14,7 @@ from score_bench import ScoreBench, straight
 
 from lagbench.errors import UnreadableFileError, WorkFailedError
 from lagbench.metrics import Tally, aggregate, select
-from lagbench.metrics.aggregate import as_stored
+from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import histograms
 from lagbench.scoring.card import (
     FRAMES,
@@ -22,8 +22,8 @@ from lagbench.scoring.card import (
     SUBMISSION,
     ScoreCard,
     digits,
-    read_scores,
 )
+from lagbench.scoring.published_scores import read_scores
 from lagbench.scoring.score_file import read_statistics, write_statistics
 
 
@@ -44,7 +44,7 @@ def noisy(card: ScoreCard) -> ScoreCard:
     frames = tuple(range(6, 96))
     ones = np.ones((len(names), 90), np.int64)
     tallies = {
-        i: as_stored(
+        i: round_statistics(
             Tally(names, frames, rng.standard_normal(ones.shape), ones, 0 * ones)
         )
         for i in range(54, 60)
@@ -87,7 +87,7 @@ def scattered(card: ScoreCard) -> ScoreCard:
         there[names.index("sliced_w2"), 1:-1] = False
         values = levels * (1 + 0.01 * rng.standard_normal(there.shape))
         weight = there.astype(np.int64)
-        tallies[i] = as_stored(
+        tallies[i] = round_statistics(
             Tally(names, frames, np.where(there, values, 0.0), weight, 0 * weight)
         )
     fields = rng.standard_normal((2, 2, 65, 65)).astype(np.float32)
@@ -146,7 +146,7 @@ def test_stored_statistics_are_rounded() -> None:
     """
     largest = float(np.finfo(np.float32).max)
     values = {0: {"a": 1e300, "b": -1e300, "c": 0.1, "d": math.nan}}
-    stored = as_stored(Tally.of("abcd", (0,), values))
+    stored = round_statistics(Tally.of("abcd", (0,), values))
     np.testing.assert_array_equal(
         stored.total[:, 0], [largest, -largest, float(np.float32(0.1)), 0.0]
     )
@@ -157,11 +157,11 @@ def test_stored_statistics_are_rounded() -> None:
         frames,
         {f: {"a": 1e-9 * math.pi**f, "b": 0.0, "c": 1.0, "d": -1e300} for f in frames},
     )
-    stored = as_stored(given)
+    stored = round_statistics(given)
     np.testing.assert_allclose(stored.total[0, :80], given.total[0, :80], rtol=2.0**-11)
     assert len(np.unique(np.frexp(stored.total[0, :80])[0] * 2**11 % 1)) == 1
     assert [set(row) for row in stored.total[1:]] == [{0.0}, {1.0}, {-largest}]
-    np.testing.assert_array_equal(as_stored(stored).total[:3], stored.total[:3])
+    np.testing.assert_array_equal(round_statistics(stored).total[:3], stored.total[:3])
 
 
 def test_preview_shows_the_truth_beside_the_prediction(

@@ -28,17 +28,18 @@ from lagbench.references.shipped import (
 from lagbench.references.table import COUNTING
 from lagbench.scoring import references as references_of_scoring
 from lagbench.scoring import score as scoring
-from lagbench.scoring.card import SUBMISSION, ScoreCard, best_floor, skill
-from lagbench.scoring.record import record
+from lagbench.scoring.card import SUBMISSION, ScoreCard
+from lagbench.scoring.measure_references import measure_and_ship
 from lagbench.scoring.references import (
     differences,
-    kept_in,
     measurable,
     measure,
-    measured_again,
     measured_sizes,
+    remeasure,
+    saved_folder,
 )
 from lagbench.scoring.score_file import read_statistics
+from lagbench.scoring.skill import best_reference, compute_skill
 from lagbench.scoring.tables import card_tables
 
 
@@ -60,8 +61,11 @@ def test_skill_is_one_minus_the_ratio_of_means() -> None:
     both.
     """
     floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
-    found = [skill([scored(v)], floors) for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])]
-    assert [(one.floor, one.value) for one in found] == [
+    found = [
+        compute_skill([scored(v)], floors)
+        for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])
+    ]
+    assert [(one.reference, one.value) for one in found] == [
         ("frozen-field", v) for v in (0.75, 1.0, -1.0)
     ]
     floors = {
@@ -70,10 +74,10 @@ def test_skill_is_one_minus_the_ratio_of_means() -> None:
         "stranger": scored([0.1]),
     }
     assert (
-        best_floor({name: floors[name] for name in COUNTING.intersection(floors)})
+        best_reference({name: floors[name] for name in COUNTING.intersection(floors)})
         == "analog"
     )
-    gappy = skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
+    gappy = compute_skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
     np.testing.assert_equal((gappy.value, gappy.interval), (0.75, (math.nan, math.nan)))
 
 
@@ -85,18 +89,18 @@ def test_what_skill_and_its_interval_need() -> None:
     """
     ours = scored([1.0, 1.0])
     pearson = scored([0.5, 0.5], "vorticity_pearson")
-    assert skill([ours], {}) is None
+    assert compute_skill([ours], {}) is None
     for floor in (
         scored([math.nan] * 2),
         scored([0.0, 0.0]),
         scored([1.0, 1.0], first=7),
     ):
-        assert skill([ours], {"analog": floor}) is None
-    assert skill([pearson], {"analog": pearson}) is None
+        assert compute_skill([ours], {"analog": floor}) is None
+    assert compute_skill([pearson], {"analog": pearson}) is None
     base = [1.0, 2.0, 5.0, 3.0]
-    certain = skill([scored([0.5, 1.0, 2.5, 1.5])], {"analog": scored(base)})
+    certain = compute_skill([scored([0.5, 1.0, 2.5, 1.5])], {"analog": scored(base)})
     assert (certain.value, certain.interval) == (0.5, (0.5, 0.5))
-    few = skill([scored([1.0, 1.0, 4.0])], {"analog": scored(base[:3])})
+    few = compute_skill([scored([1.0, 1.0, 4.0])], {"analog": scored(base[:3])})
     assert all(math.isnan(bound) for bound in few.interval)
 
 
@@ -107,7 +111,7 @@ def test_the_interval_is_that_of_resampled_ratios() -> None:
     rng = np.random.default_rng(3)
     base = rng.gamma(9.0, size=20)
     ours = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
-    found = skill([scored(ours.tolist())], {"analog": scored(base.tolist())})
+    found = compute_skill([scored(ours.tolist())], {"analog": scored(base.tolist())})
 
     def ratio(a: Any, b: Any, axis: int) -> Any:
         return 1.0 - a.mean(axis=axis) / b.mean(axis=axis)
@@ -128,13 +132,13 @@ def test_the_interval_of_skill_stays_below_one() -> None:
     is certain.
     """
     base = [1.0, 1.1, 0.9, 1.2, 0.8, 1.0]
-    wild = skill(
+    wild = compute_skill(
         [scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])], {"analog": scored(base)}
     )
     assert wild.interval[0] < wild.value < wild.interval[1] < 1.0
-    perfect = skill([scored([0.0] * 6)], {"analog": scored(base)})
+    perfect = compute_skill([scored([0.0] * 6)], {"analog": scored(base)})
     assert (perfect.value, perfect.interval) == (1.0, (1.0, 1.0))
-    few = skill([scored([0.0] * 3)], {"analog": scored(base[:3])})
+    few = compute_skill([scored([0.0] * 3)], {"analog": scored(base[:3])})
     np.testing.assert_equal((few.value, few.interval), (1.0, (math.nan, math.nan)))
 
 
@@ -145,14 +149,14 @@ def test_seeds_widen_the_interval_of_skill() -> None:
     base = np.full(12, 4.0)
     share = np.array([0.4, 0.5, 0.9])
     seeds = [scored((part * base).tolist()) for part in share]
-    found = skill(seeds, {"analog": scored(base.tolist())})
+    found = compute_skill(seeds, {"analog": scored(base.tolist())})
     assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
     reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
     reaches = [
         math.log((1.0 - bound) / (1.0 - found.value)) for bound in found.interval
     ]
     assert reaches[0] - reaches[1] == pytest.approx(2 * reach / 0.6, rel=0.15)
-    alone = skill(seeds[:1], {"analog": scored(base.tolist())})
+    alone = compute_skill(seeds[:1], {"analog": scored(base.tolist())})
     assert alone.interval == pytest.approx((0.6, 0.6))
 
 
@@ -249,8 +253,8 @@ def test_a_floor_that_a_data_set_lacks_is_not_measured(
 ) -> None:
     """A coarse solver at tiny: nothing is written."""
     with pytest.raises(UsageError):
-        record(
-            recorded(bench.size), bench.root, folder=tmp_path, floors=["coarse-solver"]
+        measure_and_ship(
+            recorded(bench.size), bench.root, folder=tmp_path, names=["coarse-solver"]
         )
     assert not list(tmp_path.iterdir())
 
@@ -284,7 +288,7 @@ def test_a_forged_shipped_score_is_found(
     ] == [bench.size.name]
     held = dict(measured_references)
     monkeypatch.setattr(references_of_scoring, "shipped", lambda size: held)
-    assert measured_again(bench.size, bench.root) == (tuple(held), {})
+    assert remeasure(bench.size, bench.root) == (tuple(held), {})
     monkeypatch.setattr(
         references_of_scoring, "measure", lambda *_, **__: measured_references
     )
@@ -295,9 +299,7 @@ def test_a_forged_shipped_score_is_found(
         "position_rmse": replace(score, values=1.01 * score.values),
     }
     held["persistence"] = replace(still, scores=forged)
-    assert measured_again(bench.size, bench.root)[1] == {
-        "persistence": ("position_rmse",)
-    }
+    assert remeasure(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
 
 
 def test_an_interrupted_measurement_goes_on(
@@ -308,14 +310,14 @@ def test_an_interrupted_measurement_goes_on(
     """
     size = recorded(bench.size)
     root = copied()
-    first = measure(size, root, floors=["persistence"], resume=True)
-    kept = sorted(kept_in(size, root).glob("*.npz"))
+    first = measure(size, root, names=["persistence"], resume=True)
+    kept = sorted(saved_folder(size, root).glob("*.npz"))
     assert len(kept) == len(size.subsets["test"])
     with np.load(kept[0]) as held:
         values = dict(held)
     np.savez(kept[0], **{**values, "total": 4.0 * values["total"]})
-    again = measure(size, root, floors=["persistence"], resume=True)
-    fresh = measure(size, root, floors=["persistence"])
+    again = measure(size, root, names=["persistence"], resume=True)
+    fresh = measure(size, root, names=["persistence"])
     one, two, three = (
         m["persistence"].scores["position_mse"].values for m in (first, again, fresh)
     )
@@ -350,9 +352,12 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert perfect.skill.value == 1.0
     assert standing.skill.value <= 0.0
     said = standing.as_json()["skill"]
-    assert said["floor"] == standing.skill.floor
+    assert said["floor"] == standing.skill.reference
     assert REFERENCES[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert (again.floor, again.value) == (standing.skill.floor, standing.skill.value)
+    assert (again.reference, again.value) == (
+        standing.skill.reference,
+        standing.skill.value,
+    )
     assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")

@@ -14,8 +14,8 @@ from made_up import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
 from lagbench.errors import UnreadableFileError
-from lagbench.scoring import stored as isolation
-from lagbench.scoring.stored import read_stored, unreadable_in_child
+from lagbench.scoring import score_file_checks as isolation
+from lagbench.scoring.score_file_checks import find_unreadable, read_score_file
 
 PACKAGE = Path(isolation.__file__).parents[2]
 
@@ -120,7 +120,7 @@ def test_hostile_score_files_are_refused(kind: str, own: BoardBench) -> None:
     hostile(path, kind, secret)
     assert path.stat().st_size <= 1_000_000
     with pytest.raises(UnreadableFileError):
-        read_stored(path)
+        read_score_file(path)
     own.rehash("noisy")
     result = check_board(own.folder, registry=own.registry, page=False, isolated=False)
     assert [finding.check for finding in result.findings] == ["score_file"]
@@ -140,10 +140,10 @@ def test_the_child_is_limited_and_started_anew(
     good = own.folder / SCORES / "noisy.nc"
     bad = own.folder / SCORES / "flipping.nc"
     bad.write_bytes(bad.read_bytes()[:5000])
-    assert set(unreadable_in_child([good, bad, good])) == {bad}
+    assert set(find_unreadable([good, bad, good])) == {bad}
     program = "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
     use_child(monkeypatch, own.folder.parent, program)
-    stopped = unreadable_in_child([good, bad, good])
+    stopped = find_unreadable([good, bad, good])
     assert set(stopped) == {bad}
     assert "had to be stopped" in stopped[bad]
 
@@ -158,7 +158,7 @@ def test_many_files_that_stop_the_child_are_bounded(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(isolation, "MOST_STOPS", 2)
     files = [tmp_path / f"{i}.nc" for i in range(9)]
-    found = unreadable_in_child(files)
+    found = find_unreadable(files)
     assert Path("starts").read_text() == "xx"
     assert list(found) == files
     assert ["reading it had to be" in said for said in found.values()] == [True] * 2 + [
@@ -174,6 +174,6 @@ def test_waiting_files_share_one_deadline(
     use_child(monkeypatch, tmp_path, "import time; time.sleep(60)")
     monkeypatch.setattr(isolation, "WALL_SECONDS", 0.5)
     started = time.monotonic()
-    found = unreadable_in_child([tmp_path / f"{i}.nc" for i in range(9)])
+    found = find_unreadable([tmp_path / f"{i}.nc" for i in range(9)])
     assert time.monotonic() - started < 20.0
     assert [said == isolation.UNREAD for said in found.values()] == [False] + [True] * 8

@@ -22,8 +22,8 @@ from lagbench.errors import WorkFailedError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.metrics.coverage import Cloud, covered_nodes
+from lagbench.scoring.scorability import check_scorability
 from lagbench.scoring.score import score
-from lagbench.scoring.usable import unusable
 
 GIVEN = 2
 FRAMES = 5
@@ -122,7 +122,7 @@ def test_the_default_grid_fits_the_particles(
             data["position"].values[:, [GIVEN, FRAMES - 1]].reshape(-1, side**2, 2)
         ):
             assert covered_nodes(Cloud(position, side**2 * made.spacing**2), grid) >= 16
-    assert list(unusable(size, root)) == []
+    assert list(check_scorability(size, root)) == []
 
 
 def test_nodes_are_counted_as_the_metrics_do() -> None:
@@ -169,7 +169,7 @@ def test_reasons(
     """Each way in which own data cannot be scored or validated is said."""
     made = own_split(tmp_path, made_of(), **wishes)
     size, root, _ = locate(str(made.folder))
-    reasons = "\n".join(unusable(size, root))
+    reasons = "\n".join(check_scorability(size, root))
     assert [said for said in words if said not in reasons] == []
 
 

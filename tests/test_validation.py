@@ -51,7 +51,7 @@ def validated_on_test(
     frames = {}
     for scenario in task.scenarios:
         with task.opened(scenario) as opened:
-            frames[scenario] = len(opened.scenario.active)
+            frames[scenario] = len(opened.scenario.moving_frames)
     torch.set_num_threads(1)
     return Validation(task=task, frames=frames)(restore(load(weights)))
 
@@ -189,7 +189,7 @@ def test_fewer_frames_for_tests(
     task = load_scored_task(
         unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid"
     )
-    short = replace(task, setting=replace(task.setting, horizon=4))
+    short = replace(task, config=replace(task.config, horizon=4))
     model = Drift.build(
         {}, facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
     )

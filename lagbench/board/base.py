@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from lagbench.errors import UsageError
-from lagbench.submission.findings import Finding
+from lagbench.submission.issues import ValidationIssue
 
 from .entry_file import MAX_ENTRY_BYTES
 from .folder import DEPTH, REFERENCES, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
@@ -39,7 +39,7 @@ SAFE_OPTIONS = (
 
 def check_base(
     folder: Folder, base: str, own_methods: Collection[str]
-) -> Iterator[Finding]:
+) -> Iterator[ValidationIssue]:
     """Yield the entries of others that a change touches, removes or supersedes.
 
     Args:
@@ -74,7 +74,7 @@ def check_base(
             )
 
 
-def _maintained_issue(path: Path, verb: str) -> Finding:
+def _maintained_issue(path: Path, verb: str) -> ValidationIssue:
     return make_issue(
         "base", path, verb, expected="a file of the maintainers, unchanged"
     )

@@ -33,8 +33,13 @@ from lagbench.metrics.significance import (
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.scoring.card import Preview, skill
-from lagbench.scoring.stored import Stored, read_stored, reported_frames
+from lagbench.scoring.card import Preview
+from lagbench.scoring.score_file_checks import (
+    ScoreFile,
+    read_score_file,
+    reported_frames,
+)
+from lagbench.scoring.skill import compute_skill
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Entry, EntryCost, Status, Verification
@@ -95,7 +100,7 @@ class ScoredMethod:
 
     entry: Entry
     is_current: bool
-    stored: Sequence[Stored]  # score file of each seed
+    stored: Sequence[ScoreFile]  # score file of each seed
     scores: Mapping[str, CombinedScore]  # by metric, all seeds together
 
     @property
@@ -194,7 +199,9 @@ def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod 
     size = _size_of(entry, registry, where=board.path / path)
     current = is_current(entry.dataset, size)
     try:
-        stored = [read_stored(board.path / path, size) for path in entry.score_paths]
+        stored = [
+            read_score_file(board.path / path, size) for path in entry.score_paths
+        ]
     except UnreadableFileError:
         if current:
             raise
@@ -349,7 +356,7 @@ def _skill_of(
     for reference in references:
         if reference.name in COUNTING and ranking in reference.scores:
             baselines[reference.name] = reference.scores[ranking]
-    found = skill(method.scores[ranking].seeds, baselines)
+    found = compute_skill(method.scores[ranking].seeds, baselines)
     if found is None:
         return None
     low, high = found.interval

@@ -17,10 +17,10 @@ from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import LagbenchError
 from lagbench.references.shipped import shipped_path
-from lagbench.scoring.references import measured_again
+from lagbench.scoring.references import remeasure
 from lagbench.scoring.score import score
-from lagbench.scoring.stored import unreadable_in_child
-from lagbench.submission.findings import Finding
+from lagbench.scoring.score_file_checks import find_unreadable
+from lagbench.submission.issues import ValidationIssue
 from lagbench.work.progress import Progress
 
 from .base import check_base
@@ -41,7 +41,7 @@ class CheckResult:
 
     folder: Path
     entries: int  # entries that were checked
-    findings: tuple[Finding, ...]
+    findings: tuple[ValidationIssue, ...]
     # whether the page was compared; it is not while anything else is wrong
     page_checked: bool
     # predictions that gave the same when scored again
@@ -120,7 +120,7 @@ def check_board(
 
     measured = {}
     for size in floors:
-        names, differing = measured_again(size, resolve_root(root), progress=progress)
+        names, differing = remeasure(size, resolve_root(root), progress=progress)
         measured[f"{size.split} {size.name}"] = names
         issues += _issues_of_measured(size, differing)
 
@@ -151,12 +151,12 @@ def check_board(
 def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
     """Return the score files that a child process cannot read, and why."""
     paths = (*folder.score_files(), *folder.reference_files())
-    return unreadable_in_child([folder.path / path for path in paths])
+    return find_unreadable([folder.path / path for path in paths])
 
 
 def _issues_of_measured(
     size: Size, differing: Mapping[str, Sequence[str]]
-) -> list[Finding]:
+) -> list[ValidationIssue]:
     """Return the reference predictors whose shipped scores are not those measured."""
     issues = []
     for name, metrics in differing.items():

@@ -11,8 +11,8 @@ from typing import Any
 
 from lagbench.errors import ChecksFailedError, ErrorCollector, UsageError
 from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
-from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationResult
 
 from .entry import About, Entry, EntryBudget, Meta, Prediction, mean_cost
 from .entry_file import Model, examine, format_issues, read_rivals

@@ -24,7 +24,7 @@ from lagbench.errors import (
     UsageError,
     suggest_name,
 )
-from lagbench.submission.findings import quoted
+from lagbench.submission.issues import quote
 
 from .entry import Entry, Meta, Status
 from .fields import PATTERNS
@@ -195,8 +195,8 @@ def _to_plain(value: object) -> object:
 def _issue_from(kind: type[BaseModel], item: ErrorDetails) -> SchemaIssue:
     """Return one error of pydantic as an issue."""
     location = item["loc"]
-    where = quoted(".".join(map(str, location)))[1:-1] or "the file"
-    got = quoted(item["input"])
+    where = quote(".".join(map(str, location)))[1:-1] or "the file"
+    got = quote(item["input"])
 
     if item["type"] == "extra_forbidden":
         owner = _model_at(kind, location[:-1])

@@ -12,9 +12,13 @@ from lagbench.data.checksums import file_sha256
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
 from lagbench.references.table import REFERENCES
-from lagbench.scoring.score_file import StoredScores
-from lagbench.scoring.stored import MAX_SCORE_BYTES, Stored, read_stored
-from lagbench.submission.findings import Finding
+from lagbench.scoring.score_file import SubmissionStatistics
+from lagbench.scoring.score_file_checks import (
+    MAX_SCORE_BYTES,
+    ScoreFile,
+    read_score_file,
+)
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, EntryBudget, Prediction, Status, Summary
 from .entry_file import examine, load_plain
@@ -45,7 +49,7 @@ class FolderChecks:
     folder: Folder
     registry: Registry
     unreadable: Mapping[Path, str]  # files that a child process cannot read, and why
-    issues: list[Finding] = field(default_factory=list)
+    issues: list[ValidationIssue] = field(default_factory=list)
     entries: list[Entry] = field(default_factory=list)  # entries that fit the schema
     readable_score_files: set[Path] = field(default_factory=set)
     # entries by content hash and by fingerprint of their predictions
@@ -206,7 +210,7 @@ class FolderChecks:
 
     def _read_score_file(
         self, path: Path, sha256: str, task: Size | None
-    ) -> Stored | None:
+    ) -> ScoreFile | None:
         """Return a score file; None, and an issue, where it cannot be one."""
         file = self.folder.path / path
         if not file.is_file() or self.folder.link_in(path) is not None:
@@ -229,7 +233,7 @@ class FolderChecks:
             self._add("score_file", path, self.unreadable[file])
             return None
         try:
-            stored = read_stored(file, task)
+            stored = read_score_file(file, task)
         except UnreadableFileError as error:
             self._add("score_file", path, f"{error.what}: {error.got}")
             return None
@@ -237,7 +241,11 @@ class FolderChecks:
         return stored
 
     def _check_identity(
-        self, path: Path, scores: StoredScores, entry: Entry, prediction: Prediction
+        self,
+        path: Path,
+        scores: SubmissionStatistics,
+        entry: Entry,
+        prediction: Prediction,
     ) -> None:
         """Check that a score file belongs to the entry's data set and predictions."""
         expected = {
@@ -257,7 +265,7 @@ class FolderChecks:
                 self._add("score_file", path, f"{name} {got}, not {value!a}")
 
     def _check_score_block(
-        self, path: Path, entry: Entry, scores: Sequence[StoredScores]
+        self, path: Path, entry: Entry, scores: Sequence[SubmissionStatistics]
     ) -> None:
         """Compare the score block with the scores that the score files give."""
         # only seeds of the same scenarios and frames have a mean
@@ -306,7 +314,7 @@ class FolderChecks:
                 got = self.unreadable.get(file, "an unknown name")
                 self._add("floor", path, got, expected=", ".join(REFERENCES))
                 return
-            identity = read_stored(file, size).scores.identity
+            identity = read_score_file(file, size).scores.identity
         except LagbenchError as error:
             self.issues.append(issue_from_error("floor", error, path))
             return
@@ -409,7 +417,7 @@ class FolderChecks:
             self._add("verified", VERIFIED, ascii(name)[:120])
 
 
-def _extent_of(scores: StoredScores) -> tuple[list[int], tuple[int, ...], str]:
+def _extent_of(scores: SubmissionStatistics) -> tuple[list[int], tuple[int, ...], str]:
     """Return scenarios, frames and ranking metric."""
     first_tally = next(iter(scores.tallies.values()))
     return sorted(scores.tallies), first_tally.frames, scores.ranking

@@ -20,7 +20,7 @@ from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Tally
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import METRICS, STATISTICS
-from lagbench.scoring.stored import Stored, read_stored
+from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
 
 from .entry import Entry
 from .folder import Folder
@@ -57,12 +57,12 @@ def fingerprints_of_entries(
     for entry in entries.values():
         for path in entry.score_paths:
             with suppress(UnreadableFileError):
-                tallies = read_stored(folder.path / path).scores.tallies
+                tallies = read_score_file(folder.path / path).scores.tallies
                 score_files[fingerprint_of(tallies)] = str(path)
     return score_files
 
 
-def find_impossible_values(stored: Stored) -> Iterator[str]:
+def find_impossible_values(stored: ScoreFile) -> Iterator[str]:
     """Yield values that no prediction can have, whoever wrote them.
 
     Errors and distances are never negative, correlations never above one. Where one

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from lagbench.errors import LagbenchError
-from lagbench.scoring.stored import MAX_SCORE_BYTES
-from lagbench.submission.findings import Finding, Severity
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES
+from lagbench.submission.issues import Severity, ValidationIssue
 
 RESCORE = (
     "submit the predictions again: lagbench submit; the score block is not for editing"
@@ -171,7 +171,7 @@ CHECKS: Mapping[str, BoardCheck] = {
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
-        "lagbench.scoring.record",
+        "lagbench.scoring.measure_references",
     ),
     "page": BoardCheck(
         "a page or schema.json that is not what the submissions give",
@@ -191,7 +191,7 @@ def make_issue(
     what: str | None = None,
     expected: object = None,
     fix: str | None = None,
-) -> Finding:
+) -> ValidationIssue:
     """Return an issue that rejects a pull request.
 
     Words that are not given are those of the check.
@@ -199,7 +199,7 @@ def make_issue(
     defaults = CHECKS[check]
     if expected is None:
         expected = defaults.expected
-    return Finding(
+    return ValidationIssue(
         check=check,
         severity=Severity.ERROR,
         what=what or defaults.what,
@@ -210,7 +210,9 @@ def make_issue(
     )
 
 
-def issue_from_error(check: str, error: LagbenchError, where: object) -> Finding:
+def issue_from_error(
+    check: str, error: LagbenchError, where: object
+) -> ValidationIssue:
     """Return an error as an issue."""
     return make_issue(
         check, where, error.got, what=error.what, expected=error.expected, fix=error.fix

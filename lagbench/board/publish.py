@@ -20,7 +20,7 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import write_statistics
-from lagbench.scoring.stored import MAX_SCORE_BYTES, read_stored
+from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 
 from .draft import Draft, PredictionsFile, fit
 from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
@@ -206,7 +206,7 @@ def _form_entry(
         reason = draft.extended.reason
         scored_files += draft.extended.score.files
         for copy in copies[:kept_count]:
-            tallies.append(read_stored(copy).scores.tallies)
+            tallies.append(read_score_file(copy).scores.tallies)
     for file, card, copy in zip(files, cards, copies[kept_count:], strict=True):
         scored_files.append(scored_file(card, copy, file.outside_share))
         tallies.append(card.tallies[SUBMISSION])

@@ -30,7 +30,7 @@ from lagbench.references.shipped import ReferenceScores, shipped
 from lagbench.references.table import REFERENCES as KNOWN
 from lagbench.scoring.card import SUBMISSION, Preview, ScoreCard, digits
 from lagbench.scoring.score_file import write_statistics
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 
 from .entry import OUTSIDE, DataSet, EntryFlag, ScoredFile, Summary
 from .fields import LONGEST_TEXT
@@ -137,11 +137,11 @@ def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
     references = []
     for path in folder.reference_files(size.split, size.name):
         file = folder.path / path
-        stored = read_stored(file).scores
+        stored = read_score_file(file).scores
         dataset = dataset_of(stored.identity)
         if path.stem not in KNOWN or not is_current(dataset, size):
             continue
-        read_stored(file, size)  # refuses scores that do not fit the task
+        read_score_file(file, size)  # refuses scores that do not fit the task
         combined = combine([stored.tallies])
         references.append(
             ReferenceScores(
@@ -206,7 +206,7 @@ def _truth_alone(preview: Preview) -> Preview:
 
 def _is_scored_on(path: Path, dataset_sha256: str) -> bool:
     with suppress(UnreadableFileError):
-        identity = read_stored(path).scores.identity
+        identity = read_score_file(path).scores.identity
         return identity["dataset_sha256"] == dataset_sha256
     return False
 

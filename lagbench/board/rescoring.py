@@ -18,8 +18,8 @@ from lagbench.metrics.aggregate import LONG_BITS, LONG_ROLLOUT, Tally
 from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, write_statistics
-from lagbench.scoring.stored import Stored, read_stored
-from lagbench.submission.findings import Finding
+from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
+from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
@@ -71,7 +71,7 @@ class Rescoring:
     score: Callable[..., ScoreCard]  # of predictions and extras that measure more
     confirmations: list[Confirmation] = field(default_factory=list)
 
-    def rescore(self, path: str | Path) -> Iterator[Finding]:
+    def rescore(self, path: str | Path) -> Iterator[ValidationIssue]:
         """Yield where predictions differ from the leaderboard, or their faults."""
         try:
             # the scorer alone opens them, after its checks in a child process
@@ -111,12 +111,12 @@ class Rescoring:
                     files.append(EntryFile(entry, prediction, score_path, file))
         return files
 
-    def _compare_references(self, card: ScoreCard) -> Iterator[Finding]:
+    def _compare_references(self, card: ScoreCard) -> Iterator[ValidationIssue]:
         header = card.header
         for path in self.folder.reference_files(header.split, header.size):
             if path.stem not in card.tallies or path.stem == SUBMISSION:
                 continue
-            stored = read_stored(self.folder.path / path).scores
+            stored = read_score_file(self.folder.path / path).scores
             if stored.identity["dataset_sha256"] != header.dataset_sha256:
                 continue
             differing, _ = compare_tallies(card.tallies[path.stem], stored.tallies)
@@ -126,9 +126,9 @@ class Rescoring:
 
     def _compare(
         self, path: Path, card: ScoreCard, file: EntryFile
-    ) -> Iterator[Finding]:
+    ) -> Iterator[ValidationIssue]:
         """Yield where a score card differs from an entry and its score file."""
-        stored = read_stored(self.folder.path / file.score_path)
+        stored = read_score_file(self.folder.path / file.score_path)
         extras = _extras_of(stored)
         if extras:
             try:
@@ -145,7 +145,7 @@ class Rescoring:
             new_path = Path(scratch) / "scores.nc"
             write_statistics(card, new_path)
             new_file = scored_file(card, new_path)
-            new_stored = read_stored(new_path)
+            new_stored = read_score_file(new_path)
 
         differing, difference = compare_tallies(
             new_stored.scores.tallies, stored.scores.tallies
@@ -167,7 +167,7 @@ class Rescoring:
             )
 
 
-def _extras_of(stored: Stored) -> list[str]:
+def _extras_of(stored: ScoreFile) -> list[str]:
     """Return the optional packages that measured statistics of a score file."""
     first_tally = next(iter(stored.scores.tallies.values()))
     extras = set()
@@ -177,7 +177,7 @@ def _extras_of(stored: Stored) -> list[str]:
     return sorted(extras)
 
 
-def _compare_pictures(first: Stored, second: Stored) -> list[str]:
+def _compare_pictures(first: ScoreFile, second: ScoreFile) -> list[str]:
     """Return the pictures that differ by more than their packing."""
     vorticity_step = max(first.precision, second.precision)
     differing = []
@@ -202,7 +202,7 @@ def _is_close(first: ArrayLike, second: ArrayLike, *, step: float) -> bool:
 
 def _compare_remarks(
     path: Path, card: ScoreCard, new_file: ScoredFile, file: EntryFile
-) -> Iterator[Finding]:
+) -> Iterator[ValidationIssue]:
     """Yield where flags, warnings, diverged scenarios or the budget differ."""
     old_file = file.scored_file
     pairs: dict[str, tuple[object, object]] = {

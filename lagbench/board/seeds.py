@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from lagbench.errors import ChecksFailedError, UsageError
-from lagbench.scoring.stored import read_stored
-from lagbench.submission.findings import quoted
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission.format import Header
+from lagbench.submission.issues import quote
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Meta, Status
@@ -171,8 +171,8 @@ def _require_same_method(
             raise UsageError(
                 f"the files differ from the entry in {name}",
                 where=str(folder.path / entry.yaml_path),
-                expected=quoted(expected),
-                got=quoted(got),
+                expected=quote(expected),
+                got=quote(got),
                 fix=f"{SUBMIT_APART}, by another --method; {SUBMIT_ANEW}",
             )
 
@@ -184,7 +184,7 @@ def _labels_to_compare(
 
     What the submitter states anew is not compared.
     """
-    identity = read_stored(folder.path / entry.score_paths[0]).scores.identity
+    identity = read_score_file(folder.path / entry.score_paths[0]).scores.identity
     yield "method", identity["method"], header.method
     yield "dataset_sha256", entry.dataset.sha256, header.dataset_sha256
     if "parameters" not in meta.model_fields_set and header.parameters is not None:

@@ -16,8 +16,8 @@ from lagbench.errors import ErrorCollector, UsageError, WorkFailedError
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score import score
 from lagbench.submission.checks import outside_share
-from lagbench.submission.findings import ValidationResult
 from lagbench.submission.format import WRITE
+from lagbench.submission.issues import ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress

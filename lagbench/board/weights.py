@@ -21,8 +21,8 @@ from lagbench.errors import (
     check_installed,
     check_regular,
 )
-from lagbench.submission.findings import Finding
 from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
 from lagbench.submission.provenance import TrainingProvenance
 
 from .entry import Entry, Prediction, Status, Weights
@@ -307,7 +307,9 @@ def reason_unfit_log(path: Path) -> str | None:
     return "no JSON object"
 
 
-def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]:
+def check_weights(
+    folder: Folder, entries: Sequence[Entry]
+) -> Iterator[ValidationIssue]:
     """Yield weights that are missing, edited, misplaced, without an entry or too many.
 
     Unfit logs of trainings are reported, too; a log that is not there is no issue.
@@ -363,7 +365,7 @@ def check_weights(folder: Folder, entries: Sequence[Entry]) -> Iterator[Finding]
 
 def _check_weights_file(
     folder: Folder, path: Path, weights: Weights, *, where: str
-) -> Iterator[Finding]:
+) -> Iterator[ValidationIssue]:
     file = folder.path / path
     if weights.path != path.as_posix():
         yield make_issue("weights", where, ascii(weights.path)[1:-1], expected=path)
@@ -380,7 +382,7 @@ def _check_weights_file(
             )
 
 
-def _check_log(folder: Folder, path: Path) -> Iterator[Finding]:
+def _check_log(folder: Folder, path: Path) -> Iterator[ValidationIssue]:
     file = folder.path / path
     if not file.exists() or folder.link_in(path) is not None:
         return

@@ -203,10 +203,6 @@ def import_split(
     ],
     form: FormatOption,
     output: FolderOption,
-    allow_pickle: Annotated[
-        bool,
-        option("--allow-pickle", "Rebuild pickled arrays; other calls are refused."),
-    ] = False,
     kinds: Annotated[
         str | None,
         option("--kinds LIST", "Material of kinds of particles, as in 3=jelly,0=drop."),
@@ -233,7 +229,6 @@ def import_split(
             source,
             format=form,
             output=output,
-            allow_pickle=allow_pickle,
             kinds=parse_kinds(kinds),
             progress=draw,
             **_wishes(ctx),
@@ -266,9 +261,6 @@ def adopt(
     frames_of_interest: InterestOption = None,
     cells: CellsOption = None,
     full_box: FullBoxFlag = None,
-    as_is: Annotated[
-        bool, option("--as-is", "Take arrays whose axes or velocities look mistaken.")
-    ] = False,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -281,7 +273,6 @@ def adopt(
             output=output,
             valid=valid,
             test=test,
-            as_is=as_is,
             progress=draw,
             **_wishes(ctx),
         )
@@ -293,13 +284,13 @@ def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them
     adopt share.
     """
     from lagbench.data.registry import parse_ids
-    from lagbench.exchange.trajectory import Wishes, read_wishes
+    from lagbench.exchange.trajectory import DataOptions, read_options
 
     file = ctx.params["describe"]
     said = {
         n: v
         for n, v in ctx.params.items()
-        if n in Wishes.__annotations__ and v is not None
+        if n in DataOptions.__annotations__ and v is not None
     }
     if not said["rescale"]:  # a flag that is not given says nothing
         del said["rescale"]
@@ -321,7 +312,7 @@ def _wishes(ctx: typer.Context) -> Any:  # noqa: ANN401 (the functions type them
         )
     if file is None:
         return said
-    return {**read_wishes(file), **said}
+    return {**read_options(file), **said}
 
 
 def _made(made: LocalSplit, *, as_json: bool, quiet: bool) -> None:

@@ -20,7 +20,7 @@ from lagbench.figures.tables import Table
 from lagbench.work.progress import watched
 
 if TYPE_CHECKING:
-    from lagbench.submission.findings import ValidationResult
+    from lagbench.submission.issues import ValidationResult
     from lagbench.work.progress import Progress as State
 
 WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks

@@ -35,7 +35,7 @@ from .output import (
 
 if TYPE_CHECKING:
     from lagbench.scoring.card import ScoreCard
-    from lagbench.submission.findings import ValidationResult
+    from lagbench.submission.issues import ValidationResult
 
 OwnSplitOption = Annotated[
     str | None,

@@ -157,7 +157,7 @@ def _warn_of_scores(
     from lagbench.baselines.catalogue import find
     from lagbench.baselines.recipe import recipe_for
     from lagbench.data.local import locate
-    from lagbench.scoring.usable import unusable
+    from lagbench.scoring.scorability import check_scorability
 
     tier, home, _ = locate(split, size, root=root)
     if tier.simulated:
@@ -165,7 +165,9 @@ def _warn_of_scores(
     plan = recipe_for(
         find(baseline), tier.split, tier.name, variant=variant, settings=settings
     )
-    reasons = list(unusable(tier, home, validated=plan.training.validate_every != 0))
+    reasons = list(
+        check_scorability(tier, home, validated=plan.training.validate_every != 0)
+    )
     if reasons:
         warning = "warning: what is trained here cannot be scored as it should"
         typer.echo("\n  ".join([warning, *reasons]), err=True)

@@ -1,8 +1,8 @@
-"""Trajectories in arrays of one's own: .npy, .npz and netCDF files, read frame by frame
-where they allow it.
+"""Trajectories in a user's own arrays: .npy, .npz and netCDF files.
 
-The files come from strangers: nothing is unpickled, no link is followed, and no more
-memory is taken than their bytes can fill.
+They are read frame by frame where the format allows it. The files come from strangers:
+nothing is unpickled, no link is followed, and no more memory is taken than their bytes
+can fill.
 """
 
 from __future__ import annotations
@@ -24,99 +24,115 @@ from lagbench.data.registry import MAX_ID
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
-from .mistakes import check_meaning
 from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
 
-# files that are adopted: an array, named arrays, netCDF
-READABLE = ".npy", ".npz", ".nc"
-ARRAYS = POSITION, VELOCITY, MATERIAL, WALLS = (
-    "position",
-    "velocity",
-    "material",
-    "wall_velocity",
-)
-# first bytes of the older netCDF formats, which cannot point to other files
+READABLE = (".npy", ".npz", ".nc")
+"""Files that are adopted: an array, named arrays, netCDF."""
+
+POSITION = "position"
+VELOCITY = "velocity"
+MATERIAL = "material"
+WALLS = "wall_velocity"
+ARRAYS = (POSITION, VELOCITY, MATERIAL, WALLS)
+"""Names of the arrays that are read."""
+
 CLASSIC = b"CDF"
+"""First bytes of the older netCDF formats, which cannot point to other files."""
 
-# What may be in a netCDF-4 file; chunks by default span many frames, so that more of
-# them stay unpacked.
 NETCDF = Structure(groups=None, texts=True, cache=1 << 30)
-# a file and, where it holds several, the number of the trajectory in it
+"""What may be in a netCDF-4 file.
+
+Chunks by default span many frames, so that more of them stay unpacked.
+"""
+
+INTEGER_KINDS = "iu"
+NUMBER_KINDS = "iuf"
+
 Row = tuple[Path, int | None]
+"""A file and, where it holds several, the number of the trajectory in it."""
 
 
-def natural(paths: Sequence[Path]) -> list[Path]:
+def sort_naturally(paths: Sequence[Path]) -> list[Path]:
     """Return paths in the order of their names, numbers in them by value."""
-
-    def key(path: Path) -> tuple[list[tuple[int, str]], str]:
-        parts = re.split(r"(\d+)", str(path))
-        return [(int(part) if part.isdecimal() else -1, part) for part in parts], str(
-            path
-        )
-
-    return sorted(paths, key=key)
+    return sorted(paths, key=_natural_key)
 
 
-def rows_of(path: Path) -> list[Row]:
-    """Return the trajectories of a file, or of the files of a folder by name."""
+def _natural_key(path: Path) -> tuple[list[tuple[int, str]], str]:
+    parts = []
+    for part in re.split(r"(\d+)", str(path)):
+        number = int(part) if part.isdecimal() else -1
+        parts.append((number, part))
+    return parts, str(path)
+
+
+def list_trajectories(path: Path) -> list[Row]:
+    """Return the trajectories of a file, or of the files of a folder by name.
+
+    Raises:
+        UnreadableFileError: there are no such files, or one is empty or damaged.
+        DataError: there are too many trajectories.
+    """
     if path.is_dir():
-        found = natural(
-            [
-                file
-                for file in path.iterdir()
-                if file.suffix in READABLE and file.is_file()
-            ]
-        )
-        if found:
-            return [row for file in found for row in rows_of(file)]
+        files = []
+        for file in path.iterdir():
+            if file.suffix in READABLE and file.is_file():
+                files.append(file)
+        if files:
+            rows = []
+            for file in sort_naturally(files):
+                rows += list_trajectories(file)
+            return rows
+
     if path.suffix not in READABLE or not path.is_file():
+        got = None
+        if path.is_dir():
+            got = "a folder without such files"
         raise UnreadableFileError(
             "no trajectories are there",
             where=str(path),
             expected=f"a file {', '.join(READABLE)}, or a folder of them",
-            got="a folder without such files" if path.is_dir() else None,
+            got=got,
         )
     if path.stat().st_size == 0:
         raise UnreadableFileError(
             "the file is empty", where=str(path), expected="a trajectory"
         )
-    if path.suffix != ".npy" or len(shape := _array(path).shape) != 4:
+    if path.suffix != ".npy":
+        return [(path, None)]
+
+    shape = _read_npy(path).shape
+    if len(shape) != 4:
         return [(path, None)]
     if shape[0] > MAX_ID + 1:
-        expected = f"at most {MAX_ID + 1}"
         raise DataError(
-            "too many trajectories", where=str(path), expected=expected, got=shape[0]
+            "too many trajectories",
+            where=str(path),
+            expected=f"at most {MAX_ID + 1}",
+            got=shape[0],
         )
-    return [(path, row) for row in range(shape[0])]
+    return [(path, number) for number in range(shape[0])]
 
 
-def open_row(which: Row, interval: float | None) -> Trajectory:
-    """Return a trajectory; what its arrays mean is looked at where the time between
-    frames is given [s].
-    """
-    path, row = which
-    if row is None:
-        name = str(path)
-    else:
-        name = f"{path}, trajectory {row}"
+def open_trajectory(row: Row) -> Trajectory:
+    """Return a trajectory, after a look at types and shapes of its arrays."""
+    path, number = row
+    name = str(path)
+    if number is not None:
+        name = f"{path}, trajectory {number}"
     with _reading(path):
-        if path.suffix == ".npy":
-            array = _array(path)
-            arrays = {POSITION: array if row is None else array[row]}
+        arrays: Mapping[str, Any]
+        if path.suffix == ".npz":
+            arrays = _read_npz(path)
+        elif path.suffix == ".nc":
+            arrays = _read_netcdf(path)
         else:
-            if path.suffix == ".npz":
-                arrays = _npz(path)
-            else:
-                arrays = _netcdf(path)
-        return _trajectory(path, name, arrays, interval)
+            array = _read_npy(path)
+            arrays = {POSITION: array if number is None else array[number]}
+        return _parse_trajectory(path, name, arrays)
 
 
-def _trajectory(
-    path: Path, name: str, arrays: Mapping[str, Any], interval: float | None
-) -> Trajectory:
-    """Return the trajectory of named arrays after a look at their shapes and, given an
-    interval, meaning.
-    """
+def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Trajectory:
+    """Return the trajectory of named arrays."""
     if POSITION not in arrays:
         raise UnreadableFileError(
             "there are no positions",
@@ -124,78 +140,100 @@ def _trajectory(
             expected=f"an array {POSITION!r}",
             got=", ".join(arrays) or f"none of {', '.join(ARRAYS)}",
         )
-    shape = tuple(arrays[POSITION].shape)
-    check_array(name, shape, _dtype(arrays[POSITION]))
-    frames, particles = shape[:2]
-    if VELOCITY in arrays:
-        _check_numbers(f"{name}, {VELOCITY}", arrays[VELOCITY], "velocities", shape)
-    material = np.zeros(particles, np.int8)
-    if MATERIAL in arrays:
-        what = "materials: " + ", ".join(f"{i} {m}" for i, m in enumerate(MATERIALS))
-        _check_numbers(
-            f"{name}, {MATERIAL}", arrays[MATERIAL], what, (particles,), kinds="iu"
-        )
-        material = np.asarray(arrays[MATERIAL][...])
-        if not np.isin(material, range(len(MATERIALS))).all():
-            raise DataError(f"these are no {what}", where=f"{name}, {MATERIAL}")
-    walls = None
-    if WALLS in arrays:
-        where = f"{name}, {WALLS}"
-        _check_numbers(where, arrays[WALLS], "walls", (4, 2), (frames, 4, 2))
-        walls = np.asarray(arrays[WALLS][...], np.float64)
-        with np.errstate(over="ignore"):  # they are stored as float32
-            if not np.isfinite(walls.astype(np.float32)).all():
-                raise DataError("a velocity of a wall is not finite", where=where)
-    if interval is not None:
-        check_meaning(name, arrays[POSITION], arrays.get(VELOCITY), interval)
+    position = arrays[POSITION]
+    shape = tuple(position.shape)
+    check_array(name, shape, _dtype_of(position))
+    frame_count, particle_count, _ = shape
+    velocity = arrays.get(VELOCITY)
+    if velocity is not None:
+        where = f"{name}, {VELOCITY}"
+        _check_numbers(velocity, "velocities", shape, where=where)
 
     def read() -> Iterator[Frame]:
-        velocity = arrays.get(VELOCITY)
         with _reading(path):
-            for number in range(frames):
-                frame = np.asarray(arrays[POSITION][number])
-                yield frame, None if velocity is None else np.asarray(velocity[number])
+            for frame in range(frame_count):
+                frame_velocity = None
+                if velocity is not None:
+                    frame_velocity = np.asarray(velocity[frame])
+                yield np.asarray(position[frame]), frame_velocity
 
     return Trajectory(
         name=name,
-        frames=frames,
-        material=material.astype(np.int8),
+        frames=frame_count,
+        material=_parse_material(name, arrays.get(MATERIAL), particle_count),
         read=read,
-        wall_velocity=walls,
+        wall_velocity=_parse_walls(name, arrays.get(WALLS), frame_count),
     )
 
 
-def _check_numbers(
-    where: str,
+def _parse_material(
+    name: str,
     array: Any,  # noqa: ANN401 (arrays, also netCDF's)
-    what: str,
+    particle_count: int,
+) -> NDArray[np.int8]:
+    """Return the material of each particle, shape [particle]; liquid without any."""
+    if array is None:
+        return np.zeros(particle_count, np.int8)
+    where = f"{name}, {MATERIAL}"
+    numbers = [f"{number} {material}" for number, material in enumerate(MATERIALS)]
+    kind = f"materials: {', '.join(numbers)}"
+    _check_numbers(array, kind, (particle_count,), where=where, kinds=INTEGER_KINDS)
+    material = np.asarray(array[...])
+    if not np.isin(material, range(len(MATERIALS))).all():
+        raise DataError(f"these are no {kind}", where=where)
+    return material.astype(np.int8)
+
+
+def _parse_walls(
+    name: str,
+    array: Any,  # noqa: ANN401 (arrays, also netCDF's)
+    frame_count: int,
+) -> NDArray[np.float64] | None:
+    """Return velocities of walls [length/s], [wall, 2] or [frame, wall, 2], if any."""
+    if array is None:
+        return None
+    where = f"{name}, {WALLS}"
+    _check_numbers(array, "walls", (4, 2), (frame_count, 4, 2), where=where)
+    walls = np.asarray(array[...], np.float64)
+    with np.errstate(over="ignore"):  # they are stored as float32
+        is_finite = np.isfinite(walls.astype(np.float32)).all()
+    if not is_finite:
+        raise DataError("a velocity of a wall is not finite", where=where)
+    return walls
+
+
+def _check_numbers(
+    array: Any,  # noqa: ANN401 (arrays, also netCDF's)
+    kind: str,
     *shapes: tuple[int, ...],
-    kinds: str = "iuf",
+    where: str,
+    kinds: str = NUMBER_KINDS,
 ) -> None:
-    """Refuse an array of another shape or other kinds of values, by what its file
-    declares.
-    """
-    if tuple(array.shape) not in shapes or _dtype(array).kind not in kinds:
-        raise DataError(
-            f"these are no {what}",
-            where=where,
-            expected=("integers" if kinds == "iu" else "real numbers")
-            + f" of shape {' or '.join(map(str, shapes))}",
-            got=f"{_dtype(array)} of shape {tuple(array.shape)}",
-        )
+    """Refuse an array of another shape or type of values, by what its file declares."""
+    shape = tuple(array.shape)
+    dtype = _dtype_of(array)
+    if shape in shapes and dtype.kind in kinds:
+        return
+    expected = "real numbers"
+    if kinds == INTEGER_KINDS:
+        expected = "integers"
+    raise DataError(
+        f"these are no {kind}",
+        where=where,
+        expected=f"{expected} of shape {' or '.join(map(str, shapes))}",
+        got=f"{dtype} of shape {shape}",
+    )
 
 
-def _dtype(array: Any) -> np.dtype[Any]:  # noqa: ANN401
-    """Return the type of values; netCDF has types of its own for texts and lists, here
-    objects.
-    """
+def _dtype_of(array: Any) -> np.dtype[Any]:  # noqa: ANN401
+    """Return the type of values; netCDF's types of texts and lists are objects."""
     stored = getattr(array, "datatype", array.dtype)
     if isinstance(stored, np.dtype):
         return stored
     return np.dtype(object)
 
 
-def _array(path: Path) -> NDArray[Any]:
+def _read_npy(path: Path) -> NDArray[Any]:
     with _reading(path):
         with path.open("rb") as stream:
             _check_header(str(path), stream, path.stat().st_size)
@@ -204,8 +242,9 @@ def _array(path: Path) -> NDArray[Any]:
 
 
 def _check_header(name: str, stream: IO[bytes], length: int) -> None:
-    """Refuse objects, and more values than a .npy stream of some length [bytes] can
-    hold.
+    """Refuse objects, and more values than a .npy stream can hold.
+
+    ``length`` is that of the stream [bytes].
     """
     shape, _, dtype = read_header(stream)
     if dtype.hasobject:
@@ -215,18 +254,19 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
             expected="arrays of numbers",
             fix="lagbench import --format gns-npz reads trajectories of GNS code bases",
         )
-    held = length - stream.tell()
     # NumPy reserves memory for what the header claims before it reads.
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize > held:
+    available_bytes = length - stream.tell()
+    claimed_bytes = math.prod(shape) * dtype.itemsize
+    if min(shape, default=0) < 0 or claimed_bytes > available_bytes:
         raise UnreadableFileError(
             "the array claims more than the file holds",
             where=name,
-            expected=f"{held} bytes",
+            expected=f"{available_bytes} bytes",
             got=f"{dtype} of shape {shape}",
         )
 
 
-def _npz(path: Path) -> dict[str, NDArray[Any]]:
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as archive:
         for member in archive.infolist():
             name = f"{path}, {member.filename}"
@@ -240,35 +280,38 @@ def _npz(path: Path) -> dict[str, NDArray[Any]]:
         return {name: file[name] for name in ARRAYS if name in file}
 
 
-def _netcdf(path: Path) -> dict[str, Any]:
+def _read_netcdf(path: Path) -> dict[str, Any]:
     import netCDF4
 
     with path.open("rb") as stream:
-        classic = stream.read(len(CLASSIC)) == CLASSIC
-    if not classic:  # netCDF would follow links and read other files
-        with open_hdf5(path) as held:
-            check_structure(held, path, NETCDF)
+        is_classic = stream.read(len(CLASSIC)) == CLASSIC
+    if not is_classic:  # netCDF would follow links and read other files
+        with open_hdf5(path) as hdf5:
+            check_structure(hdf5, path, NETCDF)
+
     file = netCDF4.Dataset(path, "r")
     file.set_auto_maskandscale(False)
-    arrays = {name: file.variables[name] for name in ARRAYS if name in file.variables}
-    # Values that stand for others are refused: they are read as they are stored.
-    for name, stored in arrays.items():
-        packed = {"scale_factor", "add_offset"} & set(stored.ncattrs())
-        if packed and name != MATERIAL:
+    arrays = {}
+    for name in ARRAYS:
+        if name not in file.variables:
+            continue
+        variable = file.variables[name]
+        # Values are read as they are stored: those that stand for others are refused.
+        packing = {"scale_factor", "add_offset"}.intersection(variable.ncattrs())
+        if packing and name != MATERIAL:
             raise UnreadableFileError(
                 "the values are packed",
-                where=f"{path}, {name}, {', '.join(sorted(packed))}",
+                where=f"{path}, {name}, {', '.join(sorted(packing))}",
                 expected="positions as they are, float32 or float64",
                 fix="write them again without scale_factor and add_offset",
             )
+        arrays[name] = variable
     return arrays
 
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Turn what damaged bytes raise, which is nearly any type, into an
-    UnreadableFileError.
-    """
+    """Turn what damaged bytes raise, nearly any type, into an UnreadableFileError."""
     try:
         yield
     except LagbenchError:

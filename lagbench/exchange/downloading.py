@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,9 +44,10 @@ from lagbench.store.objects import NotInStoreError, StoreUnreachableError
 from lagbench.store.publication import publish
 from lagbench.work.progress import Meter, Progress
 
-REMEDY = "try again; if it stays so, name another store: --from"
-# why something could not be downloaded
+HINT = "try again; if it stays so, name another store: --from"
+
 Reason = DataError | WorkFailedError | UsageError
+"""Why something could not be downloaded."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +85,11 @@ def download(
     on_wait: Callable[[str], None] | None = None,
     registry: Registry | None = None,
 ) -> DownloadResult:
-    """Fetch the scenarios of a split that are not on disk yet; simulate those no store
-    has.
+    """Fetch the scenarios of a split that are not on disk yet.
 
-    Every file has a temporary name until its content hash is that of datasets.yaml.
-    What was fetched before an interruption is not fetched again.
+    What no store has is simulated. Every file has a temporary name until its content
+    hash is that of datasets.yaml. What was fetched before an interruption is not
+    fetched again.
 
     Args:
         split: name of the split, or path of a local split's folder.
@@ -120,70 +121,64 @@ def download(
         raise UsageError(
             "no file comes without a connection", where="--connections", expected=">= 1"
         )
-    tier, folder, splits = locate_new(split, size, root=root, registry=registry)
-    wanted = select(tier, subset=subset, scenarios=scenarios)
-    urls = (
-        (mirror,)
-        if mirror
-        else (*splits.split(tier.split).mirrors, *list_releases(tier))
-    )
+    entry, folder, splits = locate_new(split, size, root=root, registry=registry)
+    selected = select(entry, subset=subset, scenarios=scenarios)
+    urls = [mirror] if mirror else [*splits.split(entry.split).mirrors]
+    if not mirror:
+        urls += list_releases(entry)
     with (
-        dataset_lock(folder, tier.split, tier.name, tier.major, on_wait=on_wait),
-        publish(tier, folder) as store,
+        dataset_lock(folder, entry.split, entry.name, entry.major, on_wait=on_wait),
+        publish(entry, folder) as store,
     ):
-        held = [i for i in wanted if store and i in store.stored_entries]
-        work = _Download(
-            tier,
+        published = set(selected).intersection(store.stored_entries if store else ())
+        job = DownloadJob(
+            entry,
             folder,
-            [i for i in wanted if i not in held],
-            Meter(progress),
-            connections,
+            [scenario for scenario in selected if scenario not in published],
+            meter=Meter(progress),
+            connections=connections,
         )
         try:
-            reason = work.run(urls)
+            reason = job.run(urls)
         finally:
-            manifest = work.record()
+            manifest = job.write_manifest()
             if store:
                 store.put_files(manifest, at_once=True)
-        if not work.missing:
-            verdict = compare_hashes(tier, manifest)
-            if work.downloaded and tier.simulated:
+        if not job.missing:
+            verdict = compare_hashes(entry, manifest)
+            if job.downloaded and entry.simulated:
                 if store:
-                    store.fetch(held)
-                cards = write_cards(folder, tier, splits.split(tier.split), manifest)
+                    store.fetch(sorted(published))
+                cards = write_cards(folder, entry, splits.split(entry.split), manifest)
                 if store:
                     store.finish(manifest, cards)
-    if work.missing:
+
+    if job.missing:
         if not or_generate:
             raise reason
         if announce is not None:
-            if reason.where:
-                place = f" ({reason.where})"
-            else:
-                place = ""
-            announce(
-                f"{reason.what}{place}: simulating scenarios {format_ids(work.missing)}"
-            )
-        rest = generate(
-            tier.split,
-            tier.name,
-            scenarios=work.missing,
+            announce(_describe_fallback(reason, job.missing))
+        generated = generate(
+            entry.split,
+            entry.name,
+            scenarios=job.missing,
             root=folder,
             workers=workers,
             progress=progress,
             registry=splits,
         )
-        verdict = rest.verdict
-        manifest = read_manifest(folder, tier.split, tier.name, tier.major) or manifest
+        verdict = generated.verdict
+        new_manifest = read_manifest(folder, entry.split, entry.name, entry.major)
+        manifest = new_manifest or manifest
     return DownloadResult(
-        split=tier.split,
-        size=tier.name,
-        folder=tier.folder(folder),
-        mirror=work.url,
-        downloaded=tuple(sorted(work.downloaded)),
-        kept=tuple(sorted((*held, *work.kept))),
-        generated=tuple(work.missing),
-        bytes=work.bytes,
+        split=entry.split,
+        size=entry.name,
+        folder=entry.folder(folder),
+        mirror=job.url,
+        downloaded=tuple(sorted(job.downloaded)),
+        kept=tuple(sorted((*published, *job.present))),
+        generated=tuple(job.missing),
+        bytes=job.byte_count,
         seconds=time.monotonic() - started,
         complete=manifest.complete,
         dataset_sha256=manifest.dataset_sha256,
@@ -191,14 +186,23 @@ def download(
     )
 
 
-class _Download:
-    """What is there, what is fetched, what is recorded."""
+def _describe_fallback(reason: Reason, scenarios: Sequence[int]) -> str:
+    """Return the sentence that says why scenarios are simulated."""
+    place = ""
+    if reason.where:
+        place = f" ({reason.where})"
+    return f"{reason.what}{place}: simulating scenarios {format_ids(scenarios)}"
+
+
+class DownloadJob:
+    """Find out what is missing, fetch it, and record what is there."""
 
     def __init__(
         self,
         size: Size,
         root: Path,
-        wanted: Sequence[int],
+        selected: Sequence[int],
+        *,
         meter: Meter,
         connections: int,
     ) -> None:
@@ -208,141 +212,202 @@ class _Download:
         self._connections = connections
         self.url: str | None = None  # store that files came from
         self.downloaded: list[int] = []
-        self.bytes = 0
+        self.byte_count = 0
+        self._recorded_hashes: dict[int, str] = {}
         if size.measured:
-            self._recorded = dict(size.measured.scenario_sha256)
-        else:
-            self._recorded = {}
-        self._old = read_or_empty(size, root)
-        meter.begin("checking", total=len(wanted), scenarios=len(wanted))
-        findings = [
-            inspect_scenario(root, size, i, manifest=self._old, quick=True)
-            for i in wanted
-        ]
-        self._entries = [finding.entry for finding in findings if finding.entry]
-        self.kept = [f.scenario for f in findings if f.state is DataSetState.GOOD]
-        self.missing = [
-            f.scenario for f in findings if f.state is not DataSetState.GOOD
-        ]
+            self._recorded_hashes = dict(size.measured.scenario_sha256)
+
+        self._old_manifest = read_or_empty(size, root)
+        self._entries: list[FileEntry] = []
+        self.present: list[int] = []
+        self.missing: list[int] = []
+        meter.begin("checking", total=len(selected), scenarios=len(selected))
+        for scenario in selected:
+            inspected = inspect_scenario(
+                root, size, scenario, manifest=self._old_manifest, quick=True
+            )
+            if inspected.entry:
+                self._entries.append(inspected.entry)
+            if inspected.state is DataSetState.GOOD:
+                self.present.append(scenario)
+            else:
+                self.missing.append(scenario)
 
     def run(self, urls: Iterable[str]) -> Reason:
-        """Fetch what is missing from stores in turn, unless one lies; return why
-        something still is.
+        """Fetch what is missing from stores in turn, unless one lies.
+
+        Returns why something still is missing.
         """
         place = f"{self.size.split} {self.size.name}"
+        unknown = [
+            scenario
+            for scenario in self.missing
+            if scenario not in self._recorded_hashes
+        ]
+        if unknown:
+            return DataError(
+                "datasets.yaml has no hash to check downloads against",
+                where=f"{place}, scenarios {format_ids(unknown)}",
+            )
+        placeholder = None
+        if self.size.simulated:
+            placeholder = f"{RELEASES}, a placeholder"
         reason: Reason = UsageError(
             "no store is known to download from",
             where=place,
-            got=f"{RELEASES}, a placeholder" if self.size.simulated else None,
+            got=placeholder,
             fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out "
             f"--no-generate",
         )
-        unknown = [i for i in self.missing if i not in self._recorded]
-        if unknown:
-            what = "datasets.yaml has no hash to check downloads against"
-            return DataError(what, where=f"{place}, scenarios {format_ids(unknown)}")
         for url in urls:
-            if self.missing:
-                try:
-                    reason = self._fetch_from(url.rstrip("/")) or reason
-                except StoreUnreachableError as error:
-                    reason = error
+            if not self.missing:
+                break
+            try:
+                reason = self._fetch_from(url.rstrip("/")) or reason
+            except StoreUnreachableError as error:
+                reason = error
         return reason
 
     def _fetch_from(self, url: str) -> NotInStoreError | None:
-        """Fetch what one store has; return the error of the last file that it has
-        not.
+        """Fetch what one store has.
+
+        Returns the error of the last file that it does not have.
         """
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
-        # What its manifest says of the files that datasets.yaml means; None without
-        # one.
-        claims: dict[int, FileEntry] | None = None
-        last: NotInStoreError | None = None
-        place = object_address(self.size, url, MANIFEST_NAME)
-        with suppress(NotInStoreError):
-            text = fetch_text(place, limit=MANIFEST_LIMIT, hint=REMEDY)
-            manifest = parse_manifest(self.size, text, where=place, hint=REMEDY)
-            claims = {entry.scenario: entry for entry in manifest.files}
-            other = [
-                i
-                for i in self.missing
-                if i in claims and not claims[i].has_hash(self._recorded[i])
-            ]
-            refuse_foreign_hashes(manifest, other, where=place, hint=REMEDY)
-        wanted = {}
-        for i in self.missing:
-            key = self.size.key(i)
-            claim = (claims or {}).get(i)
-            wanted[i] = FetchRequest(
-                url=object_address(self.size, url, f"{key.subset}/{i:04d}.nc"),
-                target=scenario_path(self.root, key),
-                limit=self.size.longest_file(i),
-                content_sha256=self._recorded[i],
-                length=claim.bytes if claim else None,
-                file_sha256=claim.file_sha256 if claim else None,
-                hint=REMEDY,
-            )
-        total = sum(one.length or self.size.file_bytes(i) for i, one in wanted.items())
-        self._meter.begin("downloading", total=total, scenarios=len(wanted))
+        claims = self._read_claims(url)
+        requests = self._list_requests(url, claims or {})
+        byte_count = sum(
+            item.length or self.size.file_bytes(scenario)
+            for scenario, item in requests.items()
+        )
+        self._meter.begin("downloading", total=byte_count, scenarios=len(requests))
         try:
-            if claims is None:  # it may have the archive of the data set instead
-                limit = (
-                    sum(map(self.size.longest_file, self.size.scenarios))
-                    + MANIFEST_LIMIT
-                )
-                archive = fetch_archive(
-                    self.size, url, wanted, self._count, limit=limit, hint=REMEDY
-                )
-                with suppress(NotInStoreError), closing(archive) as arrived:
-                    for claim in arrived:
-                        self._take(url, claim.scenario, claim)
+            if claims is None:
+                # A store without a manifest may have the archive of the data set.
+                if self._fetch_archive(url, requests):
                     return None
                 claims = {}
-                wanted = {
-                    i: one for i, one in wanted.items() if i not in self.downloaded
-                }
-            with closing(
-                fetch_scenarios(wanted, self._count, connections=self._connections)
-            ) as arrivals:
-                for scenario, absent in arrivals:
-                    if absent is None:
-                        self._take(url, scenario, claims.get(scenario))
-                    last = absent or last
+                for scenario in self.downloaded:
+                    requests.pop(scenario, None)
+            return self._fetch_files(url, requests, claims)
         finally:
-            self.missing = [i for i in self.missing if i not in self.downloaded]
-        return last
+            self.missing = [
+                scenario for scenario in self.missing if scenario not in self.downloaded
+            ]
 
-    def _take(self, url: str, scenario: int, claim: FileEntry | None) -> None:
-        """Note a new file; what cannot be told from it is the store's word."""
-        entry = describe_file(self.root, self.size.key(scenario))
-        if claim is not None:  # files of earlier versions state no facts
-            facts = entry.facts or claim.facts
-            entry = entry.model_copy(
-                update={"facts": facts, "twin_floor": claim.twin_floor}
+    def _read_claims(self, url: str) -> dict[int, FileEntry] | None:
+        """Return what a store's manifest says of its files; None without one.
+
+        Raises:
+            DataError: it has other content hashes than datasets.yaml.
+        """
+        place = object_address(self.size, url, MANIFEST_NAME)
+        try:
+            text = fetch_text(place, limit=MANIFEST_LIMIT, hint=HINT)
+        except NotInStoreError:
+            return None
+        manifest = parse_manifest(self.size, text, where=place, hint=HINT)
+        claims = {entry.scenario: entry for entry in manifest.files}
+        strangers = []
+        for scenario in self.missing:
+            claim = claims.get(scenario)
+            if claim and not claim.has_hash(self._recorded_hashes[scenario]):
+                strangers.append(scenario)
+        refuse_foreign_hashes(manifest, strangers, where=place, hint=HINT)
+        return claims
+
+    def _list_requests(
+        self, url: str, claims: Mapping[int, FileEntry]
+    ) -> dict[int, FetchRequest]:
+        """Return what to fetch from a store, and how to check it, by scenario."""
+        requests = {}
+        for scenario in self.missing:
+            key = self.size.key(scenario)
+            claim = claims.get(scenario)
+            requests[scenario] = FetchRequest(
+                url=object_address(self.size, url, f"{key.subset}/{scenario:04d}.nc"),
+                target=scenario_path(self.root, key),
+                limit=self.size.longest_file(scenario),
+                content_sha256=self._recorded_hashes[scenario],
+                length=claim.bytes if claim else None,
+                file_sha256=claim.file_sha256 if claim else None,
+                hint=HINT,
             )
+        return requests
+
+    def _fetch_archive(self, url: str, requests: Mapping[int, FetchRequest]) -> bool:
+        """Take files from the archive of the data set; return whether there is one."""
+        longest_files = map(self.size.longest_file, self.size.scenarios)
+        archive = fetch_archive(
+            self.size,
+            url,
+            requests,
+            self._count,
+            limit=sum(longest_files) + MANIFEST_LIMIT,
+            hint=HINT,
+        )
+        try:
+            with closing(archive) as claims:
+                for claim in claims:
+                    self._record_file(url, claim.scenario, claim)
+        except NotInStoreError:
+            return False
+        return True
+
+    def _fetch_files(
+        self,
+        url: str,
+        requests: Mapping[int, FetchRequest],
+        claims: Mapping[int, FileEntry],
+    ) -> NotInStoreError | None:
+        """Fetch files side by side; return the error of the last one not there."""
+        last_absent = None
+        arrivals = fetch_scenarios(requests, self._count, connections=self._connections)
+        with closing(arrivals):
+            for scenario, absent in arrivals:
+                if absent is None:
+                    self._record_file(url, scenario, claims.get(scenario))
+                else:
+                    last_absent = absent
+        return last_absent
+
+    def _record_file(self, url: str, scenario: int, claim: FileEntry | None) -> None:
+        """Note a new file.
+
+        The store's word is taken for what the file cannot tell: the predictability
+        limit, and what files of earlier versions do not state.
+        """
+        entry = describe_file(self.root, self.size.key(scenario))
+        if claim is not None:
+            update = {
+                "facts": entry.facts or claim.facts,
+                "twin_floor": claim.twin_floor,
+            }
+            entry = entry.model_copy(update=update)
         self._entries.append(entry)
         self.downloaded.append(scenario)
         self.url = url
         self._meter.count(scenarios=1)
 
-    def _count(self, count: int) -> None:
-        self.bytes += count
-        self._meter.count(count)
+    def _count(self, byte_count: int) -> None:
+        self.byte_count += byte_count
+        self._meter.count(byte_count)
 
-    def record(self) -> Manifest:
+    def write_manifest(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
         record_entry_hashes(self.size.folder(self.root), self._entries)
-        kept = tuple(
-            entry for entry in self._old.files if entry.scenario not in self.missing
+        kept_entries = tuple(
+            entry
+            for entry in self._old_manifest.files
+            if entry.scenario not in self.missing
         )
-        manifest = merge_entries(
-            self.size, self._old.model_copy(update={"files": kept}), self._entries
-        )
+        old_manifest = self._old_manifest.model_copy(update={"files": kept_entries})
+        manifest = merge_entries(self.size, old_manifest, self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:
-            rows = {
-                name: tuple(row) for name, row in self.size.measured.statistics.items()
-            }
-            manifest = manifest.model_copy(update={"statistics": rows})
+            statistics = {}
+            for name, row in self.size.measured.statistics.items():
+                statistics[name] = tuple(row)
+            manifest = manifest.model_copy(update={"statistics": statistics})
         if manifest.files:
             write_manifest(self.root, manifest)
         return manifest

@@ -1,5 +1,6 @@
-"""Export a data set to what other code bases read, so that their models train on it
-unchanged.
+"""Export a data set to formats of other code bases.
+
+Their models train on it unchanged.
 """
 
 from __future__ import annotations
@@ -31,19 +32,27 @@ from .metadata import (
     ENDINGS,
     NAME,
     WALL_NUMBERS,
+    ExportInfo,
     Format,
-    describe,
-    floor_of,
-    numbers_of,
+    describe_export,
+    material_numbers,
     parse_format,
+    round_down,
     write_metadata,
 )
 from .trajectory import Box, Run
 
-FORCE = "force.py"  # name of the program beside the data that LagrangeBench would run
-# layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them
-LAYERS = 3
-ALONG = (1, 1, 0, 0)  # axis along each wall: left, right, bottom, top
+FORCE = "force.py"
+"""Name of the program beside the data that LagrangeBench would run."""
+
+WALL_LAYERS = 3
+"""Layers of particles of a wall, as LagrangeBench's own lid-driven cavity has them."""
+
+WALL_AXES = (1, 1, 0, 0)
+"""Axis along each wall: left, right, bottom, top."""
+
+LOW_WALLS = (0, 2)
+"""Left and bottom."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,204 +118,88 @@ def export(
         raise UsageError(
             "only lagrangebench-h5 needs it", where="--from-walls", got=form.value
         )
-    tier, home, splits = locate(split, size, root=root, registry=registry)
-    folder = Path(output)
-    ending = ENDINGS[form]
-    _check_target(
-        folder, [f"{subset}{ending}" for subset in HASHED_SUBSETS], force=force
-    )
-    frames_of = _frames_of(tier, home)
-    statistics, digest = _recorded(tier, home)
-    with read_scenario(next(iter(frames_of["train"]))) as file:
-        spacing = math.sqrt(
-            float(file.read("particle_mass")) / float(tier.value("density"))
-        )
-        closed = "wall_velocity" in file.variables
+    entry, folder, splits = locate(split, size, root=root, registry=registry)
+    target = Path(output)
+    file_of = {subset: target / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
+    _check_target(target, list(file_of.values()), force=force)
+
+    frames_of = _frames_by_subset(entry, folder)
+    statistics, dataset_sha256 = _recorded_statistics(entry, folder)
+    spacing, is_closed = _inspect_scenario(next(iter(frames_of["train"])), entry)
+    if from_walls is None:
+        is_measured_from_walls = is_closed
+    else:
+        is_measured_from_walls = from_walls
     walls = None
     if wall_particles:
-        if not closed:
-            raise UsageError(
-                "the box has no walls that could move",
-                where="--wall-particles",
-                got=tier.split,
-            )
-        if from_walls is False and form is Format.LAGRANGEBENCH_H5:
-            what = "wall particles lie outside the unit box's bounds"
-            raise UsageError(
-                what,
-                where="--wall-particles and --unit-box",
-                fix="leave out --unit-box",
-            )
-        walls = WallParticles(tier.bounds, spacing)
-    if from_walls is None:
-        measured = closed
-    else:
-        measured = from_walls
-    # What is taken off every position, so that none is below 0 where bounds start
-    # there.
-    shifted = form is Format.LAGRANGEBENCH_H5 and (measured or wall_particles)
-    if walls:
-        beyond = walls.thickness
-    else:
-        beyond = 0.0
-    left, bottom = (
-        floor_of(low - beyond) if shifted else 0.0 for low, _ in tier.bounds
-    )
+        has_unit_box = from_walls is False and form is Format.LAGRANGEBENCH_H5
+        _check_walls(entry, is_closed=is_closed, has_unit_box=has_unit_box)
+        walls = WallParticles(entry.bounds, spacing)
+    wall_thickness = None if walls is None else walls.thickness
+    origin = (0.0, 0.0)
+    if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
+        origin = _lower_corner(entry, wall_thickness or 0.0)
+
     with contextlib.suppress(OSError):  # written last, it says that an export is whole
-        (folder / NAME).unlink()
+        (target / NAME).unlink()
     meter = Meter(progress)
-    meter.begin(
-        "exporting", total=len(frames_of), scenarios=sum(map(len, frames_of.values()))
-    )
+    scenario_count = sum(map(len, frames_of.values()))
+    meter.begin("exporting", total=len(frames_of), scenarios=scenario_count)
     shapes: dict[str, list[tuple[int, int]]] = {}
-    for subset, files in frames_of.items():
-        target = folder / f"{subset}{ending}"
-        runs = _runs(files, form, tier.frame_interval, walls)
+    for subset, frames in frames_of.items():
+        runs = _read_runs(frames, form, entry.frame_interval, walls)
         if form is Format.GNS_NPZ:
-            shapes[subset] = gns_npz.write(target, runs)
+            shapes[subset] = gns_npz.write(file_of[subset], runs)
         else:
+            shortest = min(frames.values())
             shapes[subset] = _write_h5(
-                target, runs, length=min(files.values()), origin=(left, bottom)
+                file_of[subset], runs, length=shortest, origin=origin
             )
-        meter.count(1, scenarios=len(files))
-    metadata = describe(
-        tier,
-        form,
-        shapes,
-        statistics,
-        title=splits.split(tier.split).title,
-        dataset_sha256=digest,
+        meter.count(1, scenarios=len(frames))
+
+    info = ExportInfo(
+        title=splits.split(entry.split).title,
+        dataset_sha256=dataset_sha256,
+        statistics=statistics,
         spacing=spacing,
-        origin=(left, bottom),
-        from_walls=measured,
-        free_slip=not (
-            tier.simulated and getattr(solver_constants(tier), "no_slip", False)
-        ),
-        wall=walls.thickness if walls else None,
+        origin=origin,
+        from_walls=is_measured_from_walls,
+        is_free_slip=_is_free_slip(entry),
+        wall_thickness=wall_thickness,
     )
-    written = (
-        *(folder / f"{subset}{ending}" for subset in frames_of),
-        write_metadata(folder, metadata),
-    )
-    frames = {
-        subset: sum(count for count, _ in rows) for subset, rows in shapes.items()
-    }
+    metadata_path = write_metadata(target, describe_export(entry, form, shapes, info))
+
+    trajectory_counts = {}
+    frame_counts = {}
+    left_out = 0
+    for subset, subset_shapes in shapes.items():
+        trajectory_counts[subset] = len(subset_shapes)
+        frame_counts[subset] = sum(frames for frames, _ in subset_shapes)
+        left_out += sum(frames_of[subset].values()) - frame_counts[subset]
+    written = (*file_of.values(), metadata_path)
     return ExportResult(
         format=form.value,
-        split=tier.split,
-        size=tier.name,
-        folder=folder,
+        split=entry.split,
+        size=entry.name,
+        folder=target,
         files=written,
-        trajectories={subset: len(rows) for subset, rows in shapes.items()},
-        frames=frames,
-        left_out=sum(sum(files.values()) for files in frames_of.values())
-        - sum(frames.values()),
+        trajectories=trajectory_counts,
+        frames=frame_counts,
+        left_out=left_out,
         bytes=sum(path.stat().st_size for path in written),
     )
 
 
-class WallParticles:
-    """Layers of particles beside each wall of a box: they go along and come in again at
-    its other end.
+def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, float]:
+    """Return what is taken off every position of lagrangebench-h5 [length].
+
+    No position is below 0 then, where the bounds start.
     """
-
-    def __init__(self, bounds: Box, spacing: float) -> None:
-        self.thickness = LAYERS * spacing
-        self._bounds = np.array(bounds)
-        low, high = self._bounds.T
-        # wall, place along it, place across it
-        rows: list[tuple[int, float, float]] = []
-        for wall, axis in enumerate(ALONG):
-            count = max(1, round((high[axis] - low[axis]) / spacing))
-            pitch = (high[axis] - low[axis]) / count
-            for depth in spacing * (np.arange(LAYERS) + 0.5):
-                if wall in (0, 2):
-                    across = low[1 - axis] - depth
-                else:
-                    across = high[1 - axis] + depth
-                rows += [
-                    (wall, low[axis] + pitch * (n + 0.5), across) for n in range(count)
-                ]
-        walls, along, across = np.array(rows).T
-        self.wall = walls.astype(int)  # which each particle lies beside
-        self._along = along
-        self._across = across
-
-    def join(
-        self, file: ScenarioFile, travel: NDArray[np.float64], frame: int
-    ) -> NDArray[np.float32]:
-        """Return the positions of a frame and, behind them, of walls that have gone so
-        far [frame, wall].
-        """
-        axis = np.array(ALONG)[self.wall]
-        low, high = self._bounds[axis].T
-        along = low + (self._along - low + travel[frame, self.wall]) % (high - low)
-        places = np.where(
-            axis[:, None] == [0, 1], along[:, None], self._across[:, None]
-        )
-        return np.concatenate([file.read("position", frame), places.astype(np.float32)])
+    (left, _), (bottom, _) = size.bounds
+    return round_down(left - wall_thickness), round_down(bottom - wall_thickness)
 
 
-def _runs(
-    files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None
-) -> Iterator[Run]:
-    """Yield the scenarios of a subset, each open until the next one is asked for."""
-    for path in files:
-        with read_scenario(path) as file:
-            kinds = numbers_of(form, file.read("material"))
-            position = partial(file.read, "position")
-            if walls is not None:
-                velocity = file.read("wall_velocity")
-                still, moving = WALL_NUMBERS[form]
-                ever = (velocity != 0.0).any(axis=(0, 2))
-                kinds = np.concatenate(
-                    [kinds, np.where(ever[walls.wall], moving, still)]
-                )
-                steps = interval * velocity[:, range(len(ALONG)), ALONG].astype(
-                    np.float64
-                )
-                steps[0] = 0.0  # velocity[f] acts from frame f-1 to f
-                position = partial(walls.join, file, np.cumsum(steps, axis=0))
-            yield file.header.frames, position, kinds
-
-
-def _write_h5(
-    path: Path, runs: Iterable[Run], *, length: int, origin: Sequence[float]
-) -> list[tuple[int, int]]:
-    """Write one subset for LagrangeBench, whole or not at all; return frames and
-    particles by trajectory.
-    """
-    shapes: list[tuple[int, int]] = []
-    with (
-        atomic_path(path, option="--output") as temporary,
-        h5py.File(temporary, "w", libver="earliest") as out,
-    ):
-        for frames, position, kinds in runs:
-            # That reader takes the length of the first trajectory for all: longer runs
-            # become several, and what is left over is not written. It reads chunks of
-            # one frame 5 to 10 times faster.
-            for start in range(0, frames - length + 1, length):
-                group = out.create_group(f"{len(shapes):05d}")
-                stored = group.create_dataset(
-                    "position",
-                    shape=(length, len(kinds), 2),
-                    dtype="<f4",
-                    chunks=(1, len(kinds), 2),
-                    compression="gzip",
-                    compression_opts=1,
-                    shuffle=True,
-                    track_times=False,
-                )
-                for row in range(length):
-                    stored[row] = position(start + row) - np.asarray(origin, np.float32)
-                group.create_dataset(
-                    "particle_type", data=kinds.astype("<i8"), track_times=False
-                )
-                shapes.append((length, len(kinds)))
-    return shapes
-
-
-def _check_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
+def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
     """Refuse a folder that must not be written to."""
     if (folder / FORCE).exists():
         raise UsageError(
@@ -314,19 +207,175 @@ def _check_target(folder: Path, names: Sequence[str], *, force: bool) -> None:
             where=str(folder / FORCE),
             fix="name another folder: --output",
         )
-    there = [name for name in (*names, NAME) if (folder / name).exists()]
-    if there and not force:
+    existing = [path.name for path in (*files, folder / NAME) if path.exists()]
+    if existing and not force:
         raise UsageError(
             "files of that name are there",
             where=str(folder),
-            got=", ".join(there),
+            got=", ".join(existing),
             fix="name another folder, or write over them: --force",
         )
 
 
-def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str]:
-    """Return statistics over train and data set hash: those of the registry, else of
-    the manifest.
+def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
+    """Refuse wall particles where there are no walls, or no room for them."""
+    if not is_closed:
+        raise UsageError(
+            "the box has no walls that could move",
+            where="--wall-particles",
+            got=size.split,
+        )
+    if has_unit_box:
+        raise UsageError(
+            "wall particles lie outside the unit box's bounds",
+            where="--wall-particles and --unit-box",
+            fix="leave out --unit-box",
+        )
+
+
+def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
+    """Return the spacing of particles [length], and whether the box is closed."""
+    with read_scenario(path) as file:
+        mass = float(file.read("particle_mass"))
+        is_closed = "wall_velocity" in file.variables
+    return math.sqrt(mass / float(size.value("density"))), is_closed
+
+
+def _is_free_slip(size: Size) -> bool:
+    """Return whether liquid slides along the walls, as with unknown solvers."""
+    if not size.simulated:
+        return True
+    return not getattr(solver_constants(size), "no_slip", False)
+
+
+class WallParticles:
+    """Layers of particles beside each wall of a box.
+
+    They go along with the wall, and what leaves at one end comes in at the other.
+    """
+
+    def __init__(self, bounds: Box, spacing: float) -> None:
+        self.thickness = WALL_LAYERS * spacing
+        self._bounds = np.array(bounds)
+        low, high = self._bounds.T
+        # wall, place along it [length], place across it [length]
+        rows: list[tuple[int, float, float]] = []
+        for wall, axis in enumerate(WALL_AXES):
+            length = high[axis] - low[axis]
+            count = max(1, round(length / spacing))
+            pitch = length / count
+            for depth in spacing * (np.arange(WALL_LAYERS) + 0.5):
+                if wall in LOW_WALLS:
+                    across = low[1 - axis] - depth
+                else:
+                    across = high[1 - axis] + depth
+                for number in range(count):
+                    rows.append((wall, low[axis] + pitch * (number + 0.5), across))
+        walls, along, across = np.array(rows).T
+        self.wall = walls.astype(int)  # which each particle lies beside
+        self._along = along
+        self._across = across
+
+    def append_to_frame(
+        self, file: ScenarioFile, travel: NDArray[np.float64], frame: int
+    ) -> NDArray[np.float32]:
+        """Return the positions of a frame and, behind them, of the walls.
+
+        ``travel`` is how far walls have gone [length], shape [frame, wall].
+        """
+        axis = np.array(WALL_AXES)[self.wall]
+        low, high = self._bounds[axis].T
+        start = self._along - low
+        along = low + (start + travel[frame, self.wall]) % (high - low)
+        is_along = axis[:, None] == [0, 1]  # [particle, space]
+        places = np.where(is_along, along[:, None], self._across[:, None])
+        return np.concatenate([file.read("position", frame), places.astype(np.float32)])
+
+
+def _read_runs(
+    files: Iterable[Path], form: Format, interval: float, walls: WallParticles | None
+) -> Iterator[Run]:
+    """Yield the scenarios of a subset, each open until the next one is asked for."""
+    for path in files:
+        with read_scenario(path) as file:
+            kinds = material_numbers(form, file.read("material"))
+            if walls is None:
+                yield file.header.frames, partial(file.read, "position"), kinds
+                continue
+            wall_velocity = file.read("wall_velocity")
+            wall_kinds = _wall_kinds(form, wall_velocity, walls)
+            travel = _wall_travel(wall_velocity, interval)
+            read_position = partial(walls.append_to_frame, file, travel)
+            kinds = np.concatenate([kinds, wall_kinds])
+            yield file.header.frames, read_position, kinds
+
+
+def _wall_kinds(
+    form: Format, wall_velocity: NDArray[np.floating], walls: WallParticles
+) -> NDArray[np.int64]:
+    """Return the number of each wall particle: of a wall at rest, or one that moves."""
+    at_rest, moving = WALL_NUMBERS[form]
+    ever_moves = (wall_velocity != 0.0).any(axis=(0, 2))
+    return np.where(ever_moves[walls.wall], moving, at_rest)
+
+
+def _wall_travel(
+    wall_velocity: NDArray[np.floating], interval: float
+) -> NDArray[np.float64]:
+    """Return how far each wall has gone along itself [length], shape [frame, wall]."""
+    walls = range(len(WALL_AXES))
+    along = wall_velocity[:, walls, WALL_AXES].astype(np.float64)
+    steps = interval * along
+    steps[0] = 0.0  # velocity[f] acts from frame f-1 to f
+    return np.cumsum(steps, axis=0)
+
+
+def _write_h5(
+    path: Path, runs: Iterable[Run], *, length: int, origin: tuple[float, float]
+) -> list[tuple[int, int]]:
+    """Write one subset for LagrangeBench, whole or not at all.
+
+    Its reader takes the length of the first trajectory for all: longer runs become
+    several, and what is left over is not written. It reads chunks of one frame 5 to 10
+    times faster.
+
+    Returns frames and particles of each trajectory.
+    """
+    shift = np.asarray(origin, np.float32)
+    shapes: list[tuple[int, int]] = []
+    with (
+        atomic_path(path, option="--output") as temporary,
+        h5py.File(temporary, "w", libver="earliest") as out,
+    ):
+        for frame_count, read_position, kinds in runs:
+            particle_count = len(kinds)
+            for start in range(0, frame_count - length + 1, length):
+                group = out.create_group(f"{len(shapes):05d}")
+                stored = group.create_dataset(
+                    "position",
+                    shape=(length, particle_count, 2),
+                    dtype="<f4",
+                    chunks=(1, particle_count, 2),
+                    compression="gzip",
+                    compression_opts=1,
+                    shuffle=True,
+                    track_times=False,
+                )
+                for row in range(length):
+                    stored[row] = read_position(start + row) - shift
+                group.create_dataset(
+                    "particle_type", data=kinds.astype("<i8"), track_times=False
+                )
+                shapes.append((length, particle_count))
+    return shapes
+
+
+def _recorded_statistics(
+    size: Size, root: Path
+) -> tuple[dict[str, tuple[float, ...]], str]:
+    """Return statistics over train and the data set hash.
+
+    They are those of the registry, else of the manifest.
     """
     if size.measured:
         return dict(size.measured.statistics), size.measured.dataset_sha256
@@ -341,27 +390,29 @@ def _recorded(size: Size, root: Path) -> tuple[dict[str, tuple[float, ...]], str
     return dict(manifest.statistics), manifest.dataset_sha256
 
 
-def _frames_of(size: Size, root: Path) -> dict[str, dict[Path, int]]:
-    """Return files and their frames by subset, in order of their ids, after a look at
-    each header.
+def _frames_by_subset(size: Size, root: Path) -> dict[str, dict[Path, int]]:
+    """Return files and their frames by subset, in order of their ids.
+
+    The header of each file is compared with the registry.
     """
-    frames: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
+    frames_of: dict[str, dict[Path, int]] = {subset: {} for subset in HASHED_SUBSETS}
     for scenario, path in sorted(scenario_files(size, root, HASHED_SUBSETS).items()):
         with read_scenario(path) as file:
-            found = file.header
+            header = file.header
+        expected_hash = ""
         if size.measured:
-            known = size.measured.scenario_sha256.get(scenario)
-        else:
-            known = None
-        same = (found.key.major, found.key.scenario) == (size.major, scenario)
-        if not (same and found.content_sha256.startswith(known or "")):
+            expected_hash = size.measured.scenario_sha256.get(scenario, "")
+        is_right_scenario = (
+            header.key.major == size.major and header.key.scenario == scenario
+        )
+        if not is_right_scenario or not header.content_sha256.startswith(expected_hash):
             raise DataError(
                 "a scenario is not that of the registry",
                 where=str(path),
-                expected=f"scenario {scenario}, content hash {known or 'any'}",
-                got=f"scenario {found.key.scenario}, content hash "
-                f"{found.content_sha256[:16]}",
+                expected=f"scenario {scenario}, content hash {expected_hash or 'any'}",
+                got=f"scenario {header.key.scenario}, content hash "
+                f"{header.content_sha256[:16]}",
                 fix=f"lagbench verify --split {size.split} --size {size.name}",
             )
-        frames[size.subset_of(scenario)][path] = found.frames
-    return frames
+        frames_of[size.subset_of(scenario)][path] = header.frames
+    return frames_of

@@ -1,15 +1,14 @@
-"""The format of the PyTorch GNS code bases: npz files of pickled pairs, and
-metadata.json.
+"""The format of the PyTorch GNS code bases: npz files of pickled pairs.
 
 ``train.npz``, ``valid.npz``, ``test.npz`` hold one object array per trajectory:
 positions [frame, particle, space] and the kind of each particle. NumPy stores such an
 array as a pickle: a program for a small machine, which can be made to call any
 function.
 
-The reader lets a program name what NumPy writes for arrays and nothing else, and
-NumPy's own constructors are not among what it may call: told a type's flags by a file,
-they take bytes for addresses of objects. Stand-ins note what the file says, and arrays
-of numbers are made of it.
+No such program is run here. The reader lets a pickle name what NumPy writes for arrays
+and nothing else, and calls none of NumPy's own constructors: told a type's flags by a
+file, they take bytes for addresses of objects. Stand-ins note what the file says, and
+arrays of numbers are made of it.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,59 +27,85 @@ from numpy.typing import NDArray
 from lagbench.atomic import atomic_path
 from lagbench.errors import UnreadableFileError
 
-from .metadata import Format, materials_of
+from .metadata import Format, find_materials
 from .trajectory import Run, Trajectory, check_array, check_inflation, read_header
 
-JOINT = "gns_data"  # key under which some files hold all trajectories together
-# codes of the types of numbers that may be in a file
-_NUMBERS = re.compile("[iu][1248]|f[248]|b1")
-# steps of a pickle, each makes one object; NumPy takes about fifty for a trajectory
-_MOST_STEPS = 1 << 18
-_PARTS = 3  # parts of a trajectory at the most: positions, kinds, a material property
-# how deep arrays may lie in each other: trajectories in a joint array, parts, and a
-# spare
-_DEPTH = 3
+JOINT = "gns_data"
+"""Key under which some files hold all trajectories together."""
+
+NUMBER_CODES = re.compile("[iu][1248]|f[248]|b1")
+"""Codes of the types of numbers that may be in a file."""
+
+BYTE_ORDERS = ("<", ">", "|", "=")
+
+MOST_STEPS = 1 << 18
+"""Steps of a pickle, each makes one object; NumPy takes about fifty per trajectory."""
+
+MOST_PARTS = 3
+"""Parts of a trajectory: positions, kinds, a material property."""
+
+MOST_DEPTH = 3
+"""How deep arrays may lie in each other.
+
+Trajectories in a joint array, their parts, and a spare.
+"""
+
+EXTERNAL_ATTRIBUTES = 0o644 << 16
+"""File mode of a member of a zip file."""
 
 
 def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
-    """Write one subset, whole or not at all; return frames and particles of each
-    trajectory.
+    """Write one subset, whole or not at all.
+
+    Returns frames and particles of each trajectory.
     """
     shapes: list[tuple[int, int]] = []
     with (
         atomic_path(path, option="--output") as temporary,
         zipfile.ZipFile(temporary, "w") as archive,
     ):
-        for frames, position, kinds in runs:
+        for frame_count, read_position, kinds in runs:
+            position = np.empty((frame_count, len(kinds), 2), np.float32)
+            for frame in range(frame_count):
+                position[frame] = read_position(frame)
             pair = np.empty(2, dtype=object)
-            pair[0] = np.empty((frames, len(kinds), 2), np.float32)
+            pair[0] = position
             pair[1] = kinds
-            for number in range(frames):
-                pair[0][number] = position(number)
-            # Equal data give equal bytes: the time is zip's earliest, as by default,
-            # and members are stored as numpy.savez stores them, since compressed bytes
-            # would change with the version of zlib.
-            member = zipfile.ZipInfo(f"simulation_{len(shapes)}.npy")
-            member.external_attr = 0o644 << 16
-            with archive.open(member, "w", force_zip64=True) as stream:
-                np.lib.format.write_array_header_1_0(
-                    stream, {"descr": "|O", "fortran_order": False, "shape": (2,)}
-                )
-                pickle.dump(pair, stream, protocol=4)
-            shapes.append((frames, len(kinds)))
+            _write_member(archive, f"simulation_{len(shapes)}.npy", pair)
+            shapes.append((frame_count, len(kinds)))
     return shapes
 
 
-def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
-    """Yield the trajectories of a file, one in memory at a time; its pickles are
-    rebuilt.
+def _write_member(archive: zipfile.ZipFile, name: str, pair: NDArray[Any]) -> None:
+    """Write an object array.
+
+    Equal data give equal bytes: the time is zip's earliest, as by default, and members
+    are stored as numpy.savez stores them, since compressed bytes would change with the
+    version of zlib.
+    """
+    member = zipfile.ZipInfo(name)
+    member.external_attr = EXTERNAL_ATTRIBUTES
+    header = {"descr": "|O", "fortran_order": False, "shape": pair.shape}
+    with archive.open(member, "w", force_zip64=True) as stream:
+        np.lib.format.write_array_header_1_0(stream, header)
+        pickle.dump(pair, stream, protocol=4)
+
+
+def read_trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
+    """Yield the trajectories of a file, one in memory at a time.
+
+    ``kinds`` maps numbers of particles to materials, as the user says.
+
+    Raises:
+        UnreadableFileError: the file is damaged, or holds more than arrays.
     """
     try:
         archive = zipfile.ZipFile(path)
     except (OSError, zipfile.BadZipFile) as error:
-        got = f"{type(error).__name__}: {error}"
         raise UnreadableFileError(
-            "cannot read an npz file", where=str(path), got=got
+            "cannot read an npz file",
+            where=str(path),
+            got=f"{type(error).__name__}: {error}",
         ) from error
     with archive:
         for member in archive.namelist():
@@ -88,36 +113,30 @@ def trajectories(path: Path, kinds: Mapping[int, str]) -> Iterator[Trajectory]:
             name = f"{path}, key {key!r}"
             array = _load(archive, member, name)
             if key == JOINT and array.ndim:
-                yield from (
-                    _trajectory(f"{name}, item {i}", item, kinds)
-                    for i, item in enumerate(array)
-                )
+                for number, item in enumerate(array):
+                    yield _parse_trajectory(f"{name}, item {number}", item, kinds)
             else:
-                yield _trajectory(name, array, kinds)
+                yield _parse_trajectory(name, array, kinds)
 
 
-def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory:
-    """Return the trajectory of a pair (positions, kinds) or a triple with a material
-    property.
+def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Trajectory:
+    """Return the trajectory of a pair (positions, kinds), or of a triple.
+
+    The third part is a material property.
     """
-    several = isinstance(item, tuple) or (
-        isinstance(item, np.ndarray) and item.ndim == 1
-    )
-    parts = list(item) if several else []  # type: ignore[call-overload]
+    parts = _split_parts(item)
     if len(parts) not in (2, 3) or not isinstance(parts[0], np.ndarray):
         raise UnreadableFileError(
             "this is no trajectory",
             where=name,
             expected="positions, kinds[, a material property]",
-            got=f"{type(item).__name__} of {len(parts)}"
-            if several
-            else type(item).__name__,
+            got=f"{type(item).__name__} of {len(parts)} parts",
         )
     position = parts[0]
     check_array(name, position.shape, position.dtype)
     try:
         numbers = np.asarray(parts[1])
-        values = np.unique(np.asarray(parts[2:], dtype=np.float64))
+        properties = np.unique(np.asarray(parts[2:], dtype=np.float64))
     except (ValueError, TypeError, OverflowError) as error:
         raise UnreadableFileError(
             "these are no kinds and no material property",
@@ -125,59 +144,54 @@ def _trajectory(name: str, item: object, given: Mapping[int, str]) -> Trajectory
             expected="numbers",
             got=error,
         ) from error
-    material, kept = materials_of(
-        Format.GNS_NPZ, numbers, position.shape[1], given=given, where=name
+
+    material, is_kept = find_materials(
+        Format.GNS_NPZ, numbers, position.shape[1], user_kinds=kinds, where=name
     )
-    if len(values) == 1 and not np.isfinite(values[0]):
-        raise UnreadableFileError(
-            "the material property is not finite", where=name, got=values[0]
-        )
-    if kept.all():
-        chosen = position
-    else:
-        chosen = position[:, kept]
+    if not is_kept.all():
+        position = position[:, is_kept]
+    parameters = {}
+    if len(properties) == 1:
+        parameters["material_property"] = properties[0]
+        if not np.isfinite(properties[0]):
+            raise UnreadableFileError(
+                "the material property is not finite", where=name, got=properties[0]
+            )
     return Trajectory(
         name=name,
         frames=len(position),
         material=material,
-        read=lambda: ((frame, None) for frame in chosen),
-        parameters={"material_property": values[0]} if len(values) == 1 else {},
+        read=lambda: ((frame, None) for frame in position),
+        parameters=parameters,
     )
+
+
+def _split_parts(item: object) -> list[Any]:
+    """Return the parts of a tuple or of an array of one dimension; else none."""
+    if isinstance(item, tuple):
+        return list(item)
+    if isinstance(item, np.ndarray) and item.ndim == 1:
+        return list(item)
+    return []
 
 
 def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
     """Return the array of a member, whose objects may be arrays and numbers only."""
-    about = archive.getinfo(member)
-    check_inflation(name, packed=about.compress_size, unpacked=about.file_size)
+    entry = archive.getinfo(member)
+    check_inflation(name, packed=entry.compress_size, unpacked=entry.file_size)
     try:
         with archive.open(member) as stream:
-            shape, fortran, dtype = read_header(stream)
+            shape, is_fortran, dtype = read_header(stream)
             if not dtype.hasobject:
-                return np.frombuffer(stream.read(), dtype).reshape(
-                    shape, order="F" if fortran else "C"
-                )
-            # A pickle can make the unpickler reserve far more memory than the file
-            # holds. Reading it as text finds lengths beyond the end; a memo is reserved
-            # up to its highest index; and a byte is enough to make an empty list.
-            for step, (code, argument, place) in enumerate(pickletools.genops(stream)):
-                if step > _MOST_STEPS:
-                    raise pickle.UnpicklingError(
-                        f"the pickle has more than {_MOST_STEPS} steps"
-                    )
-                if (
-                    code.name.endswith("PUT")
-                    and isinstance(argument, int)
-                    and argument > (place or 0)
-                ):
-                    raise pickle.UnpicklingError(
-                        "the pickle wants a memo larger than itself"
-                    )
+                values = np.frombuffer(stream.read(), dtype)
+                return _reshape(values, shape, is_fortran)
+            _check_steps(stream)
         with archive.open(member) as stream:
             read_header(stream)
-            found = _Arrays(stream, encoding="latin1").load()
-        if not isinstance(found, _Array):
-            raise pickle.UnpicklingError(f"the pickle holds a {type(found).__name__}")
-        return found.value().reshape(shape)
+            array = ArrayUnpickler(stream, encoding="latin1").load()
+        if not isinstance(array, PickledArray):
+            raise pickle.UnpicklingError(f"the pickle holds a {type(array).__name__}")
+        return array.build().reshape(shape)
     except Exception as error:  # damaged pickles and zip files raise nearly any type
         raise UnreadableFileError(
             "an npz file is damaged, or holds more than arrays",
@@ -187,112 +201,152 @@ def _load(archive: zipfile.ZipFile, member: str, name: str) -> NDArray[Any]:
         ) from error
 
 
-class _Type:
-    """What a pickle says of a type: its code and its order of bytes; never its
-    flags.
+def _reshape(
+    values: NDArray[Any], shape: tuple[int, ...], is_fortran: bool
+) -> NDArray[Any]:
+    return values.reshape(shape, order="F" if is_fortran else "C")
+
+
+def _check_steps(stream: IO[bytes]) -> None:
+    """Refuse a pickle that makes the unpickler reserve far more than the file holds.
+
+    Reading it as text finds lengths beyond the end. A memo is reserved up to its
+    highest index. A byte is enough to make an empty list.
     """
+    for step, (code, argument, place) in enumerate(pickletools.genops(stream)):
+        if step > MOST_STEPS:
+            raise pickle.UnpicklingError(f"the pickle has more than {MOST_STEPS} steps")
+        if not code.name.endswith("PUT") or not isinstance(argument, int):
+            continue
+        if argument > (place or 0):
+            raise pickle.UnpicklingError("the pickle wants a memo larger than itself")
+
+
+class PickledType:
+    """What a pickle says of a type: its code and byte order, and never its flags."""
 
     def __init__(self, code: str, *_: object) -> None:
         self.code = str(code)
         self.order = "|"
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
+        """Note the order of bytes."""
         self.order = str(state[1])
 
-    def numbers(self) -> np.dtype[Any]:
+    @property
+    def is_object(self) -> bool:
+        """Whether the values are Python objects."""
+        return self.code.startswith("O")
+
+    def build(self) -> np.dtype[Any]:
         """Return the type where it is one of numbers."""
-        if not _NUMBERS.fullmatch(self.code) or self.order not in ("<", ">", "|", "="):
+        if not NUMBER_CODES.fullmatch(self.code) or self.order not in BYTE_ORDERS:
             raise pickle.UnpicklingError(
                 f"the pickle holds values of type {self.code!r}"
             )
         return np.dtype(self.order + self.code)
 
 
-class _Array:
-    """What a pickle says of an array; its state comes later: version, shape, type,
-    order, values.
+class PickledArray:
+    """What a pickle says of an array.
+
+    Its state comes later: version, shape, type, order, values.
     """
 
     def __init__(self, *_: object) -> None:
         self._state: tuple[Any, ...] = ()
-        self._value: NDArray[Any] | None = None
+        self._array: NDArray[Any] | None = None
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
+        """Note shape, type, order and values."""
         self._state = state[1:]
-        self._value = None
+        self._array = None
 
-    def value(self, depth: int = _DEPTH) -> NDArray[Any]:
+    def build(self, depth: int = MOST_DEPTH) -> NDArray[Any]:
         """Return the array, made once however often it is named."""
-        if self._value is None:
-            shape, kind, fortran, data = self._state
-            if kind.code.startswith("O"):  # NumPy pickles the elements as a list
-                if not isinstance(data, list):
-                    found = type(data).__name__
-                    raise pickle.UnpicklingError(
-                        f"the pickle has a {found} for the objects of an array"
-                    )
-                flat = np.empty(len(data), dtype=object)
-                for number, item in enumerate(data):
-                    flat[number] = _resolved(item, depth - 1)
+        if self._array is None:
+            shape, dtype, is_fortran, data = self._state
+            if dtype.is_object:
+                values = _build_objects(data, depth - 1)
             else:
-                # Python 2 pickled raw values as text, a letter for a byte.
-                raw: object
-                if isinstance(data, str):
-                    raw = data.encode("latin1")
-                else:
-                    raw = data
-                if not isinstance(raw, bytes):
-                    found = type(data).__name__
-                    raise pickle.UnpicklingError(
-                        f"the pickle has a {found} for the values of an array"
-                    )
-                flat = np.frombuffer(raw, kind.numbers())
-            self._value = flat.reshape(shape, order="F" if fortran else "C")
-        return self._value
+                values = np.frombuffer(_raw_bytes(data), dtype.build())
+            self._array = _reshape(values, shape, is_fortran)
+        return self._array
 
 
-def _resolved(item: object, depth: int) -> object:
+def _build_objects(data: object, depth: int) -> NDArray[Any]:
+    """Return the elements of an object array, which NumPy pickles as a list."""
+    if not isinstance(data, list):
+        raise pickle.UnpicklingError(
+            f"the pickle has a {type(data).__name__} for the objects of an array"
+        )
+    values = np.empty(len(data), dtype=object)
+    for number, item in enumerate(data):
+        values[number] = _build_element(item, depth)
+    return values
+
+
+def _raw_bytes(data: object) -> bytes:
+    """Return the raw values; Python 2 pickled them as text, a letter for a byte."""
+    if isinstance(data, str):
+        return data.encode("latin1")
+    if isinstance(data, bytes):
+        return data
+    raise pickle.UnpicklingError(
+        f"the pickle has a {type(data).__name__} for the values of an array"
+    )
+
+
+def _build_element(item: object, depth: int) -> object:
     """Return an element of an object array: an array, a number, or a few of both."""
     if depth < 0:
         raise pickle.UnpicklingError("the pickle holds arrays in arrays without end")
-    if isinstance(item, _Array):
-        return item.value(depth)
-    if isinstance(item, tuple | list) and len(item) <= _PARTS:
-        return tuple(_resolved(part, depth - 1) for part in item)
+    if isinstance(item, PickledArray):
+        return item.build(depth)
+    if isinstance(item, tuple | list) and len(item) <= MOST_PARTS:
+        return tuple(_build_element(part, depth - 1) for part in item)
     if isinstance(item, int | float):
         return item
     raise pickle.UnpicklingError(f"the pickle holds a {type(item).__name__}")
 
 
-class _Maker:
-    """What a name of a pickle stands for: a call that makes a stand-in, and that no
-    pickle can change.
+class StandIn:
+    """What a name in a pickle stands for: a call that makes a stand-in.
+
+    No pickle can change it.
     """
 
     __slots__ = ("_kind",)
 
-    def __init__(self, kind: type[_Array | _Type] | None) -> None:
+    def __init__(self, kind: type[PickledArray | PickledType] | None) -> None:
         self._kind = kind
 
     def __call__(self, *arguments: Any) -> object:  # noqa: ANN401
+        """Return a stand-in for what NumPy would make."""
         if self._kind is None:
             raise pickle.UnpicklingError("the pickle wants to make an array by itself")
         return self._kind(*arguments)
 
     def __setstate__(self, state: object) -> None:
+        """Refuse a change."""
         raise pickle.UnpicklingError("the pickle wants to change a function")
 
 
-class _Arrays(pickle.Unpickler):
-    """Unpickler for what NumPy writes of arrays: three names, all of them stand-ins."""
+STAND_INS = {
+    ("numpy.core.multiarray", "_reconstruct"): StandIn(PickledArray),
+    ("numpy._core.multiarray", "_reconstruct"): StandIn(PickledArray),
+    ("numpy", "dtype"): StandIn(PickledType),
+    ("numpy", "ndarray"): StandIn(None),  # it is named, and never called
+}
+"""All names that a pickle may use."""
+
+
+class ArrayUnpickler(pickle.Unpickler):
+    """Unpickler for what NumPy writes of arrays: a few names, all of them stand-ins."""
 
     def find_class(self, module: str, name: str) -> Any:  # noqa: ANN401
-        if name == "_reconstruct" and module in (
-            "numpy.core.multiarray",
-            "numpy._core.multiarray",
-        ):
-            return _Maker(_Array)
-        if module == "numpy" and name in ("ndarray", "dtype"):
-            # ndarray is named, and never called
-            return _Maker(_Type if name == "dtype" else None)
-        raise pickle.UnpicklingError(f"the pickle wants to call {module}.{name}")
+        """Return the stand-in for a name; refuse all others."""
+        stand_in = STAND_INS.get((module, name))
+        if stand_in is None:
+            raise pickle.UnpicklingError(f"the pickle wants to call {module}.{name}")
+        return stand_in

@@ -1,5 +1,4 @@
-"""Make a local split: scenario files, manifest and description in a folder of their
-own.
+"""Make a local split: a folder with scenario files, manifest and description.
 
 All of it is built beside the target and renamed at the end, so that a local split is
 there whole or not at all. One frame of one trajectory is in memory at a time.
@@ -12,7 +11,9 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,7 @@ from lagbench.data.manifest import (
     describe_file,
     write_manifest,
 )
-from lagbench.data.registry import MAX_ID, NO_GENERATOR, format_ids, load
+from lagbench.data.registry import MAX_ID, NO_GENERATOR, Size, format_ids, load
 from lagbench.data.scenario import read_scenario
 from lagbench.data.statistics import file_statistics
 from lagbench.data.writer import ScenarioWriter
@@ -42,17 +43,25 @@ from lagbench.work.progress import Meter, Progress
 from .trajectory import (
     FEWEST_CELLS,
     MOST_CELLS,
+    Box,
     Description,
     Trajectory,
     estimate_spacing,
 )
 
-SIZE = "full"  # size of every local split
+SIZE = "full"
+"""Size of every local split."""
+
 VERSION = "1.0.0"
 DEVICE = "cpu"
-HEAD = '# A local split of lagbench, written by `lagbench {}`; its hashes stand under "measured".\n'
-# spacings of particles across a cell of the score grid; our own splits have 1.8 to 2.6
-PER_CELL = 2.5
+
+HEAD = (
+    "# A local split of lagbench, written by `lagbench {}`; "
+    'its hashes stand under "measured".\n'
+)
+
+SPACINGS_PER_CELL = 2.5
+"""Spacings of particles across a cell of the score grid; our splits have 1.8 to 2.6."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +88,7 @@ def output_name(output: str | Path) -> str:
 
 
 def make_local_split(
-    about: Description,
+    description: Description,
     subsets: Mapping[str, Iterable[Trajectory]],
     output: str | Path,
     *,
@@ -87,67 +96,97 @@ def make_local_split(
     counts: Mapping[str, int] | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> LocalSplit:
-    """Write a local split of the trajectories of train, valid and test; it appears
-    whole or not at all.
+    """Write a local split; it appears whole or not at all.
 
-    The last part of ``output`` is the name of the split, ``command`` stands in the head
-    of its description; ``counts`` are the trajectories of each subset, where they are
-    known before.
+    Args:
+        description: what is known of the data.
+        subsets: the trajectories of train, valid and test.
+        output: folder to make; its last part is the name of the split.
+        command: the command that stands in the head of the description.
+        counts: trajectories of each subset, where they are known before.
+        progress: called as the work advances.
+
+    Raises:
+        UsageError: the name is taken, the folder is there, or the task does not fit.
+        DataError: a subset is empty, or a trajectory cannot be used.
+        WorkFailedError: the disk is full or not writable.
     """
     folder = Path(os.path.abspath(expand_path(output, "--output")))
-    if about.name in load().splits:
-        what = f"{about.name!r} is one of the splits of lagbench"
-        raise UsageError(what, where="--output", fix="use another name")
+    if description.name in load().splits:
+        raise UsageError(
+            f"{description.name!r} is one of the splits of lagbench",
+            where="--output",
+            fix="use another name",
+        )
     if folder.exists():
-        fix = "remove it, or use another name"
-        raise UsageError("the folder is there already", where=str(folder), fix=fix)
+        raise UsageError(
+            "the folder is there already",
+            where=str(folder),
+            fix="remove it, or use another name",
+        )
+
     meter = Meter(progress)
-    with _scratch(folder) as root:
-        building = _Building(about, root)
+    with _staging_folder(folder) as root:
+        builder = SplitBuilder(description, root)
         for subset in HASHED_SUBSETS:
-            before = len(building.entries)
-            if counts:
-                total = counts[subset]
-            else:
-                total = 0
-            meter.begin(f"writing {subset}", total=total, scenarios=total)
+            count = counts[subset] if counts else 0
+            meter.begin(f"writing {subset}", total=count, scenarios=count)
+            entry_count = len(builder.entries)
             for trajectory in subsets[subset]:
-                building.add(subset, trajectory)
+                builder.add(subset, trajectory)
                 meter.count(1, scenarios=1)
-            if len(building.entries) == before:
+            if len(builder.entries) == entry_count:
                 raise DataError(
                     "a subset is empty",
                     where=subset,
                     expected="at least one trajectory",
                 )
-        manifest = building.finish(command)
-        size = load(root / about.name / DESCRIPTION).size(about.name, SIZE)
-        (root / about.name).replace(folder)
-    particles = [entry.particles for entry in manifest.files]
-    tested = {entry.particles for entry in manifest.files if entry.subset == "test"}
-    note = (
-        f"test scenarios have {min(tested)} to {max(tested)} particles: the split can "
-        f"be opened and "
-        "trained on; predictions and scores need one number for all"
-    )
+        manifest = builder.finish(command)
+        built = root / description.name
+        size = load(built / DESCRIPTION).size(description.name, SIZE)
+        built.replace(folder)
+    return _summarise(folder, size, manifest, spacing=builder.spacing)
+
+
+def _summarise(
+    folder: Path, size: Size, manifest: Manifest, *, spacing: float
+) -> LocalSplit:
+    """Return what is told of a local split that was made."""
+    particle_counts = []
+    test_counts = []
+    frame_count = 0
+    byte_count = 0
+    for entry in manifest.files:
+        particle_counts.append(entry.particles)
+        frame_count += entry.frames
+        byte_count += entry.bytes
+        if entry.subset == "test":
+            test_counts.append(entry.particles)
+    notes = []
+    if len(set(test_counts)) > 1:
+        notes.append(
+            f"test scenarios have {min(test_counts)} to {max(test_counts)} particles: "
+            f"the split can be opened and trained on; predictions and scores need one "
+            f"number for all"
+        )
     return LocalSplit(
         folder=folder,
-        name=about.name,
-        size=SIZE,
+        name=size.split,
+        size=size.name,
         scenarios={name: len(ids) for name, ids in size.subsets.items()},
-        frames=sum(entry.frames for entry in manifest.files),
-        particles=(min(particles), max(particles)),
+        frames=frame_count,
+        particles=(min(particle_counts), max(particle_counts)),
         input_frames=size.task.input_frames,
         horizon=size.task.horizon,
-        spacing=building.spacing,
-        bytes=sum(entry.bytes for entry in manifest.files),
+        spacing=spacing,
+        bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=(note,) if len(tested) > 1 else (),
+        notes=tuple(notes),
     )
 
 
 @contextmanager
-def _scratch(folder: Path) -> Iterator[Path]:
+def _staging_folder(folder: Path) -> Iterator[Path]:
     """Yield a folder beside the target that vanishes at the end."""
     root = temporary_name(folder)
     try:
@@ -157,33 +196,34 @@ def _scratch(folder: Path) -> Iterator[Path]:
         finally:
             shutil.rmtree(root, ignore_errors=True)
     except (OSError, WorkFailedError) as error:
+        reason: object = error
+        if isinstance(error, WorkFailedError):
+            reason = error.got
+        elif error.strerror:
+            reason = error.strerror
         raise WorkFailedError(
             "cannot write there",
             where=str(folder),
-            got=error.got
-            if isinstance(error, WorkFailedError)
-            else error.strerror or error,
+            got=reason,
             fix="free disk space, or name another folder: --output",
         ) from error
 
 
 @dataclass
-class _Building:
-    """A local split on the way: scenario files one by one, then manifest and
-    description.
-    """
+class SplitBuilder:
+    """Write a local split: scenario files one by one, then manifest and description."""
 
-    about: Description
+    description: Description
     root: Path  # root folder in which the split's folder is built
     # distance of neighbouring particles at first [length]; 0 before the first scenario
     spacing: float = 0.0
     # of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
-    # of any particle [length]
+    # extent of the positions of all particles [length]
     low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
     high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
     # whether trajectories have velocities of walls; None before the first
-    walled: bool | None = None
+    has_walls: bool | None = None
 
     def add(self, subset: str, trajectory: Trajectory) -> None:
         """Write the next scenario."""
@@ -194,96 +234,116 @@ class _Building:
                 where=trajectory.name,
                 expected=f"at most {MAX_ID + 1}",
             )
-        walled = trajectory.wall_velocity is not None
-        if self.walled not in (None, walled):
-            raise DataError(
-                "velocities of walls in some trajectories only",
-                where=trajectory.name,
-                expected="wall_velocity, as before"
-                if self.walled
-                else "no wall_velocity, as before",
-                fix="give zeros where walls rest",
-            )
-        self.walled = walled
-        scale = self.about.measure.scale
-        about = self.about
+        self._check_walls(trajectory)
         if not self.spacing:
-            first = np.asarray(next(trajectory.read())[0])
-            self._check(trajectory, 0, about.measure.place(first))
-            self.spacing = (
-                about.spacing or estimate_spacing(first, about.radius)
-            ) / scale
+            self.spacing = self._measure_spacing(trajectory)
+
+        description = self.description
+        wall_velocity = None
+        if trajectory.wall_velocity is not None:
+            wall_velocity = (
+                np.asarray(trajectory.wall_velocity) / description.transform.scale
+            )
+        parameters = {
+            "frame_rate": description.rate,
+            "density": description.density,
+            **trajectory.parameters,
+        }
         key = self._key(scenario, subset)
-        if trajectory.wall_velocity is None:
-            walls = None
-        else:
-            walls = np.asarray(trajectory.wall_velocity) / scale
         with ScenarioWriter(
             scenario_path(self.root, key),
             key,
             particles=len(trajectory.material),
             frames=trajectory.frames,
-            frame_interval=1.0 / about.rate,
+            frame_interval=1.0 / description.rate,
             material=trajectory.material,
-            particle_mass=about.density * self.spacing**2,
-            wall_velocity=walls,
-            parameters={
-                "frame_rate": about.rate,
-                "density": about.density,
-                **trajectory.parameters,
-            },
+            particle_mass=description.density * self.spacing**2,
+            wall_velocity=wall_velocity,
+            parameters=parameters,
             seed=NO_GENERATOR,
             device=DEVICE,
             generator=NO_GENERATOR,
-            licence=about.licence,
+            licence=description.licence,
         ) as writer:
-            for position, velocity in self._frames(trajectory):
+            for position, velocity in self._read_frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
 
-    def _key(self, scenario: int, subset: str) -> ScenarioKey:
-        name = self.about.name
-        return ScenarioKey(
-            split=name, size=SIZE, version=VERSION, scenario=scenario, subset=subset
+    def _check_walls(self, trajectory: Trajectory) -> None:
+        """Refuse trajectories of which only some have velocities of walls."""
+        has_walls = trajectory.wall_velocity is not None
+        if self.has_walls is None:
+            self.has_walls = has_walls
+        if self.has_walls == has_walls:
+            return
+        expected = "no wall_velocity, as before"
+        if self.has_walls:
+            expected = "wall_velocity, as before"
+        raise DataError(
+            "velocities of walls in some trajectories only",
+            where=trajectory.name,
+            expected=expected,
+            fix="give zeros where walls rest",
         )
 
-    def _frames(
+    def _measure_spacing(self, trajectory: Trajectory) -> float:
+        """Return the distance of neighbouring particles at first [length]."""
+        description = self.description
+        raw_position, _ = next(trajectory.read())
+        raw_position = np.asarray(raw_position)
+        position = description.transform.transform_positions(raw_position)
+        self._check_positions(position, where=f"{trajectory.name}, frame 0")
+        spacing = description.spacing
+        if not spacing:
+            spacing = estimate_spacing(raw_position, description.radius)
+        return spacing / description.transform.scale
+
+    def _key(self, scenario: int, subset: str) -> ScenarioKey:
+        return ScenarioKey(
+            split=self.description.name,
+            size=SIZE,
+            version=VERSION,
+            scenario=scenario,
+            subset=subset,
+        )
+
+    def _read_frames(
         self, trajectory: Trajectory
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        """Yield positions and velocities in the unit box; without own velocities,
-        differences.
+        """Yield positions and velocities in the unit box.
+
+        A trajectory without velocities gets differences of positions:
+        ``v(f) = (x(f) - x(f-1)) / interval``, and ``v(0) = v(1)``.
         """
+        description = self.description
         before: NDArray[np.float32] | None = None
-        for number, (raw, own) in enumerate(trajectory.read()):
-            position = self.about.measure.place(raw)
-            self._check(trajectory, number, position)
-            if own is not None:
-                with np.errstate(
-                    over="ignore"
-                ):  # what is beyond float32 becomes infinite
-                    velocity = (own / self.about.measure.scale).astype(np.float32)
-                if not np.isfinite(velocity).all():
-                    raise DataError(
-                        "a velocity is not finite",
-                        where=f"{trajectory.name}, frame {number}",
-                    )
-                yield position, velocity
+        for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
+            where = f"{trajectory.name}, frame {number}"
+            position = description.transform.transform_positions(raw_position)
+            self._check_positions(position, where=where)
+            if raw_velocity is not None:
+                yield position, self._transform_velocities(raw_velocity, where=where)
             elif before is not None:
-                velocity = (
-                    (position.astype(np.float64) - before) * self.about.rate
-                ).astype(np.float32)
-                if number == 1:  # v(f) = (x(f) - x(f-1)) / interval, and v(0) = v(1)
+                step = position.astype(np.float64) - before
+                velocity = (step * description.rate).astype(np.float32)
+                if number == 1:
                     yield before, velocity
                 yield position, velocity
             before = position
 
-    def _check(
-        self, trajectory: Trajectory, number: int, position: NDArray[np.float32]
-    ) -> None:
-        """Refuse positions that are no numbers or lie outside the unit box; note their
-        extent.
-        """
-        where = f"{trajectory.name}, frame {number}"
+    def _transform_velocities(
+        self, raw_velocity: NDArray[np.floating], *, where: str
+    ) -> NDArray[np.float32]:
+        """Return velocities in the unit box [length/s]; refuse what is not finite."""
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            velocity = raw_velocity / self.description.transform.scale
+            velocity = velocity.astype(np.float32)
+        if not np.isfinite(velocity).all():
+            raise DataError("a velocity is not finite", where=where)
+        return velocity
+
+    def _check_positions(self, position: NDArray[np.float32], *, where: str) -> None:
+        """Refuse positions not finite or outside the box; note their extent."""
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -293,207 +353,267 @@ class _Building:
                 "particles lie outside the unit box",
                 where=where,
                 expected="[0, 1] x [0, 1]",
-                got=" x ".join(
-                    f"[{a:.6g}, {b:.6g}]" for a, b in zip(low, high, strict=True)
-                ),
+                got=format_box(low, high),
                 fix="fit the box of the data into the unit box: --rescale, and "
                 "--bounds if none are stated",
             )
-        about = self.about
-        if about.bounds is not None and self.spacing:
-            box = about.measure.box(about.bounds)
-            beyond = max(
-                max(a - p, q - b) for (a, b), p, q in zip(box, low, high, strict=True)
-            )
-            if beyond > self.spacing:  # features, clamps and scores rest on the bounds
-                scale = about.measure.scale
-                corner = np.asarray(about.measure.corner)
-                extent = zip(low * scale + corner, high * scale + corner, strict=True)
-                raise UsageError(
-                    "particles lie outside the stated bounds, by more than "
-                    "their spacing",
-                    where=f"{where}; --bounds, or bounds of the metadata",
-                    expected=f"bounds that hold "
-                    f"{' x '.join(f'[{a:.6g}, {b:.6g}]' for a, b in extent)}",
-                    got=about.bounds,
-                    fix="state the box of the data, in their own length",
-                )
-        self.low, self.high = np.minimum(self.low, low), np.maximum(self.high, high)
+        self._check_stated_bounds(low, high, where=where)
+        self.low = np.minimum(self.low, low)
+        self.high = np.maximum(self.high, high)
+
+    def _check_stated_bounds(
+        self, low: NDArray[np.float32], high: NDArray[np.float32], *, where: str
+    ) -> None:
+        """Refuse particles outside the stated bounds by more than their spacing.
+
+        Features, clamps and scores rest on the bounds.
+        """
+        description = self.description
+        if description.bounds is None or not self.spacing:
+            return
+        transform = description.transform
+        excess = 0.0  # largest distance outside the bounds [length]
+        for axis, (left, right) in enumerate(
+            transform.transform_box(description.bounds)
+        ):
+            excess = max(excess, left - low[axis], high[axis] - right)
+        if excess <= self.spacing:
+            return
+        corner = np.asarray(transform.corner)
+        source_low = low * transform.scale + corner
+        source_high = high * transform.scale + corner
+        raise UsageError(
+            "particles lie outside the stated bounds, by more than their spacing",
+            where=f"{where}; --bounds, or bounds of the metadata",
+            expected=f"bounds that hold {format_box(source_low, source_high)}",
+            got=description.bounds,
+            fix="state the box of the data, in their own length",
+        )
 
     def finish(self, command: str) -> Manifest:
         """Write manifest and description; return the manifest."""
-        about = self.about
-        content = {entry.scenario: entry.content_sha256[:16] for entry in self.entries}
-        ids = {
-            name: [e.scenario for e in self.entries if e.subset == name]
-            for name in HASHED_SUBSETS
-        }
-        keys = [self._key(i, "train") for i in ids["train"]]
+        name = self.description.name
+        short_hashes = {}
+        train_paths = []
+        ids: dict[str, list[int]] = {subset: [] for subset in HASHED_SUBSETS}
+        for entry in self.entries:
+            ids[entry.subset].append(entry.scenario)
+            short_hashes[entry.scenario] = entry.content_sha256[:16]
+            if entry.subset == "train":
+                key = self._key(entry.scenario, entry.subset)
+                train_paths.append(scenario_path(self.root, key))
         manifest = build_manifest(
             None,
             self.entries,
-            split=about.name,
+            split=name,
             size=SIZE,
             version=VERSION,
             subsets=ids,
             environment=describe_machine(DEVICE),
-            recorded=content,
-            statistics=file_statistics([scenario_path(self.root, key) for key in keys]),
+            recorded=short_hashes,
+            statistics=file_statistics(train_paths),
         )
         write_manifest(self.root, manifest)
+
+        statistics = {key: list(row) for key, row in manifest.statistics.items()}
         measured: dict[str, object] = {
             "dataset_sha256": manifest.dataset_sha256,
             "subset_sha256": manifest.subset_sha256,
-            "scenario_sha256": content,
-            "statistics": {
-                name: list(row) for name, row in manifest.statistics.items()
-            },
+            "scenario_sha256": short_hashes,
+            "statistics": statistics,
             "twin_floor": [],
         }
-        splits = {about.name: self._split(ids)}
-        described = {
+        registry = {
             "format": 1,
-            "splits": splits,
-            "measured": {about.name: {SIZE: measured}},
+            "splits": {name: self._describe_split(ids)},
+            "measured": {name: {SIZE: measured}},
         }
-        text = HEAD.format(command) + format_yaml(described)
-        (self.root / about.name / DESCRIPTION).write_text(text, encoding="utf-8")
+        text = HEAD.format(command) + format_yaml(registry)
+        (self.root / name / DESCRIPTION).write_text(text, encoding="utf-8")
         return manifest
 
-    def _split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
+    def _describe_split(self, ids: Mapping[str, Sequence[int]]) -> dict[str, object]:
         """Return the description of the split as plain values."""
-        about = self.about
-        bounds = (
-            about.measure.box(about.bounds)
-            if about.bounds
-            else zip(self.low, self.high, strict=True)
-        )
-        lengths = sorted({entry.frames for entry in self.entries})
-        tested = [entry for entry in self.entries if entry.subset == "test"]
-        task = self._task(shortest=min(entry.frames for entry in tested))
-        cells = task["score_grid"]["cells"]  # type: ignore[index]
-        counts = {entry.particles for entry in tested}
-        if len(counts) == 1:
-            particles = counts.pop()
-        else:
-            particles = max(entry.particles for entry in self.entries)
-        most = "particles in one test scenario; the most of any where they differ"
-        origin = "length of the source"
-        parameters = {
-            "particles": (particles, "1", most),
-            "grid": (
-                cells,
-                "1",
-                "cells across the unit box; predictions may leave the bounds by one",
-            ),
-            "substeps_per_frame": (
-                1,
-                "1",
-                "solver steps between recorded frames, 1 where they are unknown",
-            ),
-            "frame_rate": (about.rate, "1/s", "recorded frames per second"),
-            "density": (about.density, "mass/length^2", "rest density"),
-            "spacing": (
-                self.spacing,
-                "length",
-                "distance of neighbouring particles at first",
-            ),
-            "source_scale": (
-                about.measure.scale,
-                origin,
-                "what a unit of length is in the source",
-            ),
-            "source_x": (
-                about.measure.corner[0],
-                origin,
-                "x in the source of the lower left corner",
-            ),
-            "source_y": (
-                about.measure.corner[1],
-                origin,
-                "y in the source of the lower left corner",
-            ),
-        }
-        frames = {
-            n: format_ids([e.scenario for e in self.entries if e.frames == n])
-            for n in lengths
-        }
+        description = self.description
+        task = self._describe_task()
+        parameters = {}
+        for name, value, unit, meaning in self._list_parameters(task):
+            parameters[name] = {"value": value, "unit": unit, "description": meaning}
         size = {
             "subsets": {name: format_ids(scenarios) for name, scenarios in ids.items()},
-            "frames": lengths[0] if len(lengths) == 1 else frames,
-            "bounds": [[float(low), float(high)] for low, high in bounds],
+            "frames": self._describe_frames(),
+            "bounds": self._bounds(),
             "parameters": {},
             "task": task,
         }
         return {
             "version": VERSION,
-            "title": about.title or about.name,
-            "description": about.text or about.source,
-            "citation": about.citation,
-            "licence": about.licence,
+            "title": description.title or description.name,
+            "description": description.text or description.source,
+            "citation": description.citation,
+            "licence": description.licence,
             "generator": NO_GENERATOR,
-            "source": about.source,
-            "parameters": {
-                name: {"value": value, "unit": unit, "description": words}
-                for name, (value, unit, words) in parameters.items()
-            },
+            "source": description.source,
+            "parameters": parameters,
             "sizes": {SIZE: size},
         }
 
-    def _task(self, *, shortest: int) -> dict[str, object]:
+    def _list_parameters(
+        self, task: Mapping[str, Any]
+    ) -> list[tuple[str, object, str, str]]:
+        """Return name, value, unit and meaning of each parameter."""
+        description = self.description
+        transform = description.transform
+        return [
+            (
+                "particles",
+                self._particle_count(),
+                "1",
+                "particles in one test scenario; the most of any where they differ",
+            ),
+            (
+                "grid",
+                task["score_grid"]["cells"],
+                "1",
+                "cells across the unit box; predictions may leave the bounds by one",
+            ),
+            (
+                "substeps_per_frame",
+                1,
+                "1",
+                "solver steps between recorded frames, 1 where they are unknown",
+            ),
+            ("frame_rate", description.rate, "1/s", "recorded frames per second"),
+            ("density", description.density, "mass/length^2", "rest density"),
+            (
+                "spacing",
+                self.spacing,
+                "length",
+                "distance of neighbouring particles at first",
+            ),
+            (
+                "source_scale",
+                transform.scale,
+                "length of the source",
+                "what a unit of length is in the source",
+            ),
+            (
+                "source_x",
+                transform.corner[0],
+                "length of the source",
+                "x in the source of the lower left corner",
+            ),
+            (
+                "source_y",
+                transform.corner[1],
+                "length of the source",
+                "y in the source of the lower left corner",
+            ),
+        ]
+
+    def _test_entries(self) -> list[FileEntry]:
+        return [entry for entry in self.entries if entry.subset == "test"]
+
+    def _particle_count(self) -> int:
+        """Return the particles of a test scenario; the most of any if they differ."""
+        test_counts = {entry.particles for entry in self._test_entries()}
+        if len(test_counts) == 1:
+            return test_counts.pop()
+        return max(entry.particles for entry in self.entries)
+
+    def _bounds(self) -> list[list[float]]:
+        """Return the stated walls [length], else the extent of the positions."""
+        description = self.description
+        left, bottom = self.low
+        right, top = self.high
+        sides: Box = ((left, right), (bottom, top))
+        if description.bounds:
+            sides = description.transform.transform_box(description.bounds)
+        return [[float(low), float(high)] for low, high in sides]
+
+    def _describe_frames(self) -> int | dict[int, str]:
+        """Return the number of frames; by scenario ids where it differs."""
+        scenarios_of: dict[int, list[int]] = {}
+        for entry in self.entries:
+            scenarios_of.setdefault(entry.frames, []).append(entry.scenario)
+        frame_counts = sorted(scenarios_of)
+        if len(frame_counts) == 1:
+            return frame_counts[0]
+        return {count: format_ids(scenarios_of[count]) for count in frame_counts}
+
+    def _describe_task(self) -> dict[str, Any]:
         """Return the task, as far as the shortest test scenario allows one."""
-        about = self.about
-        if about.horizon is None:
-            horizon = shortest - about.input_frames
-        else:
-            horizon = about.horizon
-        last = about.input_frames + horizon - 1
+        description = self.description
+        shortest = min(entry.frames for entry in self._test_entries())
+        horizon = description.horizon
+        if horizon is None:
+            horizon = shortest - description.input_frames
+        last = description.input_frames + horizon - 1
         if horizon < 1 or last >= shortest:
+            got = f"{description.input_frames} given"
+            if description.horizon:
+                got += f", {horizon} to predict"
             raise UsageError(
                 "a test scenario is too short for the task",
                 where="--input-frames and --horizon",
                 expected=f"together at most {shortest} frames, one of them to predict",
-                got=f"{about.input_frames} given"
-                + (f", {horizon} to predict" if about.horizon else ""),
+                got=got,
             )
-        interest = sorted(set(about.frames_of_interest or (last,)))
-        if not about.input_frames <= interest[0] <= interest[-1] <= last:
+
+        interest = sorted(set(description.frames_of_interest or (last,)))
+        if not description.input_frames <= interest[0] <= interest[-1] <= last:
+            got = str(interest)
+            if interest[0] >= 0:
+                got = format_ids(interest)
             raise UsageError(
                 "a frame of interest is not predicted",
                 where="--frames-of-interest",
-                expected=f"frames {about.input_frames} to {last}",
-                got=format_ids(interest) if interest[0] >= 0 else interest,
+                expected=f"frames {description.input_frames} to {last}",
+                got=got,
             )
-        if about.full_box:
+
+        placement = Placement.NODES
+        if description.full_box:
             placement = Placement.CELL_CENTRES
-        else:
-            placement = Placement.NODES
-        cells = about.cells or self._suitable_cells(
-            placement, (about.input_frames, last)
-        )
+        cells = description.cells
+        if not cells:
+            ends = (description.input_frames, last)
+            cells = self._suitable_cells(placement, ends)
         return {
-            "input_frames": about.input_frames,
+            "input_frames": description.input_frames,
             "horizon": horizon,
             "frames_of_interest": interest,
             "score_grid": {"cells": cells, "placement": placement.value},
-            "radius": about.radius / about.measure.scale,
+            "radius": description.radius / description.transform.scale,
         }
 
     def _suitable_cells(self, placement: Placement, frames: tuple[int, int]) -> int:
-        """Return cells of some spacings, or as near as test scenarios cover enough
-        nodes in these frames.
+        """Return cells across a score grid that suits the spacing.
+
+        Where test scenarios cover too few nodes in these frames, it is the nearest
+        number by which they cover enough.
         """
-        suits = min(
-            MOST_CELLS, max(FEWEST_CELLS, round(1.0 / (PER_CELL * self.spacing)))
-        )
+        cells = round(1.0 / (SPACINGS_PER_CELL * self.spacing))
+        cells = min(MOST_CELLS, max(FEWEST_CELLS, cells))
+        clouds = partial(self._read_clouds, frames)
+        return fitting_cells(clouds, placement, near=cells) or cells
 
-        def clouds() -> Iterator[Cloud]:
-            for entry in self.entries:
-                if entry.subset == "test":
-                    key = self._key(entry.scenario, "test")
-                    with read_scenario(scenario_path(self.root, key)) as file:
-                        for frame in frames:
-                            position = file.read("position", slice(frame, frame + 1))[0]
-                            yield Cloud(position, len(position) * self.spacing**2)
+    def _read_clouds(self, frames: tuple[int, int]) -> Iterator[Cloud]:
+        """Yield the particles of some frames of every test scenario."""
+        for entry in self._test_entries():
+            key = self._key(entry.scenario, "test")
+            with read_scenario(scenario_path(self.root, key)) as file:
+                for frame in frames:
+                    position = file.read("position", slice(frame, frame + 1))[0]
+                    area = len(position) * self.spacing**2
+                    yield Cloud(position, area)
 
-        return fitting_cells(clouds, placement, near=suits) or suits
+
+def format_box(low: NDArray[np.floating], high: NDArray[np.floating]) -> str:
+    """Return a box for a message.
+
+    >>> format_box(np.array([0.0, 0.25]), np.array([1.0, 2.0]))
+    '[0, 1] x [0.25, 2]'
+    """
+    sides = zip(low, high, strict=True)
+    return " x ".join(f"[{left:.6g}, {right:.6g}]" for left, right in sides)

@@ -1,13 +1,14 @@
 """What both formats say beside positions: metadata.json, and kinds of particles.
 
-Programs of other code bases pass over keys of metadata.json that they do not know; ours
-stand together under ``lagbench``, so that what we export comes back with its task and
-its place in the box.
+Programs of other code bases pass over keys of metadata.json that they do not know. Ours
+stand together under ``lagbench``, so that an export comes back with its task and its
+place in the box.
 
-Both formats mark each particle with a number below 9, which their models embed; only a
-few have a meaning to the programs: particles that move as prescribed, and padding. Our
-materials go to numbers without such a meaning, one each, so that nothing is lost. On
-the way back a number that no material has must be told what it stands for, or left out.
+Both formats mark each particle with a number below 9, which their models embed. Only a
+few numbers mean something to the programs: particles that move as prescribed, and
+padding. Our materials get numbers without such a meaning, one each, so that nothing is
+lost. On the way back the user must say what a number without a material stands for, or
+leave its particles out.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -39,10 +41,12 @@ from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 NAME = "metadata.json"
 OWN_KEY = "lagbench"
 MAX_BYTES = 1 << 20
+
 Pair = tuple[FiniteFloat, FiniteFloat]
 Length = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-# frames and particles of every trajectory, by subset
+
 Shapes = Mapping[str, Sequence[tuple[int, int]]]
+"""Frames and particles of every trajectory, by subset."""
 
 
 class Format(enum.StrEnum):
@@ -52,110 +56,142 @@ class Format(enum.StrEnum):
     LAGRANGEBENCH_H5 = "lagrangebench-h5"
 
 
-# of the files of subsets
 ENDINGS = {
     Format.GNS_NPZ: ".npz",
     Format.LAGRANGEBENCH_H5: ".h5",
 }
+"""Endings of the files of subsets."""
 
-NUMBERS: Mapping[Format, Mapping[str, int]] = {  # of each material
+NUMBERS: Mapping[Format, Mapping[str, int]] = {
     Format.GNS_NPZ: {"liquid": 5, "snow": 6, "jelly": 7, "rope": 8},
     Format.LAGRANGEBENCH_H5: {"liquid": 0, "jelly": 4, "snow": 5, "rope": 6},
 }
+"""Number of each material."""
 
-# of particles of a wall at rest, and of one that moves
 WALL_NUMBERS: Mapping[Format, tuple[int, int]] = {
     Format.GNS_NPZ: (3, 3),
     Format.LAGRANGEBENCH_H5: (1, 2),
 }
+"""Numbers of particles of a wall at rest, and of one that moves."""
 
-MEANINGS: Mapping[Format, Mapping[int, str]] = {  # of numbers without a material
+MEANINGS: Mapping[Format, Mapping[int, str]] = {
     Format.GNS_NPZ: {0: "rigid", 3: "kinematic: a boundary that moves as prescribed"},
     Format.LAGRANGEBENCH_H5: {1: "solid wall", 2: "moving wall", 3: "rigid body"},
 }
+"""What numbers without a material mean."""
 
-PADDING = -1  # number of particles that are not there (lagrangebench-h5)
-DROP = "drop"  # what a number is mapped to whose particles are left out
-_DROPPED = -1
+PADDING = -1
+"""Number of particles that are not there (lagrangebench-h5)."""
+
+DROP = "drop"
+"""Stands for the material of particles that are left out."""
+
+DROPPED_CODE = -1
+
+SHORT_NAMES = {"vel": "velocity", "acc": "acceleration"}
+"""Prefixes of statistics in metadata.json, and ours."""
 
 
 def parse_format(name: str) -> Format:
     """Return a format by name; of an unknown one the UsageError names the nearest."""
-    known = [form.value for form in Format]
-    if name not in known:
+    names = [form.value for form in Format]
+    if name not in names:
         raise UsageError(
-            f"no format {name!r}", where="--format", fix=suggest_name(name, known)
+            f"no format {name!r}", where="--format", fix=suggest_name(name, names)
         )
     return Format(name)
 
 
-def numbers_of(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
+def material_numbers(form: Format, material: NDArray[np.integer]) -> NDArray[np.int64]:
     """Return the number of each particle's material, shape [particle]."""
-    return np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64).take(
-        material
-    )
+    numbers = np.array([NUMBERS[form][name] for name in MATERIALS], dtype=np.int64)
+    return numbers.take(material)
 
 
-def materials_of(
+def find_materials(
     form: Format,
     numbers: NDArray[Any],
-    particles: int,
+    particle_count: int,
     *,
-    given: Mapping[int, str],
+    user_kinds: Mapping[int, str],
     where: str,
 ) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-    """Return the material of each particle kept, and a mask over all; ``given`` is what
-    the user said.
+    """Return the material of each particle that is kept, and a mask over all.
+
+    Args:
+        form: the format.
+        numbers: the number of each particle, or one for all.
+        particle_count: particles of the trajectory.
+        user_kinds: number to material, or to "drop", as the user says.
+        where: the trajectory, for messages.
+
+    Raises:
+        UnreadableFileError: no integers, numbers without a material, or no particle is
+            left.
     """
-    gns = form is Format.GNS_NPZ
-    if numbers.dtype.kind not in "iu" or numbers.shape not in [
-        (particles,),
-        *([(), (1,)] if gns else []),
-    ]:
-        raise UnreadableFileError(
-            "these are no kinds of particles",
-            where=where,
-            expected=f"an integer, or {particles} of them"
-            if gns
-            else f"{particles} integers",
-            got=f"{numbers.dtype} of shape {numbers.shape}",
-        )
-    numbers = np.broadcast_to(numbers, (particles,))
-    known = (
-        {number: name for name, number in NUMBERS[form].items()}
-        | {PADDING: DROP}
-        | dict(given)
-    )
-    codes = {
-        number: _DROPPED if name == DROP else _code(name)
-        for number, name in known.items()
-    }
-    found = np.unique(numbers).tolist()
-    strange = [number for number in found if number not in codes]
-    if strange:
+    _check_kinds(form, numbers, particle_count, where=where)
+    numbers = np.broadcast_to(numbers, (particle_count,))
+    name_of = {PADDING: DROP}
+    for name, number in NUMBERS[form].items():
+        name_of[number] = name
+    name_of.update(user_kinds)
+    code_of = {number: _material_code(name) for number, name in name_of.items()}
+
+    stored_numbers = np.unique(numbers).tolist()
+    unknown_numbers = [number for number in stored_numbers if number not in code_of]
+    if unknown_numbers:
+        meanings = MEANINGS[form]
+        known = [f"{number} ({name})" for number, name in sorted(name_of.items())]
+        unknown = [f"{n} ({meanings.get(n, 'unknown')})" for n in unknown_numbers]
+        first = unknown_numbers[0]
         raise UnreadableFileError(
             "particles of a kind that no material is known for",
             where=where,
-            expected=", ".join(
-                f"{number} ({name})" for number, name in sorted(known.items())
-            ),
-            got=", ".join(f"{n} ({MEANINGS[form].get(n, 'unknown')})" for n in strange),
-            fix=f"say what they stand for: --kinds {strange[0]}=jelly, or leave them "
-            f"out: {strange[0]}=drop",
+            expected=", ".join(known),
+            got=", ".join(unknown),
+            fix=f"say what they stand for: --kinds {first}=jelly, or leave them "
+            f"out: {first}=drop",
         )
+
     material = np.empty(numbers.shape, dtype=np.int8)
-    for number in found:
-        material[numbers == number] = codes[number]
-    kept = material != _DROPPED
-    if not kept.any():
+    for number in stored_numbers:
+        material[numbers == number] = code_of[number]
+    is_kept = material != DROPPED_CODE
+    if not is_kept.any():
         raise UnreadableFileError("every particle is padding or left out", where=where)
-    return material[kept], kept
+    return material[is_kept], is_kept
 
 
-def _code(name: str) -> int:
+def _check_kinds(
+    form: Format, numbers: NDArray[Any], particle_count: int, *, where: str
+) -> None:
+    """Refuse kinds that are not one integer per particle.
+
+    Files of gns-npz may have one for all particles.
+    """
+    shapes: list[tuple[int, ...]] = [(particle_count,)]
+    expected = f"{particle_count} integers"
+    if form is Format.GNS_NPZ:
+        shapes += [(), (1,)]
+        expected = f"an integer, or {particle_count} of them"
+    if numbers.dtype.kind not in "iu" or numbers.shape not in shapes:
+        raise UnreadableFileError(
+            "these are no kinds of particles",
+            where=where,
+            expected=expected,
+            got=f"{numbers.dtype} of shape {numbers.shape}",
+        )
+
+
+def _material_code(name: str) -> int:
+    if name == DROP:
+        return DROPPED_CODE
     if name not in MATERIALS:
-        fix = suggest_name(name, (*MATERIALS, DROP))
-        raise UsageError(f"no material {name!r}", where="--kinds", fix=fix)
+        raise UsageError(
+            f"no material {name!r}",
+            where="--kinds",
+            fix=suggest_name(name, (*MATERIALS, DROP)),
+        )
     return MATERIALS.index(name)
 
 
@@ -166,19 +202,20 @@ def parse_kinds(text: str | None) -> dict[int, str]:
     {3: 'jelly', 0: 'drop'}
     """
     kinds: dict[int, str] = {}
-    for part in text.split(",") if text else ():
+    if not text:
+        return kinds
+    for part in text.split(","):
         number, _, name = part.strip().partition("=")
         if not re.fullmatch(r"-?[0-9]{1,9}", number):
             raise UsageError(
                 "bad kinds", where="--kinds", expected="as in 3=jelly,0=drop", got=text
             )
-        if name != DROP:
-            _code(name)
+        _material_code(name)  # refuses unknown names
         kinds[int(number)] = name
     return kinds
 
 
-class Hints(BaseModel):
+class LagbenchKeys(BaseModel):
     """What our own exports add: where the box lies and what the task is."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -198,7 +235,7 @@ class Hints(BaseModel):
     wall_particle_type: tuple[int, ...] = ()
 
 
-class Source(BaseModel):
+class SourceMetadata(BaseModel):
     """What a metadata.json says, as far as a local split needs it."""
 
     model_config = ConfigDict(frozen=True)
@@ -211,132 +248,208 @@ class Source(BaseModel):
     spacing: Length | None = Field(alias="dx")
     # along x and y
     periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")
-    hints: Hints = Field(alias="lagbench")  # what our own exports add
+    lagbench: LagbenchKeys  # what our own exports add
 
 
-def floor_of(value: float) -> float:
-    """Return the largest multiple of 2^-20 below: taken off a float32 beyond it,
-    nothing is lost.
+def round_down(value: float) -> float:
+    """Return the largest multiple of 2^-20 below a value.
+
+    Taken off a float32 beyond it, nothing is lost.
     """
     return math.floor(value * 2**20) / 2**20
 
 
-def describe(
-    size: Size,
-    form: Format,
-    shapes: Shapes,
-    statistics: Mapping[str, tuple[float, ...]],
-    *,
-    title: str,
-    dataset_sha256: str,
-    spacing: float,
-    origin: tuple[float, float],
-    from_walls: bool,
-    free_slip: bool,
-    wall: float | None = None,
+@dataclass(frozen=True, kw_only=True)
+class ExportInfo:
+    """What metadata.json says of an export beside its registry entry."""
+
+    title: str  # title of the split
+    dataset_sha256: str  # hash of the data set
+    statistics: Mapping[str, tuple[float, ...]]  # over train
+    spacing: float  # distance of neighbouring particles at first [length]
+    origin: tuple[float, float]  # what was taken off every position [length]
+    from_walls: bool  # whether the bounds are the walls
+    is_free_slip: bool  # whether liquid slides along the walls
+    # layers of wall particles are so thick [length]; None without them
+    wall_thickness: float | None
+
+
+def describe_export(
+    size: Size, form: Format, shapes: Shapes, info: ExportInfo
 ) -> dict[str, object]:
-    """Return the metadata of an export whose walls, where they are particles, are
-    ``wall`` thick [length].
-    """
-    grid = size.task.score_grid
-    task = size.task
-    short = {"vel": "velocity", "acc": "acceleration"}
-    common = {
-        "bounds": [
-            [low - o, high - o]
-            for (low, high), o in zip(size.bounds, origin, strict=True)
-        ],
-        "default_connectivity_radius": task.radius,
+    """Return the metadata of an export."""
+    metadata = _common_metadata(size, info)
+    if form is Format.GNS_NPZ:
+        metadata |= _gns_metadata(size, shapes)
+    else:
+        metadata |= _lagrangebench_metadata(size, shapes, info)
+    metadata[OWN_KEY] = _lagbench_keys(size, form, info)
+    return metadata
+
+
+def _common_metadata(size: Size, info: ExportInfo) -> dict[str, object]:
+    bounds = []
+    for (low, high), origin in zip(size.bounds, info.origin, strict=True):
+        bounds.append([low - origin, high - origin])
+    metadata: dict[str, object] = {
+        "bounds": bounds,
+        "default_connectivity_radius": size.task.radius,
         "dim": 2,
-        **{f"{s}_mean": list(statistics[f"{name}_mean"]) for s, name in short.items()},
-        # Models divide by a deviation: 0 becomes 1.
-        **{
-            f"{s}_std": [v or 1.0 for v in statistics[f"{name}_std"]]
-            for s, name in short.items()
-        },
     }
-    own = {
+    for prefix, name in SHORT_NAMES.items():
+        metadata[f"{prefix}_mean"] = list(info.statistics[f"{name}_mean"])
+    for prefix, name in SHORT_NAMES.items():
+        # Models divide by a deviation: 0 becomes 1.
+        deviations = info.statistics[f"{name}_std"]
+        metadata[f"{prefix}_std"] = [deviation or 1.0 for deviation in deviations]
+    return metadata
+
+
+def _gns_metadata(size: Size, shapes: Shapes) -> dict[str, object]:
+    frame_counts = []
+    for subset_shapes in shapes.values():
+        for frame_count, _ in subset_shapes:
+            frame_counts.append(frame_count)
+    return {"sequence_length": min(frame_counts), "dt": size.frame_interval}
+
+
+def _lagrangebench_metadata(
+    size: Size, shapes: Shapes, info: ExportInfo
+) -> dict[str, object]:
+    viscosity = size.parameters.get("liquid_viscosity")
+    gravity = size.parameters.get("gravity")
+    frame_counts = {}
+    most_particles = 0
+    for subset, subset_shapes in shapes.items():
+        frame_counts[subset] = subset_shapes[0][0]
+        for _, particle_count in subset_shapes:
+            most_particles = max(most_particles, particle_count)
+
+    metadata: dict[str, object] = {
+        "case": size.split.upper(),
+        "solver": "MPM" if size.simulated else "unknown",
+        "density_evolution": False,
+        "dx": info.spacing,
+        "dt": size.dt,  # of the solver
+        "write_every": size.substeps_per_frame,
+        "t_end": (max(frame_counts.values()) - 1) * size.frame_interval,
+        "viscosity": None if viscosity is None else viscosity.value,
+        "p_bg_factor": 0.0,
+        "g_ext_magnitude": 0.0 if gravity is None else gravity.value,
+        "artificial_alpha": 0.0,
+        "free_slip": info.is_free_slip,
+        "is_bc_trick": False,
+    }
+    # One less than frames: the last one is a target only, as in the data sets of that
+    # code base.
+    for subset in ("train", "test"):
+        metadata[f"sequence_length_{subset}"] = frame_counts[subset] - 1
+    for subset in ("train", "test"):
+        metadata[f"num_trajs_{subset}"] = len(shapes[subset])
+    metadata["num_particles_max"] = most_particles
+    metadata["periodic_boundary_conditions"] = [False, False]
+
+    # Its cell lists start at 0 and are as long as the bounds are apart: particles
+    # beyond the difference would lose their neighbours.
+    if info.wall_thickness is not None:
+        bounds = []
+        for (_, high), origin in zip(size.bounds, info.origin, strict=True):
+            bounds.append([0.0, high + info.wall_thickness - origin])
+        metadata["bounds"] = bounds
+    elif not info.from_walls:
+        metadata["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
+    return metadata
+
+
+def _lagbench_keys(size: Size, form: Format, info: ExportInfo) -> dict[str, object]:
+    task = size.task
+    wall_numbers: list[int] = []
+    if info.wall_thickness is not None:
+        wall_numbers = sorted(set(WALL_NUMBERS[form]))
+    return {
         "split": size.split,
         "size": size.name,
         "version": size.version,
-        "title": title,
-        "dataset_sha256": dataset_sha256,
+        "title": info.title,
+        "dataset_sha256": info.dataset_sha256,
         "particle_type": {name: NUMBERS[form][name] for name in MATERIALS},
-        "origin": list(origin),
-        "bounds": [list(pair) for pair in size.bounds],
-        "spacing": spacing,
+        "origin": list(info.origin),
+        "bounds": [list(side) for side in size.bounds],
+        "spacing": info.spacing,
         "density": size.value("density"),
         "input_frames": task.input_frames,
         "horizon": task.horizon,
         "frames_of_interest": list(task.frames_of_interest),
-        "cells": grid.cells,
-        "placement": grid.placement,
-        "wall_particle_type": [] if wall is None else sorted({*WALL_NUMBERS[form]}),
+        "cells": task.score_grid.cells,
+        "placement": task.score_grid.placement,
+        "wall_particle_type": wall_numbers,
     }
-    if form is Format.GNS_NPZ:
-        shortest = min(frames for subset in shapes.values() for frames, _ in subset)
-        special: dict[str, object] = {
-            "sequence_length": shortest,
-            "dt": size.frame_interval,
-        }
-    else:
-        parameters = {
-            name: parameter.value for name, parameter in size.parameters.items()
-        }
-        frames_of = {subset: rows[0][0] for subset, rows in shapes.items()}
-        special = {
-            "case": size.split.upper(),
-            "solver": "MPM" if size.simulated else "unknown",
-            "density_evolution": False,
-            "dx": spacing,
-            "dt": size.dt,  # of the solver
-            "write_every": size.substeps_per_frame,
-            "t_end": (max(frames_of.values()) - 1) * size.frame_interval,
-            "viscosity": parameters.get("liquid_viscosity"),
-            "p_bg_factor": 0.0,
-            "g_ext_magnitude": parameters.get("gravity", 0.0),
-            "artificial_alpha": 0.0,
-            "free_slip": free_slip,
-            "is_bc_trick": False,
-            # One less than frames: the last one is a target only, as in the data sets
-            # of that code base.
-            **{
-                f"sequence_length_{subset}": frames_of[subset] - 1
-                for subset in ("train", "test")
-            },
-            **{
-                f"num_trajs_{subset}": len(shapes[subset])
-                for subset in ("train", "test")
-            },
-            "num_particles_max": max(n for rows in shapes.values() for _, n in rows),
-            "periodic_boundary_conditions": [False, False],
-        }
-        # Its cell lists start at 0 and are as long as the bounds are apart: particles
-        # beyond the difference would lose their neighbours.
-        if wall is not None:
-            special["bounds"] = [
-                [0.0, h + wall - o]
-                for (_, h), o in zip(size.bounds, origin, strict=True)
-            ]
-        elif not from_walls:
-            special["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
-    return {**common, **special, OWN_KEY: own}
 
 
 def write_metadata(folder: Path, metadata: Mapping[str, object]) -> Path:
     """Write metadata.json whole or not at all; return its path."""
     path = folder / NAME
-    write_atomically(
-        path, (json.dumps(metadata, indent=1) + "\n").encode(), option="--output"
-    )
+    text = json.dumps(metadata, indent=1) + "\n"
+    write_atomically(path, text.encode(), option="--output")
     return path
 
 
-def read_source(folder: Path, form: Format) -> Source:
-    """Return what a metadata.json says; what is missing, no JSON or incomplete is an
-    UnreadableFileError.
+def read_metadata(folder: Path, form: Format) -> SourceMetadata:
+    """Return what a metadata.json says.
+
+    Raises:
+        UnreadableFileError: it is missing, no JSON, or lacks what a split needs.
     """
     path = folder / NAME
+    values = _read_json(path)
+    # Newer GNS programs keep one block for training and one for rollouts.
+    block = values.get("train")
+    if isinstance(block, dict):
+        values = block
+    if values.get("dim", 2) != 2:
+        raise UnreadableFileError(
+            "the data are not plane",
+            where=f"{path}, key dim",
+            expected=2,
+            got=repr(values["dim"]),
+        )
+    spacing = None
+    substeps = 1
+    if form is Format.LAGRANGEBENCH_H5:
+        spacing = values.get("dx")
+        substeps = values.get("write_every", 1)
+    numbers = TypeAdapter(float)
+    try:
+        step = numbers.validate_python(values.get("dt") or 0.0)
+        frame_interval = step * numbers.validate_python(substeps)
+        return SourceMetadata.model_validate(
+            {
+                "bounds": values.get("bounds"),
+                "default_connectivity_radius": values.get(
+                    "default_connectivity_radius"
+                ),
+                "dt": frame_interval or None,
+                "dx": spacing,
+                "periodic_boundary_conditions": values.get(
+                    "periodic_boundary_conditions"
+                )
+                or (False, False),
+                OWN_KEY: values.get(OWN_KEY) or {},
+            }
+        )
+    except ValidationError as error:
+        first = error.errors()[0]
+    key = ".".join(map(str, first["loc"] or ("dt",)))
+    raise UnreadableFileError(
+        "the metadata lack what a split needs, or state it otherwise",
+        where=f"{path}, key {key}",
+        expected=first["msg"],
+        got=first["input"],
+    )
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """Return the JSON object of a file of at most MAX_BYTES."""
     where = str(path)
     try:
         with path.open("rb") as stream:
@@ -354,46 +467,4 @@ def read_source(folder: Path, form: Format) -> Source:
         raise UnreadableFileError(
             "the metadata are no JSON object", where=where, got=type(values).__name__
         )
-    # Newer GNS programs keep one block for training and one for rollouts.
-    block = values.get("train")
-    if isinstance(block, dict):
-        values = block
-    else:
-        values = values
-    if values.get("dim", 2) != 2:
-        raise UnreadableFileError(
-            "the data are not plane",
-            where=f"{path}, key dim",
-            expected=2,
-            got=repr(values["dim"]),
-        )
-    if form is Format.LAGRANGEBENCH_H5:
-        every = values.get("write_every", 1)
-    else:
-        every = 1
-    try:
-        step = TypeAdapter(float).validate_python(values.get("dt") or 0.0)
-        steps = TypeAdapter(float).validate_python(every)
-        return Source.model_validate(
-            {
-                "bounds": values.get("bounds"),
-                "default_connectivity_radius": values.get(
-                    "default_connectivity_radius"
-                ),
-                "dt": step * steps or None,
-                "dx": values.get("dx") if form is Format.LAGRANGEBENCH_H5 else None,
-                "periodic_boundary_conditions": values.get(
-                    "periodic_boundary_conditions"
-                )
-                or (False, False),
-                OWN_KEY: values.get(OWN_KEY) or {},
-            }
-        )
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise UnreadableFileError(
-            "the metadata lack what a split needs, or state it otherwise",
-            where=f"{path}, key {'.'.join(map(str, first['loc'] or ('dt',)))}",
-            expected=first["msg"],
-            got=first["input"],
-        ) from None
+    return values

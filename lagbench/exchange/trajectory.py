@@ -1,6 +1,4 @@
-"""Data from elsewhere: trajectories, which formats are read into, and what a user says
-of them.
-"""
+"""Trajectories from elsewhere, and what a user or their metadata say of them."""
 
 from __future__ import annotations
 
@@ -14,36 +12,57 @@ from typing import IO, Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_config
-from typing_extensions import (
-    TypedDict,
-)  # pydantic reads that of Python 3.12 and later only
+
+# pydantic reads the TypedDict of Python 3.12 and later only
+from typing_extensions import TypedDict
 
 from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import DataError, UnreadableFileError, UsageError, suggest_name
-from lagbench.submission.findings import quoted
-
-from .mistakes import misplaced_axes
+from lagbench.submission.issues import quote
 
 Array = NDArray[np.floating]
-# positions [length of the source], velocities [its length/s] if any
-Frame = tuple[Array, Array | None]
-# Frames of a trajectory, what returns the positions of one of them, and the kind of
-# each particle.
-Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
-# low and high walls along x and y
-Box = tuple[tuple[float, float], tuple[float, float]]
 
-HARMLESS = 1 << 28  # bytes that may come of anything
-MOST_INFLATION = 200  # times its own length that a larger array may unpack to
+Frame = tuple[Array, Array | None]
+"""Positions [length of the source] and velocities [its length/s], if any."""
+
+Run = tuple[int, Callable[[int], NDArray[np.float32]], NDArray[np.int64]]
+"""What a format writes of a trajectory.
+
+The number of frames, a function that returns the positions of one of them, and the kind
+of each particle.
+"""
+
+Box = tuple[tuple[float, float], tuple[float, float]]
+"""Low and high walls along x and y."""
+
+COMPONENTS = 2
+
+HARMLESS_BYTES = 1 << 28
+"""Length that an array may always unpack to [bytes]."""
+
+MOST_INFLATION = 200
+"""Times its own length that a larger array may unpack to.
+
+Moving particles compress by two or so, resting ones by a hundred: more was made to fill
+the memory.
+"""
 
 LEAST = 1e-30
-MOST = 1e30  # what a length, a time or a density may be: squares of them are floats
+MOST = 1e30
+"""What a length, a time or a density may be: squares of them are floats."""
+
 FEWEST_CELLS = 4
-MOST_CELLS = 4096  # across of a score grid
-WIDE = 3.0  # radii within which neighbours are counted to estimate the spacing
+MOST_CELLS = 4096
+"""Cells across a score grid."""
+
+NEIGHBOUR_RADII = 3.0
+"""Radii within which neighbours are counted to estimate the spacing."""
+
+INTERIOR_QUANTILE = 0.75
+"""Quantile of neighbour counts that stands for the inside of the material."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,62 +76,65 @@ class Trajectory:
     read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
     # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
     wall_velocity: Array | None = None
-    # facts that the file states and hashes
+    # parameters that the file states and hashes
     parameters: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Measure:
-    """How lengths of the source become the unit box's, ``(x - corner) / scale``: powers
-    of 2 lose no bit.
+class BoxTransform:
+    """How lengths of the source become the unit box's: ``(x - corner) / scale``.
+
+    A scale that is a power of two loses no bit.
     """
 
     scale: float = 1.0
     corner: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def fitting(cls, bounds: Box) -> Measure:
-        """Return the measure of the least scale by which a box fits, the corner 0 where
-        that is enough.
+    def fit(cls, bounds: Box) -> BoxTransform:
+        """Return the transform of the least scale by which a box fits.
+
+        The corner is 0 where that is enough.
         """
         low, high = np.array(bounds, dtype=np.float64).T
         corner = low
-        if (low >= 0.0).all() and (high <= _power(float(high.max()))).all():
-            corner = np.zeros(2)
+        scale_from_origin = power_of_two(float(high.max()))
+        if (low >= 0.0).all() and (high <= scale_from_origin).all():
+            corner = np.zeros(COMPONENTS)
         return cls(
-            scale=_power(float((high - corner).max())),
+            scale=power_of_two(float((high - corner).max())),
             corner=(float(corner[0]), float(corner[1])),
         )
 
-    def place(self, position: Array) -> NDArray[np.float32]:
+    def transform_positions(self, position: Array) -> NDArray[np.float32]:
         """Return positions in the unit box, float32."""
         if self.scale != 1.0 or any(self.corner):
             position = (position.astype(np.float64) - self.corner) / self.scale
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
             return position.astype(np.float32, copy=False)
 
-    def box(self, bounds: Box) -> Box:
+    def transform_box(self, bounds: Box) -> Box:
         """Return a box of the source in the unit box."""
-        (left, right), (bottom, top) = (
-            tuple((value - corner) / self.scale for value in pair)
-            for pair, corner in zip(bounds, self.corner, strict=True)
-        )
-        return (left, right), (bottom, top)
+        sides = []
+        for (low, high), corner in zip(bounds, self.corner, strict=True):
+            side = ((low - corner) / self.scale, (high - corner) / self.scale)
+            sides.append(side)
+        return sides[0], sides[1]
 
 
-def _power(length: float) -> float:
+def power_of_two(length: float) -> float:
     """Return the least power of two that is not below a length, at least 1."""
     if length > 1.0:
         return 2.0 ** max(0, math.ceil(math.log2(length)))
     return 1.0
 
 
-# one that a message can spell out
 Count = Annotated[int, Field(gt=-(1 << 31), lt=1 << 31)]
+"""A number that a message can print."""
 
 
 @with_config(ConfigDict(extra="forbid"))
-class Wishes(TypedDict, total=False):
+class DataOptions(TypedDict, total=False):
     """What a user may say of data from elsewhere; see :class:`Description`."""
 
     title: str
@@ -132,42 +154,46 @@ class Wishes(TypedDict, total=False):
     full_box: bool
 
 
-def read_wishes(path: Path) -> Wishes:
+def read_options(path: Path) -> DataOptions:
     """Return what a YAML file says of the data."""
-    return _checked(read_yaml(path), where=f"{path}, key ")
+    return _validate_options(read_yaml(path), where=f"{path}, key ")
 
 
-def check_wishes(wishes: Wishes) -> Wishes:
-    """Return what a caller says of the data as plain values, NumPy's converted; None
-    says nothing.
+def check_options(options: DataOptions) -> DataOptions:
+    """Return what a caller says of the data as plain values, without None.
+
+    Values of NumPy become those of Python.
     """
-    said = {name: value for name, value in wishes.items() if value is not None}
-    plain = {
-        n: v.tolist() if isinstance(v, np.ndarray | np.generic) else v
-        for n, v in said.items()
-    }
-    return _checked(plain, where="")
+    plain: dict[str, object] = {}
+    for name, value in options.items():
+        if isinstance(value, np.ndarray | np.generic):
+            plain[name] = value.tolist()
+        elif value is not None:
+            plain[name] = value
+    return _validate_options(plain, where="")
 
 
-def _checked(given: object, *, where: str) -> Wishes:
+def _validate_options(options: object, *, where: str) -> DataOptions:
     try:
-        return TypeAdapter(Wishes).validate_python(given)
+        return TypeAdapter(DataOptions).validate_python(options)
     except ValidationError as error:
         first = error.errors()[0]
-        value = first["input"]
-        key = quoted(".".join(map(str, first["loc"])))[1:-1]
-        strange = first["type"] == "extra_forbidden"
-        raise UsageError(
-            "this does not describe data",
-            where=f"{where}{key or '(whole file)'}",
-            expected=first["msg"],
-            got=quoted(value)
-            if isinstance(value, str | int | float)
-            else f"a {type(value).__name__}",
-            fix=suggest_name(key, Wishes.__annotations__)
-            if strange
-            else "docs/exchange.md has the keys",
-        ) from None
+
+    key = quote(".".join(map(str, first["loc"])))[1:-1]
+    fix = "docs/exchange.md has the keys"
+    if first["type"] == "extra_forbidden":
+        fix = suggest_name(key, DataOptions.__annotations__)
+    value = first["input"]
+    got = f"a {type(value).__name__}"
+    if isinstance(value, str | int | float):
+        got = quote(value)
+    raise UsageError(
+        "this does not describe data",
+        where=f"{where}{key or '(whole file)'}",
+        expected=first["msg"],
+        got=got,
+        fix=fix,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,65 +227,77 @@ class Description:
     cells: int | None = None
     # whether material fills the box, so that vorticity ranks; else positions rank
     full_box: bool = False
-    measure: Measure = field(init=False, default=Measure())
+    transform: BoxTransform = field(init=False, default=BoxTransform())
 
     def __post_init__(self) -> None:
-        """Check what the user gave."""
-        if not is_split_name(self.name):
-            proposal = (
-                re.sub(r"[^a-z0-9_-]+", "-", self.name.lower()).strip("-_0123456789")
-                or "own"
-            )
-            raise UsageError(
-                "a split cannot have that name",
-                where="--output, its last part",
-                expected="small letters, digits, - and _, a letter first",
-                got=self.name,
-                fix=f"--output {proposal}",
-            )
-        positive = {
-            "--radius": self.radius,
-            "--frame-interval": self.frame_interval,
-            "density": self.density,
-            "spacing": 1.0 if self.spacing is None else self.spacing,
-        }
-        for option, value in positive.items():
-            if not (LEAST <= value <= MOST):
-                raise UsageError(
-                    "not a number above 0 that computes", where=option, got=value
-                )
-        counts = (
-            ("--input-frames", self.input_frames, 2),
-            ("--horizon", self.horizon, 1),
-        )
-        for option, count, least in counts:
-            if count is not None and count < least:
-                expected = f"at least {least}"
-                raise UsageError(
-                    "too few frames for a task",
-                    where=option,
-                    expected=expected,
-                    got=count,
-                )
-        if self.bounds is not None and any(
-            not -MOST <= low < high <= MOST for low, high in self.bounds
-        ):
-            raise UsageError(
-                "bounds run from low to high", where="--bounds", got=self.bounds
-            )
-        if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
-            expected = f"{FEWEST_CELLS} to {MOST_CELLS}"
-            raise UsageError(
-                "no such score grid", where="--cells", expected=expected, got=self.cells
-            )
+        """Check what the user said, and fit the box where that is asked."""
+        self._check_name()
+        self._check_quantities()
+        self._check_counts()
+        self._check_bounds()
         if self.rescale:
             if self.bounds is None:
                 raise UsageError(
-                    "what is to fit the unit box?",
+                    "there are no bounds to fit into the unit box",
                     where="--rescale",
                     fix="add --bounds",
                 )
-            object.__setattr__(self, "measure", Measure.fitting(self.bounds))
+            object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
+
+    def _check_name(self) -> None:
+        if is_split_name(self.name):
+            return
+        plain = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower())
+        proposal = plain.strip("-_0123456789") or "own"
+        raise UsageError(
+            "a split cannot have that name",
+            where="--output, its last part",
+            expected="small letters, digits, - and _, a letter first",
+            got=self.name,
+            fix=f"--output {proposal}",
+        )
+
+    def _check_quantities(self) -> None:
+        for option, value in (
+            ("--radius", self.radius),
+            ("--frame-interval", self.frame_interval),
+            ("density", self.density),
+            ("spacing", self.spacing),
+        ):
+            if value is not None and not LEAST <= value <= MOST:
+                raise UsageError(
+                    "not a number above 0",
+                    where=option,
+                    expected=f"{LEAST:g} to {MOST:g}",
+                    got=value,
+                )
+
+    def _check_counts(self) -> None:
+        for option, count, least in (
+            ("--input-frames", self.input_frames, 2),
+            ("--horizon", self.horizon, 1),
+        ):
+            if count is not None and count < least:
+                raise UsageError(
+                    "too few frames for a task",
+                    where=option,
+                    expected=f"at least {least}",
+                    got=count,
+                )
+        if self.cells is not None and not FEWEST_CELLS <= self.cells <= MOST_CELLS:
+            raise UsageError(
+                "no such score grid",
+                where="--cells",
+                expected=f"{FEWEST_CELLS} to {MOST_CELLS}",
+                got=self.cells,
+            )
+
+    def _check_bounds(self) -> None:
+        for low, high in self.bounds or ():
+            if not -MOST <= low < high <= MOST:
+                raise UsageError(
+                    "bounds run from low to high", where="--bounds", got=self.bounds
+                )
 
     @property
     def rate(self) -> float:
@@ -268,31 +306,35 @@ class Description:
 
 
 def estimate_spacing(position: Array, radius: float) -> float:
-    """Return the distance of neighbouring particles in one frame,
-    ``sqrt(area / particles)``.
+    """Return the distance of neighbouring particles in one frame.
+
+    It is ``sqrt(area / particles)``, counted around particles inside the material.
     """
     from scipy.spatial import cKDTree
 
     points = position.astype(np.float64)
-    reach = WIDE * radius
+    reach = NEIGHBOUR_RADII * radius
     counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
-    # deep inside the material: this leaves surfaces out
-    inside = float(np.quantile(counts, 0.75))
-    if inside < 2.0 and len(points) > 1:  # a particle counts itself
+    # This quantile leaves surfaces out.
+    inside_count = float(np.quantile(counts, INTERIOR_QUANTILE))
+    if inside_count < 2.0 and len(points) > 1:  # a particle counts itself
         raise UsageError(
             "particles have no neighbours: their spacing cannot be estimated",
             where="--radius",
-            expected=f"neighbours within {WIDE:g} radii",
+            expected=f"neighbours within {NEIGHBOUR_RADII:g} radii",
             got=radius,
             fix="a larger --radius, or say in a file how far particles are apart: "
             "--describe, key spacing",
         )
-    return math.sqrt(math.pi * reach**2 / inside)
+    return math.sqrt(math.pi * reach**2 / inside_count)
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
-    """Refuse positions that are no floats of two components, or of more particles than
-    a split may have.
+    """Refuse what cannot be the positions of a trajectory.
+
+    Raises:
+        UnreadableFileError: no floats of three dimensions.
+        DataError: not two components, too few or too many frames or particles.
     """
     if len(shape) != 3 or dtype.kind != "f":
         raise UnreadableFileError(
@@ -301,29 +343,28 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             expected="floats of shape (frame, particle, 2)",
             got=f"{dtype} of shape {shape}",
         )
-    if shape[2] != 2:
-        turned = misplaced_axes(shape)
+    frame_count, particle_count, component_count = shape
+    if component_count != COMPONENTS:
         raise DataError(
-            turned.what if turned else f"positions have {shape[2]} components",
+            f"positions have {component_count} components",
             where=name,
-            expected="2: lagbench holds plane data only",
+            expected="shape (frame, particle, 2): lagbench holds plane data only",
             got=f"shape {shape}",
-            fix=turned.fix if turned else None,
         )
-    if shape[0] < 2 or shape[1] < 1:
+    if frame_count < 2 or particle_count < 1:
         raise DataError(
             "too little for a trajectory",
             where=name,
             expected="2 frames, 1 particle",
             got=shape,
         )
-    for what, limit, count in (
-        ("frames", FRAMES, shape[0]),
-        ("particles", NEEDED["particles"], shape[1]),
+    for kind, limit, count in (
+        ("frames", FRAMES, frame_count),
+        ("particles", NEEDED["particles"], particle_count),
     ):
         if not limit.holds(count):
             raise DataError(
-                f"too many {what} for a trajectory",
+                f"too many {kind} for a trajectory",
                 where=name,
                 expected=limit,
                 got=count,
@@ -332,9 +373,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
 
 def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
     """Refuse an array [bytes] that is far larger than what a file holds of it."""
-    # Particles that move compress by two or so, at rest by a hundred: more was made to
-    # fill the memory.
-    if unpacked > max(HARMLESS, MOST_INFLATION * packed):
+    if unpacked > max(HARMLESS_BYTES, MOST_INFLATION * packed):
         raise UnreadableFileError(
             "the file would unpack to far more than it holds",
             where=where,
@@ -345,9 +384,6 @@ def check_inflation(where: str, *, packed: int, unpacked: int) -> None:
 
 def read_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Return shape, whether the order is Fortran's, and type of a .npy stream."""
-    first = np.lib.format.read_magic(stream) == (1, 0)
-    if first:
-        read = np.lib.format.read_array_header_1_0
-    else:
-        read = np.lib.format.read_array_header_2_0
-    return read(stream)
+    if np.lib.format.read_magic(stream) == (1, 0):
+        return np.lib.format.read_array_header_1_0(stream)
+    return np.lib.format.read_array_header_2_0(stream)

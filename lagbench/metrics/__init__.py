@@ -19,7 +19,7 @@ from .aggregate import (
     score,
     tally,
 )
-from .frame import FramePair, Scenario, Setting, Snapshot, snapshots
+from .frame import FramePair, Scenario, Snapshot, TaskConfig, snapshots
 from .metric import (
     Direction,
     Metric,
@@ -51,10 +51,10 @@ __all__ = [
     "Resampling",
     "Scenario",
     "Score",
-    "Setting",
     "Snapshot",
     "Standing",
     "Tally",
+    "TaskConfig",
     "aggregate",
     "always",
     "at_slow_frames",

@@ -1,5 +1,4 @@
-"""From frames to scores: tallies that add, one number per scenario, a mean with its
-interval.
+"""From frames to scores: tallies that add, scores of scenarios, mean and interval.
 
 RMSE is the root of the frame mean of MSE within a scenario, then the mean over
 scenarios; every other metric is the mean over frames, then over scenarios. Undefined
@@ -31,19 +30,16 @@ LONG_ROLLOUT = 100
 """Predicted frames beyond which statistics are rounded more coarsely than float32."""
 
 LONG_BITS = 11
-"""Significant bits of statistics of a long rollout: a relative error of 4.9e-4 at most.
-"""
+"""Significant bits of statistics of a long rollout: relative error 4.9e-4."""
 
 LEVEL = 0.95
-"""Share of the resampled means that an interval holds."""
+"""Probability of an interval: the share of the resampled means between its ends."""
 
 RESAMPLES = 10_000
 """Resamples of scenarios and of seeds."""
 
 FEWEST_FOR_INTERVAL = 4
-"""Scenarios below which no interval is given: of three, Student's quantile alone
-doubles its width.
-"""
+"""Fewest scenarios with an interval: Student's quantile of three doubles its width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +54,8 @@ class Tally:
     names: tuple[str, ...]  # of the statistics
     frames: tuple[int, ...]  # absolute frame numbers
     total: Floats  # sum of the defined values, shape [statistic, frame]
-    # how many defined values that is, shape [statistic, frame]
-    weight: NDArray[np.int64]
-    undefined: NDArray[np.int64]  # how many values were NaN, shape [statistic, frame]
+    weight: NDArray[np.int64]  # number of defined values, shape [statistic, frame]
+    undefined: NDArray[np.int64]  # number of NaN values, shape [statistic, frame]
 
     @classmethod
     def of(
@@ -69,13 +64,16 @@ class Tally:
         frames: Sequence[int],
         measured: Mapping[int, Mapping[str, float]],
     ) -> Self:
-        """Return the tally of values by frame and name; what is missing weighs
-        nothing.
+        """Return the tally of values by frame and name; a missing value has weight 0.
+
+        Raises:
+            UsageError: a value of a statistic or a frame that the tally does not have.
         """
         row = {name: i for i, name in enumerate(names)}
         column = {frame: i for i, frame in enumerate(frames)}
         values = np.zeros((len(row), len(column)))
-        seen = np.zeros(values.shape, np.int64)
+        is_measured = np.zeros(values.shape, np.int64)
+
         for frame, statistics in measured.items():
             for name, value in statistics.items():
                 if name not in row or frame not in column:
@@ -83,24 +81,27 @@ class Tally:
                         f"statistic {name!r} at frame {frame} has no place in the tally"
                     )
                 values[row[name], column[frame]] = value
-                seen[row[name], column[frame]] = 1
-        nan = np.isnan(values)
+                is_measured[row[name], column[frame]] = 1
+
+        is_nan = np.isnan(values)
         return cls(
-            tuple(names),
-            tuple(frames),
-            np.where(nan, 0.0, values),
-            seen * ~nan,
-            seen * nan,
+            names=tuple(names),
+            frames=tuple(frames),
+            total=np.where(is_nan, 0.0, values),
+            weight=is_measured * ~is_nan,
+            undefined=is_measured * is_nan,
         )
 
     def __add__(self, other: Tally) -> Tally:
         """Combine two pieces of the same scenario."""
         if (self.names, self.frames) != (other.names, other.frames):
             raise UsageError("tallies of different statistics or frames do not add")
-        total = self.total + other.total
-        weight = self.weight + other.weight
         return Tally(
-            self.names, self.frames, total, weight, self.undefined + other.undefined
+            names=self.names,
+            frames=self.frames,
+            total=self.total + other.total,
+            weight=self.weight + other.weight,
+            undefined=self.undefined + other.undefined,
         )
 
     @cached_property
@@ -108,30 +109,31 @@ class Tally:
         """Value and whether it was measured, by statistic, each of shape [frame]."""
         values = np.full(self.total.shape, np.nan)
         np.divide(self.total, self.weight, out=values, where=self.weight > 0)
-        measured = self.weight + self.undefined > 0
-        values.flags.writeable = measured.flags.writeable = False
-        return dict(zip(self.names, zip(values, measured, strict=True), strict=True))
+        is_measured = self.weight + self.undefined > 0
+        values.flags.writeable = False
+        is_measured.flags.writeable = False
+
+        rows = zip(values, is_measured, strict=True)
+        return dict(zip(self.names, rows, strict=True))
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out what is read off the sums when they go to another process."""
+        """Return the fields; another process forms the cached rows again."""
         return {name: value for name, value in self.__dict__.items() if name != "_rows"}
 
     def series(self, name: str) -> Floats:
-        """Return a statistic per frame, NaN where it has no value: shape [frame],
-        read-only.
-        """
+        """Return a statistic per frame, NaN without a value, [frame], read-only."""
         return self._rows[name][0]
 
     def measured(self, name: str) -> NDArray[np.bool_]:
-        """Tell at which frames a statistic was measured, defined or not: shape [frame],
-        read-only.
+        """Return at which frames a statistic was measured, defined or not.
+
+        The shape is [frame], read-only.
         """
         return self._rows[name][1]
 
 
-def as_stored(tally: Tally) -> Tally:
-    """Return a tally rounded as scores.nc holds it: to float32, of long rollouts to 11
-    bits.
+def round_statistics(tally: Tally) -> Tally:
+    """Return a tally rounded as in scores.nc: to float32, of long rollouts to 11 bits.
 
     Scores are formed from rounded statistics, so that whoever aggregates scores.nc
     again gets the same digits. Long rollouts have so many frames that their float32
@@ -141,78 +143,81 @@ def as_stored(tally: Tally) -> Tally:
     total = tally.total
     if len(tally.frames) > LONG_ROLLOUT:
         mantissa, exponent = np.frexp(total)
-        total = np.ldexp(np.rint(np.ldexp(mantissa, LONG_BITS)), exponent - LONG_BITS)
-    stored = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
-    return replace(tally, total=stored.astype(np.float64))
+        rounded = np.rint(np.ldexp(mantissa, LONG_BITS))
+        total = np.ldexp(rounded, exponent - LONG_BITS)
+    single = np.clip(total, -LARGEST, LARGEST).astype(np.float32)
+    return replace(tally, total=single.astype(np.float64))
 
 
 def measure(pair: FramePair, metrics: Iterable[Metric]) -> dict[str, float]:
     """Return the statistics of one frame pair by name, NaN where one is undefined."""
-    found = {}
+    values = {}
     for metric in metrics:
         if metric.statistic is None:
             continue
         try:
             applies = metric.applies(pair)
         except (Exception, SystemExit) as error:
-            metric.blame(error, f"frame {pair.frame}")
+            metric.raise_named(error, f"frame {pair.frame}")
         if applies:
-            found[metric.name] = metric.measure(pair)
-    return found
+            values[metric.name] = metric.measure(pair)
+    return values
 
 
 def tally(
     pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]
 ) -> Tally:
-    """Measure consecutive frame pairs, holding one at a time."""
-    names = [m.name for m in metrics if m.statistic is not None]
-    return Tally.of(
-        names, frames, {pair.frame: measure(pair, metrics) for pair in pairs}
-    )
+    """Measure consecutive frame pairs, one in memory at a time."""
+    names = [metric.name for metric in metrics if metric.statistic is not None]
+    values = {pair.frame: measure(pair, metrics) for pair in pairs}
+    return Tally.of(names, frames, values)
 
 
 @functools.cache
-def _shares(count: int, stream: int) -> Floats:
-    """Return the share of each of some things in draws with replacement, shape
-    [resample, thing].
+def _resampled_shares(count: int, stream: int) -> Floats:
+    """Return the share of each element in draws with replacement.
+
+    The shape is [resample, element].
     """
     # Generator.random is the one distribution whose stream NumPy keeps across versions
-    uniform = np.random.Generator(np.random.PCG64(stream)).random((RESAMPLES, count))
-    drawn = (
-        np.floor(uniform * count).astype(np.intp)
-        + count * np.arange(RESAMPLES)[:, None]
-    )
-    return (
-        np.bincount(drawn.ravel(), minlength=RESAMPLES * count).reshape(
-            RESAMPLES, count
-        )
-        / count
-    )
+    generator = np.random.Generator(np.random.PCG64(stream))
+    uniform = generator.random((RESAMPLES, count))
+    element = np.floor(uniform * count).astype(np.intp)
+
+    # one flat bin per (resample, element)
+    first_bin = count * np.arange(RESAMPLES)[:, None]
+    bins = (element + first_bin).ravel()
+    counts = np.bincount(bins, minlength=RESAMPLES * count)
+    return counts.reshape(RESAMPLES, count) / count
 
 
 @dataclass(frozen=True, eq=False)
 class Resampling:
-    """A mean over seeds and scenarios, and how far others of both would lead it."""
+    """A mean over seeds and scenarios, and its spread when both are resampled."""
 
     mean: float
-    # deviations of the things that are drawn, by stream: scenarios, seeds
+    # deviations from the mean by stream of draws: 0 for scenarios, then seeds
     parts: Mapping[int, Floats]
 
     @cached_property
     def deviations(self) -> Floats:
         """Resampled means minus the mean, shape [resample]."""
-        drawn = [
-            math.sqrt(len(part) / (len(part) - 1))
-            * np.einsum("rn,n->r", _shares(len(part), stream), part)
-            for stream, part in self.parts.items()
-        ]
-        return np.asarray(np.sum(drawn, axis=0))
+        deviations = []
+        for stream, part in self.parts.items():
+            count = len(part)
+            stretch = math.sqrt(count / (count - 1))
+            shares = _resampled_shares(count, stream)
+            deviations.append(stretch * np.einsum("rn,n->r", shares, part))
+        return np.asarray(np.sum(deviations, axis=0))
 
     @property
     def _variances(self) -> list[float]:
-        return [
-            float(np.sum(x**2)) / (len(x) * (len(x) - 1)) for x in self.parts.values()
-        ]
+        """Variance of the mean by part: ``sum(x^2) / (n (n - 1))``."""
+        variances = []
+        for part in self.parts.values():
+            count = len(part)
+            variances.append(float(np.sum(part**2)) / (count * (count - 1)))
+        return variances
 
     @property
     def error(self) -> float:
@@ -222,99 +227,52 @@ class Resampling:
     @property
     def freedom(self) -> float:
         """Degrees of freedom behind the error, after Satterthwaite."""
-        drawn = zip(self._variances, self.parts.values(), strict=True)
-        squares = math.fsum(v**2 / (len(x) - 1) for v, x in drawn)
+        variances = self._variances
+        squares = math.fsum(
+            variance**2 / (len(part) - 1)
+            for variance, part in zip(variances, self.parts.values(), strict=True)
+        )
         if squares:
-            return math.fsum(self._variances) ** 2 / squares
+            return math.fsum(variances) ** 2 / squares
         return math.inf
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % percentile interval, as much wider as Student's quantile exceeds the
-        normal one's.
+        """95 % percentile interval, widened by Student's over the normal quantile.
 
         NaN of fewer than four scenarios.
         """
         if len(self.parts[0]) < FEWEST_FOR_INTERVAL:
-            return math.nan, math.nan
+            return (math.nan, math.nan)
         if not self.error:
-            return self.mean, self.mean
-        tails = (1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0
-        wider = student_quantile(self.freedom, tails[1]) / NormalDist().inv_cdf(
-            tails[1]
-        )
-        low, high = (
-            self.mean + wider * tail for tail in quantiles(self.deviations, tails)
-        )
-        return low, high
+            return (self.mean, self.mean)
 
-
-def quantiles(values: Floats, shares: Sequence[float]) -> list[float]:
-    """Return quantiles of two or more values, linear between them: the bits of
-    ``np.quantile``.
-
-    Only what stands beside them is put in its place, which takes a small part of the
-    time of a sort.
-    """
-    places = [share * (len(values) - 1) for share in shares]
-    lower = [min(int(place), len(values) - 2) for place in places]
-    placed = np.partition(values, [i for below in lower for i in (below, below + 1)])
-    found = []
-    for place, below in zip(places, lower, strict=True):
-        part, (low, high) = place - below, placed[below : below + 2].tolist()
-        found.append(
-            low + (high - low) * part
-            if part < 0.5
-            else high - (high - low) * (1.0 - part)
-        )
-    return found
+        upper = (1.0 + LEVEL) / 2.0
+        lower = (1.0 - LEVEL) / 2.0
+        normal = NormalDist().inv_cdf(upper)
+        stretch = student_quantile(self.freedom, upper) / normal
+        low, high = np.quantile(self.deviations, (lower, upper)).tolist()
+        return (self.mean + stretch * low, self.mean + stretch * high)
 
 
 @functools.cache
 def student_quantile(freedom: float, share: float) -> float:
-    """Return the quantile of Student's distribution, for shares up to 0.999 what SciPy
-    returns to rounding.
+    """Return the quantile of Student's distribution."""
+    # commands that form no interval save its import
+    from scipy.special import stdtrit
 
-    For whole degrees of freedom, which those of a single seed are, by Newton's method
-    on the finite sums 26.7.3 and 26.7.4 of Abramowitz and Stegun: SciPy takes a quarter
-    of a second to import. Shares are from 0.5 to 1.
-    """
-    # longer sums take longer; nan is not rounded
-    whole = round(freedom) if 3 <= freedom <= 1000 else 0
-    if not whole or abs(freedom - whole) > 1e-9:
-        from scipy.special import stdtrit
-
-        return float(stdtrit(freedom, share))
-    odd = whole % 2
-    angle = 0.0
-    # density of the angle atan(t / sqrt(freedom)) in units of that of its first term
-    scale = math.exp(math.lgamma((whole + 1) / 2) - math.lgamma(whole / 2)) / math.sqrt(
-        math.pi
-    )
-    for _ in range(12):  # from four steps on few change more than the last digits
-        sine = math.sin(angle)
-        cosine = math.cos(angle)
-        term = sine * (cosine if odd else 1.0)
-        within = term
-        for k in range(2 + odd, whole - 1, 2):
-            term *= cosine**2 * (k - 1) / k
-            within += term
-        if odd:
-            within = 2.0 / math.pi * (angle + within)
-        else:
-            within = within
-        angle += (2.0 * share - 1.0 - within) / (2.0 * scale * cosine ** (whole - 1))
-    return math.sqrt(whole) * math.tan(angle)
+    return float(stdtrit(freedom, share))
 
 
 def mean_over_seeds(values: ArrayLike) -> Floats:
-    """Return the mean over the seeds that have a value, NaN where none has: shape
-    without the first axis.
+    """Return the mean over the seeds that have a value, NaN where none has one.
+
+    The seeds are the first axis; the result has the other axes.
     """
     seeds = np.asarray(values, np.float64)
-    known = ~np.isnan(seeds)
-    total = np.where(known, seeds, 0.0).sum(axis=0)
-    count = known.sum(axis=0)
+    is_defined = ~np.isnan(seeds)
+    total = np.where(is_defined, seeds, 0.0).sum(axis=0)
+    count = is_defined.sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), math.nan)
 
 
@@ -332,61 +290,75 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
     only the scenarios are drawn: the mean is then that of these weights, not of the
     method. The draws are seeded: two calls with as many scenarios draw the same ones.
 
-    Values are NaN where undefined, shape [scenario] or [seed, scenario]; with those of
-    another method in the same scenarios as ``minus`` the mean is that of the
-    difference. None where fewer than two scenarios are defined. Infinite values, and
-    methods in different scenarios, are refused.
+    Args:
+        values: values of a method, NaN where undefined, shape [scenario] or [seed,
+            scenario].
+        minus: values of another method in the same scenarios; the mean is then that of
+            the difference.
+
+    Returns:
+        None where fewer than two scenarios are defined.
+
+    Raises:
+        UsageError: values are infinite, or the methods have different scenarios.
     """
-    sides = [
-        np.atleast_2d(np.asarray(side, np.float64))
-        for side in (values, minus)
-        if side is not None
-    ]
-    if len({side.shape[1] for side in sides}) > 1:
-        expected, got = (side.shape[1] for side in sides)
-        raise UsageError("methods over different scenarios", expected=expected, got=got)
-    if any(np.isinf(side).any() for side in sides):
+    methods = [np.atleast_2d(np.asarray(values, np.float64))]
+    if minus is not None:
+        methods.append(np.atleast_2d(np.asarray(minus, np.float64)))
+    _check_losses(methods)
+
+    has_value = [~np.isnan(method).all(axis=0) for method in methods]
+    defined = np.all(has_value, axis=0)  # shape [scenario]
+    if np.count_nonzero(defined) < 2:
+        return None
+
+    over_seeds = np.zeros(np.count_nonzero(defined))  # b_i, shape [scenario]
+    over_scenarios = []  # a_s of each method, shape [seed]
+    for sign, method in zip((1.0, -1.0), methods, strict=False):
+        seeds = method[:, defined]
+        seed_mean = mean_over_seeds(seeds)
+        over_seeds += sign * seed_mean
+        offsets = np.array([mean(row) for row in seeds - seed_mean])
+        over_scenarios.append(sign * offsets[~np.isnan(offsets)])
+
+    parts = {}
+    for stream, part in enumerate([over_seeds, *over_scenarios]):
+        if len(part) > 1:
+            parts[stream] = part - np.mean(part)
+    return Resampling(mean=float(np.mean(over_seeds)), parts=parts)
+
+
+def _check_losses(methods: Sequence[Floats]) -> None:
+    """Refuse methods of shape [seed, scenario] that cannot be compared."""
+    counts = [method.shape[1] for method in methods]
+    if len(set(counts)) > 1:
+        raise UsageError(
+            "methods over different scenarios", expected=counts[0], got=counts[1]
+        )
+    if any(np.isinf(method).any() for method in methods):
         raise UsageError(
             "losses are infinite",
             expected="numbers, NaN where undefined",
             got="infinity",
         )
-    defined = np.all([~np.isnan(side).all(axis=0) for side in sides], axis=0)
-    if np.count_nonzero(defined) < 2:
-        return None
-    means = np.zeros(np.count_nonzero(defined))
-    seeds = []
-    for sign, side in zip((1.0, -1.0), sides, strict=False):
-        kept = side[:, defined]
-        over_seeds = mean_over_seeds(kept)
-        means += sign * over_seeds
-        rows = np.array([mean(row) for row in kept - over_seeds])
-        seeds.append(sign * rows[~np.isnan(rows)])
-    parts = {
-        stream: part - np.mean(part)
-        for stream, part in enumerate([means, *seeds])
-        if len(part) > 1
-    }
-    return Resampling(mean=float(np.mean(means)), parts=parts)
 
 
 def bootstrap_interval(
     values: ArrayLike, minus: ArrayLike | None = None
 ) -> tuple[float, float]:
-    """Return the 95 % interval of a mean by the two-way bootstrap, which takes these:
-    :func:`resample`.
+    """Return the 95 % interval of a mean by the two-way bootstrap, :func:`resample`.
 
     NaN when fewer than four scenarios are defined.
     """
-    found = resample(values, minus)
-    if found is None:
+    resampling = resample(values, minus)
+    if resampling is None:
         return (math.nan, math.nan)
-    return found.interval
+    return resampling.interval
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """What a metric says of one prediction."""
+    """The values of a metric for one prediction."""
 
     metric: Metric
     scenarios: tuple[int, ...]  # ids, ascending
@@ -411,38 +383,64 @@ class Score:
 
 
 def score(metric: Metric, tallies: Mapping[int, Tally]) -> Score | None:
-    """Return the score of one metric, None where it was measured nowhere or the task is
-    too short.
+    """Return the score of one metric, by the tallies of the scenarios.
+
+    None where it was measured nowhere or the task is too short.
     """
     if not tallies:
         return None
     scenarios = tuple(sorted(tallies))
     frames = tallies[scenarios[0]].frames
-    asked = np.array(
-        [
-            np.all([tallies[i].measured(name) for name in metric.of], axis=0)
-            for i in scenarios
-        ]
-    )
-    if metric.horizon > len(frames) or not asked.any():
+
+    rows = []
+    for i in scenarios:
+        measured = [tallies[i].measured(name) for name in metric.of]
+        rows.append(np.all(measured, axis=0))
+    is_measured = np.array(rows)  # shape [scenario, frame]
+    if metric.horizon > len(frames) or not is_measured.any():
         return None
+
     try:
-        rows = [metric.series(*map(tallies[i].series, metric.of)) for i in scenarios]
-        series = np.stack([np.asarray(row, np.float64) for row in rows])
-        if metric.over_frames is mean and not np.isnan(series).any():
-            # all rows at once, to the same bits
-            values = np.asarray(series.mean(axis=1))
-        else:
-            values = np.array([metric.over_frames(row) for row in series])
+        series = _series(metric, [tallies[i] for i in scenarios])
+        values = _over_frames(metric, series)
     except (Exception, SystemExit) as error:
-        metric.blame(error, "over all frames")
-    undefined = tuple(np.count_nonzero(asked & np.isnan(series), axis=1).tolist())
-    return Score(metric, scenarios, frames, series, values, undefined)
+        metric.raise_named(error, "over all frames")
+
+    undefined = np.count_nonzero(is_measured & np.isnan(series), axis=1)
+    return Score(
+        metric=metric,
+        scenarios=scenarios,
+        frames=frames,
+        per_frame=series,
+        values=values,
+        undefined=tuple(undefined.tolist()),
+    )
+
+
+def _series(metric: Metric, tallies: Sequence[Tally]) -> Floats:
+    """Return the value of a metric per frame, shape [scenario, frame]."""
+    rows = []
+    for scenario in tallies:
+        statistics = [scenario.series(name) for name in metric.of]
+        rows.append(np.asarray(metric.series(*statistics), np.float64))
+    return np.stack(rows)
+
+
+def _over_frames(metric: Metric, series: Floats) -> Floats:
+    """Return the value of a metric over the horizon, shape [scenario]."""
+    if metric.over_frames is mean and not np.isnan(series).any():
+        # all rows at once, to the same bits
+        return np.asarray(series.mean(axis=1))
+    return np.array([metric.over_frames(row) for row in series])
 
 
 def aggregate(
     metrics: Iterable[Metric], tallies: Mapping[int, Tally]
 ) -> dict[str, Score]:
     """Return the scores of all metrics that this split and size have, by name."""
-    scores = {metric.name: score(metric, tallies) for metric in metrics}
-    return {name: found for name, found in scores.items() if found is not None}
+    scores = {}
+    for metric in metrics:
+        metric_score = score(metric, tallies)
+        if metric_score is not None:
+            scores[metric.name] = metric_score
+    return scores

@@ -1,13 +1,14 @@
-"""Does an elastic body keep its shape and hold together?
+"""Does an elastic body keep its shape and stay in one piece?
 
-A body is all jelly, or all rope, of a scenario: no split has two of one kind. Only
-scenarios with such a body have these metrics; elsewhere they are expected gaps.
+All jelly of a scenario is one body, and so is all rope: no split has two bodies of one
+material. Only scenarios with such a body have these metrics; elsewhere they are
+expected gaps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,105 +26,128 @@ def rigid_residual(truth: Floats, prediction: Floats) -> float:
     """
     t = truth - np.mean(truth, axis=0)
     p = prediction - np.mean(prediction, axis=0)
+    px = p[:, 0]
+    py = p[:, 1]
+
     dot = float(np.sum(p * t))
-    cross = float(np.sum(p[:, 0] * t[:, 1] - p[:, 1] * t[:, 0]))
+    cross = float(np.sum(px * t[:, 1] - py * t[:, 0]))
     size = math.hypot(dot, cross)
-    cos, sin = (dot / size, cross / size) if size > 0.0 else (1.0, 0.0)
-    turned = np.stack(
-        [cos * p[:, 0] - sin * p[:, 1], sin * p[:, 0] + cos * p[:, 1]], axis=1
-    )
-    return math.sqrt(float(np.mean(np.sum((turned - t) ** 2, axis=1))))
+    cos = 1.0
+    sin = 0.0
+    if size > 0.0:
+        cos = dot / size
+        sin = cross / size
+
+    rotated_x = cos * px - sin * py
+    rotated_y = sin * px + cos * py
+    rotated = np.stack([rotated_x, rotated_y], axis=1)
+    squares = np.sum((rotated - t) ** 2, axis=1)  # shape [particle]
+    return math.sqrt(float(np.mean(squares)))
 
 
 def shape_error(pair: FramePair, material: str) -> float:
     """Return the RMS distance of a body from its true shape [length].
 
-    Where the body is and how it is turned does not count. Good: a small part of the
-    particle spacing; a body that melts reaches its own radius.
+    Position and rotation of the body do not count. Good: a small part of the particle
+    spacing; a body that melts reaches its own radius.
     """
     members = pair.scenario.members[material]
-    return rigid_residual(
-        pair.truth.position[members], pair.prediction.position[members]
-    )
+    truth = pair.truth.position[members]
+    prediction = pair.prediction.position[members]
+    return rigid_residual(truth, prediction)
 
 
 def connectivity(pair: FramePair, material: str) -> float:
-    """Return the share of a predicted body's first-frame neighbours that are still
-    together [1].
-    """
-    return _held(pair, pair.prediction, material)
+    """Return the share of unbroken bonds in a predicted body [1]."""
+    return _intact_share(pair.prediction, material)
 
 
 def connectivity_true(pair: FramePair, material: str) -> float:
-    """Return the same share in the truth [1]: 1 unless the simulated body itself
-    tears.
-    """
-    return _held(pair, pair.truth, material)
+    """Return the share of unbroken bonds in the true body [1]: 1 unless it tears."""
+    return _intact_share(pair.truth, material)
 
 
-def _held(pair: FramePair, snapshot: Snapshot, material: str) -> float:
-    scenario = pair.scenario
-    return scenario.bonds[material].share_held(
-        snapshot.position[scenario.members[material]]
-    )
+def _intact_share(snapshot: Snapshot, material: str) -> float:
+    scenario = snapshot.scenario
+    position = snapshot.position[scenario.members[material]]
+    return scenario.bonds[material].intact_share(position)
 
 
 @dataclass(frozen=True)
 class OverBodies:
-    """Mean of a statistic over the elastic bodies of a scenario, or over those of one
-    material.
-    """
+    """Mean of a statistic over the elastic bodies of a scenario."""
 
-    # value of one body, given its material
+    # value of one body, by its material
     statistic: Callable[[FramePair, str], float]
-    materials: tuple[str, ...]  # whose bodies are taken
+    materials: tuple[str, ...]  # of the bodies that count
 
     def _present(self, pair: FramePair) -> list[str]:
         return [name for name in self.materials if name in pair.scenario.members]
 
     def __call__(self, pair: FramePair) -> float:
         """Return the mean over the bodies of one frame pair."""
-        return float(
-            np.mean([self.statistic(pair, name) for name in self._present(pair)])
-        )
+        values = [self.statistic(pair, name) for name in self._present(pair)]
+        return float(np.mean(values))
 
     def applies(self, pair: FramePair) -> bool:
-        """Tell whether the scenario has such a body."""
+        """Return whether the scenario has such a body."""
         return bool(self._present(pair))
 
 
-METRICS = tuple(
-    Metric(
-        name=f"{statistic.__name__}{suffix}",
-        family="bodies",
-        unit=unit,
-        direction=direction,
-        perfect=perfect,
-        source="section 4.8.2",
-        summary=f"{summary}, {whose}",
-        statistic=OverBodies(statistic, materials),
-        applies=OverBodies(statistic, materials).applies,
-    )
-    for statistic, unit, direction, perfect, summary in (
-        (
-            shape_error,
-            "length",
-            Direction.LOWER,
-            0.0,
-            "Distance from the true shape after a rigid fit",
-        ),
-        (
-            connectivity,
-            "1",
-            Direction.HIGHER,
-            1.0,
-            "Share of first neighbours within twice their distance",
-        ),
-        (connectivity_true, "1", Direction.NONE, None, "Connectivity of the truth"),
-    )
-    for suffix, materials, whose in (
-        ("", ELASTIC, "mean over elastic bodies"),
-        *((f"_{name}", (name,), name) for name in ELASTIC),
-    )
+def _body_metrics(
+    statistic: Callable[[FramePair, str], float],
+    summary: str,
+    *,
+    unit: str,
+    direction: Direction,
+    perfect: float | None,
+) -> Iterator[Metric]:
+    """Yield a metric over all elastic bodies, then one for each elastic material."""
+    for material in (None, *ELASTIC):
+        if material is None:
+            suffix = ""
+            materials: tuple[str, ...] = ELASTIC
+            bodies = "mean over elastic bodies"
+        else:
+            suffix = f"_{material}"
+            materials = (material,)
+            bodies = material
+
+        over_bodies = OverBodies(statistic, materials)
+        yield Metric(
+            name=f"{statistic.__name__}{suffix}",
+            family="bodies",
+            unit=unit,
+            direction=direction,
+            perfect=perfect,
+            source="section 4.8.2",
+            summary=f"{summary}, {bodies}",
+            statistic=over_bodies,
+            applies=over_bodies.applies,
+        )
+
+
+METRICS = (
+    *_body_metrics(
+        shape_error,
+        "Distance from the true shape after a rigid fit",
+        unit="length",
+        direction=Direction.LOWER,
+        perfect=0.0,
+    ),
+    *_body_metrics(
+        connectivity,
+        "Share of first neighbours within twice their distance",
+        unit="1",
+        direction=Direction.HIGHER,
+        perfect=1.0,
+    ),
+    *_body_metrics(
+        connectivity_true,
+        "Connectivity of the truth",
+        unit="1",
+        direction=Direction.NONE,
+        perfect=None,
+    ),
 )
 """Metrics of this family."""

@@ -1,10 +1,10 @@
-"""What a flow keeps: energy, momentum, density, and its place between the walls.
+"""Quantities that a flow conserves: energy, momentum, density, and the closed box.
 
 A surrogate that damps loses energy, one that blows up gains it; more energy than the
 truth is no merit, so the ratio aims at 1 and the error counts both ways. Errors of
 momentum are scaled by the truth's sum of magnitudes, which does not vanish where the
-momenta of a closed flow cancel; where the truth comes to rest the scales have a floor.
-All particles of a scenario have one mass; it cancels, and momenta are told over it.
+momenta of a closed flow cancel; where the truth comes to rest there is a least scale.
+All particles of a scenario have one mass; it cancels, and momenta are given over it.
 """
 
 from __future__ import annotations
@@ -20,18 +20,16 @@ from .frame import Floats, FramePair, Snapshot, dot, lengths, mean_squared_error
 from .metric import (
     Direction,
     enough_nodes,
-    floored_quotient,
     metric,
     metrics_of,
     quotient,
+    scaled_error,
     total,
 )
 from .metric import root_mean_square as over_frames_rms
 
 MOVING = 0.01
-"""Share of the truth's greatest kinetic energy from which on a frame counts as moving.
-"""
-
+"""Share of the truth's greatest kinetic energy from which a frame counts as moving."""
 
 ENERGIES = ("energy_predicted", "energy_true")
 
@@ -56,53 +54,58 @@ def energy_predicted(pair: FramePair) -> float:
 
 
 @metric(
-    unit="1", direction=Direction.TARGET, perfect=1.0, source="Eq. 5.11", of=ENERGIES
+    unit="1",
+    direction=Direction.TARGET,
+    perfect=1.0,
+    source="Eq. 5.11",
+    of=ENERGIES,
 )
 def energy_ratio(predicted: Floats, true: Floats) -> Floats:
     """Predicted over true kinetic energy where the truth has 1 % of its peak.
 
     Undefined in other frames: beside a truth at rest any motion is a ratio without
-    bounds, and one such frame, before a dam breaks or after all has settled, would be
-    the mean.
+    bounds, and one such frame, before a dam breaks or after all has settled, would
+    determine the mean.
     """
     peak = np.max(true, initial=0.0, where=~np.isnan(true))
-    return quotient(predicted, np.where(true >= MOVING * peak, true, 0.0))
+    moving = np.where(true >= MOVING * peak, true, 0.0)
+    return quotient(predicted, moving)
 
 
 @metric(unit="1", source="Fig. 5.19")
 def energy_retention(pair: FramePair) -> float:
     """Kinetic energy of the prediction over that of the last given frame."""
-    return _retained(pair, pair.prediction)
+    return _retained_share(pair.prediction)
 
 
 @metric(unit="1", source="Fig. 5.19")
 def energy_retention_true(pair: FramePair) -> float:
     """Kinetic energy of the truth over that of the last given frame."""
-    return _retained(pair, pair.truth)
+    return _retained_share(pair.truth)
 
 
-def _retained(pair: FramePair, snapshot: Snapshot) -> float:
-    mass = pair.scenario.particle_mass
-    given = kinetic_energy(pair.scenario.last_given, mass)
-    if given > 0.0:
-        return kinetic_energy(snapshot, mass) / given
+def _retained_share(snapshot: Snapshot) -> float:
+    mass = snapshot.scenario.particle_mass
+    initial = kinetic_energy(snapshot.scenario.initial_snapshot, mass)
+    if initial > 0.0:
+        return kinetic_energy(snapshot, mass) / initial
     return math.nan
 
 
-@_error(source="design section 8", of=ENERGIES)
+@_error(source="Eq. 5.11", of=ENERGIES)
 def energy_error(predicted: Floats, true: Floats) -> Floats:
     """Absolute error of kinetic energy over the truth's, at least 1e-3 of its greatest.
 
     NaN where the truth rests in all frames. It forgives a flow that is wrong but as
     fast.
     """
-    return floored_quotient(np.abs(predicted - true), true)
+    return scaled_error(np.abs(predicted - true), true)
 
 
-@metric(unit="frame", source="design 2, section 2", over_frames=total, per_frame=False)
+@metric(unit="frame", source="Eq. 5.11", over_frames=total, per_frame=False)
 def active_frames(pair: FramePair) -> float:
     """Predicted frames until the truth's kinetic energy stays below 1 % of its peak."""
-    return float(pair.frame in pair.scenario.active)
+    return float(pair.frame in pair.scenario.moving_frames)
 
 
 def momentum(snapshot: Snapshot) -> Floats:
@@ -111,10 +114,11 @@ def momentum(snapshot: Snapshot) -> Floats:
 
 
 def angular_momentum(snapshot: Snapshot) -> float:
-    """Return ``sum(r x u)`` about the box centre (Eq. 5.1), over the particle mass
-    [length^2/frame].
+    """Return ``sum(r x u)`` about the box centre (Eq. 5.1) [length^2/frame].
+
+    The angular momentum is given over the particle mass.
     """
-    r = snapshot.arms
+    r = snapshot.lever_arms
     u = snapshot.velocity
     return dot(r[:, 0], u[:, 1]) - dot(r[:, 1], u[:, 0])
 
@@ -135,7 +139,7 @@ def momentum_scale(pair: FramePair) -> float:
 @_error(source="section 5.2", of=("momentum_gap", "momentum_scale"))
 def momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of total momentum over its scale (at least 1e-3 of its greatest)."""
-    return floored_quotient(gap, scale)
+    return scaled_error(gap, scale)
 
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
@@ -147,18 +151,19 @@ def angular_momentum_gap(pair: FramePair) -> float:
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
 def angular_momentum_scale(pair: FramePair) -> float:
     """The truth's sum of arm times speed that scales angular_momentum_error."""
-    return dot(lengths(pair.truth.arms), pair.truth.speeds)
+    return dot(lengths(pair.truth.lever_arms), pair.truth.speeds)
 
 
 @_error(
-    source="section 5.2, Eq. 5.1", of=("angular_momentum_gap", "angular_momentum_scale")
+    source="section 5.2, Eq. 5.1",
+    of=("angular_momentum_gap", "angular_momentum_scale"),
 )
 def angular_momentum_error(gap: Floats, scale: Floats) -> Floats:
     """Error of angular momentum over its scale (at least 1e-3 of its greatest)."""
-    return floored_quotient(gap, scale)
+    return scaled_error(gap, scale)
 
 
-@_error(source="design section 8", over_frames=over_frames_rms)
+@_error(source="Eq. 3.3", over_frames=over_frames_rms)
 def density_rmse(pair: FramePair) -> float:
     """Root mean squared error of density relative to rest, over all nodes.
 
@@ -166,34 +171,32 @@ def density_rmse(pair: FramePair) -> float:
     missing and where it should not be. 0 is perfect; values of a box that is filled in
     part are small.
     """
-    return math.sqrt(
-        mean_squared_error(pair.prediction.fields.density - pair.truth.fields.density)
-    )
+    error = pair.prediction.fields.density - pair.truth.fields.density
+    return math.sqrt(mean_squared_error(error))
 
 
 @metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
 def divergence_rms(pair: FramePair) -> float:
     """Root mean squared divergence of the prediction."""
-    return _divergence(pair, pair.prediction)
+    return _divergence_rms(pair, pair.prediction)
 
 
 @metric(unit="1/frame", source="section 5.9.1", defined=enough_nodes)
 def divergence_rms_true(pair: FramePair) -> float:
     """Root mean squared divergence of the truth."""
-    return _divergence(pair, pair.truth)
+    return _divergence_rms(pair, pair.truth)
 
 
-def _divergence(pair: FramePair, snapshot: Snapshot) -> float:
-    spacing = pair.scenario.setting.grid.spacing
-    return math.sqrt(
-        mean_squared_error(divergence(snapshot.fields.velocity, spacing)[pair.nodes])
-    )
+def _divergence_rms(pair: FramePair, snapshot: Snapshot) -> float:
+    spacing = pair.scenario.config.grid.spacing
+    rate = divergence(snapshot.fields.velocity, spacing)[pair.nodes]  # [1/frame]
+    return math.sqrt(mean_squared_error(rate))
 
 
-@_error(unit="%", source="design 2, section 4")
+@_error(unit="%", source="docs/scoring.md")
 def outside_share(pair: FramePair) -> float:
     """Share of predicted particles that are past a wall."""
-    return 100.0 * pair.outside
+    return 100.0 * pair.outside_share
 
 
 METRICS = metrics_of(globals())

@@ -1,4 +1,4 @@
-"""How many nodes of a score grid particles cover, and which grid they cover enough of.
+"""Number of nodes of a score grid that particles cover, and grids with enough of them.
 
 A grid that is too fine has nodes without particles, one that is too coarse too few
 nodes inside.
@@ -17,6 +17,9 @@ from lagbench.data.grid import Grid, Placement, fields
 
 from .metric import MINIMUM_NODES
 
+CELLS = range(4, 129)
+"""Cells across of the grids that are tried."""
+
 
 @dataclass(frozen=True)
 class Cloud:
@@ -27,28 +30,30 @@ class Cloud:
 
 
 def covered_nodes(cloud: Cloud, grid: Grid) -> int:
-    """Return at how many nodes vorticity stands; metrics of it want
-    :data:`.metric.MINIMUM_NODES`.
+    """Return the number of nodes at which vorticity is defined.
+
+    Metrics of vorticity need :data:`.metric.MINIMUM_NODES` of them.
     """
     position = np.asarray(cloud.position, np.float64)
+    at_rest = np.zeros_like(position)
     full = grid.full_weight(len(position), cloud.area)
-    found = fields(position, np.zeros_like(position), grid, full=full)
-    return int(np.count_nonzero(found.differentiable))
+    grid_fields = fields(position, at_rest, grid, full=full)
+    return int(np.count_nonzero(grid_fields.differentiable))
 
 
 def fitting_cells(
     clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int
 ) -> int | None:
-    """Return the cells across, nearest to a number, of a grid of which each cloud
-    covers enough nodes.
+    """Return the number of cells nearest to ``near`` at which each cloud fits the grid.
 
-    None where there is none; of two as near the coarser one. Clouds are asked for anew
-    for each grid that is tried, so that one is in memory at a time.
+    A cloud fits a grid of which it covers enough nodes. Of two numbers as near the
+    smaller is taken; None where no grid fits. ``clouds`` is called for each grid that
+    is tried, so that one cloud is in memory at a time.
     """
-    tried: list[int] = sorted(
-        {near, *range(4, 129)}, key=lambda cells: (abs(cells - near), cells)
+    candidates: list[int] = sorted(
+        {near, *CELLS}, key=lambda cells: (abs(cells - near), cells)
     )
-    for cells in tried:
+    for cells in candidates:
         grid = Grid(cells, placement)
         if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds()):
             return cells

@@ -1,4 +1,4 @@
-"""What a metric sees: truth and prediction of one frame, and all they share.
+"""The input of a metric: truth and prediction of one frame, and all they share.
 
 A :class:`FramePair` forms each intermediate (errors, grid fields, vorticity at the
 counted nodes) once, on first use, for all metrics; a truth :class:`Snapshot` may serve
@@ -25,24 +25,22 @@ DIRECTIONS = 64
 """Directions on which clouds are projected, at equal angles over a half turn."""
 
 WALL_TOLERANCE = 1e-6
-"""A particle is outside when it is this far past a wall [length]: a few roundings of
-float32.
+"""A particle is outside when it is this far past a wall, a few float32 ulp [length].
 """
 
 STRETCH = 2.0
-"""A bond holds while its length is within this multiple of the first one."""
+"""A bond is intact while its length is within this multiple of its first length."""
 
 ELASTIC = ("jelly", "rope")
 """Materials whose bodies return to their shape."""
 
 ROUNDING = 1e-12
-"""Share of the greatest nodal velocity below which vorticity times spacing is nothing
-but rounding.
+"""Share of the greatest nodal velocity below which vorticity times spacing is rounding.
 
 Where n particles around a node move alike, ``sum(w u) / sum(w)`` is off by up to n
 2^-52 of u in double precision, and omega h, half of four such velocities, by n 2^-51:
-1e-13 for 225 particles. What turns lies far above: positions are float32, so that
-beyond 1/32 velocities that differ do so by 2^-28 or more, 4e-9.
+1e-13 for 225 particles. Rotation lies far above: positions are float32, so that
+different velocities beyond 1/32 differ by 2^-28 or more, 4e-9.
 """
 
 PERCENTILES = (5, 25, 50, 75, 95)
@@ -50,8 +48,9 @@ PERCENTILES = (5, 25, 50, 75, 95)
 
 
 def average(values: Floats) -> float:
-    """Return the mean of all values: the bits of ``np.mean``, which takes twice as long
-    on few values.
+    """Return the mean of all values.
+
+    The bits are those of ``np.mean``, which takes twice as long on few values.
     """
     return float(np.add.reduce(values, axis=None)) / values.size
 
@@ -67,96 +66,100 @@ def mean_absolute_error(error: Floats) -> float:
 
 
 def dot(a: Floats, b: Floats) -> float:
-    """Return the sum of products; unlike BLAS's its bits do not depend on the number of
-    threads.
+    """Return the sum of products of two vectors.
+
+    Unlike those of BLAS, its bits do not depend on the number of threads.
     """
     return float(np.einsum("i,i->", a, b))
 
 
 def lengths(vectors: Floats) -> Floats:
     """Return the Euclidean length of vectors, shape [particle]."""
-    return np.asarray(np.sqrt(vectors[:, 0] ** 2 + vectors[:, 1] ** 2), np.float64)
+    squares = vectors[:, 0] ** 2 + vectors[:, 1] ** 2
+    return np.asarray(np.sqrt(squares), np.float64)
 
 
 def mean_square(vectors: Floats) -> Floats:
     """Return the mean over particles of the square of each component, shape [2]."""
-    return np.array([dot(component, component) for component in vectors.T]) / len(
-        vectors
-    )
+    sums = np.array([dot(component, component) for component in vectors.T])
+    return sums / len(vectors)
 
 
 def sorted_projections(points: ArrayLike) -> NDArray[np.float32]:
-    """Return the coordinates along each direction in ascending order [length], shape
-    [direction, particle].
+    """Return the coordinates along each direction in ascending order [length].
 
-    In single precision, which is what positions are stored in: its sort is several
-    times faster, and distances are good to 1e-7 of the box.
+    The shape is [direction, particle]. The precision is single, as that of stored
+    positions: the sort is several times faster, and distances are good to 1e-7 of the
+    box.
     """
     x, y = np.asarray(points, np.float32).T
-    projected = np.empty((DIRECTIONS, len(x)), np.float32)
-    for row, angle in zip(
-        projected, np.arange(DIRECTIONS) * (math.pi / DIRECTIONS), strict=True
-    ):
-        row[:] = x * np.float32(math.cos(angle)) + y * np.float32(math.sin(angle))
+    angles = np.arange(DIRECTIONS) * (math.pi / DIRECTIONS)
+    projections = np.empty((DIRECTIONS, len(x)), np.float32)
+
+    for row, angle in zip(projections, angles, strict=True):
+        cosine = np.float32(math.cos(angle))
+        sine = np.float32(math.sin(angle))
+        row[:] = x * cosine + y * sine
         row.sort()
-    return projected
+
+    return projections
 
 
 @dataclass(frozen=True)
 class Bonds:
-    """Pairs of neighbouring particles of a body: which were together at first, and
-    which still are.
-    """
+    """Pairs of neighbouring particles of a body in the first frame."""
 
     pairs: NDArray[np.intp]  # numbers of the particles within the body, shape [pair, 2]
-    reach: Floats  # greatest length at which each bond holds [length], shape [pair]
+    breaking_length: Floats  # length beyond which a bond is broken [length], [pair]
 
     @classmethod
     def within(cls, radius: float, position: Floats) -> Bonds:
-        """Return the bonds of particles closer than a radius at first [length]."""
-        from scipy.spatial import (
-            cKDTree,
-        )  # a fifth of a second that splits without bodies save
+        """Return the bonds of particles closer than a radius in the first frame."""
+        # splits without bodies save a fifth of a second
+        from scipy.spatial import cKDTree
 
-        found = cKDTree(position).query_pairs(radius, output_type="ndarray")
-        pairs = np.asarray(found, np.intp).reshape(-1, 2)
-        return cls(pairs, STRETCH * np.sqrt(_squared_lengths(position, pairs)))
+        neighbours = cKDTree(position).query_pairs(radius, output_type="ndarray")
+        pairs = np.asarray(neighbours, np.intp).reshape(-1, 2)
+        first_length = np.sqrt(_squared_lengths(position, pairs))
+        return cls(pairs, STRETCH * first_length)
 
-    def share_held(self, position: Floats) -> float:
-        """Return the share of bonds that hold at these positions [1]; NaN if there are
-        none.
+    def intact_share(self, position: Floats) -> float:
+        """Return the share of unbroken bonds at these positions [1], NaN without bonds.
+
+        Positions have the shape [particle, 2].
         """
         if not len(self.pairs):
             return math.nan
-        return float(np.mean(_squared_lengths(position, self.pairs) <= self.reach**2))
+        is_intact = _squared_lengths(position, self.pairs) <= self.breaking_length**2
+        return float(np.mean(is_intact))
 
 
 def _squared_lengths(position: Floats, pairs: NDArray[np.intp]) -> Floats:
+    """Return the squared distance of each pair [length^2], shape [pair]."""
     gap = position[pairs[:, 0]] - position[pairs[:, 1]]
     return np.asarray(gap[:, 0] ** 2 + gap[:, 1] ** 2, np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
-    """What the metrics need to know of a split and size."""
+class TaskConfig:
+    """The task of a split and size, as far as metrics depend on it."""
 
-    # of the score fields; nodes in cell centres say that the material fills the box
+    # of the score fields; nodes in cell centres mean that the material fills the box
     grid: Grid
-    input_frames: int  # given to the model
-    horizon: int  # frames that it predicts
+    input_frames: int  # frames that the model is given
+    horizon: int  # frames that the model predicts
     # absolute frames at which slow metrics are measured
     frames_of_interest: tuple[int, ...]
     # of x, y [length] and u, v [length/frame] over train
     attribute_std: tuple[float, float, float, float]
-    radius: float  # first-frame neighbours lie within this distance [length]
-    materials: tuple[str, ...] = (
-        "liquid",
-    )  # of the split; two or more have metrics of their own
+    radius: float  # distance of neighbours in the first frame [length]
+    # of the split; two or more have metrics of their own
+    materials: tuple[str, ...] = ("liquid",)
     # walls [length]
     bounds: tuple[tuple[float, float], tuple[float, float]] = (0.0, 1.0), (0.0, 1.0)
 
     @property
-    def full_box(self) -> bool:
+    def is_full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
         return self.grid.placement is Placement.CELL_CENTRES
 
@@ -190,11 +193,10 @@ class Snapshot:
         return lengths(self.velocity)
 
     @cached_property
-    def arms(self) -> Floats:
+    def lever_arms(self) -> Floats:
         """Positions relative to the centre of the box [length], shape [particle, 2]."""
-        return np.asarray(
-            self.position - np.mean(self.scenario.setting.bounds, axis=1), np.float64
-        )
+        centre = np.mean(self.scenario.config.bounds, axis=1)
+        return np.asarray(self.position - centre, np.float64)
 
     @cached_property
     def fields(self) -> Fields:
@@ -202,36 +204,35 @@ class Snapshot:
         return fields(
             self.position,
             self.velocity,
-            self.scenario.setting.grid,
-            full=self.scenario.full,
+            self.scenario.config.grid,
+            full=self.scenario.full_weight,
         )
 
     @cached_property
     def projections(self) -> NDArray[np.float32]:
-        """Positions along fixed directions, sorted [length], shape [direction,
-        particle].
-        """
+        """Positions along fixed directions, sorted [length], [direction, particle]."""
         return sorted_projections(self.position)
 
     @cached_property
     def material_projections(self) -> Mapping[str, NDArray[np.float32]]:
-        """The same of the particles of each material, by its name."""
+        """Sorted projections of the particles of each material, by its name."""
         members = self.scenario.members
         if len(members) == 1:
             return dict.fromkeys(members, self.projections)
+
         return {
-            name: sorted_projections(self.position[index])
-            for name, index in members.items()
+            name: sorted_projections(self.position[particles])
+            for name, particles in members.items()
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What holds in all frames of one scenario."""
+    """Properties that all frames of one scenario share."""
 
-    setting: Setting  # the split and size
-    # true positions from frame 0 to the last given one, [frame, particle, 2]
-    given: NDArray[np.floating]
+    config: TaskConfig  # of the split and size
+    # true positions from frame 0 to the last input frame, [frame, particle, 2]
+    input_positions: NDArray[np.floating]
     # index into lagbench.data.MATERIALS, shape [particle]
     material: NDArray[np.integer]
     particle_mass: float  # of every particle [mass]
@@ -241,33 +242,29 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""
-        if (
-            self.given.ndim != 3
-            or len(self.given) < 2
-            or self.given.shape[1:] != (len(self.material), 2)
-        ):
-            expected = f"[2 or more frames, {len(self.material)} particles, 2]"
-            got = str(self.given.shape)
-            raise UsageError(
-                "the given frames do not fit the scenario", expected=expected, got=got
-            )
+        shape = self.input_positions.shape
+        if len(shape) == 3 and shape[0] >= 2 and shape[1:] == (len(self.material), 2):
+            return
+        raise UsageError(
+            "the input frames do not fit the scenario",
+            expected=f"[2 or more frames, {len(self.material)} particles, 2]",
+            got=str(shape),
+        )
 
     @cached_property
-    def full(self) -> float:
+    def full_weight(self) -> float:
         """Weight of a full interior node [1]."""
-        return self.setting.grid.full_weight(len(self.material), self.area)
+        return self.config.grid.full_weight(len(self.material), self.area)
 
     @cached_property
-    def last_given(self) -> Snapshot:
-        """The state that the prediction starts from."""
-        return self.snapshot(self.given[-1], self.given[-2])
+    def initial_snapshot(self) -> Snapshot:
+        """The last input frame, from which the prediction starts."""
+        return self.snapshot(self.input_positions[-1], self.input_positions[-2])
 
     @cached_property
-    def active(self) -> range:
-        """Absolute numbers of the predicted frames until the truth comes to rest; one
-        at least.
-        """
-        frames = self.setting.predicted_frames
+    def moving_frames(self) -> range:
+        """Numbers of the predicted frames until the truth rests; at least one."""
+        frames = self.config.predicted_frames
         if self.active_frames is None:
             return frames
         return frames[: max(1, self.active_frames)]
@@ -275,44 +272,55 @@ class Scenario:
     @cached_property
     def members(self) -> Mapping[str, NDArray[np.intp]]:
         """Particle numbers of each material that occurs here."""
-        found = {
-            name: np.flatnonzero(self.material == value)
-            for value, name in enumerate(MATERIALS)
-        }
-        return {name: particles for name, particles in found.items() if particles.size}
+        members = {}
+        for value, name in enumerate(MATERIALS):
+            particles = np.flatnonzero(self.material == value)
+            if particles.size:
+                members[name] = particles
+        return members
 
     @cached_property
     def bonds(self) -> Mapping[str, Bonds]:
         """Neighbours in frame 0 within each elastic body, by its material."""
-        first = np.asarray(self.given[0], np.float64)
-        elastic = {
-            name: particles
-            for name, particles in self.members.items()
-            if name in ELASTIC
-        }
-        return {
-            name: Bonds.within(self.setting.radius, first[index])
-            for name, index in elastic.items()
-        }
+        first = np.asarray(self.input_positions[0], np.float64)
+        bonds = {}
+        for name, particles in self.members.items():
+            if name in ELASTIC:
+                bonds[name] = Bonds.within(self.config.radius, first[particles])
+        return bonds
 
     def snapshot(self, position: ArrayLike, previous: ArrayLike) -> Snapshot:
-        """Return the snapshot of positions and those one frame before, both [particle,
-        2].
+        """Return the snapshot of a frame from its positions and those one frame before.
+
+        Args:
+            position: positions of the frame [length], shape [particle, 2].
+            previous: positions one frame before [length], shape [particle, 2].
+
+        Raises:
+            UsageError: an array has another shape.
+            ChecksFailedError: positions are not finite.
         """
         # columns contiguous: sums over particles and the grid transfer run along them
-        x, before = (np.asarray(a, np.float64, order="F") for a in (position, previous))
+        x = np.asarray(position, np.float64, order="F")
+        before = np.asarray(previous, np.float64, order="F")
+
         expected = (len(self.material), 2)
-        got = f"{x.shape} and {before.shape}"
         if x.shape != expected or before.shape != expected:
             raise UsageError(
-                "wrong shape of positions", expected=str(expected), got=got
+                "wrong shape of positions",
+                expected=str(expected),
+                got=f"{x.shape} and {before.shape}",
             )
-        if not np.isfinite(x).all():
-            got = (
-                f"{np.count_nonzero(~np.isfinite(x).all(axis=1))} of {len(x)} particles"
+
+        is_finite = np.isfinite(x)
+        if not is_finite.all():
+            count = np.count_nonzero(~is_finite.all(axis=1))
+            raise ChecksFailedError(
+                "positions are not finite",
+                got=f"{count} of {len(x)} particles",
+                fix="freeze the rollout at its last finite frame",
             )
-            fix = "freeze the rollout at its last finite frame"
-            raise ChecksFailedError("positions are not finite", got=got, fix=fix)
+
         return Snapshot(x, x - before, self)
 
 
@@ -322,27 +330,30 @@ def snapshots(
     *,
     previous: ArrayLike | None = None,
 ) -> Iterator[Snapshot]:
-    """Yield the snapshots of consecutive frames [length], each [particle, 2], holding
-    two frames at a time.
+    """Yield the snapshots of consecutive frames; two frames are in memory at a time.
 
-    ``previous`` are the positions one frame before the first; those last given by
-    default.
+    Args:
+        scenario: the scenario of the particles.
+        positions: positions of each frame [length], shape [particle, 2].
+        previous: positions one frame before the first; by default those of the last
+            input frame.
     """
     if previous is None:
-        before = scenario.given[-1]
+        before = scenario.input_positions[-1]
     else:
         before = previous
+
     for position in positions:
-        made = scenario.snapshot(position, before)
-        yield made
-        before = made.position
+        snapshot = scenario.snapshot(position, before)
+        yield snapshot
+        before = snapshot.position
 
 
 @dataclass(frozen=True)
 class FramePair:
     """Truth and prediction of one frame of one scenario."""
 
-    scenario: Scenario  # what holds in all its frames
+    scenario: Scenario  # properties that all its frames share
     frame: int  # absolute frame number
     truth: Snapshot  # the simulated particles
     prediction: Snapshot  # the predicted particles, in the same order
@@ -354,9 +365,7 @@ class FramePair:
 
     @cached_property
     def velocity_error(self) -> Floats:
-        """Predicted minus true per-frame velocity [length/frame], shape [particle,
-        2].
-        """
+        """Predicted minus true velocity [length/frame], shape [particle, 2]."""
         return self.prediction.velocity - self.truth.velocity
 
     @cached_property
@@ -366,9 +375,7 @@ class FramePair:
 
     @cached_property
     def velocity_square(self) -> Floats:
-        """Mean squared velocity error of each component [length^2/frame^2], shape
-        [2].
-        """
+        """Mean squared velocity error by component [length^2/frame^2], shape [2]."""
         return mean_square(self.velocity_error)
 
     @cached_property
@@ -377,23 +384,22 @@ class FramePair:
         return replace(self.prediction.fields, counted=self.truth.fields.counted)
 
     @cached_property
-    def outside(self) -> float:
+    def outside_share(self) -> float:
         """Share of predicted particles that are past a wall [1]."""
-        sides = zip(
-            self.prediction.position.T, self.scenario.setting.bounds, strict=True
-        )
-        past = [
-            (x < low - WALL_TOLERANCE) | (x > high + WALL_TOLERANCE)
-            for x, (low, high) in sides
-            if not (
-                x.min() >= low - WALL_TOLERANCE and x.max() <= high + WALL_TOLERANCE
-            )  # NaN too
-        ]
-        if past:
-            return np.count_nonzero(np.logical_or.reduce(past)) / len(
-                self.prediction.position
-            )
-        return 0.0
+        position = self.prediction.position
+        is_outside = []  # by component, where any particle is outside
+
+        for x, (low, high) in zip(position.T, self.scenario.config.bounds, strict=True):
+            lowest = low - WALL_TOLERANCE
+            highest = high + WALL_TOLERANCE
+            # nearly always; False for NaN too
+            all_inside = x.min() >= lowest and x.max() <= highest
+            if not all_inside:
+                is_outside.append((x < lowest) | (x > highest))
+
+        if not is_outside:
+            return 0.0
+        return np.count_nonzero(np.logical_or.reduce(is_outside)) / len(position)
 
     @property
     def nodes(self) -> NDArray[np.bool_]:
@@ -402,49 +408,47 @@ class FramePair:
 
     @cached_property
     def node_count(self) -> int:
-        """How many nodes are compared."""
+        """Number of nodes that are compared."""
         return int(np.count_nonzero(self.nodes))
 
     @cached_property
     def true_vorticity(self) -> Floats:
         """Omega of the truth at the compared nodes [1/frame], shape [node]."""
-        return vorticity(
-            self.truth.fields.velocity, self.scenario.setting.grid.spacing
-        )[self.nodes]
+        return self._vorticity(self.truth)
 
     @cached_property
     def predicted_vorticity(self) -> Floats:
         """Omega of the prediction at the compared nodes [1/frame], shape [node]."""
-        return vorticity(
-            self.prediction.fields.velocity, self.scenario.setting.grid.spacing
-        )[self.nodes]
+        return self._vorticity(self.prediction)
+
+    def _vorticity(self, snapshot: Snapshot) -> Floats:
+        spacing = self.scenario.config.grid.spacing
+        return vorticity(snapshot.fields.velocity, spacing)[self.nodes]
 
     @cached_property
-    def truth_turns(self) -> bool:
-        """Whether the true vorticity is more than rounding: bodies that only fly have
-        none.
-        """
-        return self._turns(self.true_vorticity, self.truth)
+    def truth_rotates(self) -> bool:
+        """Whether the true vorticity is more than rounding, unlike that of a flight."""
+        return self._rotates(self.true_vorticity, self.truth)
 
     @cached_property
-    def prediction_turns(self) -> bool:
+    def prediction_rotates(self) -> bool:
         """Whether the predicted vorticity is more than rounding."""
-        return self._turns(self.predicted_vorticity, self.prediction)
+        return self._rotates(self.predicted_vorticity, self.prediction)
 
-    def _turns(self, omega: Floats, snapshot: Snapshot) -> bool:
-        greatest = np.abs(omega).max(initial=0.0) * self.scenario.setting.grid.spacing
+    def _rotates(self, omega: Floats, snapshot: Snapshot) -> bool:
+        spacing = self.scenario.config.grid.spacing
+        greatest = np.abs(omega).max(initial=0.0) * spacing
         velocity = snapshot.fields.velocity
-        if (
-            greatest > ROUNDING * np.abs(velocity).max()
-        ):  # nearly always, and picking nodes takes longer
+
+        # nearly always true, and picking nodes takes longer
+        if greatest > ROUNDING * np.abs(velocity).max():
             return True
-        return bool(greatest > ROUNDING * np.abs(velocity[self.nodes]).max(initial=0.0))
+        nodal_velocity = np.abs(velocity[self.nodes]).max(initial=0.0)
+        return bool(greatest > ROUNDING * nodal_velocity)
 
     @cached_property
     def vorticity_residual(self) -> Floats:
-        """``r = predicted - true`` (Eq. 5.22) at the compared nodes [1/frame], shape
-        [node].
-        """
+        """``r = predicted - true`` (Eq. 5.22) at the nodes [1/frame], shape [node]."""
         return self.predicted_vorticity - self.true_vorticity
 
     @cached_property

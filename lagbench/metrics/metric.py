@@ -1,4 +1,4 @@
-"""A metric: a statistic of a frame pair and how frames become one number.
+"""A metric: a statistic of a frame pair, and how frames become one number.
 
 Statistics are taken per (scenario, frame); everything else (roots, ratios, horizons) is
 a function of their series over frames, so that a statistic is measured once however
@@ -24,14 +24,12 @@ from .frame import Floats, FramePair
 MINIMUM_NODES = 16
 """With fewer compared nodes the metrics of vorticity and divergence are undefined."""
 
-SCALE_FLOOR = 1e-3
-"""Share of the truth's greatest value below which errors are no longer scaled by its
-value.
-"""
+SMALLEST_SCALE = 1e-3
+"""Least scale of an error, as a share of the truth's greatest value."""
 
 
 class Direction(enum.StrEnum):
-    """What better means."""
+    """Which values of a metric are better."""
 
     LOWER = "lower"
     HIGHER = "higher"
@@ -45,20 +43,18 @@ def always(_: FramePair) -> bool:
 
 
 def at_slow_frames(pair: FramePair) -> bool:
-    """Tell whether this is a frame of interest or the last one."""
-    return pair.frame in pair.scenario.setting.slow_frames
+    """Return whether this is a frame of interest or the last one."""
+    return pair.frame in pair.scenario.config.slow_frames
 
 
 def enough_nodes(pair: FramePair) -> bool:
-    """Tell whether there are nodes enough to speak of a vorticity field."""
+    """Return whether enough nodes are compared for a vorticity field."""
     return pair.node_count >= MINIMUM_NODES
 
 
-def turning(pair: FramePair) -> bool:
-    """Tell whether there are nodes enough and the truth's vorticity there is more than
-    rounding.
-    """
-    return enough_nodes(pair) and pair.truth_turns
+def has_rotation(pair: FramePair) -> bool:
+    """Return whether nodes are enough and the truth's vorticity is not rounding."""
+    return enough_nodes(pair) and pair.truth_rotates
 
 
 def identity(values: Floats) -> Floats:
@@ -73,25 +69,28 @@ def quotient(numerator: Floats, denominator: Floats) -> Floats:
     return ratio
 
 
-def floored_quotient(error: Floats, scale: Floats) -> Floats:
-    """Return ``error / max(scale, 1e-3 max(scale))``, shape [frame]; NaN where all
-    scales are 0.
+def scaled_error(error: Floats, scale: Floats) -> Floats:
+    """Return ``error / max(scale, 1e-3 max(scale))``, shape [frame].
 
-    The floor keeps frames in which the truth rests from ruling the mean.
+    The least scale keeps frames in which the truth rests from dominating the mean. NaN
+    where all scales are 0.
     """
     greatest = np.max(scale, initial=0.0, where=~np.isnan(scale))
-    return quotient(error, np.maximum(scale, SCALE_FLOOR * greatest))
+    return quotient(error, np.maximum(scale, SMALLEST_SCALE * greatest))
 
 
 def mean(values: Floats) -> float:
     """Return the mean over the defined frames, NaN if there are none."""
     defined = values[~np.isnan(values)]
-    return float(np.mean(defined)) if defined.size else math.nan
+    if not defined.size:
+        return math.nan
+    return float(np.mean(defined))
 
 
 def root_mean_square(values: Floats) -> float:
-    """Return ``sqrt(mean(values^2))``: for RMSE per frame, the root of the frame mean
-    of MSE.
+    """Return ``sqrt(mean(values^2))`` over the defined frames.
+
+    Of RMSE per frame it is the root of the frame mean of MSE.
     """
     return math.sqrt(mean(values**2))
 
@@ -104,7 +103,9 @@ def last(values: Floats) -> float:
 def total(values: Floats) -> float:
     """Return the sum over the defined frames, NaN if there are none."""
     defined = values[~np.isnan(values)]
-    return float(np.sum(defined)) if defined.size else math.nan
+    if not defined.size:
+        return math.nan
+    return float(np.sum(defined))
 
 
 @dataclass(frozen=True)
@@ -112,31 +113,29 @@ class FirstFrames:
     """A reduction of the first predicted frames only; NaN when there are fewer."""
 
     count: int  # predicted frames that are taken
-    reduction: Callable[[Floats], float] = mean  # what is made of them
+    reduction: Callable[[Floats], float] = mean  # of these frames
 
     def __call__(self, values: Floats) -> float:
         """Return the reduction of those frames."""
-        return (
-            math.nan
-            if len(values) < self.count
-            else self.reduction(values[: self.count])
-        )
+        if len(values) < self.count:
+            return math.nan
+        return self.reduction(values[: self.count])
 
 
 NAME = re.compile("[a-z][a-z0-9_]{0,63}")
+"""Names that metrics may have: names in scores.nc are split at blanks."""
+
 RESERVED = ("skill",)
-"""What a metric may be called: stored names are split at blanks, and tables have a row
-`skill`.
-"""
+"""Names that no metric may have: tables have a row `skill`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Metric:
     """One entry of the table of metrics.
 
-    NaN policy: where ``applies`` says no (no such material, not a slow frame) nothing
-    is measured: an expected gap, not counted. Where ``defined`` says no, or a statistic
-    is NaN, the frame is undefined: left out of the mean and counted.
+    NaN policy: where ``applies`` is False (no such material, not a slow frame) nothing
+    is measured: an expected gap, not counted. Where ``defined`` is False, or a
+    statistic is NaN, the frame is undefined: left out of the mean and counted.
 
     Raises:
         UsageError: neither a statistic nor others' series, a text as ``of``, a target
@@ -147,9 +146,9 @@ class Metric:
     name: str  # unique
     family: str  # metrics that are shown together
     unit: str  # of the value
-    direction: Direction  # what better means
-    source: str  # equation or section that defines it
-    summary: str  # what it says, one line
+    direction: Direction  # which values are better
+    source: str  # equation, section or paper that defines it
+    summary: str  # its meaning, one line
     # value of a perfect prediction; None where it depends on truth or task
     perfect: float | None = None
     # of one frame pair; None if it follows from others
@@ -163,54 +162,57 @@ class Metric:
     series: Callable[..., Floats] = identity
     # one number of a scenario from the value per frame
     over_frames: Callable[[Floats], float] = mean
-    per_frame: bool = True  # whether the value at a single frame means anything
+    per_frame: bool = True  # whether the value at a single frame has a meaning
     horizon: int = 1  # predicted frames needed; smaller tasks do not have the metric
     # extra of lagbench that it needs; measured only when asked for
     extra: str | None = None
 
     def __post_init__(self) -> None:
-        """Fill in ``of``; refuse a metric that nothing could be computed for, judged
-        by, or stored under.
-        """
-        try:
-            # a package may give a text
-            object.__setattr__(self, "direction", Direction(self.direction))
-        except ValueError:
-            what = f"metric {self.name!r} has no such direction"
-            got = repr(self.direction)
-            fault = UsageError(
-                what, expected=", ".join(Direction), got=got, fix="name one of these"
-            )
-            raise fault from None
-        given: object = self.of
-        if isinstance(given, str):
-            what = f"metric {self.name!r} follows from a text, not from a tuple of statistics"
-            raise UsageError(
-                what, expected=f"({given!r},)", got=repr(given), fix="add the comma"
-            )
-        for name in (self.name, *self.of):
-            if (
-                not isinstance(name, str)
-                or not NAME.fullmatch(name)
-                or name in RESERVED
-            ):
-                expected = "up to 64 small letters, digits and underscores, as in my_error; not skill"
-                raise UsageError(
-                    f"no name for a metric: {name!r}",
-                    expected=expected,
-                    fix="rename it",
-                )
+        """Fill in ``of``; refuse a metric that is incomplete or has no usable name."""
+        self._convert_direction()
+        self._check_names()
         if self.statistic is None and not self.of:
             raise UsageError(
-                f"metric {self.name!r} has neither a statistic nor others to "
-                f"follow from"
+                f"metric {self.name!r} has no statistic, own or of other metrics"
             )
         if self.perfect is None and self.direction is Direction.TARGET:
-            raise UsageError(
-                f"metric {self.name!r} aims at a target and does not say which"
-            )
+            raise UsageError(f"metric {self.name!r} has a target without a value")
         if not self.of:
             object.__setattr__(self, "of", (self.name,))
+
+    def _convert_direction(self) -> None:
+        """Turn a direction that a package gives as text into a :class:`Direction`."""
+        try:
+            direction = Direction(self.direction)
+        except ValueError:
+            raise UsageError(
+                f"metric {self.name!r} has no such direction",
+                expected=", ".join(Direction),
+                got=repr(self.direction),
+                fix="name one of these",
+            ) from None
+        object.__setattr__(self, "direction", direction)
+
+    def _check_names(self) -> None:
+        """Refuse names that files and tables cannot hold."""
+        statistics: object = self.of
+        if isinstance(statistics, str):
+            raise UsageError(
+                f"metric {self.name!r} follows from a text, "
+                f"not from a tuple of statistics",
+                expected=f"({statistics!r},)",
+                got=repr(statistics),
+                fix="add the comma",
+            )
+        for name in (self.name, *self.of):
+            is_text = isinstance(name, str)
+            if not is_text or not NAME.fullmatch(name) or name in RESERVED:
+                raise UsageError(
+                    f"no name for a metric: {name!r}",
+                    expected="up to 64 small letters, digits and underscores, "
+                    "as in my_error; not skill",
+                    fix="rename it",
+                )
 
     def measure(self, pair: FramePair) -> float:
         """Return the statistic of a frame pair, NaN where it is undefined.
@@ -221,50 +223,60 @@ class Metric:
         """
         if self.statistic is None:
             return math.nan
-        try:
-            told: object = self.defined(pair)
-            clear = isinstance(told, (bool, np.bool_))
-            value: object = self.statistic(pair) if clear and told else math.nan
-        except (Exception, SystemExit) as error:
-            self.blame(error, f"frame {pair.frame}")
-        if clear and isinstance(value, float):  # nearly always
-            return float(value)
-        place = f"frame {pair.frame}"
-        if not clear:
-            raise self._broken(
-                "whether a metric is defined is neither true nor false",
-                place,
-                "a bool",
-                told,
-            )
-        with suppress(
-            TypeError, ValueError, OverflowError, RuntimeError
-        ):  # as arrays of others raise
-            if not isinstance(value, (str, bytes, complex)):
-                return float(value)  # type: ignore[arg-type]
-        raise self._broken("a metric gave no number", place, "a float", value)
 
-    def blame(self, error: Exception | SystemExit, place: str) -> NoReturn:
-        """Raise again what the metric raised, with name and place; what would end the
-        program as a fault.
+        value: object = math.nan
+        try:
+            is_defined: object = self.defined(pair)
+            is_bool = isinstance(is_defined, (bool, np.bool_))
+            if is_bool and is_defined:
+                value = self.statistic(pair)
+        except (Exception, SystemExit) as error:
+            self.raise_named(error, f"frame {pair.frame}")
+
+        if is_bool and isinstance(value, float):  # nearly always
+            return float(value)
+
+        place = f"frame {pair.frame}"
+        if not is_bool:
+            what = "whether a metric is defined is neither true nor false"
+            raise self._failure(what, place, expected="a bool", got=is_defined)
+        return self._to_number(value, place)
+
+    def _to_number(self, value: object, place: str) -> float:
+        """Return a statistic as a float; an array of one element is converted."""
+        if not isinstance(value, (str, bytes, complex)):
+            # as arrays of other packages raise
+            with suppress(TypeError, ValueError, OverflowError, RuntimeError):
+                return float(value)  # type: ignore[arg-type]
+        what = "a metric gave no number"
+        raise self._failure(what, place, expected="a float", got=value)
+
+    def raise_named(self, error: Exception | SystemExit, place: str) -> NoReturn:
+        """Raise an error of the metric's functions again, with name and place added.
+
+        Raises:
+            WorkFailedError: the error would end the program.
         """
         if isinstance(error, SystemExit):
-            raise self._broken(
-                "a metric would end the program", place, "a number", error
-            ) from error
+            what = "a metric would end the program"
+            failure = self._failure(what, place, expected="a number", got=error)
+            raise failure from error
         error.add_note(f"in metric {self.name}, {place}")
         raise error
 
-    def _broken(
-        self, what: str, place: str, expected: str, got: object
+    def _failure(
+        self, what: str, place: str, *, expected: str, got: object
     ) -> WorkFailedError:
-        package = getattr(
-            self.series if self.statistic is None else self.statistic, "__module__", "?"
+        """Return the error for a function of the metric that does not work."""
+        function = self.series if self.statistic is None else self.statistic
+        package = getattr(function, "__module__", "?")
+        return WorkFailedError(
+            what,
+            where=f"{package}, {self.name}, {place}",
+            expected=expected,
+            got=f"{type(got).__name__}: {got!r:.60}",
+            fix="mend or uninstall the package that adds it",
         )
-        where = f"{package}, {self.name}, {place}"
-        told = f"{type(got).__name__}: {got!r:.60}"
-        fix = "mend or uninstall the package that adds it"
-        return WorkFailedError(what, where=where, expected=expected, got=told, fix=fix)
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.
@@ -276,7 +288,9 @@ class Metric:
             raise UsageError(f"{self.name} is an observable: it ranks nothing")
         if self.direction is Direction.TARGET and self.perfect is not None:
             return abs(value - self.perfect)
-        return -value if self.direction is Direction.HIGHER else value
+        if self.direction is Direction.HIGHER:
+            return -value
+        return value
 
 
 def metric(
@@ -287,23 +301,22 @@ def metric(
     perfect: float | None = None,
     of: tuple[str, ...] = (),
     family: str | None = None,
-    **more: Any,  # noqa: ANN401 - further fields of Metric, as they are
+    **fields: Any,  # noqa: ANN401 - further fields of Metric, as they are
 ) -> Callable[[Callable[..., Any]], Metric]:
-    """Make a metric of a function; its name and the first line of its docstring are the
-    metric's.
+    """Return a decorator that makes a metric of a function.
 
+    Name and summary are the function's name and the first paragraph of its docstring.
     The function takes a frame pair and is the statistic; with ``of`` it takes the
     series of those statistics and returns the value per frame.
     """
     if perfect is None and direction is Direction.LOWER:
         perfect = 0.0
 
-    def made(function: Callable[..., Any]) -> Metric:
-        role: dict[str, Any]
+    def make_metric(function: Callable[..., Any]) -> Metric:
         if of:
-            role = {"of": of, "series": function}
+            fields.update(of=of, series=function)
         else:
-            role = {"statistic": function}
+            fields.update(statistic=function)
         return Metric(
             name=function.__name__,
             family=family or function.__module__.rpartition(".")[2],
@@ -312,11 +325,10 @@ def metric(
             source=source,
             summary=_first_paragraph(function.__doc__ or "").rstrip("."),
             perfect=perfect,
-            **role,
-            **more,
+            **fields,
         )
 
-    return made
+    return make_metric
 
 
 def _first_paragraph(docstring: str) -> str:
@@ -325,7 +337,5 @@ def _first_paragraph(docstring: str) -> str:
 
 
 def metrics_of(module: Mapping[str, object]) -> tuple[Metric, ...]:
-    """Return the metrics among the names of a module, in the order of their
-    definition.
-    """
+    """Return the metrics among the names of a module, in order of definition."""
     return tuple(value for value in module.values() if isinstance(value, Metric))

@@ -1,9 +1,9 @@
 """Errors of particles: position, velocity, and all attributes standardised.
 
-The particle of the prediction is the particle of the truth: order matters, and a
-swapped pair is an error even where the picture is the same. On chaotic flows these
-errors saturate at the size of the flow; then vorticity and transport say more, and
-``position_rmse_20`` stops while most flows can still be followed.
+Each particle of the prediction is compared with the same particle of the truth: order
+matters, and a swapped pair is an error even where the picture is the same. On chaotic
+flows these errors saturate at the size of the flow; then vorticity and transport say
+more, and ``position_rmse_20`` stops while most flows can still be followed.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ from .frame import Floats, FramePair, average, mean_absolute_error, mean_squared
 from .metric import Direction, FirstFrames, Metric, last, mean, metric, root_mean_square
 
 HORIZONS = (1, 5, 10, 20, 50)
-"""Predicted frames at which ``mse_avg`` and ``mse_end`` are taken besides the whole
-rollout.
-"""
+"""Horizons of ``mse_avg`` and ``mse_end`` besides the whole rollout [frame]."""
 
 SQUARED = {"length": "length^2", "length/frame": "length^2/frame^2"}
 
@@ -40,10 +38,9 @@ def attribute_mse(pair: FramePair) -> float:
     4.15 cancel in the difference. 0 is perfect; 1 is the error of always predicting the
     mean of train.
     """
-    std = np.array(pair.scenario.setting.attribute_std)
-    return average(
-        np.concatenate([pair.position_square, pair.velocity_square]) / std**2
-    )
+    std = np.array(pair.scenario.config.attribute_std)
+    squares = np.concatenate([pair.position_square, pair.velocity_square])
+    return average(squares / std**2)
 
 
 @dataclass(frozen=True)
@@ -51,105 +48,113 @@ class ErrorMean:
     """Mean of a particle error over all particles, or over those of one material."""
 
     error: Callable[[FramePair], Floats]  # of all particles, shape [particle, 2]
-    law: Callable[[Floats], float]  # mean squared or mean absolute
+    norm: Callable[[Floats], float]  # mean squared or mean absolute error
     material: str | None = None  # name of a material, None for all
 
     def __call__(self, pair: FramePair) -> float:
         """Return the mean for one frame pair."""
         error = self.error(pair)
-        return self.law(
-            error
-            if self.material is None
-            else error[pair.scenario.members[self.material]]
-        )
+        if self.material is None:
+            return self.norm(error)
+        return self.norm(error[pair.scenario.members[self.material]])
 
     def applies(self, pair: FramePair) -> bool:
-        """Tell whether the split has several materials and the scenario has this
-        one.
-        """
-        several = len(pair.scenario.setting.materials) > 1
-        return self.material is None or (
-            several and self.material in pair.scenario.members
-        )
+        """Return whether the split has several materials and the scenario this one."""
+        if self.material is None:
+            return True
+        is_mixed = len(pair.scenario.config.materials) > 1
+        return is_mixed and self.material in pair.scenario.members
 
 
-def _errors(quantity: str, unit: str, material: str | None) -> Iterator[Metric]:
-    if material is None:
-        whose = "all particles"
-    else:
-        whose = f"{material} particles"
+def _errors(quantity: str, unit: str) -> Iterator[Metric]:
+    """Yield the errors of a quantity over all particles, then by material."""
+    for material in (None, *MATERIALS):
+        yield from _errors_of_material(quantity, unit, material)
+
+
+def _errors_of_material(
+    quantity: str, unit: str, material: str | None
+) -> Iterator[Metric]:
+    """Yield MSE, MAE and RMSE of a quantity."""
     if material is None:
         suffix = ""
+        particles = "all particles"
     else:
         suffix = f"_{material}"
-    laws = {
-        "mse": (mean_squared_error, SQUARED[unit], "3.3"),
-        "mae": (mean_absolute_error, unit, "3.4"),
-    }
-    for name, (law, law_unit, equation) in laws.items():
-        statistic = ErrorMean(attrgetter(f"{quantity}_error"), law, material)
-        yield _error(
-            name=f"{quantity}_{name}{suffix}",
-            unit=law_unit,
-            source=f"Eq. {equation}",
-            summary=f"Mean {'squared' if name == 'mse' else 'absolute'} {quantity} "
-            f"error of {whose}",
-            statistic=statistic,
-            applies=statistic.applies,
-        )
+        particles = f"{material} particles"
+
+    error = attrgetter(f"{quantity}_error")
+    squared = ErrorMean(error, mean_squared_error, material)
+    yield _error(
+        name=f"{quantity}_mse{suffix}",
+        unit=SQUARED[unit],
+        source="Eq. 3.3",
+        summary=f"Mean squared {quantity} error of {particles}",
+        statistic=squared,
+        applies=squared.applies,
+    )
+    absolute = ErrorMean(error, mean_absolute_error, material)
+    yield _error(
+        name=f"{quantity}_mae{suffix}",
+        unit=unit,
+        source="Eq. 3.4",
+        summary=f"Mean absolute {quantity} error of {particles}",
+        statistic=absolute,
+        applies=absolute.applies,
+    )
     yield _error(
         name=f"{quantity}_rmse{suffix}",
         unit=unit,
         source="Eq. 3.3",
-        summary=f"Root mean squared {quantity} error of {whose}",
+        summary=f"Root mean squared {quantity} error of {particles}",
         of=(f"{quantity}_mse{suffix}",),
         series=np.sqrt,
         over_frames=root_mean_square,
     )
 
 
-def _over_rollouts() -> Iterator[Metric]:
-    """Yield mean and end of ``attribute_mse`` over the rollout and at the horizons."""
-    whole = {"mse_avg": (mean, "4.17", "Mean"), "mse_end": (last, "4.18", "Last")}
-    for name, (reduction, equation, word) in whole.items():
-        for horizon in (None, *HORIZONS):
-            if horizon is None:
-                frames = "the rollout"
-            else:
-                frames = f"the first {horizon} frames"
-            yield _error(
-                name=name if horizon is None else f"{name}_{horizon}",
-                unit="1",
-                source=f"Eq. {equation}",
-                summary=f"{word} attribute_mse of {frames}",
-                of=("attribute_mse",),
-                over_frames=reduction
-                if horizon is None
-                else FirstFrames(horizon, reduction),
-                per_frame=False,
-                horizon=horizon or 1,
-            )
+def _over_rollouts(
+    name: str, word: str, reduction: Callable[[Floats], float], source: str
+) -> Iterator[Metric]:
+    """Yield a reduction of ``attribute_mse`` over the rollout and over each horizon."""
+    rollout = partial(
+        _error, unit="1", source=source, of=("attribute_mse",), per_frame=False
+    )
+    yield rollout(
+        name=name,
+        summary=f"{word} attribute_mse of the rollout",
+        over_frames=reduction,
+    )
+    for horizon in HORIZONS:
+        yield rollout(
+            name=f"{name}_{horizon}",
+            summary=f"{word} attribute_mse of the first {horizon} frames",
+            over_frames=FirstFrames(horizon, reduction),
+            horizon=horizon,
+        )
+
+
+def _rmse_of_first_20(mse: Floats) -> float:
+    """Return the root mean squared error of the first 20 frames."""
+    return math.sqrt(FirstFrames(20)(mse))
 
 
 METRICS = (
-    *(m for name in (None, *MATERIALS) for m in _errors("position", "length", name)),
+    *_errors("position", "length"),
     _error(
         name="position_rmse_20",
         unit="length",
-        source="design 2, section 4",
+        source="LagrangeBench (Toshev et al. 2023)",
         summary="Root mean squared position error of the first 20 frames, as "
         "LagrangeBench's MSE_20",
         of=("position_mse",),
-        over_frames=lambda mse: math.sqrt(FirstFrames(20)(mse)),
+        over_frames=_rmse_of_first_20,
         per_frame=False,
         horizon=20,
     ),
-    *(
-        m
-        for name in (None, *MATERIALS)
-        for m in _errors("velocity", "length/frame", name)
-    ),
+    *_errors("velocity", "length/frame"),
     attribute_mse,
-    *_over_rollouts(),
+    *_over_rollouts("mse_avg", "Mean", mean, "Eq. 4.17"),
+    *_over_rollouts("mse_end", "Last", last, "Eq. 4.18"),
 )
 """Metrics of this family."""

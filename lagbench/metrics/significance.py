@@ -1,10 +1,9 @@
-"""Do two methods differ? Scenarios are the sample, and so are seeds where there are
-several.
+"""Do two methods differ? The sample are scenarios, and seeds if there are several.
 
 Frames of one rollout are not independent, so a scenario is one value. With several
-seeds on either side the mean difference is held against its two-way bootstrap error
-(:func:`lagbench.metrics.aggregate.resample`); with one seed on both, scenarios alone
-can be drawn: the exact sign-flip test then compares these weights, and says nothing of
+seeds of either method the mean difference is tested against its two-way bootstrap error
+(:func:`lagbench.metrics.aggregate.resample`); with one seed of both, only scenarios can
+be drawn: the exact sign-flip test then compares these weights, and says nothing about
 the methods.
 """
 
@@ -24,7 +23,7 @@ from .frame import Floats
 from .metric import mean
 
 SIGNIFICANCE = 0.05
-"""Level at which two methods are told apart."""
+"""Level of significance of a difference."""
 
 FEWEST_SCENARIOS = 6
 """Under this no p-value can reach 5 % (2^(1-5) = 0.0625), so none is claimed."""
@@ -39,12 +38,15 @@ ROUNDING = 1e-12
 def sign_flip_p(differences: ArrayLike) -> float:
     """Return the exact two-sided p-value of the sign-flip test, ``2^(1-n) <= p <= 1``.
 
-    If neither is better, each difference is as likely as its negative: the share of all
-    2^n sign patterns whose mean is at least as far from 0 as the one seen. Zero
-    differences count: they are the same under either sign. All zero gives 1. None, or
-    more than 40, are refused, as are differences that are not finite.
+    If neither method is better, each difference is as likely as its negative: the share
+    of all 2^n sign patterns whose mean is at least as far from 0 as the observed one.
+    Zero differences count: they are the same under either sign. All zero gives 1.
+
+    Raises:
+        UsageError: no difference, more than 40, or one that is not finite.
     """
-    d = np.abs(np.asarray(differences, np.float64).ravel())
+    signed = np.asarray(differences, np.float64)
+    d = np.abs(signed.ravel())
     if not np.isfinite(d).all():
         raise UsageError(
             "differences are not finite", expected="numbers", got="NaN or infinity"
@@ -55,16 +57,17 @@ def sign_flip_p(differences: ArrayLike) -> float:
             expected=f"1 to {MOST_SCENARIOS} scenarios",
             got=d.size,
         )
-    seen = abs(float(np.sum(np.asarray(differences, np.float64)))) - ROUNDING * float(
-        np.sum(d)
-    )
-    if seen <= 0.0:
+
+    observed = abs(float(np.sum(signed))) - ROUNDING * float(np.sum(d))
+    if observed <= 0.0:
         return 1.0
+
     # a sum over all scenarios is a sum over one half plus one over the other
-    left = _signed_sums(d[: d.size // 2])
-    right = np.sort(_signed_sums(d[d.size // 2 :]))
-    above = right.size - np.searchsorted(right, seen - left, side="left")
-    return float(2.0 * int(np.sum(above)) / 2.0**d.size)
+    middle = d.size // 2
+    left = _signed_sums(d[:middle])
+    right = np.sort(_signed_sums(d[middle:]))
+    extreme = right.size - np.searchsorted(right, observed - left, side="left")
+    return float(2.0 * int(np.sum(extreme)) / 2.0**d.size)
 
 
 def _signed_sums(d: Floats) -> Floats:
@@ -84,62 +87,74 @@ def differ(first: ArrayLike, second: ArrayLike) -> float:
     ``2^(1-n)``.
 
     Losses are NaN where undefined, shape [seed, scenario] or [scenario]. With fewer
-    than six scenarios in which both have a value the answer is NaN: none is claimed.
+    than six scenarios in which both have a value the result is NaN.
+
+    Raises:
+        UsageError: the methods have different scenarios, or losses are infinite.
     """
-    a, b = (np.atleast_2d(np.asarray(side, np.float64)) for side in (first, second))
+    a = np.atleast_2d(np.asarray(first, np.float64))
+    b = np.atleast_2d(np.asarray(second, np.float64))
     if a.shape[1] != b.shape[1]:
         raise UsageError(
             "methods over different scenarios", expected=a.shape[1], got=b.shape[1]
         )
-    both = ~(np.isnan(a).all(axis=0) | np.isnan(b).all(axis=0))
-    a = a[:, both]
-    b = b[:, both]
-    scenarios = a.shape[1]
-    if scenarios >= FEWEST_SCENARIOS:
-        found = resample(a, b)
-    else:
-        found = None
-    if found is None:
+
+    is_undefined = np.isnan(a).all(axis=0) | np.isnan(b).all(axis=0)
+    a = a[:, ~is_undefined]
+    b = b[:, ~is_undefined]
+    scenario_count = a.shape[1]
+    if scenario_count < FEWEST_SCENARIOS:
         return math.nan
-    if len(a) == len(b) == 1 and scenarios <= MOST_SCENARIOS:
+    resampling = resample(a, b)
+    if resampling is None:
+        return math.nan
+
+    has_one_seed = len(a) == len(b) == 1
+    if has_one_seed and scenario_count <= MOST_SCENARIOS:
         return sign_flip_p(a[0] - b[0])
-    least = float(2.0 ** (1 - scenarios))
-    if not found.error:
-        if found.mean:
+
+    least = float(2.0 ** (1 - scenario_count))
+    if not resampling.error:
+        if resampling.mean:
             return least
         return 1.0
+
+    # commands that compare nothing save its import
     from scipy.special import stdtr
 
-    return max(least, 2.0 * float(stdtr(found.freedom, -abs(found.mean) / found.error)))
+    t = abs(resampling.mean) / resampling.error
+    return max(least, 2.0 * float(stdtr(resampling.freedom, -t)))
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return p-values corrected for their number by Holm's steps; NaN, where none is
-    claimed, stays.
+    """Return p-values corrected for their number by Holm's steps; NaN stays NaN.
 
     >>> holm([0.01, 0.04, 0.03])
     [0.03, 0.06, 0.06]
     """
-    known = sorted((p, i) for i, p in enumerate(p_values) if not math.isnan(p))
+    claimed = [i for i, p in enumerate(p_values) if not math.isnan(p)]
+    claimed.sort(key=lambda i: (p_values[i], i))
+
     corrected = [math.nan] * len(p_values)
     least = 0.0
-    for step, (p, i) in enumerate(known):
-        least = max(least, min(1.0, (len(known) - step) * p))
+    for step, i in enumerate(claimed):
+        stepped = min(1.0, (len(claimed) - step) * p_values[i])
+        least = max(least, stepped)
         corrected[i] = least
     return corrected
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """How far one method is from another in one metric."""
+    """Difference of two methods in one metric."""
 
     metric: str  # its name
-    scenarios: tuple[int, ...]  # for which both have a value
+    scenarios: tuple[int, ...]  # in which both have a value
     # mean of first minus second, in the metric's loss: negative if the first is better
     difference: float
     interval: tuple[float, float]  # 95 % bootstrap interval of that mean
-    p: float  # two-sided, NaN with fewer than six scenarios: none is claimed
-    # of either side; one on both: these weights, not the methods
+    p: float  # two-sided, NaN with fewer than six scenarios
+    # of each method; one of both: these weights are compared, not the methods
     seeds: tuple[int, int] = 1, 1
 
     @property
@@ -157,7 +172,7 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
 
     Args:
         first: scores of a method's seeds.
-        second: those of another.
+        second: scores of another method's seeds.
         paired: whether seed s of both is one training, used in two ways: its scatter
             then cancels, and the differences seed by seed are tested.
 
@@ -165,37 +180,47 @@ def compare(first: Seeds, second: Seeds, *, paired: bool = False) -> Comparison:
         UsageError: the scores are of different metrics, or paired of different numbers
             of seeds.
     """
-    sides = [_listed(first), _listed(second)]
-    names = {score.metric.name for side in sides for score in side}
+    first_scores = _as_sequence(first)
+    second_scores = _as_sequence(second)
+    names = {score.metric.name for score in (*first_scores, *second_scores)}
     if len(names) != 1:
         raise UsageError("scores of different metrics", got=" and ".join(sorted(names)))
-    losses = [[_losses(score) for score in side] for side in sides]
-    defined = [set().union(*side) for side in losses]
-    common = tuple(sorted(defined[0] & defined[1]))
-    one, two = (_table(side, common) for side in losses)
-    if paired and len(one) != len(two):
-        raise UsageError(
-            "pairs of different numbers of seeds", got=f"{len(one)} and {len(two)}"
-        )
+
+    first_losses = [_losses(score) for score in first_scores]
+    second_losses = [_losses(score) for score in second_scores]
+    first_defined = set().union(*first_losses)
+    second_defined = set().union(*second_losses)
+    common = tuple(sorted(first_defined & second_defined))
+
+    a = _table(first_losses, common)
+    b = _table(second_losses, common)
+    seeds = (len(a), len(b))
     if paired:
-        tested = (one - two, np.zeros((1, len(common))))
-    else:
-        tested = (one, two)
+        if len(a) != len(b):
+            raise UsageError(
+                "pairs of different numbers of seeds", got=f"{len(a)} and {len(b)}"
+            )
+        a = a - b
+        b = np.zeros((1, len(common)))
+
+    interval = (math.nan, math.nan)
+    p = math.nan
     if common:
-        found = resample(*tested)
-    else:
-        found = None
+        p = differ(a, b)
+        resampling = resample(a, b)
+        if resampling is not None:
+            interval = resampling.interval
     return Comparison(
         metric=names.pop(),
         scenarios=common,
-        difference=mean(mean_over_seeds(tested[0]) - mean_over_seeds(tested[1])),
-        interval=(math.nan, math.nan) if found is None else found.interval,
-        p=differ(*tested) if common else math.nan,
-        seeds=(len(one), len(two)),
+        difference=mean(mean_over_seeds(a) - mean_over_seeds(b)),
+        interval=interval,
+        p=p,
+        seeds=seeds,
     )
 
 
-def _listed(seeds: Seeds) -> Sequence[Score]:
+def _as_sequence(seeds: Seeds) -> Sequence[Score]:
     if isinstance(seeds, Score):
         return [seeds]
     return seeds
@@ -203,52 +228,59 @@ def _listed(seeds: Seeds) -> Sequence[Score]:
 
 def _losses(score: Score) -> dict[int, float]:
     """Return the loss of each scenario that has a value, by id."""
-    values = zip(score.scenarios, score.values.tolist(), strict=True)
-    return {i: score.metric.loss(value) for i, value in values if not math.isnan(value)}
+    losses = {}
+    for i, value in zip(score.scenarios, score.values.tolist(), strict=True):
+        if not math.isnan(value):
+            losses[i] = score.metric.loss(value)
+    return losses
 
 
 def _table(seeds: Sequence[Mapping[int, float]], scenarios: Sequence[int]) -> Floats:
     """Return losses, NaN where undefined, shape [seed, scenario]."""
-    return np.array([[loss.get(i, math.nan) for i in scenarios] for loss in seeds])
+    rows = []
+    for losses in seeds:
+        rows.append([losses.get(i, math.nan) for i in scenarios])
+    return np.array(rows)
 
 
 def mean_loss(seeds: Seeds) -> float:
-    """Return the loss of the mean over seeds, then scenarios, as tables show it;
-    infinite without any.
-    """
-    losses = [_losses(score) for score in _listed(seeds)]
-    found = mean(mean_over_seeds(_table(losses, sorted(set().union(*losses)))))
-    if math.isnan(found):
+    """Return the loss of the mean over seeds, then scenarios; infinite without any."""
+    losses = [_losses(score) for score in _as_sequence(seeds)]
+    scenarios = sorted(set().union(*losses))
+    loss = mean(mean_over_seeds(_table(losses, scenarios)))
+    if math.isnan(loss):
         return math.inf
-    return found
+    return loss
 
 
 @dataclass(frozen=True, kw_only=True)
 class Standing:
-    """Where a method stands among those that are ranked."""
+    """Rank of a method, and whether it differs from the leader."""
 
     rank: int  # from 1, in the order of the mean
-    # against the leader, Holm-corrected for all who are compared with it; NaN without a
-    # claim
+    # against the leader, Holm-corrected for all methods that are compared with it; NaN
+    # without a claim
     p: float
-    # whether it cannot be told from the leader at 5 %; False for the leader itself
+    # whether it does not differ from the leader at 5 %; False for the leader itself
     tied: bool
 
 
 def standings(scores: Mapping[str, Seeds]) -> dict[str, Standing]:
-    """Return where each method stands, best first; methods without any value come
-    last.
-    """
-    loss = {name: mean_loss(seeds) for name, seeds in scores.items()}
-    order = sorted(scores, key=lambda name: (loss[name], name))
-    p = [
-        math.nan,
-        *holm([compare(scores[name], scores[order[0]]).p for name in order[1:]]),
-    ]
-    tied = [
-        i > 0 and loss[name] < math.inf and not p[i] < SIGNIFICANCE
-        for i, name in enumerate(order)
-    ]
-    return {
-        name: Standing(rank=i + 1, p=p[i], tied=tied[i]) for i, name in enumerate(order)
-    }
+    """Return the standing of each method, best first, those without values last."""
+    losses = {name: mean_loss(seeds) for name, seeds in scores.items()}
+    order = sorted(scores, key=lambda name: (losses[name], name))
+
+    p_values = []
+    for name in order[1:]:
+        p_values.append(compare(scores[name], scores[order[0]]).p)
+    corrected = [math.nan, *holm(p_values)]
+
+    ranked = {}
+    for i, name in enumerate(order):
+        differs = corrected[i] < SIGNIFICANCE
+        ranked[name] = Standing(
+            rank=i + 1,
+            p=corrected[i],
+            tied=i > 0 and losses[name] < math.inf and not differs,
+        )
+    return ranked

@@ -1,8 +1,7 @@
 """The one table of metrics: name, formula, unit, direction.
 
 Scorer, board, docs and plots read it. Another package adds metrics by an entry point in
-the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of them; ours
-are registered the same way.
+the group ``lagbench.metrics`` that names a :class:`Metric` or a sequence of them.
 """
 
 from __future__ import annotations
@@ -13,7 +12,12 @@ from types import MappingProxyType
 
 from lagbench.data.grid import Placement
 from lagbench.data.registry import Size, list_entry_points
-from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    load_entry_point,
+    suggest_name,
+)
 
 from . import bodies, conservation, distributions, pointwise, transport, vorticity
 from .metric import Metric
@@ -41,111 +45,118 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 STATISTICS = tuple(
     sorted({statistic for metric in METRICS.values() for statistic in metric.of})
 )
-"""Names of the statistics that they are formed from; other packages may measure more.
-"""
+"""Names of the statistics of our metrics; other packages may measure more."""
 
 CHOSEN = (
-    *(
-        "vorticity_nrmse",
-        "vorticity_rmse",
-        "vorticity_pearson",
-        "stable_frames",
-        "spectrum_error",
-    ),
-    *(
-        "vorticity_kl",
-        "vorticity_w1",
-        "cloud_distance",
-        "position_rmse_20",
-        "position_rmse",
-    ),
-    *(
-        "velocity_rmse",
-        "mse_avg",
-        "mse_end",
-        "energy_ratio",
-        "momentum_error",
-        "angular_momentum_error",
-    ),
-    *(
-        "density_rmse",
-        "divergence_rms",
-        "divergence_rms_true",
-        "outside_share",
-        "active_frames",
-    ),
-    *("shape_error", "connectivity", "sliced_w2", "sinkhorn_pot"),
+    "vorticity_nrmse",
+    "vorticity_rmse",
+    "vorticity_pearson",
+    "stable_frames",
+    "spectrum_error",
+    "vorticity_kl",
+    "vorticity_w1",
+    "cloud_distance",
+    "position_rmse_20",
+    "position_rmse",
+    "velocity_rmse",
+    "mse_avg",
+    "mse_end",
+    "energy_ratio",
+    "momentum_error",
+    "angular_momentum_error",
+    "density_rmse",
+    "divergence_rms",
+    "divergence_rms_true",
+    "outside_share",
+    "active_frames",
+    "shape_error",
+    "connectivity",
+    "sliced_w2",
+    "sinkhorn_pot",
 )
-"""Metrics of the short tables, the one that ranks aside; a data set has some of them.
-"""
-
+"""Metrics of the short tables beside the ranking metric; no data set has all."""
 
 RANKING: Mapping[Placement, str] = MappingProxyType(
     {Placement.CELL_CENTRES: "vorticity_nrmse", Placement.NODES: "cloud_distance"}
 )
-"""Metric that ranks: of vorticity where the material fills the box, of clouds where it
-has a surface.
-"""
+"""Metric that ranks: of vorticity in a full box, of clouds where there is a surface."""
 
 
 def ranking_metric(size: Size) -> str:
-    """Return the metric that ranks."""
+    """Return the name of the metric that ranks."""
     return RANKING[Placement(size.task.score_grid.placement)]
 
 
 def available() -> dict[str, Metric]:
-    """Return all metrics by name, those of other installed packages last."""
-    known = dict(METRICS)
+    """Return all metrics by name, those of other installed packages last.
+
+    Raises:
+        UsageError: a package's metrics cannot be loaded, have the name of another
+            metric, or follow from statistics that no metric measures.
+    """
+    metrics = dict(METRICS)
     for point in sorted(list_entry_points(GROUP), key=lambda point: point.name):
         if point.value.startswith(f"{__package__}."):
-            continue  # ours stand in METRICS, whatever version of lagbench is installed
+            continue  # METRICS holds ours, whatever version of lagbench is installed
         for metric in _load(point):
-            if known.setdefault(metric.name, metric) is not metric:
+            if metrics.setdefault(metric.name, metric) is not metric:
                 raise UsageError(
                     f"two metrics are named {metric.name!r}",
                     where=f"entry point {point.name} = {point.value}",
                     fix="rename one, or uninstall its package",
                 )
-    for metric in known.values():
-        if unknown := sorted(
-            name
-            for name in metric.of
-            if getattr(known.get(name), "statistic", None) is None
-        ):
+
+    statistics = {
+        name for name, metric in metrics.items() if metric.statistic is not None
+    }
+    for metric in metrics.values():
+        missing = sorted(set(metric.of) - statistics)
+        if missing:
             raise UsageError(
-                f"metric {metric.name!r} follows from what no metric measures",
+                f"metric {metric.name!r} follows from statistics that no metric "
+                f"measures",
                 expected="names of metrics that have a statistic",
-                got=", ".join(unknown),
+                got=", ".join(missing),
                 fix="mend or uninstall the package that adds it",
             )
-    return known
+    return metrics
 
 
 def _load(point: EntryPoint) -> Sequence[Metric]:
+    """Return the metrics of an entry point of another package."""
+    where = f"entry point {point.name} = {point.value}"
+    metrics: tuple[object, ...]
     try:
-        given = load_entry_point(point)
-        if isinstance(given, Iterable):
-            found = tuple(given)
+        value = load_entry_point(point)
+        if isinstance(value, Iterable):
+            metrics = tuple(value)
         else:
-            found = (given,)
-    except Exception as error:  # a stranger's module: importing it may raise anything
+            metrics = (value,)
+    except Exception as error:  # importing another package's module may raise anything
         raise UsageError(
             "a package's metrics cannot be loaded",
-            where=f"entry point {point.name} = {point.value}",
-            got=error.what
-            if isinstance(error, LagbenchError)
-            else f"{type(error).__name__}: {error}",
+            where=where,
+            got=_describe(error),
             fix="mend or uninstall that package",
         ) from error
-    for metric in found:
+
+    checked = []
+    for metric in metrics:
         if not isinstance(metric, Metric):
             raise UsageError(
-                "an entry point holds something that is no metric",
-                where=f"entry point {point.name} = {point.value}",
+                "an entry point has something that is no metric",
+                where=where,
                 expected="a lagbench.metrics.Metric or a sequence of them",
                 got=type(metric).__name__,
             )
-    return found
+        checked.append(metric)
+    return checked
+
+
+def _describe(error: Exception) -> str:
+    if isinstance(error, LagbenchError):
+        return error.what
+    return f"{type(error).__name__}: {error}"
 
 
 def select(
@@ -154,15 +165,28 @@ def select(
     extras: Collection[str] = (),
     known: Mapping[str, Metric] | None = None,
 ) -> tuple[Metric, ...]:
-    """Return metrics and those whose statistics they follow from, in the table's
-    order.
+    """Return metrics with the metrics whose statistics they need, in the table's order.
+
+    Args:
+        names: names of metrics; by default all without an extra, or with one of
+            ``extras``.
+        extras: extras whose metrics are taken by default.
+        known: the table of metrics; all that are installed by default.
+
+    Raises:
+        UsageError: no metric has one of the names.
     """
     table = available() if known is None else known
     if names is None:
-        names = [m.name for m in table.values() if m.extra is None or m.extra in extras]
-    wanted: set[str] = set()
+        names = [
+            metric.name
+            for metric in table.values()
+            if metric.extra is None or metric.extra in extras
+        ]
+
+    needed: set[str] = set()
     for name in names:
         if name not in table:
             raise UsageError(f"no metric {name!r}", fix=suggest_name(name, table))
-        wanted |= {name, *table[name].of}
-    return tuple(metric for name, metric in table.items() if name in wanted)
+        needed.update((name, *table[name].of))
+    return tuple(metric for name, metric in table.items() if name in needed)

@@ -1,6 +1,6 @@
-"""Distances between clouds of particles that do not ask which particle is which.
+"""Distances between clouds of particles, whichever particle is which.
 
-Slow, so measured at a few frames only.
+They are slow, so they are measured at a few frames only.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .frame import FramePair, sorted_projections
 from .metric import Direction, at_slow_frames, metric, metrics_of
 
 CLOUD_FRAMES = 10
-"""``cloud_distance`` is taken at every one of so many active frames."""
+"""Period of ``cloud_distance`` in frames of a moving truth."""
 
 BLUR = 0.1
 """Entropic regularisation of the Sinkhorn divergence [length^2]."""
@@ -32,21 +32,21 @@ _error = partial(metric, unit="length", direction=Direction.LOWER)
 
 
 def sliced_wasserstein2(x: ArrayLike, y: ArrayLike) -> float:
-    """Return ``sqrt(mean_ki(((x.d_k)_(i) - (y.d_k)_(i))^2))``, sorted along each
-    direction.
+    """Return ``sqrt(mean_ki(((x.d_k)_(i) - (y.d_k)_(i))^2))`` [length].
 
-    Of two clouds of as many particles [length], shape [particle, 2]. The directions are
-    fixed: nothing is drawn. A shift by s gives ``|s| / sqrt(2)``.
+    Of two clouds of as many particles [length], shape [particle, 2]; the projections on
+    each direction d_k are sorted. The directions are fixed: nothing is drawn. A shift
+    by s gives ``|s| / sqrt(2)``.
     """
     return _distance(sorted_projections(x), sorted_projections(y))
 
 
 def _distance(x: NDArray[np.float32], y: NDArray[np.float32]) -> float:
     """Return the root mean square of the differences of sorted projections [length]."""
-    squares = [
-        float(np.mean(np.subtract(a, b, dtype=np.float64) ** 2))
-        for a, b in zip(x, y, strict=True)
-    ]
+    squares = []
+    for a, b in zip(x, y, strict=True):
+        difference = np.subtract(a, b, dtype=np.float64)
+        squares.append(float(np.mean(difference**2)))
     return math.sqrt(math.fsum(squares) / len(squares))
 
 
@@ -58,65 +58,74 @@ def sinkhorn_divergence(x: NDArray[np.float64], y: NDArray[np.float64]) -> float
     shifts of the whole; three n x n matrices make it slow and large (8192 particles:
     minutes and gigabytes). Prefer :func:`sliced_wasserstein2`.
     """
+    self_cost = (_sinkhorn_cost(x, x) + _sinkhorn_cost(y, y)) / 2.0
+    return max(0.0, _sinkhorn_cost(x, y) - self_cost)
+
+
+def _sinkhorn_cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """Return the entropic transport cost between two clouds [length^2]."""
     ot = require("ot", extra="transport")
-
-    def cost(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-        weights: list[NDArray[np.float64]] = [
-            np.full(len(side), 1.0 / len(side)) for side in (a, b)
-        ]
-        distances = ot.dist(a, b, metric="sqeuclidean")
-        options = {
-            "reg": BLUR,
-            "numItermax": ROUNDS,
-            "stopThr": TOLERANCE,
-            "warn": False,
-        }
-        return float(ot.sinkhorn2(*weights, distances, **options))
-
-    return max(0.0, cost(x, y) - (cost(x, x) + cost(y, y)) / 2.0)
+    a_weights = np.full(len(a), 1.0 / len(a))
+    b_weights = np.full(len(b), 1.0 / len(b))
+    distances = ot.dist(a, b, metric="sqeuclidean")
+    cost = ot.sinkhorn2(
+        a_weights,
+        b_weights,
+        distances,
+        reg=BLUR,
+        numItermax=ROUNDS,
+        stopThr=TOLERANCE,
+        warn=False,
+    )
+    return float(cost)
 
 
 def at_cloud_frames(pair: FramePair) -> bool:
-    """Tell whether this is every tenth frame in which a truth with a surface is active;
-    of fewer the last.
+    """Return whether this is every tenth frame in which a truth with a surface moves.
+
+    Of fewer than ten moving frames it is the last one.
     """
-    if pair.scenario.setting.full_box:
+    if pair.scenario.config.is_full_box:
         return False
-    active = pair.scenario.active
-    return pair.frame in (active[CLOUD_FRAMES - 1 :: CLOUD_FRAMES] or active[-1:])
+    moving = pair.scenario.moving_frames
+    every_tenth = moving[CLOUD_FRAMES - 1 :: CLOUD_FRAMES]
+    return pair.frame in (every_tenth or moving[-1:])
 
 
-@_error(source="design 2, section 4", applies=at_cloud_frames)
+@_error(source="Bonneel et al. 2015, J. Math. Imaging Vis. 51", applies=at_cloud_frames)
 def cloud_distance(pair: FramePair) -> float:
     """Sliced W2 of each material's cloud, by its share of particles, at every tenth
     active frame.
 
-    Which particle is which does not count, of which material it is does. A cloud that
-    is shifted by s is |s| / sqrt(2) off; where the truth has come to rest nothing is
+    The identity of a particle does not count, its material does. A cloud that is
+    shifted by s is |s| / sqrt(2) off; where the truth has come to rest nothing is
     measured.
     """
     true = pair.truth.material_projections
     predicted = pair.prediction.material_projections
-    members = pair.scenario.members
-    weighted = [
-        len(members[name]) * _distance(true[name], predicted[name]) for name in members
-    ]
+    weighted = []
+    for name, particles in pair.scenario.members.items():
+        distance = _distance(true[name], predicted[name])
+        weighted.append(len(particles) * distance)
     return math.fsum(weighted) / len(pair.scenario.material)
 
 
 def at_slow_frames_of_clouds(pair: FramePair) -> bool:
-    """Tell whether this is a frame of interest or the last one; in a full box only the
-    last one.
+    """Return whether this is a frame of interest or the last one.
 
-    There the cloud is the box, whatever flows in it: 64 sorts for what hardly changes.
+    Of a full box it is the last one only: there the cloud is the box, whatever flows in
+    it, and 64 sorts would measure what hardly changes.
     """
-    setting = pair.scenario.setting
-    if setting.full_box:
-        return pair.frame == setting.predicted_frames[-1]
+    config = pair.scenario.config
+    if config.is_full_box:
+        return pair.frame == config.predicted_frames[-1]
     return at_slow_frames(pair)
 
 
-@_error(source="design section 8", applies=at_slow_frames_of_clouds)
+@_error(
+    source="Bonneel et al. 2015, J. Math. Imaging Vis. 51",
+    applies=at_slow_frames_of_clouds,
+)
 def sliced_w2(pair: FramePair) -> float:
     """Sliced Wasserstein-2 distance of the particle clouds, 64 directions."""
     return _distance(pair.truth.projections, pair.prediction.projections)

@@ -2,9 +2,9 @@
 
 ``omega = dv/dx - du/dy`` (Eq. 5.19) by :mod:`lagbench.data.grid`, per frame. Undefined
 where fewer than 16 nodes can be compared. Pearson and slope are also undefined where a
-field is constant: a prediction at rest has no correlation, neither good nor bad. Nor
-has a field of rounding, whose pattern would be that of the order of sums: bodies that
-only fly have no vorticity.
+field is constant: a prediction at rest has no correlation, neither good nor bad. The
+same holds for a field of rounding, whose pattern is that of the order of sums: bodies
+that only fly have no vorticity.
 """
 
 from __future__ import annotations
@@ -26,75 +26,78 @@ from .metric import (
     Direction,
     Metric,
     enough_nodes,
+    has_rotation,
     mean,
     metric,
     metrics_of,
     quotient,
     root_mean_square,
-    turning,
 )
 
 STABLE_PEARSON = 0.95
-"""A rollout is stable until the vorticity correlation falls below this; at 0.8 good
-models saturate.
-"""
+"""Vorticity correlation of a stable rollout; at 0.8 good models saturate."""
 
 CONSTANT = 1e-12
-"""A field is constant when its deviation from the mean is below this share of its size.
-"""
+"""Largest deviation from the mean of a constant field, as a share of its size."""
 
 
 def _deviation(values: Floats) -> tuple[Floats, float] | None:
-    """Return values minus their mean and the sum of its squares, None where they are
-    constant to rounding.
+    """Return values minus their mean, and the sum of squares of these deviations.
+
+    None where the values are constant to rounding.
     """
     deviation = values - average(values)
     squares = float((deviation**2).sum())
-    if math.sqrt(squares) > CONSTANT * math.sqrt((values**2).sum()):
+    size = math.sqrt((values**2).sum())
+    if math.sqrt(squares) > CONSTANT * size:
         return (deviation, squares)
     return None
 
 
 def pearson(x: Floats, y: Floats) -> float:
-    """Return ``r = sum(dx dy) / sqrt(sum(dx^2) sum(dy^2))`` (Eq. 5.21), NaN if one is
-    constant.
+    """Return ``r = sum(dx dy) / sqrt(sum(dx^2) sum(dy^2))`` (Eq. 5.21).
 
-    1 is perfect, 0 unrelated, -1 reversed; scale and offset do not show. The thesis's
-    best model has 0.957 at frame 54 of the cavity, its worst 0.812.
+    NaN if a field is constant. 1 is perfect, 0 unrelated, -1 reversed; scale and offset
+    do not show. The thesis's best model has 0.957 at frame 54 of the cavity, its worst
+    0.812.
     """
-    one = _deviation(x)
-    two = _deviation(y)
-    if one is None or two is None:
+    x_deviation = _deviation(x)
+    y_deviation = _deviation(y)
+    if x_deviation is None or y_deviation is None:
         return math.nan
-    (dx, xx), (dy, yy) = one, two
+    dx, xx = x_deviation
+    dy, yy = y_deviation
     r = float((dx * dy).sum() / np.sqrt(xx * yy))
     return min(max(r, -1.0), 1.0)  # in this order NaN stays NaN
 
 
 def slope(x: Floats, y: Floats) -> float:
-    """Return the least-squares slope ``sum(dx dy) / sum(dx^2)`` of y on x, NaN if x is
-    constant.
+    """Return the least-squares slope ``sum(dx dy) / sum(dx^2)`` of y on x.
+
+    NaN if x is constant.
     """
-    found = _deviation(x)
-    if found is None:
+    deviation = _deviation(x)
+    if deviation is None:
         return math.nan
-    dx, squares = found
-    return float((dx * (y - average(y))).sum() / squares)
+    dx, squares = deviation
+    dy = y - average(y)
+    return float((dx * dy).sum() / squares)
 
 
 def frames_before_fall(values: Floats) -> float:
-    """Return how many defined frames pass before one first lies below
-    :data:`STABLE_PEARSON`.
+    """Return the number of defined frames before the first below `STABLE_PEARSON`.
 
-    Undefined frames neither end the count nor count: standing still is no merit. With
-    none defined the answer is NaN. A rollout that is always defined and never falls
-    gets the whole horizon.
+    Undefined frames neither end the count nor count: standing still is no merit. NaN
+    with no defined frame. A rollout that is always defined and never falls gets the
+    whole horizon.
     """
     defined = values[~np.isnan(values)]
     if not defined.size:
         return math.nan
-    fallen = np.flatnonzero(defined < STABLE_PEARSON)
-    return float(fallen[0] if fallen.size else defined.size)
+    unstable = np.flatnonzero(defined < STABLE_PEARSON)
+    if unstable.size:
+        return float(unstable[0])
+    return float(defined.size)
 
 
 _vorticity = partial(metric, source="Eq. 3.3, Table 5.4", direction=Direction.LOWER)
@@ -118,7 +121,7 @@ def vorticity_rmse(mse: Floats) -> Floats:
     return np.sqrt(mse)
 
 
-@metric(unit="1/frame^2", source="design 2, section 4", defined=enough_nodes)
+@metric(unit="1/frame^2", source="Eq. 5.19", defined=enough_nodes)
 def vorticity_square_true(pair: FramePair) -> float:
     """Mean squared vorticity of the truth over the counted nodes."""
     return mean_squared_error(pair.true_vorticity)
@@ -126,7 +129,7 @@ def vorticity_square_true(pair: FramePair) -> float:
 
 @_vorticity(
     unit="1",
-    source="design 2, section 4",
+    source="nRMSE of PDEBench (Takamoto et al. 2022)",
     of=("vorticity_mse", "vorticity_square_true"),
     over_frames=root_mean_square,
 )
@@ -138,7 +141,8 @@ def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
     the error of a prediction at rest, sqrt(2) that of an unrelated flow of the same
     strength.
     """
-    return np.sqrt(quotient(mse, np.full(len(mse), mean(square))))
+    scenario_square = np.full(len(mse), mean(square))
+    return np.sqrt(quotient(mse, scenario_square))
 
 
 @metric(
@@ -146,11 +150,11 @@ def vorticity_nrmse(mse: Floats, square: Floats) -> Floats:
     direction=Direction.HIGHER,
     perfect=1.0,
     source="Eq. 5.21",
-    defined=turning,
+    defined=has_rotation,
 )
 def vorticity_pearson(pair: FramePair) -> float:
     """Correlation of predicted and true vorticity."""
-    if not pair.prediction_turns:
+    if not pair.prediction_rotates:
         return math.nan
     return pearson(pair.true_vorticity, pair.predicted_vorticity)
 
@@ -160,7 +164,7 @@ stable_frames = Metric(
     family="vorticity",
     unit="frame",
     direction=Direction.HIGHER,
-    source="design 2, section 4",
+    source="Kochkov et al. 2021, PNAS 118(21)",
     summary=f"Defined frames before vorticity_pearson first falls below "
     f"{STABLE_PEARSON:g}",
     of=("vorticity_pearson",),
@@ -191,14 +195,14 @@ def vorticity_residual_max(pair: FramePair) -> float:
     return float(np.abs(pair.vorticity_residual).max())
 
 
-@_towards_zero(unit="1", defined=turning)
+@_towards_zero(unit="1", defined=has_rotation)
 def vorticity_residual_slope(pair: FramePair) -> float:
     """Slope of the residual on the truth: -1 for a prediction at rest."""
     return slope(pair.true_vorticity, pair.vorticity_residual)
 
 
 def _percentile(percent: int) -> Metric:
-    """Return a percentile of the residual, linear between order statistics."""
+    """Return the metric of a percentile, linear between order statistics."""
     return Metric(
         name=f"vorticity_residual_p{percent:02d}",
         family="vorticity",
@@ -212,5 +216,8 @@ def _percentile(percent: int) -> Metric:
     )
 
 
-METRICS = (*metrics_of(globals()), *map(_percentile, PERCENTILES))
+METRICS = (
+    *metrics_of(globals()),
+    *(_percentile(percent) for percent in PERCENTILES),
+)
 """Metrics of this family, in the order of their definition."""

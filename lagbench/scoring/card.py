@@ -1,16 +1,7 @@
-"""The score card: what the scorer says of one submission, and its form as scores.json.
+"""The score card: all scores of one submission, and its form as scores.json.
 
 It holds no time, host or path, and reductions run in id order: the same predictions
-give the same bytes. Numbers have nine significant digits; what is undefined is null.
-
-Skill: how much better than the best floor, ``1 - score / score of the best floor``,
-over the ranking metric. The best floor has the least mean over its own scenarios, among
-those that count (see :mod:`lagbench.references`); the ratio is over the scenarios that both
-have. 1 is perfect, 0 says that nothing was learned, below 0 it is worse than not
-learning.
-
-Scores as a scores.json tells them, which may come from anybody: checked before they are
-used.
+give the same bytes. Numbers have nine significant digits; undefined ones are null.
 """
 
 from __future__ import annotations
@@ -18,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,22 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
-from lagbench.errors import UnreadableFileError, check_regular
-from lagbench.metrics.aggregate import (
-    LARGEST,
-    Score,
-    Tally,
-    bootstrap_interval,
-    mean_over_seeds,
-)
-from lagbench.metrics.frame import Setting
-from lagbench.metrics.metric import Direction, Metric, mean
+from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
+from lagbench.metrics.frame import TaskConfig
+from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
-from lagbench.metrics.table import available
-from lagbench.submission.findings import Finding
-from lagbench.submission.format import MAX_NAME, Header
+from lagbench.submission.format import Header
+from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
+from .skill import Skill
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -50,95 +34,13 @@ FORMAT = 1
 JSON_NAME = "scores.json"
 
 IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
-"""What says which data set was predicted, and by what."""
+"""Fields that identify the predicted data set and the method."""
 
 SUBMISSION = "submission"
-"""Row of the submission; the floors have rows of their names."""
+"""Row of the submission; reference predictors have rows of their names."""
 
 LABELS = ("seconds_per_frame", "device", "seed", "parameters", "training")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Skill:
-    """How much better a submission is than the best floor."""
-
-    metric: str  # name of the ranking metric
-    floor: str  # name of the best floor
-    value: float  # 1 - score / score of that floor
-    # 95 %: scenarios, those of the floor with them, and seeds are resampled; NaN of few
-    # scenarios
-    interval: tuple[float, float]
-    std: float = math.nan  # sample standard deviation over seeds; NaN for one
-
-    def __str__(self) -> str:
-        """Return the value, its interval where it has one, and the floor, as in a
-        table.
-        """
-        low, high = self.interval
-        if math.isnan(low):
-            interval = ""
-        else:
-            interval = f" [{low:.3f}, {high:.3f}]"
-        return f"{self.value:.3f}{interval} over {self.floor}"
-
-
-def best_floor(floors: Mapping[str, Score]) -> str | None:
-    """Return which of the floors that count has the least mean; None where none has one
-    above 0.
-    """
-    known = {name: score.mean for name, score in floors.items() if score.mean > 0.0}
-    if known:
-        return min(known, key=lambda name: known[name])
-    return None
-
-
-def skill(seeds: Sequence[Score], floors: Mapping[str, Score]) -> Skill | None:
-    """Return the skill of a method beside the scores of the floors in the same metric.
-
-    The interval is that of the ratio of means r = A / B, by the linear part of its
-    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
-    score of seed s and b_i that of the floor in scenario i, it is 1 - r exp(e). So it
-    never passes 1, and is one point where the ratio is the same everywhere. Two seeds
-    say little: its lower end may lie far down.
-
-    Args:
-        seeds: score of each seed, over the same scenarios.
-        floors: scores of the floors that count, by name.
-
-    Returns:
-        None without a floor that counts, without a scenario that both have, and for a
-        metric of which less is not better.
-    """
-    name = best_floor(floors)
-    metric = seeds[0].metric
-    scenarios = seeds[0].scenarios
-    if name is None or metric.direction is not Direction.LOWER:
-        return None
-    theirs = dict(
-        zip(floors[name].scenarios, floors[name].values.tolist(), strict=True)
-    )
-    base = np.array([theirs.get(i, math.nan) for i in scenarios])
-    own = np.stack([score.values for score in seeds])
-    both = ~np.isnan(base) & ~np.isnan(own).all(axis=0)
-    own = own[:, both]
-    base = base[both]
-    if not base.any():
-        return None
-    scale = float(np.mean(base))
-    ratio = float(np.mean(mean_over_seeds(own))) / scale
-    relative = own / ratio - base if ratio > 0.0 else own  # zeros, and certain
-    low, high = bootstrap_interval(relative / scale)
-    with_all = own[~np.isnan(own).any(axis=1)]
-    return Skill(
-        metric=metric.name,
-        floor=name,
-        value=1.0 - ratio,
-        interval=(1.0 - ratio * math.exp(high), 1.0 - ratio * math.exp(low)),
-        std=float(np.std(np.mean(with_all, axis=1) / scale, ddof=1))
-        if len(with_all) > 1
-        else math.nan,
-    )
-
+"""Fields that scores.json has where the predictions state them."""
 
 FRAMES = 45
 """Frames of the particle film, evenly spaced over the horizon."""
@@ -169,33 +71,31 @@ class Preview:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ScoreCard:
-    """What the scorer says of one submission."""
+    """All scores of one submission."""
 
-    header: Header  # what the predictions say about themselves
+    header: Header  # of the predictions
     predictions_sha256: str  # content hash of the predicted positions
-    setting: Setting  # the task, as metrics see it
+    config: TaskConfig  # of the split and size
     ranking: str  # name of the metric that ranks
-    # statistics by row and scenario: of the submission, and of floors that were
+    # statistics by row and scenario: of the submission, and of references that were
     # measured beside it
     tallies: Mapping[str, Mapping[int, Tally]]
-    # scores by row (submission, then floors) and metric
+    # scores by row (submission, then references) and metric
     scores: Mapping[str, Mapping[str, Score]]
-    # how much better than the best floor, as scored: it does not follow a replaced
-    # `scores`; None where no floor that counts has a score
+    # as scored: it does not follow a replaced `scores`; None where no reference that
+    # counts has a score
     skill: Skill | None
-    flags: tuple[Flag, ...]  # what a reader should know
-    warnings: tuple[Finding, ...]  # findings of the validation that do not reject
+    flags: tuple[Flag, ...]  # hints for the reader of a score
+    warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
 
     def __repr__(self) -> str:
-        """Return whose card it is, the ranking metric and the skill; the values are too
-        many.
-        """
+        """Return method, ranking metric and skill; the values are too many."""
         header = self.header
-        mean = self.submission[self.ranking].mean
-        whose = f"{header.method!r} on {header.split} {header.size}"
-        return f"<{type(self).__name__}: {whose}, {self.ranking} {mean:.4g}, skill {self.skill}>"
+        subject = f"{header.method!r} on {header.split} {header.size}"
+        ranking = f"{self.ranking} {self.submission[self.ranking].mean:.4g}"
+        return f"<{type(self).__name__}: {subject}, {ranking}, skill {self.skill}>"
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -205,9 +105,8 @@ class ScoreCard:
     @property
     def reported_frames(self) -> tuple[int, ...]:
         """Frames of interest, and the last one."""
-        return tuple(
-            sorted(self.setting.slow_frames.intersection(self.setting.predicted_frames))
-        )
+        predicted = self.config.predicted_frames
+        return tuple(sorted(self.config.slow_frames.intersection(predicted)))
 
     @property
     def submission(self) -> Mapping[str, Score]:
@@ -215,7 +114,7 @@ class ScoreCard:
         return self.scores[SUBMISSION]
 
     def against(self, row: str) -> Comparison:
-        """Compare the submission with a floor in the ranking metric."""
+        """Compare the submission with a reference in the ranking metric."""
         return compare(self.submission[self.ranking], self.scores[row][self.ranking])
 
     def at(self, path: Path, *more: Path) -> ScoreCard:
@@ -223,61 +122,60 @@ class ScoreCard:
         return replace(self, files=(path, *more))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the card as what scores.json holds."""
-        header = self.header
-        setting = self.setting
-        used = [score.metric for score in self.submission.values()]
-        floors = [row for row in self.scores if row != SUBMISSION]
-        return {
-            "lagbench_scores": FORMAT,
-            **{name: getattr(header, name) for name in IDENTITY},
-            "predictions_sha256": self.predictions_sha256,
-            **{
-                name: getattr(header, name)
-                for name in LABELS
-                if getattr(header, name) is not None
-            },
-            "diverged_at": {
-                str(i): frame for i, frame in sorted(header.diverged_at.items())
-            },
-            "task": {
-                "input_frames": setting.input_frames,
-                "horizon": setting.horizon,
-                "frames": list(self.reported_frames),
-                "scenarios": list(self.scenarios),
-            },
-            "ranking_metric": self.ranking,
-            "skill": _skill(self.skill),
-            "metrics": {metric.name: _described(metric) for metric in used},
-            "rows": {
-                row: {name: self._score(score, row) for name, score in scores.items()}
-                for row, scores in self.scores.items()
-            },
-            "against": {row: _comparison(self.against(row)) for row in floors},
-            "flags": {flag.name: _flag(flag) for flag in self.flags},
-            "warnings": [
-                {"check": f.check, "what": f.what, "got": f.got} for f in self.warnings
-            ],
+        """Return the content of scores.json."""
+        content: dict[str, Any] = {"lagbench_scores": FORMAT}
+        for name in IDENTITY:
+            content[name] = getattr(self.header, name)
+        content["predictions_sha256"] = self.predictions_sha256
+        for name in LABELS:
+            label = getattr(self.header, name)
+            if label is not None:
+                content[name] = label
+
+        diverged_at = sorted(self.header.diverged_at.items())
+        content["diverged_at"] = {str(i): frame for i, frame in diverged_at}
+        content["task"] = {
+            "input_frames": self.config.input_frames,
+            "horizon": self.config.horizon,
+            "frames": list(self.reported_frames),
+            "scenarios": list(self.scenarios),
         }
-
-    def _score(self, score: Score, row: str) -> dict[str, Any]:
-        said: dict[str, Any] = {
-            "mean": digits(score.mean),
-            "interval": [digits(bound) for bound in score.interval],
-            "values": [digits(value) for value in score.values.tolist()],
-            "undefined": list(score.undefined),
+        content["ranking_metric"] = self.ranking
+        content["skill"] = _skill_as_json(self.skill)
+        content["metrics"] = {
+            score.metric.name: _metric_as_json(score.metric)
+            for score in self.submission.values()
         }
-        if score.metric.per_frame:
-            said["at"] = {
-                str(frame): _at(score, frame, row) for frame in self.reported_frames
-            }
-        return said
+        content["rows"] = {row: self._row_as_json(row) for row in self.scores}
+        content["against"] = {
+            row: _comparison_as_json(self.against(row))
+            for row in self.scores
+            if row != SUBMISSION
+        }
+        content["flags"] = {flag.name: _flag_as_json(flag) for flag in self.flags}
+        content["warnings"] = [
+            {"check": warning.check, "what": warning.what, "got": warning.got}
+            for warning in self.warnings
+        ]
+        return content
+
+    def _row_as_json(self, row: str) -> dict[str, Any]:
+        """Return the scores of a row, by metric."""
+        scores = {}
+        for name, score in self.scores[row].items():
+            scores[name] = _score_as_json(score)
+            if score.metric.per_frame:
+                scores[name]["at"] = {
+                    str(frame): _frame_as_json(score, frame, row)
+                    for frame in self.reported_frames
+                }
+        return scores
 
 
-def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
-    """Return the methods; those that occur twice, or have a taken name, with a number.
+def number_methods(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]:
+    """Return the methods; those that occur twice, or have a taken name, get a number.
 
-    >>> told_apart(["gns", "gat", "gns"])
+    >>> number_methods(["gns", "gat", "gns"])
     ['gns (1)', 'gat', 'gns (2)']
     """
     count = Counter([*methods, *taken])
@@ -285,12 +183,15 @@ def told_apart(methods: Sequence[str], taken: Collection[str] = ()) -> list[str]
     names = []
     for method in methods:
         seen[method] += 1
-        names.append(f"{method} ({seen[method]})" if count[method] > 1 else method)
+        if count[method] > 1:
+            names.append(f"{method} ({seen[method]})")
+        else:
+            names.append(method)
     return names
 
 
 def digits(value: float) -> float | None:
-    """Return a number with nine significant digits, None where it is none.
+    """Return a number with nine significant digits, None where it is not finite.
 
     >>> digits(2 / 3)
     0.666666667
@@ -300,15 +201,28 @@ def digits(value: float) -> float | None:
     return None
 
 
-def _at(score: Score, frame: int, row: str) -> dict[str, Any]:
+def _interval_as_json(interval: tuple[float, float]) -> list[float | None]:
+    return [digits(bound) for bound in interval]
+
+
+def _score_as_json(score: Score) -> dict[str, Any]:
+    return {
+        "mean": digits(score.mean),
+        "interval": _interval_as_json(score.interval),
+        "values": [digits(value) for value in score.values.tolist()],
+        "undefined": list(score.undefined),
+    }
+
+
+def _frame_as_json(score: Score, frame: int, row: str) -> dict[str, Any]:
     values = score.at(frame)
-    said: dict[str, Any] = {"mean": digits(mean(values))}
+    content: dict[str, Any] = {"mean": digits(mean(values))}
     if row == SUBMISSION:
-        said["interval"] = [digits(bound) for bound in bootstrap_interval(values)]
-    return said
+        content["interval"] = _interval_as_json(bootstrap_interval(values))
+    return content
 
 
-def _described(metric: Metric) -> dict[str, Any]:
+def _metric_as_json(metric: Metric) -> dict[str, Any]:
     return {
         "family": metric.family,
         "unit": metric.unit,
@@ -319,163 +233,34 @@ def _described(metric: Metric) -> dict[str, Any]:
     }
 
 
-def _skill(found: Skill | None) -> dict[str, Any] | None:
-    if found is None:
+def _skill_as_json(skill: Skill | None) -> dict[str, Any] | None:
+    if skill is None:
         return None
     return {
-        "floor": found.floor,
-        "value": digits(found.value),
-        "interval": [digits(bound) for bound in found.interval],
+        "floor": skill.reference,
+        "value": digits(skill.value),
+        "interval": _interval_as_json(skill.interval),
     }
 
 
-def _comparison(found: Comparison) -> dict[str, Any]:
+def _comparison_as_json(comparison: Comparison) -> dict[str, Any]:
     return {
-        "metric": found.metric,
-        "difference": digits(found.difference),
-        "interval": [digits(bound) for bound in found.interval],
-        "p": digits(found.p),
+        "metric": comparison.metric,
+        "difference": digits(comparison.difference),
+        "interval": _interval_as_json(comparison.interval),
+        "p": digits(comparison.p),
     }
 
 
-def _flag(flag: Flag) -> dict[str, Any]:
-    numbers = {name: digits(value) for name, value in flag.evidence.items()}
-    return {"raised": flag.raised, "reasons": list(flag.reasons), "evidence": numbers}
+def _flag_as_json(flag: Flag) -> dict[str, Any]:
+    return {
+        "raised": flag.raised,
+        "reasons": list(flag.reasons),
+        "evidence": {name: digits(value) for name, value in flag.evidence.items()},
+    }
 
 
-def spell(card: ScoreCard) -> bytes:
+def format_scores(card: ScoreCard) -> bytes:
     """Return the bytes of scores.json."""
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
     return f"{text}\n".encode()
-
-
-MAX_BYTES = 64 << 20
-"""Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PublishedScores:
-    """What a scores.json says, as far as another submission can be compared with it."""
-
-    # split, size, version and hash of the data set, and the method
-    identity: Mapping[str, str]
-    predictions_sha256: str  # content hash of the predicted positions
-    ranking: str  # name of the metric that ranks
-    # scores by row and metric, over the horizon; values per frame are not in the file
-    scores: Mapping[str, Mapping[str, Score]]
-
-
-def read_scores(path: Path) -> PublishedScores:
-    """Read a scores.json; metrics that are not installed here are left out."""
-    check_regular(path, longest=MAX_BYTES, fix="`lagbench score` writes it")
-    try:
-        return parse_scores(json.loads(path.read_bytes()))
-    except (
-        OSError,
-        ValueError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        ArithmeticError,
-    ) as error:
-        raise unreadable_scores(path, error) from error
-    except RecursionError as error:
-        # its own trace is a thousand frames long and says no more
-        raise unreadable_scores(path, error) from None
-
-
-def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is not the scores.json or scores.nc that its
-    name promises.
-    """
-    return UnreadableFileError(
-        f"not a scores{path.suffix} of lagbench",
-        where=str(path),
-        expected="what `lagbench score` writes beside the predictions",
-        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
-        fix="score the predictions again: lagbench score predictions.nc",
-    )
-
-
-def parse_scores(held: Mapping[str, Any]) -> PublishedScores:
-    """Return what a score card as JSON says: :meth:`ScoreCard.as_json`, or a
-    scores.json.
-    """
-    if held["lagbench_scores"] != FORMAT:
-        raise ValueError(
-            f"layout {str(held['lagbench_scores'])[:MAX_NAME]!r}, not {FORMAT}"
-        )
-    ids = tuple(_integer(i, "an id") for i in held["task"]["scenarios"])
-    if len(set(ids)) < len(ids):
-        raise ValueError("scenario ids that occur twice")
-    known = available()
-    return PublishedScores(
-        identity={name: printable(held, name) for name in IDENTITY},
-        predictions_sha256=printable(held, "predictions_sha256"),
-        ranking=printable(held, "ranking_metric"),
-        scores={
-            row: {
-                n: _read_score(known[n], ids, said)
-                for n, said in scores.items()
-                if n in known
-            }
-            for row, scores in held["rows"].items()
-        },
-    )
-
-
-def printable(held: Mapping[str, Any], name: str) -> str:
-    """Return text under the rule for attributes of predictions: it goes to terminals as
-    it is.
-    """
-    text = held[name]
-    if (
-        not isinstance(text, str)
-        or not text.strip()
-        or len(text) > MAX_NAME
-        or not text.isprintable()
-    ):
-        raise ValueError(f"{name} is not printable text of 1 to {MAX_NAME} characters")
-    return text
-
-
-def _read_score(metric: Metric, ids: tuple[int, ...], said: Mapping[str, Any]) -> Score:
-    values = _floats(said["values"])
-    undefined = tuple(
-        _integer(count, "a number of frames") for count in said["undefined"]
-    )
-    for numbers in (values, undefined):
-        if len(numbers) != len(ids):
-            raise ValueError(
-                f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios"
-            )
-    return Score(
-        metric=metric,
-        scenarios=ids,
-        frames=(),
-        per_frame=np.empty((len(ids), 0)),
-        values=np.array(values),
-        undefined=undefined,
-    )
-
-
-def _integer(number: object, what: str) -> int:
-    if (
-        not isinstance(number, int)
-        or isinstance(number, bool)
-        or not 0 <= number < 2**31
-    ):
-        raise ValueError(f"{what} is no integer from 0 to 2^31 - 1")
-    return int(number)
-
-
-def _floats(values: Iterable[float | None]) -> list[float]:
-    held = list(values)
-    found = [math.nan if value is None else float(value) for value in held]
-    if any(isinstance(value, bool) for value in held):
-        raise ValueError("a value that is no number")
-    if any(
-        abs(value) > float(f"{LARGEST:.9g}") for value in found
-    ):  # as rounded in the file
-        raise ValueError(f"a value beyond {LARGEST:.3g}, which scores do not exceed")
-    return found

@@ -1,16 +1,15 @@
 """Compare two methods over the test scenarios: ``lagbench compare A B``.
 
-The scenarios are the sample, paired by id; so are seeds, where a side is a folder of
-several. Six scenarios are needed before 5 % can be reached; with fewer no significance
-is claimed and the intervals speak alone. With one seed on each side these weights are
-compared, not methods.
+The scenarios are the sample, paired by id; so are seeds, where a folder of several is
+given. Six scenarios are needed before 5 % can be reached; with fewer only the intervals
+are reported. With one seed of each method these weights are compared, not methods.
 """
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +19,7 @@ from lagbench.data.registry import Registry
 from lagbench.errors import (
     ChecksFailedError,
     DataError,
+    LagbenchError,
     UnreadableFileError,
     UsageError,
     check_regular,
@@ -32,36 +32,33 @@ from lagbench.metrics.significance import compare as compare_scores
 from lagbench.references.table import REFERENCES
 from lagbench.submission.format import MAX_NAME
 
-from .card import (
-    JSON_NAME,
-    SUBMISSION,
-    PublishedScores,
-    digits,
-    parse_scores,
-    read_scores,
-    told_apart,
-)
+from .card import JSON_NAME, SUBMISSION, digits, number_methods
+from .published_scores import PublishedScores, parse_scores, read_scores
 from .score import score
 from .score_file import NETCDF_NAME
-from .stored import MAX_SCORE_BYTES, published, unreadable_in_child
+from .score_file_checks import (
+    MAX_SCORE_BYTES,
+    find_unreadable,
+    read_published_scores,
+)
 
 SAME = ("split", "size", "dataset_sha256")
-"""What two submissions must share."""
+"""Fields in which two submissions must be equal."""
 
 AGAIN = "score the predictions again: lagbench score predictions.nc"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Contestant:
-    """One side of a comparison."""
+    """One of the two methods of a comparison."""
 
-    name: str  # what the user called it
+    name: str  # as the user gave it
     # split, size, version and hash of the data set, and the method
     identity: Mapping[str, str]
     predictions: tuple[str, ...]  # content hash of the predicted positions, by seed
     ranking: str  # name of the metric that ranks
     scores: Mapping[str, tuple[Score, ...]]  # of each seed, by metric
-    floors: Mapping[str, Mapping[str, Score]]  # rows scored beside it
+    references: Mapping[str, Mapping[str, Score]]  # rows scored beside it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,103 +68,122 @@ class MetricComparison:
     metric: Metric
     first: float  # mean of the first over seeds and scenarios
     second: float  # mean of the second
-    # frames of either side without a value, which are left out of its mean
+    # frames of each method without a value, which are left out of its mean
     undefined: tuple[int, int]
     test: Comparison  # difference, interval and p-value, in the metric's loss
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ComparisonResult:
-    """How two methods compare."""
+    """Result of the comparison of two methods."""
 
     split: str  # of both
     size: str  # of both
-    first: str  # method of the first, told apart from that of the second
-    second: str  # method of the second, likewise, or the name of the floor
-    # whether both methods have one name, so that a number tells them apart
-    namesakes: bool
-    same_predictions: bool  # whether both hold the same positions
+    first: str  # name of the first method, numbered if both have one name
+    second: str  # name of the second method, likewise, or of the reference
+    namesakes: bool  # whether both methods have one name
+    same_predictions: bool  # whether both have the same positions
     ranking: str  # name of the metric that ranks
-    scenarios: int  # how many both have in that metric
-    seeds: tuple[int, int]  # of either side
-    floor: bool  # whether the second is a floor, which has no seeds
+    scenarios: int  # number of scenarios that both have in that metric
+    seeds: tuple[int, int]  # of each method
+    floor: bool  # whether the second is a reference, which has no seeds
     # the ranking one first; observables are left out
     metrics: Mapping[str, MetricComparison]
 
     def __repr__(self) -> str:
-        """Return who is compared and the verdict; the values are too many."""
-        who = f"{self.first!r} and {self.second!r} on {self.split} {self.size}"
-        return f"<{type(self).__name__}: {who}: {self.verdict}>"
+        """Return the two methods and the verdict; the values are too many."""
+        methods = f"{self.first!r} and {self.second!r} on {self.split} {self.size}"
+        return f"<{type(self).__name__}: {methods}: {self.verdict}>"
 
     @property
     def verdict(self) -> str:
-        """What the ranking metric says, in one sentence that claims no more than it
-        may.
-        """
-        test = self.metrics[self.ranking].test
+        """The result in the ranking metric, in one sentence."""
         if self.same_predictions:
             return "both hold the same predictions"
         if self.scenarios < FEWEST_SCENARIOS:
-            said = f"{self.scenarios} scenarios: no significance is claimed under {FEWEST_SCENARIOS}"
-            few = self.scenarios < FEWEST_FOR_INTERVAL
-            return said + (
-                f", no interval under {FEWEST_FOR_INTERVAL}"
-                if few
-                else "; read the intervals"
-            )
+            return self._verdict_of_few
+
+        test = self.metrics[self.ranking].test
         if not test.significant:
             return f"{self.ranking}: no difference at 5 % ({self._sample})"
+        better = self.second
         if test.difference < 0.0:
             better = self.first
-        else:
-            better = self.second
         return f"{self.ranking}: {better} is better ({self._sample})"
 
     @property
+    def _verdict_of_few(self) -> str:
+        """The verdict of too few scenarios for a p-value."""
+        verdict = (
+            f"{self.scenarios} scenarios: no significance is claimed under "
+            f"{FEWEST_SCENARIOS}"
+        )
+        if self.scenarios < FEWEST_FOR_INTERVAL:
+            return f"{verdict}, no interval under {FEWEST_FOR_INTERVAL}"
+        return f"{verdict}; read the intervals"
+
+    @property
     def _sample(self) -> str:
-        p, one, two = self.metrics[self.ranking].test.p, *self.seeds
+        """The p-value with the number of scenarios and seeds behind it."""
+        p = self.metrics[self.ranking].test.p
+        return f"p = {p:.3g}, {self.scenarios} scenarios, {self._seeds_in_words}"
+
+    @property
+    def _seeds_in_words(self) -> str:
+        first, second = self.seeds
+        if self.floor and first == 1:
+            return "one seed: these weights, not the method"
         if self.floor:
-            if one > 1:
-                what = f"{one} seeds"
-            else:
-                what = "one seed: these weights, not the method"
-        elif one == two == 1:
-            what = "one seed each: these weights, not the methods"
-        else:
-            what = f"{one} and {two} seeds"
-            what += (
-                ": of one seed its weights, not the method" if 1 in self.seeds else ""
+            return f"{first} seeds"
+        if first == second == 1:
+            return "one seed each: these weights, not the methods"
+        if 1 in self.seeds:
+            return (
+                f"{first} and {second} seeds: of one seed its weights, not the method"
             )
-        return f"p = {p:.3g}, {self.scenarios} scenarios, {what}"
+        return f"{first} and {second} seeds"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the comparison as plain values; what is undefined is None."""
-        metrics = {
-            name: {
-                "unit": found.metric.unit,
-                "first": digits(found.first),
-                "second": digits(found.second),
-                "undefined": list(found.undefined),
-                "difference": digits(found.test.difference),
-                "interval": [digits(bound) for bound in found.test.interval],
-                "p": digits(found.test.p),
-                "significant": found.test.significant,
-                "scenarios": list(found.test.scenarios),
-            }
-            for name, found in self.metrics.items()
+        """Return the comparison as plain values; undefined ones are None."""
+        metrics = {}
+        for name, comparison in self.metrics.items():
+            metrics[name] = _metric_as_json(comparison)
+        return {
+            "split": self.split,
+            "size": self.size,
+            "first": self.first,
+            "second": self.second,
+            "same_predictions": self.same_predictions,
+            "ranking": self.ranking,
+            "scenarios": self.scenarios,
+            "verdict": self.verdict,
+            "seeds": list(self.seeds),
+            "metrics": metrics,
         }
-        fields = (
-            "split",
-            "size",
-            "first",
-            "second",
-            "same_predictions",
-            "ranking",
-            "scenarios",
-            "verdict",
-        )
-        held = {name: getattr(self, name) for name in fields}
-        return {**held, "seeds": list(self.seeds), "metrics": metrics}
+
+
+def _metric_as_json(comparison: MetricComparison) -> dict[str, Any]:
+    test = comparison.test
+    return {
+        "unit": comparison.metric.unit,
+        "first": digits(comparison.first),
+        "second": digits(comparison.second),
+        "undefined": list(comparison.undefined),
+        "difference": digits(test.difference),
+        "interval": [digits(bound) for bound in test.interval],
+        "p": digits(test.p),
+        "significant": test.significant,
+        "scenarios": list(test.scenarios),
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ScoringOptions:
+    """Options with which predictions are scored."""
+
+    root: str | Path | None
+    workers: int | None
+    registry: Registry | None
 
 
 def compare(
@@ -187,177 +203,217 @@ def compare(
             several seeds without their numbers, as in
             ``leaderboard/scores/cavity/full/neuralmpm.nc``; or a predictions.nc, which
             is then scored.
-        second: another; or the name of a floor, which stands in the first's scores: in
-            a scores.nc the best one, in the ranking metric.
+        second: another; or the name of a reference in the first's scores: in a
+            scores.nc the best one, in the ranking metric.
         metrics: metrics to compare; by default all that judge.
         root: folder of all data sets, where predictions are to be scored.
         workers: worker processes for that.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: an unknown metric or floor, or the two belong to different splits or
-            sizes.
+        UsageError: an unknown metric or reference, or the two belong to different
+            splits or sizes.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
-    plain = Path(second).name == str(second) and not Path(second).suffix
-    bare = plain and not os.path.lexists(second)  # the name of a floor
-    if str(first) in REFERENCES and not os.path.lexists(first):
-        fix = f"give the floor last: lagbench compare {'PREDICTIONS' if bare else second} {first}"
-        raise UsageError(
-            "a floor stands in the scores of a submission", got=str(first), fix=fix
-        )
-    for path in (*_seeds_of(Path(first)), *(() if bare else _seeds_of(Path(second)))):
-        check_regular(path)  # before what is there is scored
-    one = _contestant(first, root, workers, registry)
-    if bare and str(second) in one.floors:
-        floor = str(second)
+    scoring = _ScoringOptions(root=root, workers=workers, registry=registry)
+    is_bare = _is_bare_name(second)
+    _check_order(first, second, is_bare=is_bare)
+
+    # before anything is scored
+    for path in _seed_files(Path(first)):
+        check_regular(path)
+    if not is_bare:
+        for path in _seed_files(Path(second)):
+            check_regular(path)
+
+    one = _load_contestant(first, scoring)
+    is_reference = is_bare and str(second) in one.references
+    if is_reference:
+        two = _reference_beside(one, str(second))
+    elif is_bare:
+        raise _no_reference(one, first, str(second))
     else:
-        floor = None
-    if floor is None and bare:
-        if str(second) in REFERENCES:
-            raise UsageError(
-                "these scores do not hold the floor",
-                where=str(first),
-                expected=str(second),
-                got=f"scores of {', '.join(one.floors) or 'no floor'}",
-                fix="a scores.nc holds the best floor only: compare predictions.nc or "
-                "scores.json",
-            )
-        if one.floors:
-            floors = f"{suggest_name(str(second), one.floors)}; or "
-        else:
-            floors = ""
-        fix = f"{floors}name scores, predictions or a folder of them"
-        raise UsageError("neither a floor nor a file", got=ascii(str(second)), fix=fix)
-    if floor is None:
-        two = _contestant(second, root, workers, registry)
-    else:
-        two = _floor(one, floor)
+        two = _load_contestant(second, scoring)
+
     between = f"{one.name} and {two.name}"
     _check_same(between, one.identity, two.identity)
-    if floor is None and 0 < len(
-        shared := set(one.predictions) & set(two.predictions)
-    ) < max(len(one.predictions), len(two.predictions)):
-        raise UsageError(
-            "both sides have predictions of their own and the same ones",
-            where=between,
-            expected="other trainings on either side",
-            got=f"{len(shared)} in common",
-            fix="compare seeds of one method with those of another",
-        )
-    judged = _judged(one, two)
-    methods = one.identity["method"], two.identity["method"]
-    if floor is None:
-        names = told_apart(methods)
-    else:
-        names = [*told_apart(methods[:1], taken=(floor,)), floor]
-    if isinstance(metrics, str):
-        metrics = (metrics,)
-    else:
-        metrics = metrics
-    for name in metrics:
-        if name not in judged:
-            raise UsageError(
-                f"no metric {name!r} to compare by",
-                where="--metric",
-                fix=suggest_name(name, judged),
-            )
-    wanted = {one.ranking, *(metrics or judged)}
-    order = sorted(wanted, key=lambda name: (name != one.ranking, judged.index(name)))
-    found = {name: _compared(one.scores[name], two.scores[name]) for name in order}
+    if not is_reference:
+        _check_overlap(between, one, two)
+
+    judging = _judging_metrics(one, two)
+    chosen = _choose_metrics(metrics, judging)
+    order = [one.ranking]
+    for name in judging:
+        if name in chosen and name != one.ranking:
+            order.append(name)
+    comparisons = {
+        name: _compare_metric(one.scores[name], two.scores[name]) for name in order
+    }
+
+    first_name, second_name = _names(one, two, is_reference=is_reference)
+    has_one_name = one.identity["method"] == two.identity["method"]
     return ComparisonResult(
         split=one.identity["split"],
         size=one.identity["size"],
-        first=names[0],
-        second=names[1],
-        namesakes=floor is None and methods[0] == methods[1],
+        first=first_name,
+        second=second_name,
+        namesakes=has_one_name and not is_reference,
         same_predictions=set(one.predictions) == set(two.predictions),
         ranking=one.ranking,
-        scenarios=len(found[one.ranking].test.scenarios),
+        scenarios=len(comparisons[one.ranking].test.scenarios),
         seeds=(len(one.predictions), len(two.predictions)),
-        floor=floor is not None,
-        metrics=found,
+        floor=is_reference,
+        metrics=comparisons,
     )
 
 
-def _contestant(
-    source: str | Path,
-    root: str | Path | None,
-    workers: int | None,
-    registry: Registry | None,
-) -> Contestant:
-    """Return a method with the scores of its seeds, and the floors beside the first of
-    them.
-    """
-    held = []
-    for path in _seeds_of(Path(source)):
-        if path.suffix == ".json":
-            found = read_scores(path)
-        else:
-            found = _read(path, root, workers, registry)
-        if SUBMISSION not in found.scores:
-            raise _incomplete(
-                str(path),
-                f"a row {SUBMISSION!r}",
-                ", ".join(map(repr, list(found.scores)[:10]))[:MAX_NAME],
-            )
-        held.append(found)
-    first = held[0]
-    own = [one.scores[SUBMISSION] for one in held]
-    name, *names = (f"{source} ({one.identity['method']})" for one in held)
-    for other, one in zip(names, held[1:], strict=True):
-        _check_same(
-            f"{name} and {other}", first.identity, one.identity, more=("method",)
+def _is_bare_name(second: str | Path) -> bool:
+    """Return whether the second argument is a name, not a path or an existing file."""
+    path = Path(second)
+    is_plain = path.name == str(second) and not path.suffix
+    return is_plain and not os.path.lexists(second)
+
+
+def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> None:
+    """Refuse a reference as the first of the two."""
+    if str(first) not in REFERENCES or os.path.lexists(first):
+        return
+    scores = second
+    if is_bare:
+        scores = "PREDICTIONS"
+    raise UsageError(
+        "a reference is part of the scores of a submission",
+        got=str(first),
+        fix=f"give the reference last: lagbench compare {scores} {first}",
+    )
+
+
+def _no_reference(contestant: Contestant, first: str | Path, second: str) -> UsageError:
+    """Return the error for a name that is no reference in the first's scores."""
+    if second in REFERENCES:
+        present = ", ".join(contestant.references) or "no reference"
+        return UsageError(
+            "these scores do not have the reference",
+            where=str(first),
+            expected=second,
+            got=f"scores of {present}",
+            fix="a scores.nc has the best reference only: compare predictions.nc or "
+            "scores.json",
         )
-    predictions = tuple(one.predictions_sha256 for one in held)
-    if len(set(predictions)) < len(held):
-        expected = "another seed of the method in each folder"
-        fix = "one file stands for one training: leave copies out"
+    hint = ""
+    if contestant.references:
+        hint = f"{suggest_name(second, contestant.references)}; or "
+    return UsageError(
+        "neither a reference nor a file",
+        got=ascii(second),
+        fix=f"{hint}name scores, predictions or a folder of them",
+    )
+
+
+def _check_overlap(where: str, one: Contestant, two: Contestant) -> None:
+    """Refuse methods that share some of their predictions, but not all."""
+    shared = set(one.predictions) & set(two.predictions)
+    most = max(len(one.predictions), len(two.predictions))
+    if 0 < len(shared) < most:
         raise UsageError(
-            "the same predictions twice", where=str(source), expected=expected, fix=fix
+            "some predictions belong to both methods",
+            where=where,
+            expected="different trainings of the two methods",
+            got=f"{len(shared)} in common",
+            fix="compare seeds of one method with those of another",
         )
-    common = [name for name in own[0] if all(name in scores for scores in own)]
+
+
+def _names(one: Contestant, two: Contestant, *, is_reference: bool) -> list[str]:
+    """Return the names of the two methods, numbered where they are equal."""
+    methods = (one.identity["method"], two.identity["method"])
+    if not is_reference:
+        return number_methods(methods)
+    return [*number_methods(methods[:1], taken=(two.name,)), two.name]
+
+
+def _choose_metrics(metrics: Collection[str], judging: Sequence[str]) -> set[str]:
+    """Return the names of the metrics that are compared; by default all that judge."""
+    if isinstance(metrics, str):
+        metrics = (metrics,)
+    for name in metrics:
+        if name not in judging:
+            raise UsageError(
+                f"no metric {name!r} to compare by",
+                where="--metric",
+                fix=suggest_name(name, judging),
+            )
+    return set(metrics or judging)
+
+
+def _load_contestant(source: str | Path, scoring: _ScoringOptions) -> Contestant:
+    """Return a method with the scores of its seeds.
+
+    The references are those beside its first seed.
+    """
+    seeds = []
+    for path in _seed_files(Path(source)):
+        scores = _load_scores(path, scoring)
+        if SUBMISSION not in scores.scores:
+            rows = ", ".join(map(repr, list(scores.scores)[:10]))
+            raise _incomplete(str(path), f"a row {SUBMISSION!r}", rows[:MAX_NAME])
+        seeds.append(scores)
+
+    first = seeds[0]
+    _check_seeds(source, seeds)
+    rows_of_seeds = [seed.scores[SUBMISSION] for seed in seeds]
+    by_metric = {}
+    for name in rows_of_seeds[0]:
+        if all(name in scores for scores in rows_of_seeds):
+            by_metric[name] = tuple(scores[name] for scores in rows_of_seeds)
+
+    references = dict(first.scores)
+    del references[SUBMISSION]
     return Contestant(
         name=str(source),
         identity=first.identity,
-        predictions=predictions,
+        predictions=tuple(seed.predictions_sha256 for seed in seeds),
         ranking=first.ranking,
-        scores={name: tuple(scores[name] for scores in own) for name in common},
-        floors={
-            row: scores for row, scores in first.scores.items() if row != SUBMISSION
-        },
+        scores=by_metric,
+        references=references,
     )
 
 
-def _seeds_of(path: Path) -> list[Path]:
-    """Return the score files of a folder: its own, or those of its folders; of a file
-    the path itself.
+def _check_seeds(source: str | Path, seeds: Sequence[PublishedScores]) -> None:
+    """Refuse seeds of different methods or tasks, and copies of one seed."""
+    first = seeds[0].identity
+    first_name = f"{source} ({first['method']})"
+    for seed in seeds[1:]:
+        where = f"{first_name} and {source} ({seed.identity['method']})"
+        _check_same(where, first, seed.identity, more=("method",))
 
-    What is not there may be the name that a leaderboard's files of several seeds share.
+    hashes = {seed.predictions_sha256 for seed in seeds}
+    if len(hashes) < len(seeds):
+        raise UsageError(
+            "the same predictions twice",
+            where=str(source),
+            expected="another seed of the method in each folder",
+            fix="one file stands for one training: leave copies out",
+        )
+
+
+def _seed_files(path: Path) -> list[Path]:
+    """Return the score files of the seeds of a method.
+
+    Of a folder its own file, or those of its folders; of a file the path itself. A
+    missing path may be the name that a leaderboard's files of several seeds share.
     """
     if not os.path.isdir(path):  # unlike Path.is_dir, it takes any name
-        place = path
-        with suppress(OSError):  # the working folder is gone
-            place = Path(os.path.abspath(path))
-        on_a_board = path.suffix == ".nc" and place.parts[-4:-3] == ("scores",)
-        if on_a_board and not os.path.lexists(path):
-            shared = sorted(path.parent.glob("*.nc"))
-        else:
-            shared = []
-        name = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
-        return [file for file in shared if name.fullmatch(file.stem)] or [path]
-    for folders in (
-        [path],
-        sorted(inner for inner in path.iterdir() if inner.is_dir()),
-    ):
-        files = [
-            [folder / name for name in (JSON_NAME, NETCDF_NAME)] for folder in folders
-        ]
-        if found := [
-            file for one in files if (file := next(filter(os.path.isfile, one), None))
-        ]:
-            return found
+        return _numbered_files(path) or [path]
+
+    inner_folders = sorted(inner for inner in path.iterdir() if inner.is_dir())
+    for folders in ([path], inner_folders):
+        files = []
+        for folder in folders:
+            files += _score_files(folder)[:1]
+        if files:
+            return files
     raise UnreadableFileError(
         "no scores in the folder",
         where=str(path),
@@ -367,24 +423,46 @@ def _seeds_of(path: Path) -> list[Path]:
     )
 
 
-def _read(
-    path: Path, root: str | Path | None, workers: int | None, registry: Registry | None
-) -> PublishedScores:
+def _score_files(folder: Path) -> list[Path]:
+    """Return scores.json and scores.nc of a folder, those that exist."""
+    files = [folder / JSON_NAME, folder / NETCDF_NAME]
+    return [file for file in files if os.path.isfile(file)]
+
+
+def _numbered_files(path: Path) -> list[Path]:
+    """Return a leaderboard's files of the seeds of a method, by name without number."""
+    place = path
+    with suppress(OSError):  # the working folder is gone
+        place = Path(os.path.abspath(path))
+    is_on_board = path.suffix == ".nc" and place.parts[-4:-3] == ("scores",)
+    if not is_on_board or os.path.lexists(path):
+        return []
+    numbered = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
+    files = sorted(path.parent.glob("*.nc"))
+    return [file for file in files if numbered.fullmatch(file.stem)]
+
+
+def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
+    """Return the scores of a scores.json, a score file or a predictions.nc."""
+    if path.suffix == ".json":
+        return read_scores(path)
+
     real = path.resolve()
-    large = (length := real.stat().st_size) > MAX_SCORE_BYTES
-    reason = (
-        f"{length} bytes, more than scores take"
-        if large
-        else unreadable_in_child([real]).get(real)
-    )
-    if reason is None:
-        return published(real)
+    length = real.stat().st_size
+    if length > MAX_SCORE_BYTES:
+        reason = f"{length} bytes, more than scores take"
+    else:
+        reason = find_unreadable([real]).get(real, "")
+    if not reason:
+        return read_published_scores(real)
+
     try:
-        # through JSON, so that its digits are those of a scores.json
-        return parse_scores(
-            score(
-                path, root=root, workers=workers, registry=registry, write=False
-            ).as_json()
+        card = score(
+            path,
+            root=scoring.root,
+            workers=scoring.workers,
+            registry=scoring.registry,
+            write=False,
         )
     except (UnreadableFileError, ChecksFailedError) as error:
         with real.open("rb") as stream:
@@ -399,13 +477,21 @@ def _read(
             got=f"as scores: {reason}; as predictions: {error.what}, {error.got}",
             fix=AGAIN,
         ) from error
+    # through JSON, so that its digits are those of a scores.json
+    return parse_scores(card.as_json())
 
 
-def _floor(beside: Contestant, name: str) -> Contestant:
-    identity = {**beside.identity, "method": name}
-    scores = {metric: (score,) for metric, score in beside.floors[name].items()}
+def _reference_beside(contestant: Contestant, name: str) -> Contestant:
+    """Return a reference that was scored beside a method."""
+    scores = {}
+    for metric, reference_score in contestant.references[name].items():
+        scores[metric] = (reference_score,)
     return replace(
-        beside, name=name, identity=identity, predictions=("",), scores=scores
+        contestant,
+        name=name,
+        identity={**contestant.identity, "method": name},
+        predictions=("",),
+        scores=scores,
     )
 
 
@@ -416,52 +502,71 @@ def _check_same(
     *,
     more: tuple[str, ...] = (),
 ) -> None:
+    """Refuse two submissions that differ in the data set or in ``more`` fields."""
     for key in (*SAME, *more):
-        if (first := one[key]) != (second := two[key]):
-            kind = DataError if key == "dataset_sha256" else UsageError
-            fix = "compare submissions to the same split, size and data set"
-            fix += (
-                ", and keep the seeds of each method in a folder of its own"
-                if more
-                else ""
-            )
-            what = f"the two submissions differ in {key}"
-            raise kind(what, where=where, expected=first, got=second, fix=fix)
+        if one[key] == two[key]:
+            continue
+        fix = "compare submissions to the same split, size and data set"
+        if more:
+            fix += ", and keep the seeds of each method in a folder of its own"
+        kind: type[LagbenchError] = UsageError
+        if key == "dataset_sha256":
+            kind = DataError
+        raise kind(
+            f"the two submissions differ in {key}",
+            where=where,
+            expected=one[key],
+            got=two[key],
+            fix=fix,
+        )
 
 
-def _judged(one: Contestant, two: Contestant) -> list[str]:
-    """Return the names of the metrics to compare by, the ranking one of the first among
-    them.
+def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
+    """Return the names of the metrics that judge and that both methods have.
+
+    Raises:
+        UnreadableFileError: the ranking metric of the first is not among them.
     """
-    judging = [
-        name
-        for name, held in one.scores.items()
-        if held[0].metric.direction is not Direction.NONE
-    ]
-    for side, names in ((one, judging), (two, two.scores)):
-        if one.ranking not in names:
-            raise _incomplete(
-                side.name,
-                f"values of a ranking metric that judges, {one.ranking!r}",
-                None,
-            )
+    judging = []
+    for name, scores in one.scores.items():
+        if scores[0].metric.direction is not Direction.NONE:
+            judging.append(name)
+
+    expected = f"values of a ranking metric that judges, {one.ranking!r}"
+    if one.ranking not in judging:
+        raise _incomplete(one.name, expected, None)
+    if one.ranking not in two.scores:
+        raise _incomplete(two.name, expected, None)
     return [name for name in judging if name in two.scores]
 
 
 def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:
-    what = "scores without the row or the ranking metric"
-    return UnreadableFileError(what, where=where, expected=expected, got=got, fix=AGAIN)
+    return UnreadableFileError(
+        "scores without the row or the ranking metric",
+        where=where,
+        expected=expected,
+        got=got,
+        fix=AGAIN,
+    )
 
 
-def _compared(first: tuple[Score, ...], second: tuple[Score, ...]) -> MetricComparison:
-    one, two = (
-        mean(mean_over_seeds([score.values for score in side]))
-        for side in (first, second)
-    )
-    lost, gone = (
-        sum(sum(score.undefined) for score in side) for side in (first, second)
-    )
-    test = compare_scores(first, second)
+def _compare_metric(
+    first: tuple[Score, ...], second: tuple[Score, ...]
+) -> MetricComparison:
+    """Compare the seeds of two methods in one metric."""
     return MetricComparison(
-        metric=first[0].metric, first=one, second=two, undefined=(lost, gone), test=test
+        metric=first[0].metric,
+        first=_mean(first),
+        second=_mean(second),
+        undefined=(_count_undefined(first), _count_undefined(second)),
+        test=compare_scores(first, second),
     )
+
+
+def _mean(seeds: tuple[Score, ...]) -> float:
+    """Return the mean over seeds, then over scenarios."""
+    return mean(mean_over_seeds([seed.values for seed in seeds]))
+
+
+def _count_undefined(seeds: tuple[Score, ...]) -> int:
+    return sum(sum(seed.undefined) for seed in seeds)

@@ -1,18 +1,17 @@
-"""Flags: what a reader of a score should know. They reject nothing.
+"""Flags: hints for the reader of a score. They reject nothing.
 
 ``copy_suspect``: the error moves from frame to frame as that of no rollout does.
-``below_twin_floor``: closer to the truth than the solver itself after a nudge of 2^-20.
+``below_twin_floor``: closer to the truth than the solver itself after a perturbation of
+2^-20.
 ``physics``: kinetic energy or filled area far from the truth's.
 
-The thresholds lie between what honest predictions of our own splits show and what those
-made from the truth do: ``python benchmarks/flag_calibration.py`` prints both,
-docs/scoring.md has its table.
-
-How a prediction's error moves from frame to frame: evidence for the flags.
+The thresholds lie between honest predictions of our own splits and predictions made
+from the truth: ``python benchmarks/flag_calibration.py`` prints both, docs/scoring.md
+has its table.
 
 An honest rollout builds on its own last frame, so its error e(f) = x_pred(f) -
-x_true(f) carries over; a prediction that was put together from the truth leaves other
-traces.
+x_true(f) carries over from frame to frame; a prediction that was put together from the
+truth has an error that moves in other ways.
 """
 
 from __future__ import annotations
@@ -34,6 +33,30 @@ Floats = NDArray[np.float64]
 SHIFTS = (-2, -1, 1, 2)
 """Frames by which the truth is shifted against the prediction."""
 
+AUTOCORRELATION = 0.5
+"""Least correlation of the errors of two consecutive frames of a rollout."""
+
+DROP = 0.5
+"""An error that falls below this share within one frame was reset to the truth."""
+
+SHIFT_GAIN = 0.25
+"""The truth was shifted if a shift in time leaves less than this share of the error."""
+
+GROWTH = 2.0
+"""An error within one frame's motion accumulates if it grows by at least this."""
+
+ENERGY = (0.1, 10.0)
+"""Range of kinetic energy over the truth's outside of which ``physics`` is raised."""
+
+OCCUPANCY = (0.5, 1.5)
+"""Range of filled area over the truth's outside of which ``physics`` is raised."""
+
+TWIN_REGULAR = 0.1
+"""The predictability limit counts below this share of the RMSE of persistence."""
+
+ROUNDING = 2.0**-20
+"""Errors below this are those of numbers, not of models [length]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trace:
@@ -43,8 +66,8 @@ class Trace:
     overlap: Floats  # e(f) e(f-1) [length^2], NaN at the first frame, shape [frame]
     motion: Floats  # u_true(f)^2 [length^2/frame^2], shape [frame]
     predicted_motion: Floats  # u_pred(f)^2 [length^2/frame^2], shape [frame]
-    # (x_pred(f) - x_true(f+s))^2 by shift s [length^2], NaN where frame f+s is not
-    # predicted yet nor given, shape [frame]
+    # (x_pred(f) - x_true(f+s))^2 by shift s [length^2], NaN where frame f+s is neither
+    # an input frame nor predicted yet, shape [frame]
     shifted: Mapping[int, Floats]
     # nodes that the prediction fills over those that the truth fills [1], shape [frame]
     occupancy: Floats
@@ -55,80 +78,64 @@ class Tracer:
     """Collects the trace of one scenario, frame pair by frame pair."""
 
     def __init__(self, scenario: Scenario) -> None:
-        frames = scenario.setting.horizon
-        self._first = scenario.setting.input_frames
-        self._true = deque(
-            np.asarray(scenario.given[-2:], np.float64), maxlen=max(SHIFTS)
-        )
-        self._predicted: deque[Floats] = deque(maxlen=max(SHIFTS))
+        frame_count = scenario.config.horizon
+        longest = max(SHIFTS)
+        last_inputs = np.asarray(scenario.input_positions[-2:], np.float64)
+        self._first = scenario.config.input_frames
+        self._true = deque(last_inputs, maxlen=longest)
+        self._predicted: deque[Floats] = deque(maxlen=longest)
         self._error: Floats | None = None
-        names = (
-            "error",
-            "overlap",
-            "motion",
-            "predicted_motion",
-            "occupancy",
-            "outside",
+        self._trace = Trace(
+            error=np.full(frame_count, np.nan),
+            overlap=np.full(frame_count, np.nan),
+            motion=np.full(frame_count, np.nan),
+            predicted_motion=np.full(frame_count, np.nan),
+            shifted={shift: np.full(frame_count, np.nan) for shift in SHIFTS},
+            occupancy=np.full(frame_count, np.nan),
+            outside=np.full(frame_count, np.nan),
         )
-        self._series = {name: np.full(frames, np.nan) for name in names}
-        self._shifted = {shift: np.full(frames, np.nan) for shift in SHIFTS}
 
     def add(self, pair: FramePair) -> None:
-        """Take in the next frame."""
+        """Add the next frame."""
         i = pair.frame - self._first
-        true = pair.truth.position
-        predicted = pair.prediction.position
+        trace = self._trace
         error = pair.position_error
-        series = self._series
-        series["error"][i] = average(pair.position_square)
+
+        trace.error[i] = average(pair.position_square)
         if self._error is not None:
-            series["overlap"][i] = sum(map(dot, error.T, self._error.T)) / error.size
-        series["motion"][i] = pair.truth.speed_square / error.size
-        series["predicted_motion"][i] = pair.prediction.speed_square / error.size
-        filled = counted_nodes(pair.prediction.fields.weight, pair.scenario.full)
-        full = max(1, int(np.count_nonzero(pair.truth.fields.counted)))
-        series["occupancy"][i] = int(np.count_nonzero(filled)) / full
-        series["outside"][i] = pair.outside
-        for back, earlier in enumerate(reversed(self._true), start=1):
-            self._shifted[-back][i] = average(mean_square(predicted - earlier))
-        for back, earlier in enumerate(reversed(self._predicted), start=1):
-            self._shifted[back][i - back] = average(mean_square(earlier - true))
-        self._true.append(true)
-        self._predicted.append(predicted)
+            trace.overlap[i] = sum(map(dot, error.T, self._error.T)) / error.size
+        trace.motion[i] = pair.truth.speed_square / error.size
+        trace.predicted_motion[i] = pair.prediction.speed_square / error.size
+        trace.occupancy[i] = _occupancy(pair)
+        trace.outside[i] = pair.outside_share
+        self._add_shifted(i, pair)
         self._error = error
 
+    def _add_shifted(self, i: int, pair: FramePair) -> None:
+        """Compare the frame with earlier ones, of truth and of prediction."""
+        true = pair.truth.position
+        predicted = pair.prediction.position
+        shifted = self._trace.shifted
+
+        for back, earlier in enumerate(reversed(self._true), start=1):
+            shifted[-back][i] = average(mean_square(predicted - earlier))
+        for back, earlier in enumerate(reversed(self._predicted), start=1):
+            shifted[back][i - back] = average(mean_square(earlier - true))
+
+        self._true.append(true)
+        self._predicted.append(predicted)
+
     def result(self) -> Trace:
-        """Return what was collected."""
-        return Trace(**self._series, shifted=self._shifted)
+        """Return the trace of the frames that were added."""
+        return self._trace
 
 
-AUTOCORRELATION = 0.5
-"""Below this the error of a frame has too little to do with that of the frame before.
-"""
-
-DROP = 0.5
-"""An error that falls to less than this share within one frame was reset to the truth.
-"""
-
-SHIFT_GAIN = 0.25
-"""When a shift in time leaves less than this share of the error, the truth was shifted.
-"""
-
-GROWTH = 2.0
-"""An error within one frame's motion that grows by less than this does not accumulate.
-"""
-
-ENERGY = (0.1, 10.0)
-"""Kinetic energy relative to the truth's outside of which ``physics`` is raised."""
-
-OCCUPANCY = (0.5, 1.5)
-"""Filled area relative to the truth's outside of which ``physics`` is raised."""
-
-TWIN_REGULAR = 0.1
-"""The twin floor counts while it is below this share of the RMSE of persistence."""
-
-ROUNDING = 2.0**-20
-"""Errors below this are those of numbers, not of models [length]."""
+def _occupancy(pair: FramePair) -> float:
+    """Return the nodes that the prediction fills over those that the truth fills."""
+    weight = pair.prediction.fields.weight
+    is_filled = counted_nodes(weight, pair.scenario.full_weight)
+    true_count = int(np.count_nonzero(pair.truth.fields.counted))
+    return int(np.count_nonzero(is_filled)) / max(1, true_count)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,14 +143,14 @@ class Flag:
     """One flag of a submission."""
 
     name: str
-    raised: bool | None  # whether it is raised; None where that cannot be told
+    raised: bool | None  # whether it is raised; None where that is unknown
     reasons: tuple[str, ...]  # why, one clause each
     evidence: Mapping[str, float]  # the numbers behind it
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evidence:
-    """What the error of one scenario does from frame to frame; NaN where it is 0."""
+class ErrorDynamics:
+    """Behaviour of the error of one scenario over the frames; NaN where it is 0."""
 
     autocorrelation: float  # mean over frames of the cosine between e(f) and e(f-1) [1]
     drop: float  # least ratio of the RMS errors of two consecutive frames [1]
@@ -157,128 +164,146 @@ class Evidence:
     exact: int  # frames in which the truth moves and the error is 0
 
 
-def evidence(trace: Trace) -> Evidence:
-    """Return what the error of one scenario does from frame to frame."""
+def analyse_error(trace: Trace) -> ErrorDynamics:
+    """Return the behaviour of the error of one scenario over the frames."""
     before = trace.error[:-1]
     error = trace.error[1:]
-    told = before > ROUNDING**2
-    cosine = quotient(trace.overlap[1:], np.sqrt(error * before))[told]
-    fall = np.sqrt(quotient(error, before))[told]
+    is_above_rounding = before > ROUNDING**2
+    cosine = quotient(trace.overlap[1:], np.sqrt(error * before))[is_above_rounding]
+    fall = np.sqrt(quotient(error, before))[is_above_rounding]
+    drop = math.nan
+    if fall.size:
+        drop = float(np.min(fall))
+
+    shift, shift_gain = _best_shift(trace)
     quarter = max(1, len(trace.error) // 4)
-    gains = {0: 1.0}
-    for shift, shifted in trace.shifted.items():
-        known = ~np.isnan(shifted)
-        gains[shift] = _root_ratio(
-            float(np.sum(shifted[known])), float(np.sum(trace.error[known]))
-        )
-    best = min(
-        gains, key=lambda shift: math.inf if math.isnan(gains[shift]) else gains[shift]
-    )
-    return Evidence(
+    late_error = float(np.mean(trace.error[-quarter:]))
+    is_exact = (trace.error == 0.0) & (trace.motion > 0.0)
+    return ErrorDynamics(
         autocorrelation=mean(cosine),
-        drop=float(np.min(fall)) if fall.size else math.nan,
-        shift=best,
-        shift_gain=gains[best],
-        growth=_root_ratio(
-            float(np.mean(trace.error[-quarter:])), float(trace.error[0])
-        ),
+        drop=drop,
+        shift=shift,
+        shift_gain=shift_gain,
+        growth=_root_ratio(late_error, float(trace.error[0])),
         steps=_root_ratio(float(np.max(trace.error)), float(np.mean(trace.motion))),
-        exact=int(np.count_nonzero((trace.error == 0.0) & (trace.motion > 0.0))),
+        exact=int(np.count_nonzero(is_exact)),
     )
 
 
-def copy_suspect(traces: Sequence[Trace]) -> Flag:
-    """Judge whether a prediction was put together from the truth; one such scenario is
-    enough.
+def _best_shift(trace: Trace) -> tuple[int, float]:
+    """Return the shift with the least share of the RMS error, and that share."""
+    best = 0
+    least = 1.0
+    for shift, shifted in trace.shifted.items():
+        is_known = ~np.isnan(shifted)
+        shifted_error = float(np.sum(shifted[is_known]))
+        gain = _root_ratio(shifted_error, float(np.sum(trace.error[is_known])))
+        if gain < least:
+            best = shift
+            least = gain
+    return best, least
 
-    A constant offset beyond a frame's motion, or a share of the truth mixed into a
-    rollout, is not seen.
+
+def judge_copying(traces: Sequence[Trace]) -> Flag:
+    """Judge whether a prediction was put together from the truth.
+
+    One such scenario is enough. A constant offset beyond a frame's motion, or a share
+    of the truth mixed into a rollout, is not seen.
     """
-    found = [evidence(trace) for trace in traces]
-    exact = sum(e.exact for e in found)
-    best = min(found, key=lambda e: e.shift_gain)
-    told = {
+    scenarios = [analyse_error(trace) for trace in traces]
+    exact = sum(scenario.exact for scenario in scenarios)
+    best = min(scenarios, key=lambda scenario: scenario.shift_gain)
+    is_independent = any(s.autocorrelation < AUTOCORRELATION for s in scenarios)
+    is_reset = any(s.drop < DROP for s in scenarios)
+    is_shifted = any(s.shift_gain < SHIFT_GAIN for s in scenarios)
+    is_bounded = any(s.growth < GROWTH and s.steps < 1.0 for s in scenarios)
+
+    reasons = {
         f"{exact} predicted frames are the truth, bit for bit": exact > 0,
-        "the error of a frame does not follow from that of the frame before": any(
-            e.autocorrelation < AUTOCORRELATION for e in found
+        "the error of a frame does not follow from that of the frame before": (
+            is_independent
         ),
-        "the error drops within one frame": any(e.drop < DROP for e in found),
-        "a shift in time removes most of the error": any(
-            e.shift_gain < SHIFT_GAIN for e in found
-        ),
-        "the error stays within one frame's motion and does not accumulate": any(
-            e.growth < GROWTH and e.steps < 1.0 for e in found
-        ),
+        "the error drops within one frame": is_reset,
+        "a shift in time removes most of the error": is_shifted,
+        "the error stays within one frame's motion and does not accumulate": is_bounded,
     }
-    numbers = {
+    evidence = {
         "exact_frames": float(exact),
-        "error_autocorrelation": _least(e.autocorrelation for e in found),
-        "error_drop": _least(e.drop for e in found),
+        "error_autocorrelation": _least(s.autocorrelation for s in scenarios),
+        "error_drop": _least(s.drop for s in scenarios),
         "best_shift": float(best.shift),
         "shift_gain": best.shift_gain,
-        "error_growth": _least(e.growth for e in found),
-        "error_in_steps": max(e.steps for e in found),
+        "error_growth": _least(s.growth for s in scenarios),
+        "error_in_steps": max(s.steps for s in scenarios),
     }
-    return _flag("copy_suspect", told, numbers)
+    return _make_flag("copy_suspect", reasons, evidence)
 
 
-def _flag(name: str, told: Mapping[str, bool], numbers: Mapping[str, float]) -> Flag:
-    """Return a flag that is raised for what is true of the reasons."""
-    reasons = tuple(reason for reason, holds in told.items() if holds)
-    return Flag(name=name, raised=bool(reasons), reasons=reasons, evidence=numbers)
-
-
-def below_twin_floor(
-    error: Floats, persistence: Floats, floor: Sequence[float]
+def _make_flag(
+    name: str, reasons: Mapping[str, bool], evidence: Mapping[str, float]
 ) -> Flag:
-    """Judge whether a prediction is closer to the truth than the nudged twin of the
-    solver.
+    """Return a flag that is raised if any of the reasons holds."""
+    holding = tuple(reason for reason, holds in reasons.items() if holds)
+    return Flag(name=name, raised=bool(holding), reasons=holding, evidence=evidence)
 
-    Where the twin has lost its way itself (its RMSE has come near that of persistence),
-    a cautious prediction may be closer than it; such frames do not count. All are
-    position RMSE per predicted frame, mean over scenarios [length], shape [frame]; the
-    floor is empty where it is not recorded.
+
+def judge_predictability(
+    error: Floats, persistence: Floats, limit: Sequence[float]
+) -> Flag:
+    """Judge whether a prediction is closer to the truth than a perturbed solver run.
+
+    Where the perturbed run itself has lost the truth (its RMSE has come near that of
+    persistence), a cautious prediction may be closer; such frames do not count.
+
+    Args:
+        error: position RMSE of the prediction, mean over scenarios [length], [frame].
+        persistence: position RMSE of persistence, likewise.
+        limit: position RMSE of the perturbed run, likewise; empty where not recorded.
     """
     name = "below_twin_floor"
-    if len(floor) != len(error):
+    if len(limit) != len(error):
         return Flag(
             name=name, raised=None, reasons=("no twin floor is recorded",), evidence={}
         )
-    twin = np.asarray(floor, np.float64)
-    regular = twin < TWIN_REGULAR * persistence
-    count = int(np.count_nonzero(regular & (error < twin)))
-    numbers = {
+
+    perturbed = np.asarray(limit, np.float64)
+    is_compared = perturbed < TWIN_REGULAR * persistence
+    is_below = is_compared & (error < perturbed)
+    count = int(np.count_nonzero(is_below))
+    reason = f"{count} frames are closer to the truth than the solver's twin"
+    evidence = {
         "frames_below": float(count),
-        "frames_compared": float(np.count_nonzero(regular)),
+        "frames_compared": float(np.count_nonzero(is_compared)),
     }
-    return _flag(
-        name,
-        {f"{count} frames are closer to the truth than the solver's twin": count > 0},
-        numbers,
-    )
+    return _make_flag(name, {reason: count > 0}, evidence)
 
 
-def physics(traces: Sequence[Trace]) -> Flag:
+def judge_physics(traces: Sequence[Trace]) -> Flag:
     """Judge whether energy and filled area stay near the truth's."""
-    energy = _ratio(
-        sum(np.sum(t.predicted_motion) for t in traces),
-        sum(np.sum(t.motion) for t in traces),
-    )
-    occupancy = float(np.mean([np.mean(t.occupancy) for t in traces]))
-    outside = float(np.mean([np.mean(t.outside) for t in traces]))
-    told = {
-        f"{energy:.2g} times the truth's kinetic energy": energy < ENERGY[0]
-        or energy > ENERGY[1],
-        f"the particles fill {occupancy:.2g} times the truth's area": occupancy
-        < OCCUPANCY[0]
-        or occupancy > OCCUPANCY[1],
+    predicted_motion = sum(np.sum(trace.predicted_motion) for trace in traces)
+    motion = sum(np.sum(trace.motion) for trace in traces)
+    energy = _ratio(predicted_motion, motion)
+    occupancy = float(np.mean([np.mean(trace.occupancy) for trace in traces]))
+    outside = float(np.mean([np.mean(trace.outside) for trace in traces]))
+
+    reasons = {
+        f"{energy:.2g} times the truth's kinetic energy": _is_beyond(energy, ENERGY),
+        f"the particles fill {occupancy:.2g} times the truth's area": (
+            _is_beyond(occupancy, OCCUPANCY)
+        ),
     }
-    return _flag(
-        "physics", told, {"energy": energy, "occupancy": occupancy, "outside": outside}
-    )
+    evidence = {"energy": energy, "occupancy": occupancy, "outside": outside}
+    return _make_flag("physics", reasons, evidence)
+
+
+def _is_beyond(value: float, limits: tuple[float, float]) -> bool:
+    """Return whether a value lies outside of a range; False for NaN."""
+    low, high = limits
+    return value < low or value > high
 
 
 def _least(values: Iterable[float]) -> float:
+    """Return the least value that is not NaN, NaN without one."""
     return min((v for v in values if not math.isnan(v)), default=math.nan)
 
 

@@ -1,9 +1,9 @@
-"""The scores of floors: shipped with the package, or measured where they are not.
+"""The scores of reference predictors: shipped with the package, or measured.
 
-:func:`measure` is what the shipped ones come from
-(``python -m lagbench.scoring.record``) and what they are checked against. A scenario
-that is measured is kept under the root folder, so that an interrupted measurement goes
-on where it stopped.
+:func:`measure` produces the shipped ones
+(``python -m lagbench.scoring.measure_references``), and they are checked against it.
+Each measured scenario is saved under the root folder, so that an interrupted
+measurement continues where it stopped.
 """
 
 from __future__ import annotations
@@ -11,16 +11,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry, Size, load
-from lagbench.metrics.aggregate import Tally, aggregate
+from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.frame import snapshots
 from lagbench.metrics.table import select
 from lagbench.references.predictor import ReferencePredictor, given_in
@@ -30,32 +28,32 @@ from lagbench.work.pool import Report
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .scenario import measure_rows, predicted_by
+from .scenario import measure_rows, predict_reference
 from .task import ScoredTask, load_scored_task
 
 TOLERANCE = 1e-4
-"""Relative difference up to which shipped and measured values are equal: libraries
-round differently.
-"""
+"""Relative difference of equal values: libraries round differently."""
 
 
 def measurable(size: Size, root: Path) -> tuple[str, ...]:
-    """Return the names of the floors that scoring measures where none are shipped:
-    those that count.
+    """Return the names of the references that scoring measures where none are shipped.
+
+    These are the ones that count.
     """
-    return tuple(floor.name for floor in _possible(size, root) if floor.counts)
+    references = _with_data(size, root)
+    return tuple(reference.name for reference in references if reference.counts)
 
 
-def _possible(size: Size, root: Path) -> list[ReferencePredictor]:
-    """Return the floors of a size; what looks at train only where all of train is
-    there.
-    """
-    trained = _has(size, root, "train")
-    return [floor for floor in references_of(size) if trained or not floor.reads_train]
+def _with_data(size: Size, root: Path) -> list[ReferencePredictor]:
+    """Return the references of a size; those that read train only if it is there."""
+    references = references_of(size)
+    if _has_files(size, root, "train"):
+        return list(references)
+    return [reference for reference in references if not reference.reads_train]
 
 
-def _has(size: Size, root: Path, subset: str) -> bool:
-    """Tell whether all files of a subset, which is not empty, are there."""
+def _has_files(size: Size, root: Path, subset: str) -> bool:
+    """Return whether all files of a subset, which is not empty, are there."""
     ids = size.subsets.get(subset, ())
     return bool(ids) and all(size.path(root, i).is_file() for i in ids)
 
@@ -67,82 +65,97 @@ def measured_sizes(
     name: str | None = None,
     registry: Registry | None = None,
 ) -> list[Size]:
-    """Return the sizes of our splits whose test subset lies under a root, or those that
-    are named.
+    """Return the sizes of our splits whose test subset lies under a root.
+
+    Args:
+        root: folder of all data sets.
+        split: the only split.
+        name: the only size; with a split it is returned whether its files are there or
+            not.
+        registry: the splits; ours when None.
     """
-    described = registry or load()
-    sizes = [
-        described.size(one, tier)
-        for one in ((split,) if split else described.splits)
-        for tier in ((name,) if name else described.split(one).sizes)
-    ]
-    return [size for size in sizes if (split and name) or _has(size, root, "test")]
+    if registry is None:
+        registry = load()
+    splits = [split] if split else list(registry.splits)
+
+    sizes = []
+    for one_split in splits:
+        names = [name] if name else list(registry.split(one_split).sizes)
+        sizes += [registry.size(one_split, one_name) for one_name in names]
+    if split and name:
+        return sizes
+    return [size for size in sizes if _has_files(size, root, "test")]
 
 
-def measured_again(
+def remeasure(
     size: Size, root: Path, *, progress: Callable[[Progress], None] | None = None
 ) -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Measure the shipped floors of a data set again: which were measured, and what
-    differs in them.
+    """Measure the shipped references of a data set again.
+
+    Returns:
+        The names of the measured references, and by name the metrics that differ.
     """
-    names = tuple(floor.name for floor in _possible(size, root))
-    known = {
-        name: held for name, held in (shipped(size) or {}).items() if name in names
-    }
-    return names, differences(
-        known, measure(size, root, floors=names, progress=progress)
-    )
+    names = tuple(reference.name for reference in _with_data(size, root))
+    expected = shipped(size) or {}
+    comparable = {name: expected[name] for name in expected if name in names}
+    measured = measure(size, root, names=names, progress=progress)
+    return names, differences(comparable, measured)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceJob:
-    """What a worker needs to measure the floors on one scenario."""
+    """Input of a worker that measures the references on one scenario."""
 
     task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
-    floors: tuple[str, ...]  # names of the floors
+    references: tuple[str, ...]  # their names
     metrics: tuple[str, ...]  # names of the metrics
-    keep: Path | None = None  # file that holds the result once it is there
+    saved: Path | None = None  # file of the result of an earlier run, or for this one
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceTallies:
-    """What was measured of the floors on one scenario."""
+    """Statistics of the references on one scenario."""
 
     scenario: int  # id of the scenario
-    tallies: Mapping[str, Tally]  # statistics by name of the floor
+    tallies: Mapping[str, Tally]  # statistics by name of the reference
     # CPU time of the prediction, median over frames [s]
     seconds_per_frame: Mapping[str, float]
 
 
 def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
-    """Measure the floors on one scenario, or read what was measured before."""
-    if job.keep is not None and job.keep.is_file():
-        report(job.task.setting.horizon)
-        return _kept(job, job.keep)
-    seconds: dict[str, list[float]] = {name: [] for name in job.floors}
+    """Measure the references on one scenario, or read the result of an earlier run."""
+    if job.saved is not None and job.saved.is_file():
+        report(job.task.config.horizon)
+        return _load(job.scenario, job.saved)
+
+    seconds: dict[str, list[float]] = {name: [] for name in job.references}
     with job.task.opened(job.scenario) as truth:
         given = given_in(truth.file, job.task.size, job.task.truth.root)
-        rows = {
-            name: snapshots(
-                truth.scenario, _timed(predicted_by(REFERENCES[name], given), taken)
-            )
-            for name, taken in seconds.items()
-        }
+        rows = {}
+        for name in job.references:
+            frames = predict_reference(REFERENCES[name], given)
+            timed = _time_frames(frames, seconds[name])
+            rows[name] = snapshots(truth.scenario, timed)
         tallies, _ = measure_rows(
-            truth.scenario, truth.snapshots(), rows, select(job.metrics), report=report
+            truth.scenario,
+            truth.snapshots(),
+            rows,
+            metrics=select(job.metrics),
+            report=report,
         )
-    medians = {name: float(np.median(taken)) for name, taken in seconds.items()}
-    found = ReferenceTallies(job.scenario, tallies, medians)
-    if job.keep is not None:
-        _keep(found, job.keep)
-    return found
+
+    medians = {name: float(np.median(seconds[name])) for name in seconds}
+    result = ReferenceTallies(job.scenario, tallies, medians)
+    if job.saved is not None:
+        _save(result, job.saved)
+    return result
 
 
-def _timed(
+def _time_frames(
     frames: Iterator[NDArray[np.float32]], seconds: list[float]
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield frames; add the CPU time that each took."""
+    """Yield frames; append the CPU time of each to ``seconds`` [s]."""
     while True:
         start = time.process_time()
         frame = next(frames, None)
@@ -152,44 +165,45 @@ def _timed(
         yield frame
 
 
-def _keep(found: ReferenceTallies, path: Path) -> None:
+def _save(result: ReferenceTallies, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    first, *_ = tallies = list(found.tallies.values())
-    held: dict[str, Any] = {
-        "floors": list(found.tallies),
-        "names": first.names,
-        "frames": first.frames,
-    }
-    held |= {
-        part: [getattr(tally, part) for tally in tallies]
-        for part in ("total", "weight", "undefined")
-    }
+    tallies = list(result.tallies.values())
     with atomic_path(path, option="--root") as temporary, open(temporary, "wb") as file:
-        np.savez(file, **held, seconds_per_frame=list(found.seconds_per_frame.values()))
-
-
-def _kept(job: ReferenceJob, path: Path) -> ReferenceTallies:
-    with np.load(path, allow_pickle=False) as held:
-        names = tuple(held["names"].tolist())
-        frames = tuple(held["frames"].tolist())
-        sums = zip(held["total"], held["weight"], held["undefined"], strict=True)
-        floors = held["floors"].tolist()
-        return ReferenceTallies(
-            job.scenario,
-            {
-                name: Tally(names, frames, *parts)
-                for name, parts in zip(floors, sums, strict=True)
-            },
-            dict(zip(floors, held["seconds_per_frame"].tolist(), strict=True)),
+        np.savez(
+            file,
+            floors=list(result.tallies),
+            names=tallies[0].names,
+            frames=tallies[0].frames,
+            total=[tally.total for tally in tallies],
+            weight=[tally.weight for tally in tallies],
+            undefined=[tally.undefined for tally in tallies],
+            seconds_per_frame=list(result.seconds_per_frame.values()),
         )
 
 
-def kept_in(size: Size, root: Path) -> Path:
-    """Return the folder in which an interrupted measurement of a data set is kept."""
+def _load(scenario: int, path: Path) -> ReferenceTallies:
+    with np.load(path, allow_pickle=False) as arrays:
+        references = arrays["floors"].tolist()
+        names = tuple(arrays["names"].tolist())
+        frames = tuple(arrays["frames"].tolist())
+        seconds = arrays["seconds_per_frame"].tolist()
+        totals = arrays["total"]
+        weights = arrays["weight"]
+        undefined = arrays["undefined"]
+
+    tallies = {}
+    for i, reference in enumerate(references):
+        tallies[reference] = Tally(names, frames, totals[i], weights[i], undefined[i])
+    return ReferenceTallies(
+        scenario, tallies, dict(zip(references, seconds, strict=True))
+    )
+
+
+def saved_folder(size: Size, root: Path) -> Path:
+    """Return the folder in which an interrupted measurement of a data set is saved."""
+    sha256 = "unrecorded"
     if size.measured:
         sha256 = size.measured.dataset_sha256
-    else:
-        sha256 = "unrecorded"
     return root / ".floors" / f"{size.split}-{size.name}-{sha256[:16]}"
 
 
@@ -197,73 +211,99 @@ def measure(
     size: Size,
     root: Path,
     *,
-    floors: Collection[str] | None = None,
+    names: Collection[str] | None = None,
     workers: int = 1,
     resume: bool = False,
     progress: Callable[[Progress], None] | None = None,
 ) -> dict[str, ReferenceScores]:
-    """Return the scores of floors of a data set, by default all, those of single frames
-    by scenario.
+    """Return the scores of references of a data set by name.
 
-    The test subset must be there, and train for ``analog``. With ``resume`` what is
-    measured is kept under the root, and what is kept there is taken.
+    The test subset must be there, and train for ``analog``.
+
+    Args:
+        size: the split and size.
+        root: folder of all data sets.
+        names: names of the references; by default all.
+        workers: worker processes.
+        resume: whether each scenario is saved under the root, and read if it was saved
+            by an earlier run.
+        progress: called with the state of the work.
     """
     task = load_scored_task(size, root)
-    names = tuple(
-        floor.name
-        for floor in references_of(size)
-        if floors is None or floor.name in floors
+    metrics = select()
+    references = tuple(
+        reference.name
+        for reference in references_of(size)
+        if names is None or reference.name in names
     )
-    jobs = {
-        f"floors on scenario {i}": ReferenceJob(
+    folder = saved_folder(size, root)
+    jobs = {}
+    for scenario in task.scenarios:
+        saved = None
+        if resume:
+            saved = folder / f"{scenario:04d}.npz"
+        jobs[f"references on scenario {scenario}"] = ReferenceJob(
             task=task,
-            scenario=i,
-            floors=names,
-            metrics=tuple(metric.name for metric in select()),
-            keep=kept_in(size, root) / f"{i:04d}.npz" if resume else None,
+            scenario=scenario,
+            references=references,
+            metrics=tuple(metric.name for metric in metrics),
+            saved=saved,
         )
-        for i in task.scenarios
-    }
+
     meter = Meter(progress)
     meter.begin(
-        "measuring floors", total=len(jobs) * task.setting.horizon, scenarios=len(jobs)
+        "measuring references",
+        total=len(jobs) * task.config.horizon,
+        scenarios=len(jobs),
     )
-    found = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
-    floors_scores = {}
-    for name in names:
+    results = run_all(measure_scenario, jobs, workers=workers, report=meter.count)
+
+    measured = {}
+    for name in references:
         scores = aggregate(
-            select(), {held.scenario: held.tallies[name] for held in found}
+            metrics, {result.scenario: result.tallies[name] for result in results}
         )
-        floors_scores[name] = ReferenceScores(
+        seconds = [result.seconds_per_frame[name] for result in results]
+        measured[name] = ReferenceScores(
             name=name,
             scores=scores,
-            seconds_per_frame=float(
-                np.median([held.seconds_per_frame[name] for held in found])
-            ),
+            seconds_per_frame=float(np.median(seconds)),
             correlation=correlation_of(scores),
         )
-    return floors_scores
+    return measured
 
 
 def differences(
-    expected: Mapping[str, ReferenceScores], found: Mapping[str, ReferenceScores]
+    expected: Mapping[str, ReferenceScores], measured: Mapping[str, ReferenceScores]
 ) -> dict[str, tuple[str, ...]]:
-    """Return by floor the metrics whose values per scenario differ, those that one
-    lacks included.
+    """Return by reference the metrics whose values per scenario differ.
+
+    A metric that only one of the two has differs.
     """
-    near = partial(np.allclose, rtol=TOLERANCE, atol=1e-12, equal_nan=True)
-    unlike = {}
-    for name in {**expected, **found}:
-        one, two = (
-            held[name].scores if name in held else {} for held in (expected, found)
-        )
-        unlike[name] = tuple(
-            metric
-            for metric in {**one, **two}
-            if not (
-                metric in one
-                and metric in two
-                and near(one[metric].values, two[metric].values)
-            )
-        )
-    return {name: metrics for name, metrics in unlike.items() if metrics}
+    unequal = {}
+    for name in {**expected, **measured}:
+        before = _scores_of(expected, name)
+        after = _scores_of(measured, name)
+        metrics = []
+        for metric in {**before, **after}:
+            if not _are_equal(before.get(metric), after.get(metric)):
+                metrics.append(metric)
+        if metrics:
+            unequal[name] = tuple(metrics)
+    return unequal
+
+
+def _scores_of(
+    references: Mapping[str, ReferenceScores], name: str
+) -> Mapping[str, Score]:
+    if name in references:
+        return references[name].scores
+    return {}
+
+
+def _are_equal(before: Score | None, after: Score | None) -> bool:
+    if before is None or after is None:
+        return False
+    return np.allclose(
+        before.values, after.values, rtol=TOLERANCE, atol=1e-12, equal_nan=True
+    )

@@ -1,6 +1,4 @@
-"""Score a predictions.nc: validate, measure, aggregate, put beside the floors, flag,
-write.
-"""
+"""Score a predictions.nc: validate, measure, aggregate, compare, flag, write."""
 
 from __future__ import annotations
 
@@ -19,29 +17,29 @@ from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import shipped
 from lagbench.references.table import COUNTING
-from lagbench.submission.findings import Finding, ValidationResult
-from lagbench.submission.format import Anatomy, Header
+from lagbench.submission.format import FileInfo, Header
+from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
-from .card import JSON_NAME, SUBMISSION, ScoreCard, read_scores, skill, spell
-from .flags import Flag, below_twin_floor, copy_suspect, physics
+from .card import JSON_NAME, SUBMISSION, ScoreCard, format_scores
+from .flags import Flag, judge_copying, judge_physics, judge_predictability
+from .published_scores import read_scores
 from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
+from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME, write_statistics
+from .skill import compute_skill
 from .task import ScoredTask, load_scored_task
-from .usable import OF_NODES, few_nodes
 
 PREDICTIONS = "predictions.nc"
 """The usual name of a submission; its scores lie beside it."""
 
 WORTH_WORKERS = 1_000_000
-"""Particles times predicted frames below which starting worker processes costs more
-than it gains.
-"""
+"""Least particles times predicted frames for which worker processes are worth it."""
 
 
 def score(
@@ -67,16 +65,17 @@ def score(
             beside a file of another name the folder of that name.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
-        extras: extras whose metrics are wanted too, as in ("transport",).
-        progress: told how far the work is.
-        examined: told what the validation found, before anything is raised for it.
+        extras: extras whose metrics are measured too, as in ("transport",).
+        progress: called with the state of the work.
+        examined: called with the result of the validation, before anything is raised
+            for it.
         registry: where splits are described; ours when None.
         write: whether to write the two files.
-        validated: what :func:`lagbench.validate` with ``require_truth`` said of this
-            very file and root, if it was asked before; the file is not validated again.
+        validated: the result of :func:`lagbench.validate` with ``require_truth`` for
+            this very file and root; the file is then not validated again.
 
     Returns:
-        The score card; ``files`` names what was written.
+        The score card; ``files`` names the written files.
 
     Raises:
         UsageError: an extra that brings no metrics, or that is not installed; scores of
@@ -88,17 +87,19 @@ def score(
         WorkFailedError: a worker or the cluster was lost, the disk is full, or the
             folder cannot be written to, which is seen before the work.
     """
-    metrics = _chosen(extras)
+    metrics = _select_metrics(extras)
     path = Path(predictions).absolute()
-    holder = resolve_root(root)
-    described = load_rooted_registry(holder, registry)
-    if output_dir is None:
-        folder = scores_folder(Path(predictions))
-    else:
+    data_root = resolve_root(root)
+    splits = load_rooted_registry(data_root, registry)
+    folder = scores_folder(Path(predictions))
+    if output_dir is not None:
         folder = Path(output_dir)
-    result = validated or validate(
-        path, root=holder, require_truth=True, registry=described
-    )
+
+    # validation
+    if validated is None:
+        result = validate(path, root=data_root, require_truth=True, registry=splits)
+    else:
+        result = validated
     if result.path != path:
         raise UsageError(
             "the validation is of another file", where=str(path), got=result.path
@@ -106,127 +107,140 @@ def score(
     if examined is not None:
         examined(result)
     result.check()
+
     if write:
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header = opened.header
-        anatomy = opened.anatomy
-        content = result.sha256 or opened.content_sha256()
+        anatomy = opened.info
+        sha256 = result.sha256 or opened.content_sha256()
     if write:
-        _check_own(folder / JSON_NAME, header)
-    task = load_scored_task(described.size(header.split, header.size), holder)
-    known = shipped(task.size) or {}
-    floors = () if known else measurable(task.size, holder)
-    outcomes = _outcomes(
+        _check_overwriting(folder / JSON_NAME, header)
+
+    # measurement
+    size = splits.size(header.split, header.size)
+    # a validation that compares with the truth has hashed it
+    is_hashed = validated is None and "discontinuous_start" not in result.skipped
+    task = load_scored_task(size, data_root, is_hashed=is_hashed)
+    shipped_references = shipped(size) or {}
+    references: tuple[str, ...] = ()
+    if not shipped_references:
+        references = measurable(size, data_root)
+    outcomes = score_scenarios(
         task,
         path,
         anatomy,
-        tuple(m.name for m in metrics),
-        floors,
-        workers,
-        scheduler,
-        Meter(progress),
+        metrics=tuple(metric.name for metric in metrics),
+        references=references,
+        workers=workers,
+        scheduler=scheduler,
+        meter=Meter(progress),
     )
-    tallies = {
-        row: {outcome.scenario: outcome.tallies[row] for outcome in outcomes}
-        for row in outcomes[0].tallies
+
+    # aggregation
+    tallies = {}
+    for row in outcomes[0].tallies:
+        tallies[row] = {outcome.scenario: outcome.tallies[row] for outcome in outcomes}
+    scores: dict[str, Mapping[str, Score]] = {}
+    for row, row_tallies in tallies.items():
+        scores[row] = aggregate(metrics, row_tallies)
+    for name, reference in shipped_references.items():
+        scores[name] = reference.scores
+
+    ranking = ranking_metric(size)
+    counting = {
+        row: row_scores[ranking]
+        for row, row_scores in scores.items()
+        if row in COUNTING and ranking in row_scores
     }
-    scores: dict[str, Mapping[str, Score]] = {
-        row: aggregate(metrics, held) for row, held in tallies.items()
-    }
-    scores |= {name: floor.scores for name, floor in known.items()}
-    ranking = ranking_metric(task.size)
-    floored = {
-        row: held[ranking]
-        for row, held in scores.items()
-        if row in COUNTING and ranking in held
-    }
-    preview = next(
-        outcome.preview for outcome in outcomes if outcome.preview is not None
-    )
     card = ScoreCard(
         header=header,
-        predictions_sha256=content,
-        setting=task.setting,
+        predictions_sha256=sha256,
+        config=task.config,
         ranking=ranking,
         tallies=tallies,
         scores=scores,
-        skill=skill([scores[SUBMISSION][ranking]], floored),
-        flags=_flags(task, outcomes, scores),
-        warnings=(*result.warnings, *_undefined(task, tallies[SUBMISSION])),
-        preview=preview,
+        skill=compute_skill([scores[SUBMISSION][ranking]], counting),
+        flags=_judge(task, outcomes, scores),
+        warnings=(*result.warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
+        preview=next(one.preview for one in outcomes if one.preview is not None),
     )
     if write:
-        return _written(card, folder)
+        return _write(card, folder)
     return card
 
 
 def scores_folder(predictions: Path) -> Path:
-    """Return where the scores of a file go by default.
+    """Return the default folder of the scores of a file.
 
-    >>> scores_folder(Path("runs/predictions.nc")).as_posix(), scores_folder(Path("runs/gns.nc")).as_posix()
-    ('runs', 'runs/gns')
+    >>> scores_folder(Path("runs/predictions.nc")).as_posix()
+    'runs'
+    >>> scores_folder(Path("runs/gns.nc")).as_posix()
+    'runs/gns'
     """
-    usual = predictions.name == PREDICTIONS
-    if usual:
+    if predictions.name == PREDICTIONS:
         return predictions.parent
     return predictions.parent / predictions.stem
 
 
-def _check_own(path: Path, header: Header) -> None:
+def _check_overwriting(path: Path, header: Header) -> None:
     """Refuse to write over scores of another method or data set."""
     if not path.exists():
         return
     try:
-        held = read_scores(path).identity
-        found = " ".join(held[name] for name in ("method", "split", "size"))
+        identity = read_scores(path).identity
+        present = f"{identity['method']} {identity['split']} {identity['size']}"
     except UnreadableFileError:
-        found = "something else"
-    own = f"{header.method} {header.split} {header.size}"
-    if found != own:
+        present = "something else"
+    expected = f"{header.method} {header.split} {header.size}"
+    if present != expected:
         raise UsageError(
             "the scores of another submission lie there",
             where=str(path),
-            expected=f"no such file, or the scores of {own}",
-            got=found,
+            expected=f"no such file, or the scores of {expected}",
+            got=present,
             fix="keep them: --output FOLDER; or remove them first",
         )
 
 
-def _undefined(task: ScoredTask, held: Mapping[int, Tally]) -> Iterator[Finding]:
-    """Warn where the vorticity of all scenarios, or of any where it ranks, has too few
-    nodes throughout.
+def _warn_of_few_nodes(
+    task: ScoredTask, tallies: Mapping[int, Tally]
+) -> Iterator[ValidationIssue]:
+    """Warn of scenarios whose vorticity has too few nodes in every frame.
+
+    Where it ranks, of any such scenario; else only if all scenarios are such.
     """
-    lost = [i for i, tally in held.items() if not _has_nodes(tally)]
-    if lost and (ranking_metric(task.size) == OF_NODES or len(lost) == len(held)):
-        yield few_nodes(task, lost)
+    without = [i for i, tally in tallies.items() if not _has_nodes(tally)]
+    if not without:
+        return
+    if ranking_metric(task.size) == OF_NODES or len(without) == len(tallies):
+        yield few_nodes_warning(task, without)
 
 
 def _has_nodes(tally: Tally) -> bool:
-    """Tell whether the vorticity was compared in any frame, if it was measured."""
+    """Return whether the vorticity was compared in any frame, if it was measured."""
     if "vorticity_mse" not in tally.names:
         return True
-    return bool(tally.weight[tally.names.index("vorticity_mse")].any())
+    row = tally.names.index("vorticity_mse")
+    return bool(tally.weight[row].any())
 
 
-def _written(card: ScoreCard, folder: Path) -> ScoreCard:
+def _write(card: ScoreCard, folder: Path) -> ScoreCard:
+    """Write both files and return the card with their paths."""
     json_path = folder / JSON_NAME
     netcdf_path = folder / NETCDF_NAME
-    with atomic_path(
-        json_path, option="--output"
-    ) as temporary:  # both, or neither where the disk is full
-        temporary.write_bytes(spell(card))
+    # both, or neither where the disk is full
+    with atomic_path(json_path, option="--output") as temporary:
+        temporary.write_bytes(format_scores(card))
         write_statistics(card, netcdf_path)
     return card.at(json_path, netcdf_path)
 
 
-def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
+def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
     """Return the metrics to measure; refuse an extra that brings none."""
-    known = {metric.extra for metric in available().values() if metric.extra}
     if isinstance(extras, str):
         extras = (extras,)
-    else:
-        extras = extras
+    known = {metric.extra for metric in available().values() if metric.extra}
     for extra in extras:
         if extra not in known:
             raise UsageError(
@@ -237,55 +251,67 @@ def _chosen(extras: Collection[str]) -> tuple[Metric, ...]:
     return select(extras=extras)
 
 
-def _outcomes(
+def score_scenarios(
     task: ScoredTask,
     path: Path,
-    anatomy: Anatomy,
+    anatomy: FileInfo,
+    *,
     metrics: tuple[str, ...],
-    floors: tuple[str, ...],
+    references: tuple[str, ...],
     workers: int | None,
     scheduler: str | None,
     meter: Meter,
 ) -> list[ScenarioScores]:
-    """Return what was measured of every scenario, by ascending id."""
-    ids = task.scenarios
-    horizon = task.setting.horizon
-    jobs = {
-        f"scenario {i}": ScenarioJob(
+    """Return the statistics of every scenario, by ascending id.
+
+    Args:
+        task: the test subset.
+        path: a predictions.nc that has been validated.
+        anatomy: content of its headers.
+        metrics: names of the metrics.
+        references: names of the references to measure beside it.
+        workers: worker processes; None: one per core where the work is worth it.
+        scheduler: address of a Dask scheduler that takes the scenarios instead.
+        meter: counts the frames.
+    """
+    scenarios = task.scenarios
+    jobs = {}
+    for scenario in scenarios:
+        jobs[f"scenario {scenario}"] = ScenarioJob(
             task=task,
-            scenario=i,
+            scenario=scenario,
             predictions=path,
             anatomy=anatomy,
             metrics=metrics,
-            floors=floors,
-            pictured=i == ids[0],
+            references=references,
+            has_preview=scenario == scenarios[0],
         )
-        for i in ids
-    }
+
+    frame_count = len(scenarios) * task.config.horizon
     if workers is None:
-        worth = len(ids) * horizon * task.size.particles >= WORTH_WORKERS
-        if worth:
+        workers = 1
+        if frame_count * task.size.particles >= WORTH_WORKERS:
             workers = available_cores()
-        else:
-            workers = 1
-    meter.begin("scoring", total=len(ids) * horizon, scenarios=len(ids))
+    meter.begin("scoring", total=frame_count, scenarios=len(scenarios))
     return run_all(
         score_scenario, jobs, workers=workers, scheduler=scheduler, report=meter.count
     )
 
 
-def _flags(
+def _judge(
     task: ScoredTask,
     outcomes: Sequence[ScenarioScores],
     scores: Mapping[str, Mapping[str, Score]],
 ) -> tuple[Flag, ...]:
+    """Return the flags of a submission."""
     traces = [outcome.trace for outcome in outcomes]
-    error, still = (
-        np.asarray(np.mean(scores[row]["position_rmse"].per_frame, axis=0))
-        for row in (SUBMISSION, extrapolation.PERSISTENCE.name)
-    )
+    # position RMSE, mean over scenarios [length], shape [frame]
+    submission = scores[SUBMISSION]["position_rmse"]
+    persistence = scores[extrapolation.PERSISTENCE.name]["position_rmse"]
+    error = np.asarray(np.mean(submission.per_frame, axis=0))
+    persistence_error = np.asarray(np.mean(persistence.per_frame, axis=0))
     return (
-        copy_suspect(traces),
-        below_twin_floor(error, still, task.twin_floor),
-        physics(traces),
+        judge_copying(traces),
+        judge_predictability(error, persistence_error, task.predictability_limit),
+        judge_physics(traces),
     )

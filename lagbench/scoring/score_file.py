@@ -2,14 +2,15 @@
 
 Every score of the submission follows from it: ``read_statistics(path).scores()`` gives
 the digits of scores.json. Statistics are float32 and NaN where undefined, those of long
-rollouts rounded to 11 significant bits (see :func:`as_stored`), so that no full size
-takes more than 1 MB; ``measured`` tells which were measured at all. What the best floor
-scores in the ranking metric stands beside them, so that the skill can be formed again.
+rollouts rounded to 11 significant bits (see :func:`round_statistics`), so that no full
+size takes more than 1 MB; ``measured`` marks those that were measured at all. The
+scores of the best reference in the ranking metric are stored too, so that the skill can
+be formed again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -23,211 +24,239 @@ from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 from lagbench.references.table import COUNTING
 
-from .card import (
-    FORMAT,
-    IDENTITY,
-    SUBMISSION,
-    Preview,
-    ScoreCard,
-    Skill,
-    printable,
-    skill,
-    unreadable_scores,
-)
+from .card import FORMAT, IDENTITY, SUBMISSION, Preview, ScoreCard
+from .published_scores import require_printable, unreadable_scores
+from .skill import Skill, compute_skill
 
 NETCDF_NAME = "scores.nc"
 
 INDEX = 4096
-"""About what HDF5 takes for the index of chunks; smaller variables are not compressed
-[bytes].
-"""
+"""Size of the index of chunks in HDF5; smaller variables are not compressed [bytes]."""
 
 LEVELS = 65534
-"""Greatest packed value of a preview; 65535 stands for what is missing."""
+"""Greatest packed value of a preview; 65535 marks missing values."""
 
 FILM_RANGE = (-0.5, 1.5)
 """Positions in the preview are clipped to this range [length]."""
 
-_PREVIEW: Mapping[str, tuple[tuple[str, ...], str]] = {
-    "vorticity": (
-        ("side", "map_frame", "x_node", "y_node"),
-        "vorticity per frame; side: truth, prediction",
-    ),
-    "histogram": (
-        ("side", "map_frame", "bin"),
-        "shares of 64 vorticity bins over the truth's range",
-    ),
-    "film": (
-        ("side", "film_frame", "film_particle", "space"),
-        "particle positions [length]",
-    ),
-}
+VORTICITY_DIMS = ("side", "map_frame", "x_node", "y_node")
+HISTOGRAM_DIMS = ("side", "map_frame", "bin")
+FILM_DIMS = ("side", "film_frame", "film_particle", "space")
 
 
 def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -> None:
     """Write scores.nc, whole or not at all; equal cards give equal bytes.
 
-    ``option`` is what the user names another folder with, for the message.
+    ``option`` is the user's option for another folder, for the message.
+
+    Raises:
+        WorkFailedError: the file cannot be written.
     """
     import netCDF4
 
     with atomic_path(path, option=option) as temporary:
         try:
-            with netCDF4.Dataset(
-                temporary, "w", format="NETCDF4"
-            ) as file:  # closing it writes most of it
-                _define(file, card)
+            # closing the file writes most of it
+            with netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
+                _write_card(file, card)
         except (OSError, RuntimeError) as error:
-            fix = f"free disk space, or name a folder that you may write to: {option}"
             raise WorkFailedError(
-                "cannot write scores", where=str(path), got=error, fix=fix
+                "cannot write scores",
+                where=str(path),
+                got=error,
+                fix=f"free disk space, or name a folder that you may write to: "
+                f"{option}",
             ) from error
 
 
-def _define(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
+def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     tallies = [card.tallies[SUBMISSION][i] for i in card.scenarios]
     names = tallies[0].names
     frames = tallies[0].frames
-    file.setncatts(
-        {
-            "lagbench_scores": FORMAT,
-            **{name: getattr(card.header, name) for name in IDENTITY},
-            "predictions_sha256": card.predictions_sha256,
-            "ranking_metric": card.ranking,
-            "statistics": " ".join(names),
-        }
-    )
-    _store(file, "scenario", ("scenario",), np.array(card.scenarios, np.int32))
-    _store(file, "frame", ("frame",), np.array(frames, np.int32))
+
+    attributes: dict[str, Any] = {"lagbench_scores": FORMAT}
+    for name in IDENTITY:
+        attributes[name] = getattr(card.header, name)
+    attributes["predictions_sha256"] = card.predictions_sha256
+    attributes["ranking_metric"] = card.ranking
+    attributes["statistics"] = " ".join(names)
+    file.setncatts(attributes)
+
+    _write_variable(file, "scenario", ("scenario",), np.array(card.scenarios, np.int32))
+    _write_variable(file, "frame", ("frame",), np.array(frames, np.int32))
     if card.skill is not None:
-        file.best_floor = card.skill.floor
-        values = card.scores[card.skill.floor][card.ranking].values
-        _store(file, "best_floor_value", ("scenario",), values)
+        file.best_floor = card.skill.reference
+        values = card.scores[card.skill.reference][card.ranking].values
+        _write_variable(file, "best_floor_value", ("scenario",), values)
+
+    values = _stack(tally.series(name) for name in names for tally in tallies)
+    measured = _stack(tally.measured(name) for name in names for tally in tallies)
+    shape = (len(names), len(tallies), len(frames))
     dims = ("statistic", "scenario", "frame")
-    values = np.stack(
-        [np.stack([tally.series(name) for tally in tallies]) for name in names]
-    )
-    measured = np.stack(
-        [np.stack([tally.measured(name) for tally in tallies]) for name in names]
-    )
-    _store(file, "value", dims, values.astype(np.float32))
-    _store(file, "measured", dims, measured.astype(np.int8))
-    _define_preview(file.createGroup("preview"), card.preview)
+    _write_variable(file, "value", dims, values.reshape(shape).astype(np.float32))
+    _write_variable(file, "measured", dims, measured.reshape(shape).astype(np.int8))
+    _write_preview(file.createGroup("preview"), card.preview)
 
 
-def _define_preview(group: Any, preview: Preview) -> None:  # noqa: ANN401
+def _stack(rows: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    return np.stack(list(rows))
+
+
+def _write_preview(group: Any, preview: Preview) -> None:  # noqa: ANN401
     group.scenario = preview.scenario
-    numbers = {
-        "map_frame": preview.map_frames,
-        "film_frame": preview.film_frames,
-        "film_particle": preview.particles,
-    }
-    for name, held in numbers.items():
-        _store(group, name, (name,), np.array(held, np.int32))
-    _store(group, "material", ("film_particle",), preview.material)
-    _store(group, "histogram_range", ("map_frame", "end"), preview.histogram_range)
-    film = np.clip(preview.film, *FILM_RANGE)
-    for name, values in {
-        "vorticity": preview.vorticity,
-        "histogram": preview.histogram,
-        "film": film,
-    }.items():
-        dims, text = _PREVIEW[name]
-        packed, attributes = _packed(values, FILM_RANGE if name == "film" else None)
-        _store(group, name, dims, packed, {"long_name": text, **attributes})
+    for name, numbers in (
+        ("map_frame", preview.map_frames),
+        ("film_frame", preview.film_frames),
+        ("film_particle", preview.particles),
+    ):
+        _write_variable(group, name, (name,), np.array(numbers, np.int32))
+    _write_variable(group, "material", ("film_particle",), preview.material)
+    _write_variable(
+        group, "histogram_range", ("map_frame", "end"), preview.histogram_range
+    )
+
+    _write_packed(
+        group,
+        "vorticity",
+        VORTICITY_DIMS,
+        preview.vorticity,
+        limits=_defined_range(preview.vorticity),
+        long_name="vorticity per frame; side: truth, prediction",
+    )
+    _write_packed(
+        group,
+        "histogram",
+        HISTOGRAM_DIMS,
+        preview.histogram,
+        limits=_defined_range(preview.histogram),
+        long_name="shares of 64 vorticity bins over the truth's range",
+    )
+    _write_packed(
+        group,
+        "film",
+        FILM_DIMS,
+        np.clip(preview.film, *FILM_RANGE),
+        limits=FILM_RANGE,
+        long_name="particle positions [length]",
+    )
 
 
-def _packed(
-    values: NDArray[np.float32], limits: tuple[float, float] | None
+def _write_packed(
+    group: Any,  # noqa: ANN401
+    name: str,
+    dims: tuple[str, ...],
+    values: NDArray[np.float32],
+    *,
+    limits: tuple[float, float],
+    long_name: str,
+) -> None:
+    """Write values as integers between two limits."""
+    packed, packing = _pack(values, limits)
+    _write_variable(group, name, dims, packed, {"long_name": long_name, **packing})
+
+
+def _defined_range(values: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the least and greatest finite value; 0 and 1 where there is none."""
+    wide = values.astype(np.float64)
+    finite = wide[np.isfinite(wide)]
+    if not finite.size:
+        return (0.0, 1.0)
+    return (float(finite.min()), float(finite.max()))
+
+
+def _pack(
+    values: NDArray[np.float32], limits: tuple[float, float]
 ) -> tuple[NDArray[np.uint16], dict[str, Any]]:
     """Return values as uint16 and the CF attributes that unpack them."""
+    low, high = limits
     wide = values.astype(np.float64)
-    known = wide[np.isfinite(wide)]
-    low, high = limits or (
-        (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-    )
     scale = (high - low) / LEVELS or 1.0
-    steps = np.where(np.isfinite(wide), np.rint((wide - low) / scale), LEVELS + 1)
+    steps = np.rint((wide - low) / scale)
+    packed = np.where(np.isfinite(wide), steps, LEVELS + 1)
     attributes = {
         "scale_factor": scale,
         "add_offset": low,
         "_FillValue": np.uint16(LEVELS + 1),
     }
-    return steps.astype(np.uint16), attributes
+    return packed.astype(np.uint16), attributes
 
 
-def _store(
+def _write_variable(
     group: Any,  # noqa: ANN401
     name: str,
     dims: tuple[str, ...],
     values: NDArray[Any],
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    given = dict(attributes or {})
+    """Write a variable, compressed if it is large, and its new dimensions."""
     for dim, length in zip(dims, values.shape, strict=True):
         if dim not in group.dimensions:
             group.createDimension(dim, length)
-    fill = given.pop("_FillValue", False)
-    packed = values.nbytes > INDEX
+
+    plain_attributes = dict(attributes or {})
+    fill_value = plain_attributes.pop("_FillValue", False)
+    is_large = values.nbytes > INDEX
     variable = group.createVariable(
         name,
         values.dtype,
         dims,
-        compression="zlib" if packed else None,
+        compression="zlib" if is_large else None,
         complevel=9,
         shuffle=True,
-        fill_value=fill,
-        chunksizes=values.shape if packed else None,
-        contiguous=not packed,
+        fill_value=fill_value,
+        chunksizes=values.shape if is_large else None,
+        contiguous=not is_large,
     )
-    variable.setncatts(given)
+    variable.setncatts(plain_attributes)
     variable.set_auto_maskandscale(False)
     variable[...] = values
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StoredScores:
-    """What a scores.nc holds beside its preview."""
+class SubmissionStatistics:
+    """Content of a scores.nc beside its preview."""
 
     # split, size, version and hash of the data set, and the method
     identity: Mapping[str, str]
     predictions_sha256: str  # content hash of the predicted positions
     ranking: str  # name of the metric that ranks
     tallies: Mapping[int, Tally]  # statistics of the submission by scenario
-    # name of the best floor; None where none that counts has a score
-    best_floor: str | None = None
-    # what it scores in the ranking metric, NaN where undefined, shape [scenario]
-    best_floor_values: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    # name of the best reference; None where none that counts has a score
+    best_reference: str | None = None
+    # its scores in the ranking metric, NaN where undefined, shape [scenario]
+    best_reference_values: NDArray[np.float64] = field(
+        default_factory=lambda: np.empty(0)
+    )
 
     def skill(self) -> Skill | None:
-        """Return how much better than the best floor; None where none that counts has a
-        score.
-        """
-        ours = self._scored(self.ranking).get(self.ranking)
-        if self.best_floor is None or ours is None:
+        """Return the skill; None where no reference that counts has a score."""
+        ranking = self._aggregate([self.ranking]).get(self.ranking)
+        if self.best_reference is None or ranking is None:
             return None
-        floor = replace(ours, values=self.best_floor_values)
-        return skill([ours], {self.best_floor: floor})
+        reference = replace(ranking, values=self.best_reference_values)
+        return compute_skill([ranking], {self.best_reference: reference})
 
     def scores(self) -> dict[str, Score]:
-        """Return the scores of all installed metrics whose statistics are here, by
-        name.
-        """
-        return self._scored(*available())
+        """Return the scores of all installed metrics whose statistics are here."""
+        return self._aggregate(available())
 
-    def _scored(self, *wanted: str) -> dict[str, Score]:
-        names = set(next(iter(self.tallies.values())).names)
-        known = available()
-        metrics = [
-            known[name]
-            for name in wanted
-            if name in known and names.issuperset(known[name].of)
-        ]
+    def _aggregate(self, names: Iterable[str]) -> dict[str, Score]:
+        """Return scores by the name of the metric."""
+        statistics = set(next(iter(self.tallies.values())).names)
+        table = available()
+        metrics = []
+        for name in names:
+            if name in table and statistics.issuperset(table[name].of):
+                metrics.append(table[name])
         return aggregate(metrics, self.tallies)
 
 
-def read_statistics(path: Path) -> StoredScores:
-    """Read the statistics of a scores.nc."""
+def read_statistics(path: Path) -> SubmissionStatistics:
+    """Read the statistics of a scores.nc.
+
+    Raises:
+        UnreadableFileError: it is no scores.nc.
+    """
     import netCDF4
 
     try:
@@ -235,54 +264,70 @@ def read_statistics(path: Path) -> StoredScores:
             file.set_auto_maskandscale(False)
             if file.lagbench_scores != FORMAT:
                 raise ValueError(f"layout {file.lagbench_scores!r}, not {FORMAT}")
-            names = tuple(str(file.statistics).split())
-            frames = tuple(file["frame"][:].tolist())
-            scenarios = file["scenario"][:].tolist()
-            named = {*IDENTITY, "predictions_sha256", "ranking_metric", "best_floor"}
-            held = {
-                name: file.getncattr(name)
-                for name in named.intersection(file.ncattrs())
-            }
-            floor = held.get("best_floor")
-            of_floor = np.empty(0)
-            if floor is not None:
-                of_floor = np.asarray(file["best_floor_value"][:], np.float64)
-                if (
-                    floor not in COUNTING
-                    or of_floor.shape != (len(scenarios),)
-                    or np.isinf(of_floor).any()
-                ):
-                    raise ValueError("not the scores of a floor")
-            values = file["value"][:].astype(np.float64)
-            measured = file["measured"][:]
-            return StoredScores(
-                identity={name: printable(held, name) for name in IDENTITY},
-                predictions_sha256=printable(held, "predictions_sha256"),
-                ranking=printable(held, "ranking_metric"),
-                tallies={
-                    scenario: _tally(names, frames, values[:, i], measured[:, i])
-                    for i, scenario in enumerate(scenarios)
-                },
-                best_floor=floor,
-                best_floor_values=of_floor,
+            reference, reference_values = _read_reference(file)
+            return SubmissionStatistics(
+                identity={name: _read_text(file, name) for name in IDENTITY},
+                predictions_sha256=_read_text(file, "predictions_sha256"),
+                ranking=_read_text(file, "ranking_metric"),
+                tallies=_read_tallies(file),
+                best_reference=reference,
+                best_reference_values=reference_values,
             )
     except Exception as error:  # HDF5 on damaged bytes raises nearly any type
         raise unreadable_scores(path, error) from error
 
 
-def _tally(
+def _read_text(file: Any, name: str) -> str:  # noqa: ANN401
+    text = file.getncattr(name)
+    if not isinstance(text, str):
+        raise ValueError(f"{name} is no text")
+    return require_printable(text)
+
+
+def _read_reference(file: Any) -> tuple[str | None, NDArray[np.float64]]:  # noqa: ANN401
+    """Return name and values of the best reference; None where the file has none."""
+    if "best_floor" not in file.ncattrs():
+        return None, np.empty(0)
+    name = file.getncattr("best_floor")
+    values = np.asarray(file["best_floor_value"][:], np.float64)
+    has_right_shape = values.shape == (len(file["scenario"]),)
+    if name not in COUNTING or not has_right_shape or np.isinf(values).any():
+        raise ValueError("not the scores of a reference")
+    return name, values
+
+
+def _read_tallies(file: Any) -> dict[int, Tally]:  # noqa: ANN401
+    """Return the statistics of each scenario."""
+    names = tuple(str(file.statistics).split())
+    frames = tuple(file["frame"][:].tolist())
+    scenarios = file["scenario"][:].tolist()
+    values = file["value"][:].astype(np.float64)
+    measured = file["measured"][:]
+
+    tallies = {}
+    for i, scenario in enumerate(scenarios):
+        is_measured = measured[:, i] != 0
+        tallies[scenario] = _make_tally(names, frames, values[:, i], is_measured)
+    return tallies
+
+
+def _make_tally(
     names: tuple[str, ...],
     frames: tuple[int, ...],
     values: NDArray[np.float64],
-    measured: NDArray[np.int8],
+    is_measured: NDArray[np.bool_],
 ) -> Tally:
+    """Return the tally of values of shape [statistic, frame]."""
     if values.shape != (len(names), len(frames)):
         raise ValueError(
             f"{values.shape} values of {len(names)} statistics at {len(frames)} frames"
         )
-    undefined = np.isnan(values) & (measured != 0)
-    weight = ~np.isnan(values) & (measured != 0)
-    total = np.where(weight, values, 0.0)
+    is_nan = np.isnan(values)
+    has_value = ~is_nan & is_measured
     return Tally(
-        names, frames, total, weight.astype(np.int64), undefined.astype(np.int64)
+        names=names,
+        frames=frames,
+        total=np.where(has_value, values, 0.0),
+        weight=has_value.astype(np.int64),
+        undefined=(is_nan & is_measured).astype(np.int64),
     )

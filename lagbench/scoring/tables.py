@@ -1,9 +1,9 @@
-"""What a score card and a comparison print, as tables of text."""
+"""Tables of text that show a score card and a comparison."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction, Metric, mean
@@ -11,24 +11,21 @@ from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
 
 from .card import SUBMISSION, ScoreCard
-from .compare import ComparisonResult
+from .compare import ComparisonResult, MetricComparison
 
 SHOWN_AT_FRAMES = (
-    *(
-        "vorticity_mse",
-        "vorticity_mae",
-        "vorticity_rmse",
-        "vorticity_pearson",
-        "vorticity_kl",
-    ),
-    *(
-        "vorticity_w1",
-        "spectrum_error",
-        "position_rmse",
-        "attribute_mse",
-        "energy_ratio",
-    ),
-    *("outside_share", "sliced_w2"),
+    "vorticity_mse",
+    "vorticity_mae",
+    "vorticity_rmse",
+    "vorticity_pearson",
+    "vorticity_kl",
+    "vorticity_w1",
+    "spectrum_error",
+    "position_rmse",
+    "attribute_mse",
+    "energy_ratio",
+    "outside_share",
+    "sliced_w2",
 )
 """Metrics in the table of frames of interest."""
 
@@ -38,123 +35,129 @@ ARROWS = {
     Direction.TARGET: " ◎",
     Direction.NONE: "",
 }
-"""How the better side of a metric is marked, behind its name."""
+"""Marks of the better side of a metric, behind its name."""
+
+FLAG_STATES = {True: "raised", False: "not raised", None: "unknown"}
 
 
 def card_tables(
     card: ScoreCard, *, every: bool = False, floors: bool = False
 ) -> Iterator[Table]:
-    """Yield tables over the horizon, at frames of interest and per scenario, of every
-    metric or the chosen.
+    """Yield tables over the horizon, at frames of interest and per scenario.
 
-    With ``floors`` they stand beside all floors instead of the best one.
+    Args:
+        card: the score card.
+        every: whether every metric is shown, not only the chosen ones.
+        floors: whether all references are shown beside the submission, not only the
+            best one.
     """
-    chosen = card.submission if every else dict.fromkeys((card.ranking, *CHOSEN))
-    names = [name for name in chosen if name in card.submission]
-    at_frames = (
-        [n for n in names if card.submission[n].metric.per_frame]
-        if every
-        else SHOWN_AT_FRAMES
-    )
-    method = card.header.method
-    frames = card.reported_frames
-    task = f"{card.header.split} {card.header.size}, {card.setting.horizon} frames"
-    beside = [row for row in card.scores if row != SUBMISSION]
-    if not floors:
-        if card.skill:
-            beside = [card.skill.floor]
-        else:
-            beside = beside[:1]
-    yield _over_horizon(card, names, beside, f"{method} on {task}, mean over scenarios")
-    rows: list[tuple[str, ...]] = [
-        (name, *(_number(mean(card.submission[name].at(frame))) for frame in frames))
-        for name in at_frames
-        if name in card.submission
-    ]
-    yield Table(
-        f"{method} at frames, mean over scenarios",
-        ("metric", *map(str, frames)),
-        tuple(rows),
-    )
-    shown = [SUBMISSION, *beside]
-    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
-    rows = [
-        (str(i), *map(_number, values))
-        for i, *values in zip(card.scenarios, *columns, strict=True)
-    ]
-    yield Table(
-        f"{card.ranking} per scenario", ("scenario", *map(_head, shown)), tuple(rows)
-    )
+    if every:
+        names = list(card.submission)
+        frame_names = [n for n in names if card.submission[n].metric.per_frame]
+    else:
+        chosen = dict.fromkeys((card.ranking, *CHOSEN))
+        names = [name for name in chosen if name in card.submission]
+        frame_names = [name for name in SHOWN_AT_FRAMES if name in card.submission]
+
+    references = [row for row in card.scores if row != SUBMISSION]
+    if not floors and card.skill:
+        references = [card.skill.reference]
+    elif not floors:
+        references = references[:1]
+
+    yield _over_horizon(card, names, references)
+    yield _at_frames(card, frame_names)
+    yield _per_scenario(card, [SUBMISSION, *references])
 
 
 def _over_horizon(
-    card: ScoreCard, names: Collection[str], floors: Collection[str], title: str
+    card: ScoreCard, names: Collection[str], references: Collection[str]
 ) -> Table:
-    found = card.skill
-    if found is None:
-        skill = "-"
-    else:
-        skill = _with_interval(found.value, found.interval)
-    rows = [
-        (
-            "skill ↑",
-            skill,
-            *("0" if found and row == found.floor else "" for row in floors),
-        )
-    ]
+    """Return the table of scores over the horizon."""
+    skill_cell = "-"
+    best = None
+    if card.skill is not None:
+        skill_cell = _with_interval(card.skill.value, card.skill.interval)
+        best = card.skill.reference
+    zeros = ["0" if row == best else "" for row in references]
+    rows = [("skill ↑", skill_cell, *zeros)]
+
     for name in names:
         score = card.submission[name]
+        cell = _with_interval(score.mean, score.interval)
         if any(score.undefined):
-            mark = " †"
-        else:
-            mark = ""
-        own = f"{_with_interval(score.mean, score.interval)}{mark}"
-        others = (card.scores[row].get(name) for row in floors)
-        means = ("-" if other is None else _number(other.mean) for other in others)
-        rows.append((_named(score.metric), own, *means))
-    return Table(
-        title, ("metric", f"{SUBMISSION} [95 %]", *map(_head, floors)), tuple(rows)
-    )
+            cell += " †"
+        means = [_mean_cell(card, row, name) for row in references]
+        rows.append((_label(score.metric), cell, *means))
+
+    header = card.header
+    task = f"{header.split} {header.size}, {card.config.horizon} frames"
+    title = f"{header.method} on {task}, mean over scenarios"
+    heads = [_break_name(row) for row in references]
+    return Table(title, ("metric", f"{SUBMISSION} [95 %]", *heads), tuple(rows))
 
 
-def _named(metric: Metric) -> str:
-    """Return the name of a metric, which side is better, and its unit."""
+def _mean_cell(card: ScoreCard, row: str, name: str) -> str:
+    if name not in card.scores[row]:
+        return "-"
+    return _number(card.scores[row][name].mean)
+
+
+def _at_frames(card: ScoreCard, names: Collection[str]) -> Table:
+    """Return the table of scores at the frames of interest."""
+    frames = card.reported_frames
+    rows: list[tuple[str, ...]] = []
+    for name in names:
+        score = card.submission[name]
+        rows.append((name, *[_number(mean(score.at(frame))) for frame in frames]))
+    title = f"{card.header.method} at frames, mean over scenarios"
+    return Table(title, ("metric", *map(str, frames)), tuple(rows))
+
+
+def _per_scenario(card: ScoreCard, shown: Sequence[str]) -> Table:
+    """Return the table of the ranking metric by scenario."""
+    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
+    rows: list[tuple[str, ...]] = []
+    for i, *values in zip(card.scenarios, *columns, strict=True):
+        rows.append((str(i), *map(_number, values)))
+    heads = ("scenario", *map(_break_name, shown))
+    return Table(f"{card.ranking} per scenario", heads, tuple(rows))
+
+
+def _label(metric: Metric) -> str:
+    """Return the name of a metric, the mark of its better side, and its unit."""
+    label = f"{metric.name}{ARROWS[metric.direction]}"
     if metric.unit == "1":
-        unit = ""
-    else:
-        unit = f" [{metric.unit}]"
-    return f"{metric.name}{ARROWS[metric.direction]}{unit}"
+        return label
+    return f"{label} [{metric.unit}]"
 
 
-def _head(name: str) -> str:
-    """Return a name as the head of a column, in lines."""
+def _break_name(name: str) -> str:
+    """Return a name as the head of a column, broken into lines at its hyphens."""
     return "-\n".join(name.split("-"))
 
 
 def flag_lines(card: ScoreCard) -> Iterator[str]:
-    """Yield what marks mean, what is undefined, and what flags, warnings and floors
-    say, one line each.
-    """
+    """Yield the legend, undefined frames, comparisons, flags and warnings, by line."""
     yield "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
-    lost = {
-        name: sum(score.undefined)
-        for name, score in card.submission.items()
-        if name in CHOSEN
-    }
-    if any(lost.values()):
-        frames = len(card.scenarios) * card.setting.horizon
-        said = ", ".join(f"{name} {count}" for name, count in lost.items() if count)
-        yield f"† frames without a value, of {frames}: {said}"
+
+    undefined = []
+    for name, score in card.submission.items():
+        count = sum(score.undefined)
+        if name in CHOSEN and count:
+            undefined.append(f"{name} {count}")
+    if undefined:
+        frames = len(card.scenarios) * card.config.horizon
+        yield f"† frames without a value, of {frames}: {', '.join(undefined)}"
+
     for row in card.scores:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"
     for flag in card.flags:
-        word = {True: "raised", False: "not raised", None: "unknown"}[flag.raised]
+        line = f"flag {flag.name}: {FLAG_STATES[flag.raised]}"
         if flag.reasons:
-            reasons = f": {'; '.join(flag.reasons)}"
-        else:
-            reasons = ""
-        yield f"flag {flag.name}: {word}{reasons}"
+            line += f": {'; '.join(flag.reasons)}"
+        yield line
     for warning in card.warnings:
         yield f"warning [{warning.check}] {warning.what}: {warning.got}"
         if warning.fix:
@@ -162,67 +165,82 @@ def flag_lines(card: ScoreCard) -> Iterator[str]:
 
 
 def _against(card: ScoreCard, row: str) -> str:
-    found = card.against(row)
-    low, high = found.interval
-    if math.isnan(found.difference):
+    """Return the result of the comparison with a reference."""
+    comparison = card.against(row)
+    difference = comparison.difference
+    if math.isnan(difference):
         return f"{card.ranking} cannot be compared"
-    # to the digits that floors are shipped with
-    if abs(found.difference) <= 5.0 * 10.0**-DIGITS * abs(
-        card.scores[row][card.ranking].mean
-    ):
+    # to the digits that references are shipped with
+    rounding = 5.0 * 10.0**-DIGITS * abs(card.scores[row][card.ranking].mean)
+    if abs(difference) <= rounding:
         return f"{card.ranking} is the same"
-    if found.difference < 0.0:
-        # the bounds of what is printed: how much better
-        word, low, high = "better", -high, -low
-    else:
-        word = "worse"
-    if math.isnan(low):
-        spread = ""
-    else:
-        spread = f"{_number(low)} to {_number(high)}, "
-    if math.isnan(found.p):
-        p = f"{len(found.scenarios)} scenarios: no p-value"
-    else:
-        p = f"p = {found.p:.3g}"
-    return f"{card.ranking} {word} by {_number(abs(found.difference))} ({spread}{p})"
+
+    # the printed bounds are those of the size of the difference
+    low, high = comparison.interval
+    word = "worse"
+    if difference < 0.0:
+        word = "better"
+        low, high = (-bound for bound in reversed(comparison.interval))
+
+    interval = ""
+    if not math.isnan(low):
+        interval = f"{_number(low)} to {_number(high)}, "
+    p = f"{len(comparison.scenarios)} scenarios: no p-value"
+    if not math.isnan(comparison.p):
+        p = f"p = {comparison.p:.3g}"
+    return f"{card.ranking} {word} by {_number(abs(difference))} ({interval}{p})"
 
 
 def comparison_tables(
     result: ComparisonResult, *, every: bool = False
 ) -> Iterator[Table]:
-    """Yield differences in the loss, negative favours the first, and means, of every
-    metric or the chosen.
+    """Yield differences in the loss, then means.
+
+    A negative difference favours the first method, also where more of the metric is
+    better. With ``every`` all metrics are shown, not only the chosen ones.
     """
-    chosen = result.metrics if every else (result.ranking, *CHOSEN)
-    shown = [found for name, found in result.metrics.items() if name in chosen]
+    chosen = (result.ranking, *CHOSEN)
+    shown = []
+    for name, comparison in result.metrics.items():
+        if every or name in chosen:
+            shown.append(comparison)
+
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
-    differences = tuple(
-        (
-            _named(found.metric),
-            _with_interval(found.test.difference, found.test.interval),
-            "-" if math.isnan(found.test.p) else f"{found.test.p:.3g}",
-        )
-        for found in shown
-    )
-    # a loss is what is less for the better one, also where more of the metric is better
     yield Table(
         f"{title}; below 0 the first is better",
         ("metric", "loss difference [95 %]", "p"),
-        differences,
+        tuple(_difference_row(comparison) for comparison in shown),
     )
-    means = tuple(
-        (
-            _named(found.metric),
-            *(
-                _number(value) + (f" ({lost} frames undefined)" if lost else "")
-                for value, lost in zip(
-                    (found.first, found.second), found.undefined, strict=True
-                )
-            ),
-        )
-        for found in shown
+    yield Table(
+        "means",
+        ("metric", _break_name(result.first), _break_name(result.second)),
+        tuple(_means_row(comparison) for comparison in shown),
     )
-    yield Table("means", ("metric", _head(result.first), _head(result.second)), means)
+
+
+def _difference_row(comparison: MetricComparison) -> tuple[str, ...]:
+    test = comparison.test
+    p = "-"
+    if not math.isnan(test.p):
+        p = f"{test.p:.3g}"
+    difference = _with_interval(test.difference, test.interval)
+    return (_label(comparison.metric), difference, p)
+
+
+def _means_row(comparison: MetricComparison) -> tuple[str, ...]:
+    first_undefined, second_undefined = comparison.undefined
+    return (
+        _label(comparison.metric),
+        _with_undefined(comparison.first, first_undefined),
+        _with_undefined(comparison.second, second_undefined),
+    )
+
+
+def _with_undefined(value: float, undefined: int) -> str:
+    """Return a mean with the number of frames that are left out of it."""
+    if undefined:
+        return f"{_number(value)} ({undefined} frames undefined)"
+    return _number(value)
 
 
 def _with_interval(value: float, interval: tuple[float, float]) -> str:

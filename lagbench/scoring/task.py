@@ -1,7 +1,7 @@
-"""The test subset as metrics see it: what submissions are scored on.
+"""The test subset as metrics see it: the truth that submissions are scored against.
 
-Scoring needs the files of ``test`` only; what follows from ``train`` stands in
-datasets.yaml or, for a data set that is not recorded there, in its manifest.
+Scoring needs the files of ``test`` only; statistics of ``train`` are read from
+datasets.yaml or, for a data set that is not recorded there, from its manifest.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Size
 from lagbench.data.scenario import ScenarioFile
 from lagbench.errors import DataError
-from lagbench.metrics.frame import Scenario, Setting, Snapshot, snapshots
+from lagbench.metrics.frame import Scenario, Snapshot, TaskConfig, snapshots
 from lagbench.store.copy import update_working_copy
 from lagbench.submission.truth import Truth
 
 BLOCK_BYTES = 1 << 20
-"""True positions are read in blocks of about this size: a call for each frame costs
-more than its bytes.
+"""True positions are read in blocks of about this size [bytes].
+
+A call for each frame costs more than its bytes.
 """
 
 
@@ -35,40 +36,36 @@ more than its bytes.
 class OpenScenario:
     """A scenario whose file is open."""
 
-    scenario: Scenario  # what holds in all its frames
+    scenario: Scenario  # properties that all its frames share
     file: ScenarioFile
 
     def snapshots(self) -> Iterator[Snapshot]:
-        """Yield the true snapshots of the predicted frames, a block in memory at a
-        time.
-        """
+        """Yield the true snapshots of the predicted frames; a block is in memory."""
         return snapshots(self.scenario, self._frames())
 
     def _frames(self) -> Iterator[NDArray[np.float32]]:
-        numbers = self.scenario.setting.predicted_frames
-        step = max(1, BLOCK_BYTES // (8 * len(self.scenario.material)))
+        numbers = self.scenario.config.predicted_frames
+        frame_bytes = 8 * len(self.scenario.material)
+        step = max(1, BLOCK_BYTES // frame_bytes)
         for first in numbers[::step]:
-            yield from self.file.read(
-                "position", slice(first, min(first + step, numbers.stop))
-            )
+            last = min(first + step, numbers.stop)
+            yield from self.file.read("position", slice(first, last))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """The test subset of one split and size; while a model is trained, the valid
-    subset.
-    """
+    """The test subset of a split and size; in a training, the valid subset."""
 
     truth: Truth  # its files
-    setting: Setting  # the split and size, as metrics see it
+    config: TaskConfig  # of the split and size
     density: float  # rest density [mass/length^2]
-    # position RMSE of the nudged twin per predicted frame [length]; empty where it is
-    # recorded nowhere
-    twin_floor: tuple[float, ...] = ()
+    # position RMSE of the perturbed solver run per predicted frame [length]; empty
+    # where it is not recorded
+    predictability_limit: tuple[float, ...] = ()
 
     @property
     def size(self) -> Size:
-        """What the registry says of the split and size."""
+        """The split and size in the registry."""
         return self.truth.size
 
     @property
@@ -82,57 +79,78 @@ class ScoredTask:
         with self.truth.open(scenario) as file:
             material = file.read("material")
             mass = float(file.read("particle_mass"))
-            held = Scenario(
-                setting=self.setting,
-                given=file.read("position", slice(0, self.setting.input_frames)),
+            input_frames = slice(0, self.config.input_frames)
+            properties = Scenario(
+                config=self.config,
+                input_positions=file.read("position", input_frames),
                 material=material,
                 particle_mass=mass,
                 area=mass * len(material) / self.density,
                 active_frames=_active_frames(file),
             )
-            yield OpenScenario(held, file)
+            yield OpenScenario(properties, file)
 
 
-def load_scored_task(size: Size, root: Path, *, subset: str = "test") -> ScoredTask:
-    """Check that a subset is there and gather what the metrics need to know."""
-    update_working_copy(size, root, size.subsets[subset])
+def load_scored_task(
+    size: Size, root: Path, *, subset: str = "test", is_hashed: bool = False
+) -> ScoredTask:
+    """Check that a subset is there and collect what the metrics need.
+
+    Args:
+        size: the split and size.
+        root: folder of all data sets.
+        subset: the subset whose truth is needed.
+        is_hashed: whether the caller has fetched and hashed the files just before, so
+            that they are not hashed again.
+
+    Raises:
+        DataError: files are missing, damaged or too short, or the statistics of train
+            are not recorded.
+    """
     truth = Truth(size, root, subset)
-    truth.require()
-    truth.check()
+    if not is_hashed:
+        update_working_copy(size, root, size.subsets[subset])
+        truth.require()
+        truth.check()
+
     scenarios = sorted(size.subsets[subset])
-    present = set().union(*(_materials(truth, scenario) for scenario in scenarios))
+    present: set[str] = set()
+    for scenario in scenarios:
+        present.update(_materials(truth, scenario))
+
     if size.measured:
-        manifest = None
+        statistics: Mapping[str, tuple[float, ...]] = size.measured.statistics
+        limit = size.measured.twin_floor
     else:
         manifest = read_manifest(root, size.split, size.name, size.major)
+        statistics = manifest.statistics if manifest else {}
+        limit = _predictability_limit(manifest, scenarios)
+
     task = size.task
+    config = TaskConfig(
+        grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
+        input_frames=task.input_frames,
+        horizon=task.horizon,
+        frames_of_interest=task.frames_of_interest,
+        attribute_std=_attribute_std(size, root, statistics),
+        radius=task.radius,
+        materials=tuple(name for name in MATERIALS if name in present),
+        bounds=size.bounds,
+    )
     return ScoredTask(
         truth=truth,
+        config=config,
         density=float(size.value("density")),
-        twin_floor=size.measured.twin_floor
-        if size.measured
-        else _floor(manifest, scenarios),
-        setting=Setting(
-            grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
-            input_frames=task.input_frames,
-            horizon=task.horizon,
-            frames_of_interest=task.frames_of_interest,
-            attribute_std=_attribute_std(size, root, manifest),
-            radius=task.radius,
-            materials=tuple(name for name in MATERIALS if name in present),
-            bounds=size.bounds,
-        ),
+        predictability_limit=limit,
     )
 
 
 def _active_frames(file: ScenarioFile) -> int | None:
-    """Return how many predicted frames pass until the truth rests, None where the file
-    does not say.
-    """
+    """Return the predicted frames until the truth rests, None if not stated."""
     stated = file.header.parameters.get("active_frames")
-    if stated is None or (isinstance(stated, int | np.integer) and stated >= 0):
-        if stated is None:
-            return None
+    if stated is None:
+        return None
+    if isinstance(stated, int | np.integer) and stated >= 0:
         return int(stated)
     raise DataError(
         "active_frames is no number of frames",
@@ -143,45 +161,54 @@ def _active_frames(file: ScenarioFile) -> int | None:
 
 
 def _materials(truth: Truth, scenario: int) -> set[str]:
-    """Return the materials of a scenario after checking that its file is long
-    enough.
-    """
+    """Return the materials of a scenario after a check of its length."""
     needed = truth.size.task.input_frames + truth.size.task.horizon
     with truth.open(scenario) as file:
         frames = file.header.frames
         material = file.read("material")
     if frames < needed:
-        where = str(truth.path(scenario))
-        what = f"a {truth.subset} scenario is too short"
-        raise DataError(what, where=where, expected=f"{needed} frames", got=frames)
+        raise DataError(
+            f"a {truth.subset} scenario is too short",
+            where=str(truth.path(scenario)),
+            expected=f"{needed} frames",
+            got=frames,
+        )
     return {MATERIALS[value] for value in np.unique(material).tolist()}
 
 
 def _attribute_std(
-    size: Size, root: Path, manifest: Manifest | None
+    size: Size, root: Path, statistics: Mapping[str, tuple[float, ...]]
 ) -> tuple[float, float, float, float]:
     """Return the standard deviations of x, y, u, v over train."""
-    known: Mapping[str, tuple[float, ...]] = manifest.statistics if manifest else {}
-    if size.measured:
-        known = size.measured.statistics
     try:
-        (x, y), (u, v) = known["position_std"], known["velocity_std"]
+        x, y = statistics["position_std"]
+        u, v = statistics["velocity_std"]
     except (KeyError, ValueError):
         raise DataError(
-            "the statistics of train are recorded nowhere",
+            "the statistics of train are not recorded",
             where=f"datasets.yaml, and the manifest of {size.split} {size.name} "
             f"in {root}",
             expected="position_std and velocity_std, two numbers each",
-            got=", ".join(known) or "nothing",
+            got=", ".join(statistics) or "nothing",
             fix=suggest_repair(size, root=root),
         ) from None
     return x, y, u, v
 
 
-def _floor(manifest: Manifest | None, test: Sequence[int]) -> tuple[float, ...]:
-    """Return the mean twin floor over the test scenarios, empty unless all have one."""
-    entries = [manifest.entry(scenario) if manifest else None for scenario in test]
-    rows = [entry.twin_floor for entry in entries if entry and entry.twin_floor]
-    if len(rows) < len(test) or len({len(row) for row in rows}) != 1:
+def _predictability_limit(
+    manifest: Manifest | None, scenarios: Sequence[int]
+) -> tuple[float, ...]:
+    """Return the mean limit over the test scenarios, empty unless all have one."""
+    if manifest is None:
         return ()
-    return tuple(np.mean(rows, axis=0).tolist())
+    limits = []
+    for scenario in scenarios:
+        entry = manifest.entry(scenario)
+        if entry is None or not entry.twin_floor:
+            return ()
+        limits.append(entry.twin_floor)
+
+    lengths = {len(limit) for limit in limits}
+    if len(lengths) != 1:
+        return ()
+    return tuple(np.mean(limits, axis=0).tolist())

@@ -1,5 +1,6 @@
-"""What a training took, as training.json, predictions.nc and entries of the leaderboard
-say it.
+"""The budget of a training: steps, hours, validations.
+
+It stands in training.json, in predictions.nc and in entries of the leaderboard.
 """
 
 from __future__ import annotations
@@ -9,9 +10,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 Track = Literal["equal compute", "converged"]
-"""What trainings are compared by: the same processor time, or until more of it brings
-nothing.
-"""
+"""What trainings share: the same processor time, or enough of it to converge."""
 
 EQUAL_MINUTES = {"mini": 15.0, "full": 60.0}
 """Processor time of a training of equal compute, by size [min]."""
@@ -20,9 +19,13 @@ TOLERANCE = 0.05
 """Share by which the processor time may be longer."""
 
 CONVERGED = 0.02
-"""Greatest share by which the validation error falls while the budget of a converged
-training doubles.
+"""Greatest share by which the validation error of a converged training falls.
+
+It falls by that while the budget doubles.
 """
+
+EARLIEST_HALF = 0.4
+"""Share of the steps from which on a validation stands for the first half."""
 
 MOST_VALIDATIONS = 20
 """Validations that a budget holds; of more of them some are left out."""
@@ -74,7 +77,7 @@ class Budget(BaseModel):
     ] = ()
 
 
-def budget_in(text: str) -> Budget | None:
+def parse_budget(text: str) -> Budget | None:
     """Return the budget that a text holds as JSON; None where it is none."""
     try:
         return Budget.model_validate_json(text)
@@ -83,33 +86,49 @@ def budget_in(text: str) -> Budget | None:
 
 
 def track_of(size: str, budget: Budget) -> Track | None:
-    """Return the track that a training belongs to, by its record alone; None for none.
+    """Return the track that a training belongs to, by its budget alone.
 
     Equal compute: at most 15 minutes of processor time at mini and 60 at full, 5 % more
     allowed, without a GPU; validations do not count. Converged: over the last doubling
     of the steps the best validation fell by less than 2 %, and every window was seen.
+    None for neither.
     """
-    most = EQUAL_MINUTES.get(size)
-    on_cpu = budget.cpu_hours is not None and not budget.gpu_hours
-    if (
-        most is not None
-        and on_cpu
-        and 60.0 * (budget.cpu_hours or 0.0) <= most * (1.0 + TOLERANCE)
-    ):
+    if is_equal_compute(size, budget):
         return "equal compute"
-    first = budget.start_steps or 0
-    steps = first + (budget.steps or 0)
-    before = [
-        (step, value)
-        for step, value in budget.validations
-        if first + step <= (steps + 1) // 2
-    ]
-    # A validation near half the steps must tell what the last doubling brought.
-    if not before or budget.best is None or first + before[-1][0] < 0.4 * steps:
-        return None
-    if budget.epochs is not None and budget.epochs < 1.0 and not first:
-        return None
-    half = min(value for _, value in before)
-    if half > 0.0 and (half - budget.best) / half < CONVERGED:
+    if is_converged(budget):
         return "converged"
     return None
+
+
+def is_equal_compute(size: str, budget: Budget) -> bool:
+    """Return whether the processor time is within that of equal compute."""
+    allowed_minutes = EQUAL_MINUTES.get(size)
+    if allowed_minutes is None or budget.cpu_hours is None or budget.gpu_hours:
+        return False
+    minutes = 60.0 * budget.cpu_hours
+    return minutes <= allowed_minutes * (1.0 + TOLERANCE)
+
+
+def is_converged(budget: Budget) -> bool:
+    """Return whether the last doubling of the steps brought next to nothing."""
+    start_steps = budget.start_steps or 0
+    if budget.epochs is not None and budget.epochs < 1.0 and not start_steps:
+        return False
+    if budget.best is None:
+        return False
+
+    all_steps = start_steps + (budget.steps or 0)
+    early_errors = []  # validation errors in the first half of the steps
+    last_early_step = 0
+    for step, error in budget.validations:
+        if start_steps + step <= (all_steps + 1) // 2:
+            early_errors.append(error)
+            last_early_step = start_steps + step
+    # A validation near half the steps must tell what the last doubling brought.
+    if not early_errors or last_early_step < EARLIEST_HALF * all_steps:
+        return False
+
+    best_early_error = min(early_errors)
+    if best_early_error <= 0.0:
+        return False
+    return (best_early_error - budget.best) / best_early_error < CONVERGED

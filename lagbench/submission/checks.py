@@ -1,6 +1,4 @@
-"""Checks on the predicted positions: finite, frozen, where they lie, how far they
-jump.
-"""
+"""Check the predicted positions: finite, frozen, inside the box, without jumps."""
 
 from __future__ import annotations
 
@@ -14,9 +12,9 @@ from numpy.typing import NDArray
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
 
-from .findings import Findings
+from .issues import IssueCollector
 from .predictions import Predictions
-from .start import JUMP, Start
+from .start import JUMP, StartFrames, largest_true_displacement
 from .truth import Truth, squared_lengths
 
 MAX_DISTANCE = 10.0
@@ -25,27 +23,34 @@ MAX_DISTANCE = 10.0
 FILL = np.float32(9.969209968386869e36)
 """What netCDF puts where a float32 was never written."""
 
+AXES = "xy"
+
+Block = NDArray[np.float32]
+"""Consecutive frames of positions [length], shape [frame, particle, space]."""
+
 
 @dataclass
-class Survey:
+class ScenarioScan:
     """What one pass over a scenario's predictions saw."""
 
     scenario: int
-    values: int = 0
-    bad: int = 0  # values that are not finite, or were never written
-    unwritten: int = 0  # those of them that were never written
-    first_bad: tuple[int, int, int] | None = None  # frame, particle and component
-    positions: int = 0
-    outside: int = 0  # positions more than a solver cell outside the box
-    off_grid: int = 0  # positions outside the unit box
+    value_count: int = 0
+    bad_values: int = 0  # values that are not finite, or were never written
+    unwritten_values: int = 0  # those of them that were never written
+    # frame, particle and component
+    first_bad: tuple[int, int, int] | None = None
+    position_count: int = 0
+    outside_box: int = 0  # positions more than a solver cell outside the box
+    outside_grid: int = 0  # positions outside the unit box
     farthest: float = 0.0  # largest distance outside the box along an axis [length]
     first_outside: tuple[int, int] | None = None  # frame and particle
-    # frame and particle of the first beyond MAX_DISTANCE
-    lost: tuple[int, int] | None = None
-    jump_at: tuple[int, int] | None = None  # frame and particle of the largest jump
-    settled: int = 0  # frame that is repeated from there to the end
-    _first: tuple[int, NDArray[np.float32]] | None = field(default=None, repr=False)
-    _last: NDArray[np.float32] | None = field(default=None, repr=False)
+    # frame and particle of the first position beyond MAX_DISTANCE
+    first_lost: tuple[int, int] | None = None
+    # frame and particle of the largest jump
+    jump_at: tuple[int, int] | None = None
+    last_moving_frame: int = 0  # frame that is repeated from there to the end
+    _first_frame: tuple[int, Block] | None = field(default=None, repr=False)
+    _last_frame: Block | None = field(default=None, repr=False)
     _jump_square: float = field(default=0.0, repr=False)
 
     @property
@@ -53,228 +58,270 @@ class Survey:
         """Largest distance of a particle between consecutive frames [length]."""
         return math.sqrt(self._jump_square)
 
-    def add(self, first: int, block: NDArray[np.float32], size: Size) -> None:
-        """Take in consecutive frames [length], shape [frame, particle, space], the
-        first one by number.
-        """
-        if not (
-            block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL
-        ):  # NaN too
-            wrong = ~np.isfinite(block) | (block == FILL)
-            if wrong.any():
-                if self.first_bad is None:
-                    frame, particle, axis = (int(i[0]) for i in np.nonzero(wrong))
-                    self.first_bad = (first + frame, particle, axis)
-                self.bad += int(np.count_nonzero(wrong))
-                self.unwritten += int(np.count_nonzero(block == FILL))
-                block = np.where(wrong, np.float32(np.nan), block)
-        self.values += block.size
+    def add(self, first: int, block: Block, size: Size) -> None:
+        """Take in consecutive frames, the first of which has the number ``first``."""
+        block = self._mask_bad_values(first, block)
         self._add_places(first, block, size)
-        if self._last is None:
-            self._first = (first, block[:1].copy())
-            self.settled = first
+        if self._last_frame is None:
+            self._first_frame = (first, block[:1].copy())
+            self.last_moving_frame = first
             self._add_steps(first + 1, block)
         else:
-            self._add_steps(first, np.concatenate([self._last, block]))
-        self._last = block[-1:].copy()
+            self._add_steps(first, np.concatenate([self._last_frame, block]))
+        self._last_frame = block[-1:].copy()
 
-    def follow(self, given: NDArray[np.floating]) -> None:
+    def add_given_frame(self, position: NDArray[np.floating]) -> None:
         """Take in the step from the last given frame to the first predicted one."""
-        if self._first:
-            frame, first = self._first
-            self._add_jumps(frame, np.concatenate([given[None], first]))
+        if self._first_frame is None:
+            return
+        first, predicted = self._first_frame
+        self._add_jumps(first, np.concatenate([position[None], predicted]))
 
-    def _add_places(self, first: int, block: NDArray[np.float32], size: Size) -> None:
-        slack = 1.0 / size.grid
+    def _mask_bad_values(self, first: int, block: Block) -> Block:
+        """Return the block with NaN where values are not finite or never written."""
+        self.value_count += block.size
+        # One pass over sound values; a comparison with NaN is false.
+        is_sound = block.min(initial=0.0) > -np.inf and block.max(initial=0.0) < FILL
+        if is_sound:
+            return block
+        is_unwritten = block == FILL
+        is_bad = ~np.isfinite(block) | is_unwritten
+        if not is_bad.any():
+            return block
+        if self.first_bad is None:
+            frame, particle, axis = first_index(is_bad)
+            self.first_bad = (first + frame, particle, axis)
+        self.bad_values += int(np.count_nonzero(is_bad))
+        self.unwritten_values += int(np.count_nonzero(is_unwritten))
+        return np.where(is_bad, np.float32(np.nan), block)
+
+    def _add_places(self, first: int, block: Block, size: Size) -> None:
+        self.position_count += block[..., 0].size
+        cell = 1.0 / size.grid
         low, high = np.array(size.bounds, np.float64).T
-        self.positions += block[..., 0].size
-        sides = zip(np.moveaxis(block, -1, 0), low, high, strict=True)
-        if all(
-            left - x.min() <= slack and x.max() - right <= slack
-            for x, left, right in sides
-        ):
-            return  # nearly always, and 20 times as fast; NaN goes on
+        if is_inside(block, low=low, high=high, slack=cell):
+            return  # nearly always, and 20 times as fast
+
+        # distance outside the box along an axis, shape [frame, particle]
         beyond = np.fmax(low - block, block - high).max(axis=-1)
-        far = beyond > slack
-        if far.any():
-            if self.first_outside is None:
-                frame, particle = (int(i[0]) for i in np.nonzero(far))
-                self.first_outside = (first + frame, particle)
-            self.outside += int(np.count_nonzero(far))
-            self.farthest = max(self.farthest, float(beyond[far].max()))
-            self.off_grid += int(
-                np.count_nonzero(((block < 0) | (block > 1)).any(axis=-1))
-            )
-            if self.lost is None and self.farthest > MAX_DISTANCE:
-                frame, particle = (int(i[0]) for i in np.nonzero(beyond > MAX_DISTANCE))
-                self.lost = (first + frame, particle)
+        is_outside = beyond > cell
+        if not is_outside.any():
+            return
+        if self.first_outside is None:
+            frame, particle = first_index(is_outside)
+            self.first_outside = (first + frame, particle)
+        self.outside_box += int(np.count_nonzero(is_outside))
+        self.farthest = max(self.farthest, float(beyond[is_outside].max()))
+        is_outside_grid = ((block < 0) | (block > 1)).any(axis=-1)
+        self.outside_grid += int(np.count_nonzero(is_outside_grid))
+        if self.first_lost is None and self.farthest > MAX_DISTANCE:
+            frame, particle = first_index(beyond > MAX_DISTANCE)
+            self.first_lost = (first + frame, particle)
 
-    def _add_steps(self, first: int, joined: NDArray[np.float32]) -> None:
-        moved = np.flatnonzero((joined[1:] != joined[:-1]).any(axis=(1, 2)))
-        if moved.size:
-            self.settled = first + int(moved[-1])
-        self._add_jumps(first, joined)
+    def _add_steps(self, first: int, frames: Block) -> None:
+        """Take in steps; the first of them leads to the frame ``first``."""
+        has_moved = (frames[1:] != frames[:-1]).any(axis=(1, 2))
+        moved_steps = np.flatnonzero(has_moved)
+        if moved_steps.size:
+            self.last_moving_frame = first + int(moved_steps[-1])
+        self._add_jumps(first, frames)
 
-    def _add_jumps(self, first: int, joined: NDArray[np.floating]) -> None:
-        """Take in the steps between consecutive frames, of which the first leads to
-        ``first``.
-        """
-        before = joined[0].astype(np.float64)
-        for frame, there in enumerate(
-            joined[1:]
-        ):  # a frame fits the cache, a block does not
-            after = there.astype(np.float64)
+    def _add_jumps(self, first: int, frames: NDArray[np.floating]) -> None:
+        """Take in steps; the first of them leads to the frame ``first``."""
+        before = frames[0].astype(np.float64)
+        # A frame fits the cache of a processor, a block does not.
+        for step, frame in enumerate(frames[1:]):
+            after = frame.astype(np.float64)
             squares = squared_lengths(after - before)
             before = after
             if np.isnan(squares.max()):
                 squares = np.nan_to_num(squares)
-            if squares.max() > self._jump_square:
-                self._jump_square = float(squares.max())
-                self.jump_at = (first + frame, int(squares.argmax()))
+            largest = float(squares.max())
+            if largest > self._jump_square:
+                self._jump_square = largest
+                self.jump_at = (first + step, int(squares.argmax()))
 
 
-def survey(predictions: Predictions, size: Size) -> tuple[list[Survey], str | None]:
+def first_index(mask: NDArray[np.bool_]) -> tuple[int, ...]:
+    """Return the index of the first true value."""
+    return tuple(int(places[0]) for places in np.nonzero(mask))
+
+
+def is_inside(
+    block: Block, *, low: NDArray[np.float64], high: NDArray[np.float64], slack: float
+) -> bool:
+    """Return whether no position lies more than a slack [length] outside the box.
+
+    NaN is not inside.
+    """
+    for axis, (lowest, highest) in enumerate(zip(low, high, strict=True)):
+        values = block[..., axis]
+        beyond_low = lowest - values.min()
+        beyond_high = values.max() - highest
+        if not (beyond_low <= slack and beyond_high <= slack):
+            return False
+    return True
+
+
+def scan_positions(
+    predictions: Predictions, size: Size
+) -> tuple[list[ScenarioScan], str | None]:
     """Read all predictions of known scenarios once, in blocks, by ascending id.
 
     Returns what was seen, and the content hash where all scenarios are known.
     """
-    known = sorted(set(predictions.header.scenarios) & set(size.subsets["test"]))
-    surveys = [Survey(scenario) for scenario in known]
-    hasher = predictions.hasher()
-    for one in surveys:
-        for first, block in predictions.blocks(one.scenario):
+    stored_scenarios = set(predictions.header.scenarios)
+    known_scenarios = sorted(stored_scenarios.intersection(size.subsets["test"]))
+    scans = []
+    hasher = predictions.start_hash()
+    for scenario in known_scenarios:
+        scan = ScenarioScan(scenario)
+        for first, block in predictions.blocks(scenario):
             hasher.update("position", block)
-            one.add(first, block, size)
-    whole = known == sorted(predictions.header.scenarios)
-    return surveys, hasher.hexdigest() if whole else None
+            scan.add(first, block, size)
+        scans.append(scan)
+
+    if known_scenarios != sorted(predictions.header.scenarios):
+        return scans, None
+    return scans, hasher.hexdigest()
 
 
-def check_finite(surveys: list[Survey], out: Findings) -> None:
+def check_finite(scans: list[ScenarioScan], issues: IssueCollector) -> None:
     """Report values that are NaN, infinite or were never written."""
-    out.made("finite")
-    bad = [one for one in surveys if one.first_bad]
-    if not bad:
+    issues.complete("finite")
+    bad_scans = [scan for scan in scans if scan.first_bad is not None]
+    if not bad_scans:
         return
-    frame, particle, axis = bad[0].first_bad or (0, 0, 0)
-    count = sum(one.bad for one in bad)
-    unwritten = sum(one.unwritten for one in bad)
+    bad_values = sum(scan.bad_values for scan in bad_scans)
+    unwritten_values = sum(scan.unwritten_values for scan in bad_scans)
+    value_count = sum(scan.value_count for scan in scans)
+    frame, particle, axis = bad_scans[0].first_bad or (0, 0, 0)
+
+    what = f"{bad_values} values are no numbers"
     fix = (
         "freeze a diverging rollout at its last finite frame and name it in diverged_at"
     )
-    out.error(
+    if unwritten_values == bad_values:
+        what = f"{bad_values} values were never written"
+        fix = "write every frame of every scenario"
+    got = f"{bad_values} of {value_count} values in {len(bad_scans)} scenarios"
+    if unwritten_values:
+        got += f", {unwritten_values} of them netCDF's fill value"
+    issues.error(
         "finite",
-        f"{count} values are no numbers"
-        if unwritten < count
-        else f"{count} values were never written",
-        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle "
-        f"{particle}, {'xy'[axis]}",
+        what,
+        where=f"first in scenario {bad_scans[0].scenario}, frame {frame}, "
+        f"particle {particle}, {AXES[axis]}",
         expected="finite positions everywhere",
-        got=f"{count} of {sum(one.values for one in surveys)} values in {len(bad)} "
-        f"scenarios"
-        + (f", {unwritten} of them netCDF's fill value" if unwritten else ""),
-        fix="write every frame of every scenario" if unwritten == count else fix,
+        got=got,
+        fix=fix,
     )
 
 
 def check_frozen(
-    predictions: Predictions, surveys: list[Survey], out: Findings
+    predictions: Predictions, scans: list[ScenarioScan], issues: IssueCollector
 ) -> None:
-    """Report rollouts that go on moving after the frame at which they are said to be
-    frozen.
-    """
-    for one in surveys:
-        mark = predictions.header.diverged_at.get(one.scenario)
-        if mark is not None and one.settled > mark:
-            out.error(
-                "diverged_at",
-                "the rollout moves after it was frozen",
-                where=f"scenario {one.scenario}, frame {one.settled}",
-                expected=f"the positions of frame {mark} from there on, as "
-                f"'diverged_at' says",
-                got=f"another position in frame {one.settled} than in the one before",
-                fix="freeze a diverging rollout at its last finite frame, or leave "
-                "'diverged_at' out",
-            )
+    """Report rollouts that move after the frame from which they should be frozen."""
+    for scan in scans:
+        frozen_from = predictions.header.diverged_at.get(scan.scenario)
+        if frozen_from is None or scan.last_moving_frame <= frozen_from:
+            continue
+        moving = scan.last_moving_frame
+        issues.error(
+            "diverged_at",
+            "the rollout moves after it was frozen",
+            where=f"scenario {scan.scenario}, frame {moving}",
+            expected=f"the positions of frame {frozen_from} from there on, as "
+            f"'diverged_at' says",
+            got=f"another position in frame {moving} than in the one before",
+            fix="freeze a diverging rollout at its last finite frame, or leave "
+            "'diverged_at' out",
+        )
 
 
-def check_domain(surveys: list[Survey], size: Size, out: Findings) -> None:
-    """Flag positions more than a solver cell outside the box; refuse those beyond ten
-    boxes.
-    """
-    out.made("in_domain")
-    bad = [one for one in surveys if one.first_outside]
-    if not bad:
+def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) -> None:
+    """Flag positions outside the box; refuse those beyond ten boxes."""
+    issues.complete("in_domain")
+    outside_scans = [scan for scan in scans if scan.first_outside is not None]
+    if not outside_scans:
         return
-    lost = next((one for one in bad if one.lost), None)
-    if lost is not None:
-        frame, particle = lost.lost or (0, 0)
-        out.error(
+    farthest = max(scan.farthest for scan in outside_scans)
+    for scan in outside_scans:
+        if scan.first_lost is None:
+            continue
+        frame, particle = scan.first_lost
+        issues.error(
             "in_domain",
             "positions lie far beyond the box: one of them would ruin every mean",
-            where=f"first in scenario {lost.scenario}, frame {frame}, particle "
+            where=f"first in scenario {scan.scenario}, frame {frame}, particle "
             f"{particle}",
             expected=f"at most {MAX_DISTANCE:g} lengths of the unit box outside "
             f"the walls",
-            got=f"up to {max(one.farthest for one in bad):.3g} outside",
+            got=f"up to {farthest:.3g} outside",
             fix="freeze a diverging rollout before that and name the frame in "
             "diverged_at",
         )
         return
-    frame, particle = bad[0].first_outside or (0, 0)
-    share = sum(one.outside for one in bad) / max(
-        1, sum(one.positions for one in surveys)
-    )
-    out.warning(
+
+    position_count = sum(scan.position_count for scan in scans)
+    share = sum(scan.outside_box for scan in outside_scans) / max(1, position_count)
+    outside_grid = sum(scan.outside_grid for scan in outside_scans)
+    frame, particle = outside_scans[0].first_outside or (0, 0)
+    issues.warning(
         "in_domain",
         f"{share:.2%} of the positions lie outside the box",
-        where=f"first in scenario {bad[0].scenario}, frame {frame}, particle "
-        f"{particle}",
+        where=f"first in scenario {outside_scans[0].scenario}, frame {frame}, "
+        f"particle {particle}",
         expected=f"x in {size.bounds[0]}, y in {size.bounds[1]}, up to a solver "
         f"cell beyond",
-        got=f"up to {max(one.farthest for one in bad):.3g} outside;"
-        f" {sum(one.off_grid for one in bad)} positions are outside the unit box and "
-        f"carry no grid weight",
+        got=f"up to {farthest:.3g} outside; {outside_grid} positions are outside the "
+        f"unit box and carry no grid weight",
         fix="positions are in lengths of the unit box, the walls' places are the "
         "split's bounds",
     )
 
 
 def check_jumps(
-    surveys: list[Survey], starts: Mapping[int, Start], truth: Truth, out: Findings
+    scans: list[ScenarioScan],
+    starts: Mapping[int, StartFrames],
+    *,
+    truth: Truth,
+    issues: IssueCollector,
 ) -> None:
-    """Flag particles that jump much farther in a frame than any particle of the
-    truth.
-    """
-    for one in surveys:
-        start = starts[one.scenario]
-        one.follow(start.given)
-        limit = JUMP * start.largest_step(truth, one.scenario, enough=one.jump / JUMP)
-        if one.jump_at and one.jump > limit:
-            frame, particle = one.jump_at
-            out.warning(
-                "max_displacement",
-                "a particle jumps",
-                where=f"scenario {one.scenario}, from frame {frame - 1} to {frame}, "
-                f"particle {particle}",
-                expected=f"at most {limit:.3g}, {JUMP:g} times the truth's largest "
-                f"displacement in a frame",
-                got=f"{one.jump:.3g}",
-                fix="check the rollout for instability, and that particles keep "
-                "their order",
-            )
-    out.made("max_displacement")
+    """Flag particles that jump much farther in a frame than any true particle."""
+    for scan in scans:
+        start = starts[scan.scenario]
+        scan.add_given_frame(start.last_given)
+        limit = JUMP * largest_true_displacement(
+            start, truth=truth, scenario=scan.scenario, enough=scan.jump / JUMP
+        )
+        if scan.jump_at is None or scan.jump <= limit:
+            continue
+        frame, particle = scan.jump_at
+        issues.warning(
+            "max_displacement",
+            "a particle jumps",
+            where=f"scenario {scan.scenario}, from frame {frame - 1} to {frame}, "
+            f"particle {particle}",
+            expected=f"at most {limit:.3g}, {JUMP:g} times the truth's largest "
+            f"displacement in a frame",
+            got=f"{scan.jump:.3g}",
+            fix="check the rollout for instability, and that particles keep "
+            "their order",
+        )
+    issues.complete("max_displacement")
 
 
 def outside_share(opened: Predictions, size: Size) -> float:
-    """Return the share of positions that lie more than a solver cell outside the
-    box.
-    """
-    low, high = np.array(size.bounds).T + np.array([[-1.0], [1.0]]) / size.grid
-    found = 0
-    count = 0
+    """Return the share of positions more than a solver cell outside the box."""
+    low, high = np.array(size.bounds).T
+    lowest = low - 1.0 / size.grid
+    highest = high + 1.0 / size.grid
+    outside_count = 0
+    position_count = 0
     for scenario in opened.header.scenarios:
         for _, block in opened.blocks(scenario):
-            beyond = ((block < low) | (block > high)).any(axis=-1)
-            found = found + int(beyond.sum())
-            count = count + beyond.size
-    return round_digits(found / max(1, count), 4)
+            is_outside = ((block < lowest) | (block > highest)).any(axis=-1)
+            outside_count += int(is_outside.sum())
+            position_count += is_outside.size
+    return round_digits(outside_count / max(1, position_count), 4)

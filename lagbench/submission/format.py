@@ -1,8 +1,7 @@
-"""What a predictions.nc is: its names, what its headers say, and the checks on its
-layout.
+"""The layout of a predictions.nc: its names, its headers, and the checks on them.
 
-No data set is needed here. What is wrong is recorded, not raised; only a file that HDF5
-cannot read at all raises.
+No data set is needed here. What is wrong is collected, not raised; only a file that
+HDF5 cannot read at all raises.
 """
 
 from __future__ import annotations
@@ -27,8 +26,8 @@ from lagbench.data.structure import (
 )
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
-from .budget import Budget, budget_in
-from .findings import Findings, quoted
+from .budget import Budget, parse_budget
+from .issues import IssueCollector, quote
 from .provenance import TrainingProvenance
 
 FORMAT = 1
@@ -95,17 +94,23 @@ ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
 }
 """Attributes of each variable, as we write them."""
 
-_START = "start from what `lagbench template` writes, or use lagbench.submission.write"
+USE_TEMPLATE = (
+    "start from what `lagbench template` writes, or use lagbench.submission.write"
+)
 WRITE = (
     "write it with lagbench.submission.write, or fill what `lagbench template` writes"
 )
 """How to get a right file."""
 
-_WRITE = (
+WRITE_IN_CHUNKS = (
     "write it with lagbench.submission.write, or with chunks (1, 1, particle, space)"
 )
-_SURROGATES = re.compile("[\ud800-\udfff]")  # what no UTF-8 has
-_KINDS = {str: "text", int: "an integer", float: "a positive number"}
+
+SURROGATES = re.compile("[\ud800-\udfff]")
+"""Characters that no UTF-8 has."""
+
+KINDS = {str: "text", int: "an integer", float: "a positive number"}
+"""Types of optional attributes in words."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,8 +140,8 @@ class Header:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Anatomy:
-    """A file as its headers describe it."""
+class FileInfo:
+    """What the headers of a file say."""
 
     # entry of the root group to what it is; the first MAX_LINKS of them
     links: Mapping[str, str]
@@ -150,10 +155,10 @@ class Anatomy:
     length: int  # length of the file [bytes]
 
 
-def kind_of(name: str) -> str:
+def describe_kind(name: str) -> str:
     """Return in words what an attribute must be.
 
-    >>> kind_of("seed"), kind_of("parameters")
+    >>> describe_kind("seed"), describe_kind("parameters")
     ('an integer', 'an integer >= 0')
     """
     if name in REQUIRED:
@@ -162,88 +167,101 @@ def kind_of(name: str) -> str:
         return "JSON of a training's budget"
     if name == "provenance":
         return "JSON of a training's provenance"
-    return f"{_KINDS[OPTIONAL[name]]}{' >= 0' if name == 'parameters' else ''}"
+    kind = KINDS[OPTIONAL[name]]
+    if name == "parameters":
+        return f"{kind} >= 0"
+    return kind
 
 
-def fits(name: str, value: object) -> bool:
-    """Tell whether an attribute may have a value.
+def is_attribute_valid(name: str, value: object) -> bool:
+    """Return whether an attribute may have a value.
 
-    >>> fits("seed", -5), fits("parameters", -5), fits("parameters", 0), fits("method", " ")
-    (True, False, True, False)
+    >>> is_attribute_valid("seed", -5), is_attribute_valid("parameters", -5)
+    (True, False)
+    >>> is_attribute_valid("parameters", 0), is_attribute_valid("method", " ")
+    (True, False)
     """
     if name in REQUIRED:
-        if isinstance(value, str):
-            text = value
-        else:
-            text = ""
-        return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
-    if isinstance(value, bool) or (
-        isinstance(value, int) and not -(2**63) <= value < 2**64
-    ):
+        return isinstance(value, str) and is_name_valid(value)
+    if isinstance(value, bool):
         return False
-    if isinstance(value, str) and (
-        len(value) > MAX_ATTRIBUTE or _SURROGATES.search(value) or "\0" in value
-    ):
-        return False  # HDF5 stores UTF-8, up to the first NUL
-    if OPTIONAL[name] is float:
-        return isinstance(value, (int, float)) and 0 < value < math.inf
+    if isinstance(value, str):
+        return OPTIONAL[name] is str and is_text_valid(name, value)
+    if isinstance(value, int):
+        return is_integer_valid(name, value)
+    if isinstance(value, float):
+        return OPTIONAL[name] is float and 0 < value < math.inf
+    return False
+
+
+def is_name_valid(text: str) -> bool:
+    """Return whether a text can be a required attribute."""
+    return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
+
+
+def is_text_valid(name: str, text: str) -> bool:
+    """Return whether a text can be an optional attribute.
+
+    HDF5 stores UTF-8, up to the first NUL.
+    """
+    if len(text) > MAX_ATTRIBUTE or SURROGATES.search(text) or "\0" in text:
+        return False
     if name == "budget":
-        return isinstance(value, str) and budget_in(value) is not None
+        return parse_budget(text) is not None
     if name == "provenance":
-        return (
-            isinstance(value, str) and TrainingProvenance.from_json(value) is not None
-        )
-    return isinstance(value, OPTIONAL[name]) and not (
-        name == "parameters" and int(value) < 0
-    )
+        return TrainingProvenance.from_json(text) is not None
+    return True
 
 
-def require_fit(name: str, value: object) -> None:
+def is_integer_valid(name: str, value: int) -> bool:
+    """Return whether an integer can be an optional attribute."""
+    if not -(2**63) <= value < 2**64:
+        return False
+    if OPTIONAL[name] is float:
+        return value > 0
+    if name == "parameters":
+        return value >= 0
+    return OPTIONAL[name] is int
+
+
+def require_valid_attribute(name: str, value: object) -> None:
     """Refuse a value that an attribute may not have, before it is written."""
-    if not fits(name, value):
+    if not is_attribute_valid(name, value):
         raise UsageError(
             f"the label {name!r} does not fit",
-            expected=kind_of(name),
-            got=quoted(value),
+            expected=describe_kind(name),
+            got=quote(value),
         )
 
 
-def dissect(file: h5py.File, path: Path) -> Anatomy:
+def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     """Return what a file holds; of values only coordinates are read."""
     length = path.stat().st_size
+    root = file["/"]
     with hdf5_errors(path):
-        links, count = list_members(file["/"])
-        names = ("lagbench_format", *REQUIRED, *OPTIONAL)
-        attributes = {name: read_single_value(file["/"], name) for name in names}
+        links, link_count = list_members(root)
+        attributes = {}
+        for name in ("lagbench_format", *REQUIRED, *OPTIONAL):
+            attributes[name] = read_single_value(root, name)
+
     arrays = {}
     integers = {}
     packing = {}
     for name in ("position", *INTEGERS):
-        if links.get(name) == "variable":
-            with hdf5_errors(path, name):
-                dataset = file[name]
-                array = describe_array(dataset)
-                if array.shape:
-                    arrays[name] = array
-                else:
-                    arrays[name] = replace(array, shape=None)
-                if name == "position":
-                    found = {key: read_single_value(dataset, key) for key in PACKING}
-                    packing = {
-                        key: value for key, value in found.items() if value is not None
-                    }
-                elif (
-                    array.shape is not None
-                    and len(array.shape) == 1
-                    and array.shape[0] <= MAX_COORDINATE
-                    and array.chunk_bytes <= MAX_COORDINATE_CHUNK
-                    and array.kind.lstrip("u").startswith("int")
-                    and not find_storage_issue(array, length=length)
-                ):
-                    integers[name] = tuple(int(i) for i in dataset[...])
-    return Anatomy(
+        if links.get(name) != "variable":
+            continue
+        with hdf5_errors(path, name):
+            dataset = file[name]
+            array = describe_array(dataset)
+            # A scalar has no dimensions to check.
+            arrays[name] = array if array.shape else replace(array, shape=None)
+            if name == "position":
+                packing = read_packing(dataset)
+            elif is_coordinate_readable(array, length=length):
+                integers[name] = tuple(int(value) for value in dataset[...])
+    return FileInfo(
         links=links,
-        link_count=count,
+        link_count=link_count,
         attributes=attributes,
         arrays=arrays,
         packing=packing,
@@ -252,196 +270,228 @@ def dissect(file: h5py.File, path: Path) -> Anatomy:
     )
 
 
-def header_of(anatomy: Anatomy) -> Header:
+def read_packing(dataset: h5py.Dataset) -> dict[str, object]:
+    """Return the attributes of a variable by which its values would be unpacked."""
+    attributes = {name: read_single_value(dataset, name) for name in PACKING}
+    return {name: value for name, value in attributes.items() if value is not None}
+
+
+def is_coordinate_readable(array: ArrayInfo, *, length: int) -> bool:
+    """Return whether an array is a list of integers that is safe to read.
+
+    ``length`` is that of the file [bytes].
+    """
+    return (
+        array.shape is not None
+        and len(array.shape) == 1
+        and array.shape[0] <= MAX_COORDINATE
+        and array.chunk_bytes <= MAX_COORDINATE_CHUNK
+        and array.kind.lstrip("u").startswith("int")
+        and not find_storage_issue(array, length=length)
+    )
+
+
+def header_of(info: FileInfo) -> Header:
     """Return the header of a file whose layout has been checked."""
-    scenarios = anatomy.integers["scenario"]
-    marks = anatomy.integers.get("diverged_at", ())
-    labels: dict[str, Any] = {name: str(anatomy.attributes[name]) for name in REQUIRED}
+    labels: dict[str, Any] = {name: str(info.attributes[name]) for name in REQUIRED}
     for name, kind in OPTIONAL.items():
-        value = anatomy.attributes[name]
+        value = info.attributes[name]
         if kind is float and isinstance(value, int):
             value = float(value)
-        else:
-            value = value
-        if isinstance(value, kind):
-            labels[name] = value
-        else:
-            labels[name] = None
-    if labels["budget"]:
-        labels["budget"] = budget_in(labels["budget"])
-    else:
-        labels["budget"] = None
+        labels[name] = value if isinstance(value, kind) else None
+    if labels["budget"] is not None:
+        labels["budget"] = parse_budget(labels["budget"])
     if labels["provenance"]:
         labels["provenance"] = TrainingProvenance.from_json(labels["provenance"])
     elif labels["training"]:
         labels["provenance"] = TrainingProvenance.from_sentence(labels["training"])
+
+    scenarios = info.integers["scenario"]
+    frozen_from = info.integers.get("diverged_at", ())
+    diverged_at = {}
+    for scenario, frame in zip(scenarios, frozen_from, strict=False):
+        if frame >= 0:
+            diverged_at[scenario] = frame
+    position_shape = info.arrays["position"].shape or ()
     return Header(
         **labels,
         scenarios=scenarios,
-        frames=anatomy.integers["frame"],
-        particles=(anatomy.arrays["position"].shape or ())[2],
-        diverged_at={
-            i: mark for i, mark in zip(scenarios, marks, strict=False) if mark >= 0
-        },
+        frames=info.integers["frame"],
+        particles=position_shape[2],
+        diverged_at=diverged_at,
     )
 
 
-def refuse_other_kinds(anatomy: Anatomy, path: Path) -> None:
-    """Refuse a file of ours that holds no predictions: all that could be said of it
-    would mislead.
+def refuse_other_kinds(info: FileInfo, path: Path) -> None:
+    """Refuse a file of ours that holds no predictions.
+
+    All other checks would mislead.
+
+    Raises:
+        UnreadableFileError: it is a score file or a scenario file.
     """
-    if {"position", "scenario"} <= anatomy.links.keys():
+    if {"position", "scenario"} <= info.links.keys():
         return
-    for name, what in OTHERS.items():
-        if name in anatomy.links:
+    for name, kind in OTHERS.items():
+        if name in info.links:
             raise UnreadableFileError(
                 "a file of another kind",
                 where=str(path),
                 expected="predictions",
-                got=what,
-                fix=_START,
+                got=kind,
+                fix=USE_TEMPLATE,
             )
 
 
-def check_format(anatomy: Anatomy, out: Findings) -> bool:
-    """Check links, variables, storage and attributes; tell whether the values can be
-    read.
+def check_format(info: FileInfo, issues: IssueCollector) -> bool:
+    """Check links, variables, storage and attributes.
+
+    Returns whether the values can be read.
     """
-    out.made("format")
-    for name, kind in anatomy.links.items():
+    issues.complete("format")
+    _check_links(info, issues)
+    _check_variables(info, issues)
+    _check_storage(info, issues)
+    is_readable = not issues.first_failed("format")
+    _check_attributes(info, issues)
+    return is_readable
+
+
+def _check_links(info: FileInfo, issues: IssueCollector) -> None:
+    for name, kind in info.links.items():
         if kind.endswith("link"):
-            out.error(
+            issues.error(
                 "format",
                 f"there is a {kind}, which is not followed",
-                where=quoted(name),
+                where=quote(name),
                 expected="variables that lie in this file",
                 got=kind,
                 fix="store the values themselves",
             )
-    if anatomy.link_count > MAX_LINKS:
-        most = f"at most {MAX_LINKS}"
-        count = anatomy.link_count
-        out.error(
+    if info.link_count > MAX_LINKS:
+        issues.error(
             "format",
             "too many variables",
             where="/",
-            expected=most,
-            got=count,
-            fix=_START,
+            expected=f"at most {MAX_LINKS}",
+            got=info.link_count,
+            fix=USE_TEMPLATE,
         )
-    known = [quoted(other) for other in anatomy.links][:10]
+
+
+def _check_variables(info: FileInfo, issues: IssueCollector) -> None:
+    stored_names = [quote(name) for name in info.links][:10]
     for name in ("position", "scenario", "frame"):
-        kind = anatomy.links.get(name, "")
-        if kind != "variable" and not kind.endswith("link"):
-            if kind:
-                fix = _START
-            else:
-                fix = suggest_name(quoted(name), known)
-            got = kind or ", ".join(known) or "nothing"
-            what = f"no variable {name!r}"
-            expected = f"a variable {name!r}"
-            out.error("format", what, where="/", expected=expected, got=got, fix=fix)
-    for name, array in anatomy.arrays.items():
-        problem = find_storage_issue(array, length=anatomy.length)
-        if problem is None and (name == "position" or name in anatomy.integers):
+        kind = info.links.get(name, "")
+        if kind == "variable" or kind.endswith("link"):
             continue
-        what, expected, got = problem or (
-            "a coordinate cannot be read",
-            f"one dimension of at most {MAX_COORDINATE} integers",
-            f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
-        )
-        if problem:
-            fix = _WRITE
+        if kind:
+            fix = USE_TEMPLATE
         else:
-            fix = _START
-        out.error(
+            fix = suggest_name(quote(name), stored_names)
+        issues.error(
             "format",
-            what,
-            where=f"variable {name!r}",
-            expected=expected,
-            got=got,
+            f"no variable {name!r}",
+            where="/",
+            expected=f"a variable {name!r}",
+            got=kind or ", ".join(stored_names) or "nothing",
             fix=fix,
         )
-    readable = not out.failed("format")
-    _check_attributes(anatomy, out)
-    return readable
 
 
-def _check_attributes(anatomy: Anatomy, out: Findings) -> None:
-    for name, value in anatomy.attributes.items():
+def _check_storage(info: FileInfo, issues: IssueCollector) -> None:
+    for name, array in info.arrays.items():
+        where = f"variable {name!r}"
+        problem = find_storage_issue(array, length=info.length)
+        if problem is not None:
+            issues.error(
+                "format",
+                problem.what,
+                where=where,
+                expected=problem.expected,
+                got=problem.got,
+                fix=WRITE_IN_CHUNKS,
+            )
+        elif name != "position" and name not in info.integers:
+            issues.error(
+                "format",
+                "a coordinate cannot be read",
+                where=where,
+                expected=f"one dimension of at most {MAX_COORDINATE} integers",
+                got=f"{array.kind}, shape {array.shape}, chunks {array.chunks}",
+                fix=USE_TEMPLATE,
+            )
+
+
+def _check_attributes(info: FileInfo, issues: IssueCollector) -> None:
+    for name, value in info.attributes.items():
         if name == "lagbench_format":
             expected = str(FORMAT)
-            right = not isinstance(value, (str, UnusableAttribute)) and value == FORMAT
+            is_right = (
+                not isinstance(value, (str, UnusableAttribute)) and value == FORMAT
+            )
         elif name in REQUIRED:
-            expected = kind_of(name)
-            right = fits(name, value)
+            expected = describe_kind(name)
+            is_right = is_attribute_valid(name, value)
         else:
-            expected = f"{kind_of(name)}, or no such attribute"
-            right = value is None or fits(name, value)
-        if right:
+            expected = f"{describe_kind(name)}, or no such attribute"
+            is_right = value is None or is_attribute_valid(name, value)
+        if is_right:
             continue
-        if isinstance(value, UnusableAttribute):
-            got = value.reason
-        else:
-            got = quoted(value)
-        out.error(
+
+        what = f"the attribute {name!r} cannot be used"
+        got = describe_value(value)
+        if value is None:
+            what = f"the attribute {name!r} is missing"
+            got = "no such attribute"
+        issues.error(
             "format",
-            f"the attribute {name!r} "
-            f"{'is missing' if value is None else 'cannot be used'}",
+            what,
             where="global attributes",
             expected=expected,
-            got="no such attribute" if value is None else got,
+            got=got,
             fix=f"set it: file.{name} = ...",
         )
 
 
-def check_dims(anatomy: Anatomy, out: Findings) -> bool:
+def describe_value(value: object) -> str:
+    """Return the value of an attribute for a message, or why it has none."""
+    if isinstance(value, UnusableAttribute):
+        return value.reason
+    return quote(value)
+
+
+def check_dims(info: FileInfo, issues: IssueCollector) -> bool:
     """Check names, order and lengths of the dimensions of ``position``."""
-    array = anatomy.arrays.get("position")
+    array = info.arrays.get("position")
     if array is None or array.shape is None:
-        out.skip("'position' cannot be read", "dims")
+        issues.skip("'position' cannot be read", "dims")
         return False
-    out.made("dims")
+    issues.complete("dims")
     where = "variable 'position'"
     if array.dims != DIMS:
-        got = (
-            ", ".join(
-                quoted(name) if name else "one without a name" for name in array.dims
-            )
-            or "none"
-        )
-        expected = ", ".join(DIMS)
-        fix = _START
-        if sorted(array.dims) == sorted(DIMS):
-            fix = "transpose it"
-        elif len(array.dims) == len(DIMS) - 1:
-            fix = "add the leading dimension 'scenario', also for a single scenario"
-        elif not any(array.dims):
-            fix = (
-                "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
-            )
-        out.error(
+        names = [quote(name) if name else "one without a name" for name in array.dims]
+        issues.error(
             "dims",
             "the dimensions are others",
             where=where,
-            expected=expected,
-            got=got,
-            fix=fix,
+            expected=", ".join(DIMS),
+            got=", ".join(names) or "none",
+            fix=_hint_for_dims(array.dims),
         )
         return False
-    rows = {name: anatomy.integers.get(name) for name in ("scenario", "frame")}
-    counted = [
-        f"as many as {name!r}" if held is None else len(held)
-        for name, held in rows.items()
-    ]
-    lengths = (*counted, array.shape[2], SPACE)
+
+    lengths = (
+        _length_of("scenario", info),
+        _length_of("frame", info),
+        array.shape[2],
+        SPACE,
+    )
     if array.shape != lengths:
-        swapped = array.shape[2] == SPACE and array.shape[3] > SPACE
-        if swapped:
+        fix = USE_TEMPLATE
+        if array.shape[2] == SPACE and array.shape[3] > SPACE:
             fix = "particle and space seem to be swapped: transpose them"
-        else:
-            fix = _START
-        out.error(
+        issues.error(
             "dims",
             "the lengths do not fit",
             where=where,
@@ -453,74 +503,91 @@ def check_dims(anatomy: Anatomy, out: Findings) -> bool:
     return True
 
 
-def check_dtype(anatomy: Anatomy, out: Findings) -> bool:
+def _hint_for_dims(dims: tuple[str, ...]) -> str:
+    if sorted(dims) == sorted(DIMS):
+        return "transpose it"
+    if len(dims) == len(DIMS) - 1:
+        return "add the leading dimension 'scenario', also for a single scenario"
+    if not any(dims):
+        return "attach dimension scales, as netCDF4 and xarray do; plain h5py does not"
+    return USE_TEMPLATE
+
+
+def _length_of(name: str, info: FileInfo) -> int | str:
+    """Return the length of a coordinate, in words where it could not be read."""
+    values = info.integers.get(name)
+    if values is None:
+        return f"as many as {name!r}"
+    return len(values)
+
+
+def check_dtype(info: FileInfo, issues: IssueCollector) -> bool:
     """Check that positions are float32 and not packed as scaled numbers."""
-    array = anatomy.arrays.get("position")
+    array = info.arrays.get("position")
     if array is None:
-        out.skip("there is no variable 'position'", "dtype")
+        issues.skip("there is no variable 'position'", "dtype")
         return False
-    out.made("dtype")
+    issues.complete("dtype")
     where = "variable 'position'"
     if array.kind != "float32":
-        fix = "store positions as float32: positions.astype('float32')"
-        out.error(
+        issues.error(
             "dtype",
             "the type is another",
             where=where,
             expected="float32",
             got=array.kind,
-            fix=fix,
+            fix="store positions as float32: positions.astype('float32')",
         )
-    if anatomy.packing:
-        said = {
-            n: v.reason if isinstance(v, UnusableAttribute) else quoted(v)
-            for n, v in anatomy.packing.items()
-        }
-        out.error(
+    if info.packing:
+        packing = [
+            f"{name} = {describe_value(value)}" for name, value in info.packing.items()
+        ]
+        issues.error(
             "dtype",
             "the values are packed, and are not unpacked here",
             where=where,
             expected="no scale_factor and no add_offset",
-            got=", ".join(f"{name} = {text}" for name, text in said.items()),
+            got=", ".join(packing),
             fix="store the positions themselves as float32",
         )
-    return not out.failed("dtype")
+    return not issues.first_failed("dtype")
 
 
-def check_marks(anatomy: Anatomy, out: Findings) -> None:
-    """Check that ``diverged_at``, where it is there, has a predicted frame or -1 per
-    scenario.
-    """
-    array = anatomy.arrays.get("diverged_at")
-    marks = anatomy.integers.get("diverged_at")
-    frames = anatomy.integers.get("frame")
-    if array is not None and (marks is None or frames is None):
-        out.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
+def check_diverged_at(info: FileInfo, issues: IssueCollector) -> None:
+    """Check that ``diverged_at``, if any, has a predicted frame or -1 per scenario."""
+    array = info.arrays.get("diverged_at")
+    if array is None:
+        issues.complete("diverged_at")
         return
-    out.made("diverged_at")
-    if array is None or marks is None or frames is None:
+    frozen_from = info.integers.get("diverged_at")
+    frames = info.integers.get("frame")
+    if frozen_from is None or frames is None:
+        issues.skip("'diverged_at' or 'frame' cannot be read", "diverged_at")
         return
+
+    issues.complete("diverged_at")
     where = "variable 'diverged_at'"
-    if array.dims != ("scenario",) or len(marks) != len(
-        anatomy.integers.get("scenario", ())
-    ):
-        out.error(
+    scenario_count = len(info.integers.get("scenario", ()))
+    if array.dims != ("scenario",) or len(frozen_from) != scenario_count:
+        dimension = "one without a name"
+        if any(array.dims):
+            dimension = quote(array.dims[0])
+        issues.error(
             "diverged_at",
             "it is not told per scenario",
             where=where,
             expected="one value per scenario, on the dimension 'scenario'",
-            got=f"{len(marks)} on "
-            f"{quoted(array.dims[0]) if any(array.dims) else 'one without a name'}",
+            got=f"{len(frozen_from)} on {dimension}",
             fix="store it beside 'scenario', or leave it out",
         )
-    wrong = sorted(set(marks) - {NEVER, *frames})
-    if wrong:
-        out.error(
+    wrong_frames = sorted(set(frozen_from) - {NEVER, *frames})
+    if wrong_frames:
+        issues.error(
             "diverged_at",
             "a rollout is frozen at no predicted frame",
             where=where,
             expected=f"absolute numbers of predicted frames, {NEVER} for a rollout "
             f"that did not diverge",
-            got=", ".join(map(str, wrong[:5])),
+            got=", ".join(map(str, wrong_frames[:5])),
             fix=f"name the first frozen frame, or {NEVER}",
         )

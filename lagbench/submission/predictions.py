@@ -17,35 +17,37 @@ from lagbench.data.registry import format_ids
 from lagbench.data.structure import estimate_chunk_cache
 from lagbench.errors import UsageError
 
-from .findings import Findings
 from .format import (
     DIMS,
     REQUIRED,
     SPACE,
     WRITE,
-    Anatomy,
+    FileInfo,
     Header,
     check_dims,
+    check_diverged_at,
     check_dtype,
     check_format,
-    check_marks,
-    dissect,
     header_of,
+    inspect_file,
 )
+from .issues import IssueCollector
 
 BLOCK_BYTES = 1 << 20
 """Blocks have about this size [bytes]."""
+
+FLOAT_BYTES = np.dtype(np.float32).itemsize
 
 
 class Predictions:
     """An open predictions.nc; use it as a context manager."""
 
     def __init__(
-        self, path: Path, anatomy: Anatomy, position: h5py.Dataset, stack: ExitStack
+        self, path: Path, info: FileInfo, position: h5py.Dataset, stack: ExitStack
     ) -> None:
         self.path = path
-        self.anatomy = anatomy
-        self.header: Header = header_of(anatomy)
+        self.info = info
+        self.header: Header = header_of(info)
         self._position = position
         self._stack = stack
         self._row = {
@@ -65,11 +67,10 @@ class Predictions:
         self._stack.close()
 
     def frames(self, scenario: int, start: int, count: int) -> NDArray[np.float32]:
-        """Return consecutive frames of a scenario; the order of scenarios does not
-        matter.
+        """Return consecutive frames of a scenario.
 
         Args:
-            scenario: id of the scenario.
+            scenario: id of the scenario; the order of scenarios does not matter.
             start: absolute number of the first frame, one of ``header.frames``.
             count: how many stored frames to read from there.
 
@@ -81,26 +82,26 @@ class Predictions:
             UsageError: the file has no such scenario or frames.
             UnreadableFileError: the file is damaged there.
         """
-        numbers = self.header.frames
-        if start in numbers:
-            first = numbers.index(start)
-        else:
-            first = -1
-        if (
-            scenario not in self._row
-            or first < 0
-            or count < 0
-            or first + count > len(numbers)
-        ):
-            what = "the file has no such frames"
-            got = f"scenario {scenario}, {count} frames from {start}"
-            expected = f"scenarios {format_ids(self.header.scenarios)}, frames {format_ids(numbers)}"
-            raise UsageError(what, where=str(self.path), expected=expected, got=got)
+        first = self._index_of(scenario, start, count)
+        row = self._row[scenario]
         with hdf5_errors(self.path, "position"):
-            values: NDArray[Any] = self._position[
-                self._row[scenario], first : first + count
-            ]
+            values: NDArray[Any] = self._position[row, first : first + count]
             return np.ascontiguousarray(values, dtype=np.float32)
+
+    def _index_of(self, scenario: int, start: int, count: int) -> int:
+        """Return the index of a frame after which so many frames are stored."""
+        numbers = self.header.frames
+        if scenario in self._row and start in numbers:
+            first = numbers.index(start)
+            if 0 <= count <= len(numbers) - first:
+                return first
+        raise UsageError(
+            "the file has no such frames",
+            where=str(self.path),
+            expected=f"scenarios {format_ids(self.header.scenarios)}, "
+            f"frames {format_ids(numbers)}",
+            got=f"scenario {scenario}, {count} frames from {start}",
+        )
 
     def blocks(self, scenario: int) -> Iterator[tuple[int, NDArray[np.float32]]]:
         """Yield a scenario in pieces of about 1 MiB: absolute first frame, positions.
@@ -110,9 +111,10 @@ class Predictions:
             UnreadableFileError: the file is damaged.
         """
         numbers = self.header.frames
-        step = max(1, BLOCK_BYTES // (4 * SPACE * max(1, self.header.particles)))
-        for first in range(0, len(numbers), step):
-            count = min(step, len(numbers) - first)
+        frame_bytes = FLOAT_BYTES * SPACE * max(1, self.header.particles)
+        block_frames = max(1, BLOCK_BYTES // frame_bytes)
+        for first in range(0, len(numbers), block_frames):
+            count = min(block_frames, len(numbers) - first)
             yield numbers[first], self.frames(scenario, numbers[first], count)
 
     def content_sha256(self) -> str:
@@ -123,30 +125,29 @@ class Predictions:
         Raises:
             UnreadableFileError: the file is damaged.
         """
-        hasher = self.hasher()
+        hasher = self.start_hash()
         for scenario in sorted(self.header.scenarios):
             for _, block in self.blocks(scenario):
                 hasher.update("position", block)
         return hasher.hexdigest()
 
-    def hasher(self) -> ContentHasher:
-        """Return the content hash as far as the header goes; blocks follow by ascending
-        scenario id.
+    def start_hash(self) -> ContentHasher:
+        """Return a content hash of the header.
+
+        Blocks of positions are to be added by ascending scenario id.
         """
         header = self.header
-        ids = sorted(header.scenarios)
-        identity = {name: getattr(header, name) for name in REQUIRED}
-        hasher = ContentHasher(
-            {**identity, "scenarios": ids, "frames": list(header.frames)}
-        )
-        shape = (len(ids), len(header.frames), header.particles, SPACE)
+        scenarios = sorted(header.scenarios)
+        identity: dict[str, Any] = {name: getattr(header, name) for name in REQUIRED}
+        identity["scenarios"] = scenarios
+        identity["frames"] = list(header.frames)
+        hasher = ContentHasher(identity)
+        shape = (len(scenarios), len(header.frames), header.particles, SPACE)
         hasher.declare("position", np.dtype(np.float32), DIMS, shape)
         return hasher
 
 
-def open_predictions(
-    path: str | Path, *, checked: Anatomy | None = None
-) -> Predictions:
+def open_predictions(path: str | Path, *, info: FileInfo | None = None) -> Predictions:
     """Open a predictions.nc without trusting it.
 
     Only the layout of the file is checked here, not its agreement with a data set: that
@@ -155,8 +156,8 @@ def open_predictions(
 
     Args:
         path: the file.
-        checked: the anatomy of this very file when it was opened before: one as long is
-            not checked again.
+        info: what the headers of this very file say, where it was opened before. The
+            layout of a file of the same length is not checked again.
 
     Raises:
         UnreadableFileError: missing, not netCDF4, or damaged.
@@ -165,25 +166,28 @@ def open_predictions(
     path = Path(path)
     with ExitStack() as stack:
         file = stack.enter_context(open_hdf5(path, fix=WRITE))
-        if checked is None or checked.length != path.stat().st_size:
-            checked = dissect(file, path)
-            out = Findings()
-            for check in (check_format, check_dims, check_dtype, check_marks):
-                check(checked, out)
-            out.result(path).check()
-        return attach(file, path, checked, stack)
+        if info is None or info.length != path.stat().st_size:
+            info = inspect_file(file, path)
+            issues = IssueCollector()
+            check_format(info, issues)
+            check_dims(info, issues)
+            check_dtype(info, issues)
+            check_diverged_at(info, issues)
+            issues.result(path).check()
+        return attach(file, path, info, stack)
 
 
 def attach(
-    file: h5py.File, path: Path, anatomy: Anatomy, stack: ExitStack
+    file: h5py.File, path: Path, info: FileInfo, stack: ExitStack
 ) -> Predictions:
-    """Return the predictions of an open file whose layout has been checked; they take
-    over the stack.
+    """Return the predictions of an open file whose layout has been checked.
+
+    They take over the stack.
     """
     with hdf5_errors(path, "position"):
         # just the chunk cache that reading in order needs
-        size, kept = estimate_chunk_cache(anatomy.arrays["position"])
-        plist = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
-        plist.set_chunk_cache(10 * kept + 521, size, 1.0)
-        position = h5py.Dataset(h5py.h5d.open(file.id, b"position", plist))
-    return Predictions(path, anatomy, position, stack.pop_all())
+        cache_bytes, chunk_count = estimate_chunk_cache(info.arrays["position"])
+        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        access.set_chunk_cache(10 * chunk_count + 521, cache_bytes, 1.0)
+        position = h5py.Dataset(h5py.h5d.open(file.id, b"position", access))
+    return Predictions(path, info, position, stack.pop_all())

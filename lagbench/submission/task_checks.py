@@ -1,244 +1,218 @@
-"""Checks that a file answers the task: split, data set, scenarios, frames,
-particles.
-"""
+"""Check that a file answers the task: split, data set, scenarios, frames, particles."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Sequence
 from pathlib import Path
 
 from lagbench.data.layout import major_of, quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
-from lagbench.data.registry import Registry, Size, format_ids
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.data.registry import Size, format_ids
 
-from .findings import Findings, quoted
-from .format import Anatomy
+from .format import FileInfo
+from .issues import IssueCollector, quote
 
-_VERSION = re.compile(r"[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}")
 HASH = re.compile(r"[0-9a-f]{64}")
+VERSION = re.compile(r"[1-9]\d{0,5}\.\d{1,6}\.\d{1,6}")
 
-MAX_SPELLED = 60
+MAX_LIST = 60
 """Longest list of numbers in a message [characters]."""
 
+MAX_QUOTED_NUMBERS = 20
+"""Most numbers that are quoted one by one."""
 
-def check_split(anatomy: Anatomy, registry: Registry, out: Findings) -> Size | None:
-    """Check that split and size are known; return what the registry says of them."""
-    split, size = (anatomy.attributes[name] for name in ("split", "size"))
-    if not isinstance(split, str) or not isinstance(size, str):
-        out.skip("the file does not name its split and size", "split")
+
+def check_split(
+    info: FileInfo, size: Size | None, *, hint: str, issues: IssueCollector
+) -> Size | None:
+    """Check that the registry has the split and size that a file names; return it.
+
+    Args:
+        info: what the file says.
+        size: the entry of the registry of that name; None where there is none.
+        hint: what to do where there is none.
+        issues: where an issue is added.
+    """
+    split_name = info.attributes["split"]
+    size_name = info.attributes["size"]
+    if not isinstance(split_name, str) or not isinstance(size_name, str):
+        issues.skip("the file does not name its split and size", "split")
         return None
-    out.made("split")
-    try:
-        return registry.size(split, size)
-    except (UsageError, UnreadableFileError) as error:
-        known = error.fix or error.what
-    out.error(
+    issues.complete("split")
+    if size is not None and (size.split, size.name) == (split_name, size_name):
+        return size
+    issues.error(
         "split",
         "no such split and size",
         where="attributes 'split' and 'size'",
         expected="a split and size that `lagbench list` shows",
-        got=f"{quoted(split)}, {quoted(size)}",
-        fix=f"{known.splitlines()[0]}; or say where a split of your own lies: "
-        f"--root FOLDER",
+        got=f"{quote(split_name)}, {quote(size_name)}",
+        fix=f"{hint}; or say where a split of your own lies: --root FOLDER",
     )
     return None
 
 
-def check_dataset(anatomy: Anatomy, size: Size, root: Path, out: Findings) -> None:
-    """Check that the predictions were made from the data set that the registry
-    means.
-    """
-    version, got = (
-        anatomy.attributes[name] for name in ("dataset_version", "dataset_sha256")
-    )
-    if not isinstance(version, str) or not isinstance(got, str):
-        out.skip("the file does not name its data set", "dataset")
+def check_dataset(
+    info: FileInfo, size: Size, root: Path, issues: IssueCollector
+) -> None:
+    """Check that the predictions were made from the data set of the registry."""
+    version = info.attributes["dataset_version"]
+    stored_hash = info.attributes["dataset_sha256"]
+    if not isinstance(version, str) or not isinstance(stored_hash, str):
+        issues.skip("the file does not name its data set", "dataset")
         return
-    out.made("dataset")
-    remake = f"predict again, from {size.split} {size.name} {size.version}"
-    if not _VERSION.fullmatch(version) or major_of(version) != size.major:
-        out.error(
+
+    issues.complete("dataset")
+    name = f"{size.split} {size.name}"
+    predict_again = f"predict again, from {name} {size.version}"
+    if not VERSION.fullmatch(version) or major_of(version) != size.major:
+        issues.error(
             "dataset",
             "the predictions are for another version of the data set",
             where="attribute 'dataset_version'",
             expected=size.version,
-            got=quoted(version),
-            fix=f"{remake}; if theirs is later, install a later lagbench",
+            got=quote(version),
+            fix=f"{predict_again}; if theirs is later, install a later lagbench",
         )
-    expected = dataset_hash_of(size, root)
-    if expected is None and HASH.fullmatch(got):
-        out.warning(
+
+    where = "attribute 'dataset_sha256'"
+    expected_hash = dataset_hash_of(size, root)
+    if expected_hash is None and HASH.fullmatch(stored_hash):
+        issues.warning(
             "dataset",
             "the data set hash cannot be compared",
-            where="attribute 'dataset_sha256'",
-            expected=f"a recorded hash of {size.split} {size.name}",
+            where=where,
+            expected=f"a recorded hash of {name}",
             got="neither datasets.yaml nor a complete manifest has one",
             fix=suggest_repair(size, root=root),
         )
-    elif got != expected:
-        out.error(
+    elif stored_hash != expected_hash:
+        verify = f"lagbench verify --split {size.split} --size {size.name}"
+        issues.error(
             "dataset",
             "the predictions were made from another data set",
-            where="attribute 'dataset_sha256'",
-            expected=expected or "64 hex digits",
-            got=quoted(got),
-            fix=f"{remake}; whether it is what lies here, says lagbench verify "
-            f"--split {size.split}"
-            f" --size {size.name} --root {quote_root(root)}",
+            where=where,
+            expected=expected_hash or "64 hex digits",
+            got=quote(stored_hash),
+            fix=f"{predict_again}; {verify} --root {quote_root(root)} says whether it is "
+            f"the data set that lies here",
         )
 
 
 def dataset_hash_of(size: Size, root: Path) -> str | None:
-    """Return the hash of a data set: the registry's, else that of a complete local
-    one.
+    """Return the recorded hash of a data set.
+
+    It is the registry's, else that of a complete local data set; None without either.
     """
-    return (size.measured or read_or_empty(size, root)).dataset_sha256
+    if size.measured is not None:
+        return size.measured.dataset_sha256
+    return read_or_empty(size, root).dataset_sha256
 
 
-def check_scenarios(anatomy: Anatomy, size: Size, out: Findings) -> None:
+def check_scenarios(info: FileInfo, size: Size, issues: IssueCollector) -> None:
     """Check that every test scenario is there once, in any order, and no other."""
-    got = anatomy.integers.get("scenario")
-    if got is None:
-        out.skip("the coordinate 'scenario' cannot be read", "scenarios")
+    stored = info.integers.get("scenario")
+    if stored is None:
+        issues.skip("the coordinate 'scenario' cannot be read", "scenarios")
         return
-    out.made("scenarios")
-    wanted = size.subsets["test"]
-    twice = sorted(i for i, count in Counter(got).items() if count > 1)
-    problems = {
-        "missing": (sorted(set(wanted) - set(got)), "predict every test scenario"),
-        "unknown": (sorted(set(got) - set(wanted)), guess_scenarios(got, size.subsets)),
-        "duplicate": (twice, "store every scenario once"),
-    }
-    for word, (ids, fix) in problems.items():
-        if ids:
-            out.error(
-                "scenarios",
-                f"{len(ids)} {word} scenario{'s' if len(ids) > 1 else ''}",
-                where="coordinate 'scenario'",
-                expected=spell_numbers(wanted),
-                got=f"{word}: {_numbers(ids)}",
-                fix=fix,
-            )
-
-
-def _numbers(ids: Sequence[int]) -> str:
-    """Return numbers for a message; negative ones would read as ranges."""
-    if min(ids) >= 0:
-        return spell_numbers(ids)
-    return quoted(list(ids[:20]))
-
-
-def check_frames(anatomy: Anatomy, size: Size, out: Findings) -> None:
-    """Check that the frames are those to predict, ascending."""
-    got = anatomy.integers.get("frame")
-    if got is None:
-        out.skip("the coordinate 'frame' cannot be read", "frames")
-        return
-    out.made("frames")
-    expected = frames_to_predict(size)
-    if list(got) != list(expected):
-        out.error(
-            "frames",
-            "the frames are not those to predict",
-            where="coordinate 'frame'",
-            expected=f"{spell_numbers(expected)} (absolute numbers, {len(expected)} "
-            f"of them)",
-            got=f"{_numbers(got) if got else 'none'} ({len(got)})",
-            fix=guess_frames(got, expected),
+    issues.complete("scenarios")
+    expected = size.subsets["test"]
+    missing = sorted(set(expected) - set(stored))
+    unknown = sorted(set(stored) - set(expected))
+    duplicate = [scenario for scenario, count in Counter(stored).items() if count > 1]
+    for kind, scenarios, fix in (
+        ("missing", missing, "predict every test scenario"),
+        ("unknown", unknown, "store the ids of the test scenarios, and no others"),
+        ("duplicate", sorted(duplicate), "store every scenario once"),
+    ):
+        if not scenarios:
+            continue
+        plural = "s" if len(scenarios) > 1 else ""
+        issues.error(
+            "scenarios",
+            f"{len(scenarios)} {kind} scenario{plural}",
+            where="coordinate 'scenario'",
+            expected=format_ranges(expected),
+            got=f"{kind}: {format_numbers(scenarios)}",
+            fix=fix,
         )
+
+
+def check_frames(info: FileInfo, size: Size, issues: IssueCollector) -> None:
+    """Check that the frames are those to predict, ascending."""
+    stored = info.integers.get("frame")
+    if stored is None:
+        issues.skip("the coordinate 'frame' cannot be read", "frames")
+        return
+    issues.complete("frames")
+    expected = frames_to_predict(size)
+    if list(stored) == list(expected):
+        return
+    first = expected[0]
+    last = expected[-1]
+    issues.error(
+        "frames",
+        "the frames are not those to predict",
+        where="coordinate 'frame'",
+        expected=f"{format_ranges(expected)} (absolute numbers, {len(expected)} "
+        f"of them)",
+        got=f"{format_numbers(stored)} ({len(stored)})",
+        fix=f"store the frames {first} to {last}, each once, ascending; "
+        f"frame 0 is the first given one",
+    )
 
 
 def frames_to_predict(size: Size) -> range:
     """Return the absolute numbers of the frames that a model must predict."""
-    return range(size.task.input_frames, size.task.input_frames + size.task.horizon)
+    task = size.task
+    return range(task.input_frames, task.input_frames + task.horizon)
 
 
-def check_particles(anatomy: Anatomy, size: Size, out: Findings) -> bool:
-    """Check the number of particles."""
-    array = anatomy.arrays.get("position")
-    if array is None or array.shape is None or out.failed("dims"):
-        out.skip("the dimensions are not known", "particles")
+def check_particles(info: FileInfo, size: Size, issues: IssueCollector) -> bool:
+    """Check the number of particles; return whether it is right."""
+    array = info.arrays.get("position")
+    if array is None or array.shape is None or issues.first_failed("dims"):
+        issues.skip("the dimensions are not known", "particles")
         return False
-    out.made("particles")
-    if array.shape[2] != size.particles:
-        out.error(
-            "particles",
-            "the number of particles is another",
-            where="variable 'position', dimension 'particle'",
-            expected=size.particles,
-            got=array.shape[2],
-            fix=f"predict every particle of {size.split} {size.name}, in the order of "
-            f"the given frames",
-        )
-    return array.shape[2] == size.particles
+    issues.complete("particles")
+    particle_count = array.shape[2]
+    if particle_count == size.particles:
+        return True
+    issues.error(
+        "particles",
+        "the number of particles is another",
+        where="variable 'position', dimension 'particle'",
+        expected=size.particles,
+        got=particle_count,
+        fix=f"predict every particle of {size.split} {size.name}, in the order of "
+        f"the given frames",
+    )
+    return False
 
 
-# --- guesses, so that a message can say what may have happened ------------------------
+def format_numbers(numbers: Sequence[int]) -> str:
+    """Return numbers for a message, as ranges unless a minus would read as one.
+
+    >>> format_numbers([6, 7, 8, 10]), format_numbers([-1, 3]), format_numbers([])
+    ('6-8,10', '[-1, 3]', 'none')
+    """
+    if not numbers:
+        return "none"
+    if min(numbers) < 0:
+        return quote(list(numbers[:MAX_QUOTED_NUMBERS]))
+    return format_ranges(numbers)
 
 
-def spell_numbers(numbers: Sequence[int]) -> str:
-    """Return numbers as ranges, shortened in the middle where they are many.
+def format_ranges(numbers: Sequence[int]) -> str:
+    """Return numbers as ranges, cut off where the text is long.
 
-    >>> spell_numbers([6, 7, 8, 10])
+    >>> format_ranges([6, 7, 8, 10])
     '6-8,10'
     """
     text = format_ids(numbers)
-    if len(text) <= MAX_SPELLED:
+    if len(text) <= MAX_LIST:
         return text
-    return f"{text[: MAX_SPELLED - 3]}... ({len(numbers)} numbers)"
-
-
-def guess_frames(got: Sequence[int], expected: range) -> str:
-    """Return what seems to have happened to the frame numbers."""
-    given = expected.start
-    count = len(expected)
-    if not got:
-        return "there are no frames"
-    number, times = Counter(got).most_common(1)[0]
-    if times > 1:
-        return f"frame {number} stands twice"
-    if sorted(got) == list(expected):
-        return "seems to hold the right frames in another order: store them ascending"
-    steps = {b - a for a, b in pairwise(got)}
-    if len(steps) == 1 and (step := min(steps)) > 1:
-        if step % 100 in (11, 12, 13):
-            ending = "th"
-        else:
-            ending = {1: "st", 2: "nd", 3: "rd"}.get(step % 10, "th")
-        return f"seems to skip: it holds every {step}{ending} frame only"
-    first = got[0]
-    last = got[-1]
-    if steps and steps != {1}:
-        if missing := sorted(set(expected) - set(got)):
-            return f"lacks the frames {spell_numbers(missing)}"
-        return "holds frames that are no predictions"
-    if first in (0, 1) and len(got) == count:
-        return f"seems to count from the first predicted frame, whose absolute number is {given}"
-    if first < given and last == given + count - 1:
-        return (
-            f"seems to start at the input frames: leave out the frames before {given}"
-        )
-    if first == given and last < given + count - 1:
-        return f"stops too early: the last frame is {given + count - 1}"
-    if first == given:
-        return f"goes on too long: leave out the frames after {given + count - 1}"
-    if len(got) == count:
-        return f"seems to be shifted by {first - given} frames"
-    return "holds other frames"
-
-
-def guess_scenarios(got: Sequence[int], subsets: Mapping[str, Sequence[int]]) -> str:
-    """Return where unknown scenario ids may come from."""
-    for subset, ids in subsets.items():
-        if subset != "test" and set(got) <= set(ids):
-            return f"these are scenarios of {subset}"
-    if list(got) == list(range(len(subsets["test"]))) or list(got) == list(
-        range(1, len(got) + 1)
-    ):
-        return "seems to count the scenarios: store their ids"
-    return "name the scenarios by their ids"
+    return f"{text[: MAX_LIST - 3]}... ({len(numbers)} numbers)"

@@ -1,15 +1,15 @@
-"""Validate a predictions.nc: every named check, all findings together, in a child with
-limits.
+"""Validate a predictions.nc: make every check and report all issues together.
 
 HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes
-changed at random four made HDF5 2.0 loop. What loops, crashes or asks for too much ends
-a child process; the parent says so and goes on.
+changed at random four made HDF5 2.0 loop. Files are therefore read in child processes
+with limits. A file that loops, crashes or asks for too much ends the child; the parent
+reports that and goes on.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -17,22 +17,35 @@ from typing import Any
 import h5py
 
 from lagbench.data.hdf5 import check_file, open_hdf5
-from lagbench.data.local import RootedRegistry, load_rooted_registry, resolve_root
+from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry, Size
-from lagbench.errors import DataError, UnreadableFileError, UsageError, suggest_name
+from lagbench.errors import DataError, UnreadableFileError, UsageError
 from lagbench.work.machine import run_in_child
 
-from .checks import check_domain, check_finite, check_frozen, check_jumps, survey
-from .findings import CHECKS, Finding, Findings, Severity, ValidationResult
+from .checks import (
+    check_domain,
+    check_finite,
+    check_frozen,
+    check_jumps,
+    scan_positions,
+)
 from .format import (
     WRITE,
-    Anatomy,
+    FileInfo,
     check_dims,
+    check_diverged_at,
     check_dtype,
     check_format,
-    check_marks,
-    dissect,
+    inspect_file,
     refuse_other_kinds,
+)
+from .issues import (
+    CHECKS,
+    IssueCollector,
+    Severity,
+    ValidationIssue,
+    ValidationResult,
+    sort_issues,
 )
 from .predictions import attach
 from .start import check_start, read_starts
@@ -46,8 +59,9 @@ from .task_checks import (
 from .truth import Truth
 
 CPU_SECONDS = 5.0
-"""Computing time for a small file, the start of the child aside [s]; a sound one takes
-2 on a busy core.
+"""Computing time for a small file, the start of the child aside [s].
+
+A sound file takes 2 on a busy core.
 """
 
 WALL_SECONDS = 600.0
@@ -60,9 +74,18 @@ machine that is busy with other work a sound file may take minutes.
 BYTES_PER_SECOND = 20e6
 """Larger files get more time: a slow reader's speed [bytes/s]."""
 
-TRUE = ("start", "discontinuous_start", "max_displacement")
-VALUES = ("finite", "in_domain", *TRUE)
-TASK = ("dataset", "scenarios", "frames", "particles")
+BLOCK_BYTES = 512
+"""Unit in which a system counts what a file occupies [bytes]."""
+
+TRUTH_CHECKS = ("start", "discontinuous_start", "max_displacement")
+VALUE_CHECKS = ("finite", "in_domain", *TRUTH_CHECKS)
+TASK_CHECKS = ("dataset", "scenarios", "frames", "particles")
+
+Request = Mapping[str, Any]
+"""Arguments of a function that a child calls, as JSON holds them."""
+
+Answer = dict[str, Any]
+"""What such a function returns."""
 
 
 def seconds_for(path: Path) -> float:
@@ -72,10 +95,11 @@ def seconds_for(path: Path) -> float:
     what has to be read.
     """
     status = path.stat()
-    blocks: int | None = getattr(status, "st_blocks", None)
-    return (
-        status.st_size if blocks is None else min(status.st_size, 512 * blocks)
-    ) / BYTES_PER_SECOND
+    byte_count = status.st_size
+    block_count: int | None = getattr(status, "st_blocks", None)
+    if block_count is not None:
+        byte_count = min(byte_count, BLOCK_BYTES * block_count)
+    return byte_count / BYTES_PER_SECOND
 
 
 def validate(
@@ -95,234 +119,265 @@ def validate(
             the test subset there.
         require_truth: whether a missing test subset is an error of the check
             ``dataset``, as it is for scoring; else those checks are skipped and say so.
-        isolated: whether to look at the file in a child process with limits on memory
-            and time. Without it a malicious file can stop this process.
+        isolated: whether to read the file in child processes with limits on memory
+            and time. Without them a malicious file can stop this process.
         registry: where splits are described; ours when None.
 
     Returns:
-        What was found; ``result.check()`` raises unless the file is valid.
+        All issues; ``result.check()`` raises unless the file is valid.
         ``lagbench.score`` takes it, so that nothing is read twice.
     """
     folder = resolve_root(root)
     file = Path(path).absolute()
-    known = load_rooted_registry(folder, registry)
-    if isolated:
-        look = _isolated
-    else:
-        look = _examine
-    result = look(file, folder, known, require_truth=require_truth)
-    if result.split is None or result.size is None or "split" not in result.passed:
-        return result
-    size = known.size(result.split, result.size)
-    # Only the file says which test subset it needs; the child that reads it fetches
-    # nothing.
-    from lagbench.store.copy import update_working_copy
+    splits = load_rooted_registry(folder, registry)
+    try:
+        check_file(file, fix=WRITE)
+        names = _call(read_names, {"path": str(file)}, isolated=isolated)
+    except UnreadableFileError as error:
+        return _unreadable(file, error)
 
-    if update_working_copy(size, folder, size.subsets["test"]):
-        result = look(file, folder, known, require_truth=require_truth)
-    if "discontinuous_start" in result.skipped:
+    size, hint = _find_size(names, splits)
+    size_json = None
+    if size is not None:
+        _fetch_truth(size, folder)
+        size_json = size.model_dump_json()
+    request = {
+        "path": str(file),
+        "root": str(folder),
+        "size": size_json,
+        "hint": hint,
+        "require_truth": require_truth,
+    }
+    try:
+        answer = _call(run_checks, request, isolated=isolated)
+    except UnreadableFileError as error:
+        return _unreadable(file, error)
+
+    result = _parse_result(file, answer)
+    if size is None or "discontinuous_start" in result.skipped:
         return result
     try:
         Truth(size, folder).check()
     except DataError as error:
-        # What was said by a truth that is not the one of the registry is taken back.
-        out = Findings()
-        out.raised("dataset", error)
-        findings = [f for f in result.findings if f.check not in TRUE]
-        findings += out.result(result.path).findings
-        return dataclasses.replace(
-            result,
-            findings=tuple(sorted(findings, key=lambda f: CHECKS.index(f.check))),
-            passed=tuple(
-                check for check in result.passed if check not in ("dataset", *TRUE)
-            ),
-            skipped={
-                **result.skipped,
-                **dict.fromkeys(TRUE, f"{error.what}: {error.where}"),
-            },
-        )
+        return _without_truth(result, error)
     return result
 
 
-def _isolated(
-    path: Path, root: Path, registry: Registry, *, require_truth: bool
-) -> ValidationResult:
-    """Examine a file in a child process; whatever stops the child fails the check
-    ``readable``.
+def _call(
+    function: Callable[[Request], Answer], request: Request, *, isolated: bool
+) -> Answer:
+    """Call a function that reads a file, in a child process with limits if isolated.
+
+    Raises:
+        UnreadableFileError: the child had to be stopped.
     """
-    request = {
-        "path": str(path),
-        "root": str(root),
-        "require_truth": require_truth,
-        "sizes": {
-            split: {
-                name: registry.size(split, name).model_dump_json()
-                for name in found.sizes
-            }
-            for split, found in registry.splits.items()
-        },
-    }
-    try:
-        check_file(path, fix=WRITE)
-        extra = seconds_for(path)
-        seconds = CPU_SECONDS + extra
-        wall = WALL_SECONDS + extra
-        values, stopped = run_in_child(
-            f"{__name__}.{examine.__name__}", [request], seconds=seconds, wall=wall
+    if not isolated:
+        return function(request)
+    path = Path(request["path"])
+    extra = seconds_for(path)
+    answers, reason = run_in_child(
+        f"{__name__}.{function.__name__}",
+        [request],
+        seconds=CPU_SECONDS + extra,
+        wall=WALL_SECONDS + extra,
+    )
+    if not answers:
+        raise UnreadableFileError(
+            "reading the file had to be stopped",
+            where=str(path),
+            expected="a file that HDF5 reads within the limits",
+            got=reason,
+            fix="the file is damaged or made to do harm; write it again with "
+            "lagbench.submission.write",
         )
-        if not values:
-            raise UnreadableFileError(
-                "reading the file had to be stopped",
-                where=str(path),
-                expected="a file that HDF5 reads within the limits",
-                got=stopped,
-                fix="the file is damaged or made to do harm; write it again with "
-                "lagbench.submission.write",
-            )
-    except UnreadableFileError as error:
-        out = Findings()
-        out.raised("readable", error)
-        out.skip("the file cannot be read", *CHECKS)
-        return out.result(path)
-    said = values[0]
-    findings = tuple(
-        Finding(**{**f, "severity": Severity(f["severity"])}) for f in said["findings"]
-    )
-    return ValidationResult(
-        **{**said, "path": path, "findings": findings, "passed": tuple(said["passed"])}
-    )
+    answer: Answer = answers[0]
+    return answer
 
 
-class _Sizes(RootedRegistry):
-    """The sizes that a parent sent, and the local splits of its root folder."""
+def read_names(request: Request) -> Answer:
+    """Return the split and the size that a file names; called in a child.
 
-    def __init__(self, sent: Mapping[str, Mapping[str, str]], root: Path) -> None:
-        super().__init__(Registry({}, {}), root)
-        self.sent = sent
-
-    def size(self, split: str, name: str) -> Size:
-        """Return one size of a split."""
-        if split in self.sent and name in self.sent[split]:
-            return Size.model_validate_json(self.sent[split][name], strict=False)
-        if split in self.sent:
-            raise UsageError(
-                f"split {split!r} has no size {name!r}",
-                fix=suggest_name(name, self.sent[split]),
-            )
-        if split not in self.local_names():
-            raise UsageError(
-                f"no split {split!r}",
-                fix=suggest_name(split, [*self.sent, *self.local_names()]),
-            )
-        return super().size(split, name)
+    They are None where the file names none or cannot be read.
+    """
+    path = Path(request["path"])
+    names: Answer = {"split": None, "size": None}
+    try:
+        with open_hdf5(path, fix=WRITE) as file:
+            info = inspect_file(file, path)
+    except UnreadableFileError:
+        return names  # run_checks reports it
+    for name in names:
+        value = info.attributes[name]
+        if isinstance(value, str):
+            names[name] = value
+    return names
 
 
-def examine(request: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Make all checks in this process, for a parent."""
+def _find_size(names: Answer, registry: Registry) -> tuple[Size | None, str]:
+    """Return the size that a file names, or None and a hint."""
+    if names["split"] is None or names["size"] is None:
+        return None, ""
+    try:
+        return registry.size(names["split"], names["size"]), ""
+    except (UsageError, UnreadableFileError) as error:
+        hint = error.fix or error.what
+        return None, hint.splitlines()[0]
+
+
+def _fetch_truth(size: Size, root: Path) -> None:
+    # Validating without a store needs no network library.
+    from lagbench.store.copy import update_working_copy
+
+    update_working_copy(size, root, size.subsets["test"])
+
+
+def run_checks(request: Request) -> Answer:
+    """Make all checks and return the result as JSON holds it; called in a child."""
     path = Path(request["path"])
     root = Path(request["root"])
-    result = _examine(
-        path,
-        root,
-        _Sizes(request["sizes"], root),
-        require_truth=request["require_truth"],
-    )
+    size = None
+    if request["size"] is not None:
+        size = Size.model_validate_json(request["size"], strict=False)
+
+    issues = IssueCollector()
+    names: dict[str, str] = {}
+    content_hash = None
+    try:
+        with open_hdf5(path, fix=WRITE) as file:
+            info = inspect_file(file, path)
+            refuse_other_kinds(info, path)
+            for name in ("split", "size", "method"):
+                value = info.attributes[name]
+                if isinstance(value, str):
+                    names[name] = value
+            issues.complete("readable")
+            size = check_split(info, size, hint=request["hint"], issues=issues)
+            if _check_headers(info, size, root=root, issues=issues) and size:
+                content_hash = _check_values(
+                    file,
+                    path,
+                    info=info,
+                    truth=Truth(size, root),
+                    require_truth=request["require_truth"],
+                    issues=issues,
+                )
+    except UnreadableFileError as error:
+        issues.add_exception("readable", error)
+        issues.skip("the file cannot be read", *CHECKS)
+
+    result = issues.result(path, sha256=content_hash, **names)
     return dataclasses.asdict(result) | {"path": str(path)}
 
 
-def _examine(
-    path: Path, root: Path, registry: Registry, *, require_truth: bool
-) -> ValidationResult:
-    out = Findings()
-    names: dict[str, str] = {}
-    content = None
-    try:
-        with open_hdf5(path, fix=WRITE) as file:
-            anatomy = dissect(file, path)
-            refuse_other_kinds(anatomy, path)
-            texts = {
-                name: anatomy.attributes[name] for name in ("split", "size", "method")
-            }
-            names = {
-                name: text for name, text in texts.items() if isinstance(text, str)
-            }
-            out.made("readable")
-            size = _check_layout_and_task(anatomy, registry, root, out)
-            if size is not None:
-                content = _check_values(
-                    file, path, anatomy, Truth(size, root), require_truth, out
-                )
-    except UnreadableFileError as error:
-        out.raised("readable", error)
-        out.skip("the file cannot be read", *CHECKS)
-    return out.result(path, sha256=content, **names)
-
-
-def _check_layout_and_task(
-    anatomy: Anatomy, registry: Registry, root: Path, out: Findings
-) -> Size | None:
-    """Make the checks that need no values; return the size if the values can be looked
-    at.
-    """
-    stored, laid_out, typed = (
-        check(anatomy, out) for check in (check_format, check_dims, check_dtype)
-    )
-    check_marks(anatomy, out)
-    size = check_split(anatomy, registry, out)
+def _check_headers(
+    info: FileInfo, size: Size | None, *, root: Path, issues: IssueCollector
+) -> bool:
+    """Make the checks that need no positions; return whether positions can be read."""
+    has_format = check_format(info, issues)
+    has_dims = check_dims(info, issues)
+    has_dtype = check_dtype(info, issues)
+    check_diverged_at(info, issues)
     if size is None:
-        out.skip("the split is not known", *TASK, *VALUES)
-        return None
-    check_dataset(anatomy, size, root, out)
-    check_scenarios(anatomy, size, out)
-    check_frames(anatomy, size, out)
-    sized = check_particles(anatomy, size, out)
-    # Frames far beyond the horizon would make the work as long as the file claims to
-    # be.
-    bounded = len(anatomy.integers.get("frame", ())) <= 2 * (
-        size.task.input_frames + size.task.horizon
-    )
-    if stored and laid_out and typed and sized and bounded:
-        return size
-    out.skip(
-        f"{out.failed('format', 'dims', 'dtype', 'particles', 'frames')} failed",
-        *VALUES,
-    )
-    return None
+        issues.skip("the split is not known", *TASK_CHECKS, *VALUE_CHECKS)
+        return False
+
+    check_dataset(info, size, root, issues)
+    check_scenarios(info, size, issues)
+    check_frames(info, size, issues)
+    has_particles = check_particles(info, size, issues)
+    # Far more frames than the task has would make the work as long as the file claims
+    # to be.
+    task_frames = size.task.input_frames + size.task.horizon
+    is_bounded = len(info.integers.get("frame", ())) <= 2 * task_frames
+    if has_format and has_dims and has_dtype and has_particles and is_bounded:
+        return True
+    failed = issues.first_failed("format", "dims", "dtype", "particles", "frames")
+    issues.skip(f"{failed} failed", *VALUE_CHECKS)
+    return False
 
 
 def _check_values(
     file: h5py.File,
     path: Path,
-    anatomy: Anatomy,
+    *,
+    info: FileInfo,
     truth: Truth,
     require_truth: bool,
-    out: Findings,
+    issues: IssueCollector,
 ) -> str | None:
-    """Make the checks that read positions; return the content hash where all were
-    read.
+    """Make the checks that read positions.
+
+    Returns the content hash where all positions were read.
     """
     with ExitStack() as stack:
-        predictions = attach(file, path, anatomy, stack)
-        surveys, content = survey(predictions, truth.size)
-        check_finite(surveys, out)
-        if not out.failed("diverged_at") and "diverged_at" not in out.skipped:
-            check_frozen(predictions, surveys, out)
-        check_domain(surveys, truth.size, out)
-        if out.failed("frames") or "frames" in out.skipped:
-            out.skip("frames failed", *TRUE)
-            return content
+        predictions = attach(file, path, info, stack)
+        scans, content_hash = scan_positions(predictions, truth.size)
+        check_finite(scans, issues)
+        if not issues.first_failed("diverged_at") and (
+            "diverged_at" not in issues.skipped
+        ):
+            check_frozen(predictions, scans, issues)
+        check_domain(scans, truth.size, issues)
+
+        if issues.first_failed("frames") or "frames" in issues.skipped:
+            issues.skip("frames failed", *TRUTH_CHECKS)
+            return content_hash
         try:
             truth.require()
         except DataError as error:
             if require_truth:
-                out.raised("dataset", error)
-            out.skip(f"{error.what} in {truth.root}: {error.fix}", *TRUE)
-            return content
+                issues.add_exception("dataset", error)
+            issues.skip(f"{error.what} in {truth.root}: {error.fix}", *TRUTH_CHECKS)
+            return content_hash
         try:
             starts = read_starts(predictions, truth)
-            check_start(starts, predictions.header.frames[0], truth, out)
-            check_jumps(surveys, starts, truth, out)
+            first_frame = predictions.header.frames[0]
+            check_start(starts, first_frame=first_frame, truth=truth, issues=issues)
+            check_jumps(scans, starts, truth=truth, issues=issues)
         except DataError as error:
-            out.raised("dataset", error)
-            out.skip(f"{error.what}: {error.where}", *TRUE)
-        return content
+            issues.add_exception("dataset", error)
+            issues.skip(f"{error.what}: {error.where}", *TRUTH_CHECKS)
+        return content_hash
+
+
+def _parse_result(path: Path, answer: Answer) -> ValidationResult:
+    """Return the result that JSON holds."""
+    issues = []
+    for item in answer["findings"]:
+        severity = Severity(item["severity"])
+        issues.append(ValidationIssue(**(item | {"severity": severity})))
+    fields = {
+        **answer,
+        "path": path,
+        "findings": tuple(issues),
+        "passed": tuple(answer["passed"]),
+    }
+    return ValidationResult(**fields)
+
+
+def _unreadable(path: Path, error: UnreadableFileError) -> ValidationResult:
+    """Return the result for a file that cannot be read."""
+    issues = IssueCollector()
+    issues.add_exception("readable", error)
+    issues.skip("the file cannot be read", *CHECKS)
+    return issues.result(path)
+
+
+def _without_truth(result: ValidationResult, error: DataError) -> ValidationResult:
+    """Return a result without the checks that used a damaged truth.
+
+    ``error`` says what is wrong with the truth.
+    """
+    collector = IssueCollector()
+    collector.add_exception("dataset", error)
+    issues = [issue for issue in result.findings if issue.check not in TRUTH_CHECKS]
+    issues += collector.result(result.path).findings
+    passed = [
+        check for check in result.passed if check not in ("dataset", *TRUTH_CHECKS)
+    ]
+    skipped = dict(result.skipped)
+    for check in TRUTH_CHECKS:
+        skipped[check] = f"{error.what}: {error.where}"
+    return dataclasses.replace(
+        result, findings=sort_issues(issues), passed=tuple(passed), skipped=skipped
+    )

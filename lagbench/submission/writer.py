@@ -17,12 +17,27 @@ from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size, format_ids
 from lagbench.errors import DataError, UsageError, WorkFailedError, suggest_name
 
-from .findings import quoted
-from .format import ATTRIBUTES, DIMS, FORMAT, NEVER, OPTIONAL, SPACE, require_fit
+from .format import (
+    ATTRIBUTES,
+    DIMS,
+    FORMAT,
+    NEVER,
+    OPTIONAL,
+    SPACE,
+    require_valid_attribute,
+)
+from .issues import quote
 from .task_checks import HASH, dataset_hash_of, frames_to_predict
 from .truth import Truth
 
-Label = str | int | float  # value of an optional attribute
+CHUNK_CACHE_BYTES = 1 << 20
+"""Memory for the chunks of a variable while it is written [bytes]."""
+
+MAX_REASON = 200
+"""Longest reason that a message repeats [characters]."""
+
+Label = str | int | float
+"""Value of an optional attribute."""
 
 
 class PredictionsWriter:
@@ -64,31 +79,22 @@ class PredictionsWriter:
         self.path = Path(path)
         self.size, folder, _ = locate(split, size, root=root, registry=registry)
         if dataset_sha256 is None:
-            _bring(self.size, folder)
-            dataset_sha256 = dataset_hash_of(self.size, folder)
-            if dataset_sha256 is None:
-                raise DataError(
-                    "the hash of the data set is not known",
-                    where=f"{self.size.split} {self.size.name}",
-                    expected="a hash in datasets.yaml, or a complete data set here",
-                    fix=f"{suggest_repair(self.size, root=folder)}, or give dataset_sha256",
-                )
-        self._hash = dataset_sha256
-        if not isinstance(self._hash, str) or not HASH.fullmatch(self._hash):
+            dataset_sha256 = _recorded_hash(self.size, folder)
+        if not isinstance(dataset_sha256, str) or not HASH.fullmatch(dataset_sha256):
             raise UsageError(
                 "dataset_sha256 does not fit",
                 expected="64 hex digits",
-                got=quoted(self._hash),
+                got=quote(dataset_sha256),
             )
-        require_fit("method", method)
-        self._names = ("position", "velocity") if velocity else ("position",)
-        self._rows = {
-            scenario: row
-            for row, scenario in enumerate(sorted(self.size.subsets["test"]))
-        }
-        self._open = False  # whether a file is being written
+        require_valid_attribute("method", method)
+        self._dataset_sha256 = dataset_sha256
+        self._variables = ("position", "velocity") if velocity else ("position",)
+        self._row_of: dict[int, int] = {}
+        for row, scenario in enumerate(sorted(self.size.subsets["test"])):
+            self._row_of[scenario] = row
+        self._is_open = False
         self._written: set[int] = set()
-        self._diverged = np.full(len(self._rows), NEVER, np.int32)
+        self._diverged_at = np.full(len(self._row_of), NEVER, np.int32)
         self._labels: dict[str, Label] = {"method": method}
         self.label(**labels)
 
@@ -111,53 +117,53 @@ class PredictionsWriter:
         for name, value in labels.items():
             if isinstance(value, np.generic):
                 value = value.item()
-            else:
-                value = value
             if name not in OPTIONAL:
                 raise UsageError(f"no label {name!r}", fix=suggest_name(name, OPTIONAL))
-            require_fit(name, value)
+            require_valid_attribute(name, value)
             self._labels[name] = value
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the predictions."""
         import netCDF4
 
-        if self._open:
+        if self._is_open:
             raise UsageError(
                 "the file is being written",
                 where=str(self.path),
                 fix="enter a writer once",
             )
         self._written.clear()
-        self._diverged.fill(NEVER)
+        self._diverged_at.fill(NEVER)
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self.path, option="--output"))
             with self._writing():
                 self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
                 stack.callback(self._abandon)
-                for name, length in zip(
-                    DIMS, (len(self._rows), *self.shape), strict=True
-                ):
-                    self._file.createDimension(name, length)
-                self._create(
-                    "scenario", "scenario", np.array(list(self._rows), np.int32)
-                )
-                self._create(
-                    "frame", "frame", np.array(frames_to_predict(self.size), np.int32)
-                )
-                for name in self._names:
-                    self._create(name)
-                size = self.size
-                head = {"Conventions": "CF-1.11", "lagbench_format": np.int32(FORMAT)}
-                names = {
-                    "split": size.split,
-                    "size": size.name,
-                    "dataset_version": size.version,
-                }
-                self._file.setncatts({**head, **names, "dataset_sha256": self._hash})
+                self._write_headers()
             self._stack = stack.pop_all()
-        self._open = True
+        self._is_open = True
         return self
+
+    def _write_headers(self) -> None:
+        """Create dimensions, coordinates, empty variables and required attributes."""
+        lengths = (len(self._row_of), *self.shape)
+        for name, length in zip(DIMS, lengths, strict=True):
+            self._file.createDimension(name, length)
+
+        self._create_coordinate("scenario", "scenario", list(self._row_of))
+        self._create_coordinate("frame", "frame", frames_to_predict(self.size))
+        for name in self._variables:
+            self._create_variable(name)
+        self._file.setncatts(
+            {
+                "Conventions": "CF-1.11",
+                "lagbench_format": np.int32(FORMAT),
+                "split": self.size.split,
+                "size": self.size.name,
+                "dataset_version": self.size.version,
+                "dataset_sha256": self._dataset_sha256,
+            }
+        )
 
     def add(
         self,
@@ -181,58 +187,73 @@ class PredictionsWriter:
                 finite, or a rollout that is not frozen where ``diverged_at`` says.
             WorkFailedError: the disk is full.
         """
-        if not self._open:
-            fix = "with PredictionsWriter(...) as writer:"
-            raise UsageError("no file is open", where=str(self.path), fix=fix)
-        if scenario not in self._rows or scenario in self._written:
-            if scenario in self._written:
-                what = "is written twice"
-            else:
-                what = "is no test scenario"
-            expected = f"whole numbers: {format_ids(self._rows)}"
-            raise UsageError(f"scenario {scenario!r} {what}", expected=expected)
-        if velocity is None:
-            arrays = [position]
-        else:
-            arrays = [position, velocity]
-        if len(arrays) != len(self._names):
+        if not self._is_open:
+            raise UsageError(
+                "no file is open",
+                where=str(self.path),
+                fix="with PredictionsWriter(...) as writer:",
+            )
+        self._check_scenario(scenario)
+        arrays = {"position": position}
+        if velocity is not None:
+            arrays["velocity"] = velocity
+        if len(arrays) != len(self._variables):
             raise UsageError(
                 "velocities come for every scenario or for none",
                 where=f"scenario {scenario}",
             )
-        checked = [
-            self._checked(n, scenario, held)
-            for n, held in zip(self._names, arrays, strict=True)
-        ]
+        values = {}
+        for name, array in arrays.items():
+            values[name] = self._check_values(name, scenario, array)
+        if diverged_at is not None:
+            self._check_frozen(scenario, values["position"], diverged_at)
+
+        row = self._row_of[scenario]
+        with self._writing():
+            for name, array in values.items():
+                self._file[name][row] = array
+        if diverged_at is not None:
+            self._diverged_at[row] = diverged_at
+        self._written.add(scenario)
+
+    def _check_scenario(self, scenario: int) -> None:
+        """Refuse a scenario that is unknown or written already."""
+        expected = f"whole numbers: {format_ids(self._row_of)}"
+        if scenario in self._written:
+            raise UsageError(
+                f"scenario {scenario!r} is written twice", expected=expected
+            )
+        if scenario not in self._row_of:
+            raise UsageError(
+                f"scenario {scenario!r} is no test scenario", expected=expected
+            )
+
+    def _check_frozen(
+        self, scenario: int, position: NDArray[np.float32], diverged_at: int
+    ) -> None:
+        """Refuse a rollout that moves after the frame from which it is frozen."""
         frames = frames_to_predict(self.size)
         where = f"diverged_at of scenario {scenario}"
-        if diverged_at is not None and diverged_at not in frames:
-            what = "no such frame is predicted"
-            expected = format_ids(frames)
+        if diverged_at not in frames:
             raise UsageError(
-                what, where=where, expected=expected, got=repr(diverged_at)
+                "no such frame is predicted",
+                where=where,
+                expected=format_ids(frames),
+                got=repr(diverged_at),
             )
-        rest = checked[0][
-            len(frames) if diverged_at is None else frames.index(diverged_at) :
-        ]
-        moved = np.flatnonzero((rest != rest[:1]).any(axis=(1, 2)))
-        if moved.size:
+        first_frozen = frames.index(diverged_at)
+        frozen = position[first_frozen:]
+        has_moved = (frozen != frozen[:1]).any(axis=(1, 2))
+        moved_frames = np.flatnonzero(has_moved)
+        if moved_frames.size:
+            first_moved = frames[first_frozen + int(moved_frames[0])]
             raise UsageError(
                 "the rollout moves after it was frozen",
                 where=where,
                 expected=f"the same positions from frame {diverged_at} on",
-                got=f"frame {frames[int(moved[0]) - len(rest)]} differs",
+                got=f"frame {first_moved} differs",
                 fix="freeze a diverging rollout at its last finite frame",
             )
-        row = self._rows[scenario]
-        with self._writing():
-            for name, values in zip(self._names, checked, strict=True):
-                self._file[name][row] = values
-        if diverged_at is None:
-            self._diverged[row] = NEVER
-        else:
-            self._diverged[row] = diverged_at
-        self._written.add(scenario)
 
     def __exit__(
         self,
@@ -241,116 +262,147 @@ class PredictionsWriter:
         trace: TracebackType | None,
     ) -> None:
         """Finish and rename the file, or remove it when the body raised."""
-        self._open = False
+        self._is_open = False
         if error is not None:
             self._stack.__exit__(kind, error, trace)
             return
         with self._stack:
-            if missing := sorted(set(self._rows) - self._written):
-                what = f"{len(missing)} test scenarios are missing"
-                got = f"missing: {format_ids(missing)}"
+            missing = sorted(set(self._row_of) - self._written)
+            if missing:
                 raise UsageError(
-                    what, where=str(self.path), expected=format_ids(self._rows), got=got
+                    f"{len(missing)} test scenarios are missing",
+                    where=str(self.path),
+                    expected=format_ids(self._row_of),
+                    got=f"missing: {format_ids(missing)}",
                 )
             with self._writing():
-                if (self._diverged != NEVER).any():
-                    self._create("diverged_at", "scenario", self._diverged)
+                if (self._diverged_at != NEVER).any():
+                    self._create_coordinate(
+                        "diverged_at", "scenario", self._diverged_at
+                    )
                 self._file.setncatts(self._labels)
                 self._file.close()
 
     def _abandon(self) -> None:
-        """Close a file that goes; that it cannot be written either must not hide the
-        error before.
-        """
+        """Close a file that goes; a second error must not hide the first one."""
         if self._file.isopen():
             with suppress(OSError, RuntimeError):
                 self._file.close()
 
-    def _checked(
+    def _check_values(
         self, name: str, scenario: int, values: ArrayLike
     ) -> NDArray[np.float32]:
+        """Return values as float32; refuse a wrong type, shape or values not finite."""
         where = f"{name} of scenario {scenario}"
-        try:
-            given = np.asanyarray(values)
-            if np.ma.is_masked(given):
-                kind = "masked values"
-            else:
-                kind = f"values of type {given.dtype}"
-        except (
-            ValueError,
-            TypeError,
-            RuntimeError,
-        ) as error:  # ragged lists, tensors with gradients
-            given = np.empty(0, object)
-            kind = f"{type(values).__name__}: {str(error)[:200]}"
-        if given.dtype.kind not in "fiu" or np.ma.is_masked(given):
-            expected = "an array of numbers without a mask"
-            raise UsageError(
-                "these are no positions", where=where, expected=expected, got=kind
-            )
+        numbers = _numbers_of(values, where)
         with np.errstate(over="ignore"):
-            array = np.asarray(given).astype(np.float32)
+            array = numbers.astype(np.float32)
         if array.shape != self.shape:
-            turned = sorted(array.shape) == sorted(self.shape)
-            if turned:
+            fix = None
+            if sorted(array.shape) == sorted(self.shape):
                 fix = "transpose it: frame, particle, space"
-            else:
-                fix = None
-            got = array.shape
             raise UsageError(
                 "the shape is another",
                 where=where,
                 expected=self.shape,
-                got=got,
+                got=array.shape,
                 fix=fix,
             )
-        wrong = np.argwhere(~np.isfinite(array))
-        if len(wrong):
-            frame, particle, axis = wrong[0].tolist()
-            what = f"{len(wrong)} values are not finite as float32"
-            got = array[frame, particle, axis]
-            where += (
-                f", frame {frame + self.size.task.input_frames}, particle {particle}"
+        bad_places = np.argwhere(~np.isfinite(array))
+        if len(bad_places):
+            step, particle, axis = bad_places[0].tolist()
+            frame = self.size.task.input_frames + step
+            raise UsageError(
+                f"{len(bad_places)} values are not finite as float32",
+                where=f"{where}, frame {frame}, particle {particle}",
+                got=array[step, particle, axis],
+                fix="freeze a diverging rollout at its last finite frame and give "
+                "diverged_at",
             )
-            fix = "freeze a diverging rollout at its last finite frame and give diverged_at"
-            raise UsageError(what, where=where, got=got, fix=fix)
         return array
 
-    def _create(
-        self, name: str, dim: str = "", values: NDArray[np.int32] | None = None
+    def _create_coordinate(
+        self, name: str, dim: str, values: Sequence[int] | NDArray[np.int32]
     ) -> None:
-        packing: dict[str, Any] = {"endian": "little", "fill_value": False}
-        if not dim:
-            # Not packed: zlib saves little of digits that hardly repeat, and unpacking
-            # makes scoring slower. Frames are written once, in order: a cache of a MiB
-            # does.
-            packing |= {
-                "fletcher32": True,
-                "chunksizes": (1, 1, *self.shape[1:]),
-                "chunk_cache": 1 << 20,
-            }
         variable = self._file.createVariable(
-            name, "i4" if dim else "f4", (dim,) if dim else DIMS, **packing
+            name, "i4", (dim,), endian="little", fill_value=False
         )
         variable.setncatts(ATTRIBUTES[name])
-        if values is not None:
-            variable[:] = values
+        variable[:] = np.array(values, np.int32)
+
+    def _create_variable(self, name: str) -> None:
+        # Not packed: zlib saves little of digits that hardly repeat, and unpacking
+        # makes scoring slower. Frames are written once, in order: a cache of a MiB
+        # does.
+        variable = self._file.createVariable(
+            name,
+            "f4",
+            DIMS,
+            endian="little",
+            fill_value=False,
+            fletcher32=True,
+            chunksizes=(1, 1, *self.shape[1:]),
+            chunk_cache=CHUNK_CACHE_BYTES,
+        )
+        variable.setncatts(ATTRIBUTES[name])
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         try:
             yield
         except (OSError, RuntimeError) as error:
-            fix = "free disk space, or name a folder that you may write to: --output"
-            what = "cannot write the predictions"
-            where = str(self.path)
-            raise WorkFailedError(what, where=where, got=error, fix=fix) from error
+            raise WorkFailedError(
+                "cannot write the predictions",
+                where=str(self.path),
+                got=error,
+                fix="free disk space, or name a folder that you may write to: --output",
+            ) from error
 
 
-def _bring(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
-    from lagbench.store.copy import (
-        update_working_copy,
-    )  # http and more, which a child that only reads can do without
+def _recorded_hash(size: Size, root: Path) -> str:
+    """Return the recorded hash of a data set.
+
+    Raises:
+        DataError: none is recorded.
+    """
+    _fetch(size, root)
+    recorded = dataset_hash_of(size, root)
+    if recorded is None:
+        raise DataError(
+            "the hash of the data set is not known",
+            where=f"{size.split} {size.name}",
+            expected="a hash in datasets.yaml, or a complete data set here",
+            fix=f"{suggest_repair(size, root=root)}, or give dataset_sha256",
+        )
+    return recorded
+
+
+def _numbers_of(values: ArrayLike, where: str) -> NDArray[Any]:
+    """Return values as an array; refuse what is masked or no number."""
+    try:
+        array = np.asanyarray(values)
+    except (ValueError, TypeError, RuntimeError) as error:
+        # ragged lists, tensors with gradients
+        raise _no_positions(where, f"{type(values).__name__}: {error}") from error
+    if np.ma.is_masked(array):
+        raise _no_positions(where, "masked values")
+    if array.dtype.kind not in "fiu":
+        raise _no_positions(where, f"values of type {array.dtype}")
+    return np.asarray(array)
+
+
+def _no_positions(where: str, got: str) -> UsageError:
+    return UsageError(
+        "these are no positions",
+        where=where,
+        expected="an array of numbers without a mask",
+        got=got[:MAX_REASON],
+    )
+
+
+def _fetch(size: Size, root: Path, scenarios: Sequence[int] = ()) -> None:
+    # Writing without a store needs no network library.
+    from lagbench.store.copy import update_working_copy
 
     update_working_copy(size, root, scenarios)
 
@@ -407,48 +459,53 @@ def write(
         registry=registry,
         **labels,
     )
-    ids = sorted(writer.size.subsets["test"])
-    placed = _by_id(positions, ids)
-    if velocities is None:
-        moving = None
-    else:
-        moving = _by_id(velocities, ids)
-    marks = diverged_at or {}
-    for name, held in (("velocities", moving or {}), ("diverged_at", marks)):
-        if unknown := [scenario for scenario in held if scenario not in ids]:
-            got = ", ".join(map(quoted, unknown[:5]))
-            fix = "name scenarios by id, not by row"
-            raise UsageError(
-                "no such test scenario",
-                where=name,
-                expected=format_ids(ids),
-                got=got,
-                fix=fix,
-            )
+    scenarios = sorted(writer.size.subsets["test"])
+    position_of = _by_scenario(positions, scenarios)
+    velocity_of = {} if velocities is None else _by_scenario(velocities, scenarios)
+    frozen_from = diverged_at or {}
+    _require_test_scenarios("velocities", velocity_of, scenarios)
+    _require_test_scenarios("diverged_at", frozen_from, scenarios)
     with writer:
-        for scenario, values in placed.items():
-            if moving is None:
-                velocity = None
-            else:
-                velocity = moving.get(scenario)
-            writer.add(scenario, values, velocity, diverged_at=marks.get(scenario))
+        for scenario, position in position_of.items():
+            writer.add(
+                scenario,
+                position,
+                velocity_of.get(scenario),
+                diverged_at=frozen_from.get(scenario),
+            )
     return writer.path
 
 
-def _by_id(
-    values: Mapping[int, ArrayLike] | ArrayLike, ids: list[int]
+def _by_scenario(
+    values: Mapping[int, ArrayLike] | ArrayLike, scenarios: list[int]
 ) -> Mapping[int, ArrayLike]:
+    """Return values by scenario id; an array holds scenarios by ascending id."""
     if isinstance(values, Mapping):
         return values
     array = np.asarray(values)
-    if array.ndim != len(DIMS) or len(array) != len(ids):
+    if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
             "the array does not hold one entry per test scenario",
-            expected=f"{len(ids)} scenarios ({format_ids(ids)}) first, 4 dimensions",
+            expected=f"{len(scenarios)} scenarios ({format_ids(scenarios)}) first, "
+            f"{len(DIMS)} dimensions",
             got=f"shape {array.shape}",
             fix="or give a mapping of scenario id to array",
         )
-    return dict(zip(ids, array, strict=True))
+    return dict(zip(scenarios, array, strict=True))
+
+
+def _require_test_scenarios(
+    name: str, values: Mapping[int, object], scenarios: list[int]
+) -> None:
+    unknown = [scenario for scenario in values if scenario not in scenarios]
+    if unknown:
+        raise UsageError(
+            "no such test scenario",
+            where=name,
+            expected=format_ids(scenarios),
+            got=", ".join(map(quote, unknown[:5])),
+            fix="name scenarios by id, not by row",
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -490,38 +547,47 @@ def template(
             recorded hash.
         WorkFailedError: the disk is full or not writable.
     """
-    folder_there = Path(output).is_dir()
-    if folder_there or (Path(output).exists() and not overwrite):
-        if folder_there:
-            what = "the output is a folder"
-        else:
-            what = "there is such a file already"
-        fix = "write elsewhere: -o template.nc" + (
-            "" if folder_there else "; or replace it: --overwrite"
-        )
-        raise UsageError(what, where=str(output), fix=fix)
-    entry, folder, described = locate(split, size, root=root, registry=registry)
-    _bring(entry, folder, entry.subsets["test"])
+    _check_output(Path(output), overwrite=overwrite)
+    entry, folder, splits = locate(split, size, root=root, registry=registry)
+    _fetch(entry, folder, entry.subsets["test"])
     truth = Truth(entry, folder)
     truth.require()
-    ids = tuple(sorted(entry.subsets["test"]))
+    writer = PredictionsWriter(
+        output,
+        split=entry.split,
+        size=entry.name,
+        method="persistence",
+        root=folder,
+        registry=splits,
+    )
+    scenarios = tuple(sorted(entry.subsets["test"]))
+    with writer:
+        for scenario in scenarios:
+            last_given = truth.given_frames(scenario)[-1]
+            writer.add(scenario, np.broadcast_to(last_given, writer.shape))
     frames = frames_to_predict(entry)
-    named: dict[str, Any] = {
-        "split": entry.split,
-        "size": entry.name,
-        "method": "persistence",
-    }
-    with PredictionsWriter(output, **named, root=folder, registry=described) as writer:
-        for scenario in ids:
-            writer.add(
-                scenario, np.broadcast_to(truth.given(scenario)[-1], writer.shape)
-            )
     return TemplateResult(
         path=writer.path,
         split=entry.split,
         size=entry.name,
-        scenarios=ids,
+        scenarios=scenarios,
         frames=(frames[0], frames[-1]),
         particles=entry.particles,
         bytes=writer.path.stat().st_size,
     )
+
+
+def _check_output(output: Path, *, overwrite: bool) -> None:
+    """Refuse a folder, or a file that may not be replaced."""
+    if output.is_dir():
+        raise UsageError(
+            "the output is a folder",
+            where=str(output),
+            fix="write elsewhere: -o template.nc",
+        )
+    if output.exists() and not overwrite:
+        raise UsageError(
+            "there is such a file already",
+            where=str(output),
+            fix="write elsewhere: -o template.nc; or replace it: --overwrite",
+        )

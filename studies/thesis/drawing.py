@@ -66,7 +66,7 @@ class OpenRollouts:
 
         None is the truth. In a given frame a model has the positions of the truth.
         """
-        first_predicted = self.scenario.setting.predicted_frames[0]
+        first_predicted = self.scenario.config.predicted_frames[0]
         if name is None or frame < first_predicted:
             return np.asarray(self.file.read("position", frame), np.float64)
         predictions = self.predictions[name]

@@ -29,8 +29,8 @@ from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.shipped import shipped, shipped_path
 from lagbench.references.table import COUNTING, REFERENCES
-from lagbench.scoring.card import best_floor
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
+from lagbench.scoring.skill import best_reference
 
 from .roster import ROSTER
 
@@ -373,7 +373,7 @@ class SplitResults:
         for name, method in self.methods.items():
             if name in COUNTING and self.ranking in method.scores:
                 scores[name] = method.scores[self.ranking]
-        return best_floor(scores)
+        return best_reference(scores)
 
     def skill(self, name: str) -> float:
         """Return ``1 - score / score of the best naive baseline``.

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from lagbench.data.manifest import read_manifest
 from lagbench.errors import DataError
 from lagbench.figures.tables import Table
-from lagbench.metrics.distributions import kl, normalised
+from lagbench.metrics.distributions import kl, normalise
 from lagbench.metrics.table import METRICS
 
 from .cases import key_frame, scenario_of
@@ -261,7 +261,7 @@ def cubic_errors(truth: Floats, prediction: Floats) -> Mapping[str, float]:
         "mae": float(np.mean(np.abs(residual))),
         "mse": mse,
         "rmse": mse**0.5,
-        "kl": kl(normalised(true), normalised(predicted)),
+        "kl": kl(normalise(true), normalise(predicted)),
         "pearson": correlation,
     }
 

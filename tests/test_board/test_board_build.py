@@ -31,7 +31,7 @@ from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,8 @@ def test_the_truth_is_not_that_of_an_explosion(bench: BoardBench, board: Board) 
     """Maps of truth and prediction share one packing: the tab's truth is the finest."""
     names = ("flipping", "noisy")
     coarse, fine = (
-        read_stored(bench.folder / f"scores/cavity/tiny/{name}.nc") for name in names
+        read_score_file(bench.folder / f"scores/cavity/tiny/{name}.nc")
+        for name in names
     )
     assert coarse.precision > 5.0 * fine.precision
     truth = board.tabs[0].truth.vorticity

@@ -27,7 +27,7 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.references import references_of
-from lagbench.scoring.stored import read_stored
+from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.submission import open_predictions
 
 
@@ -348,7 +348,7 @@ def test_floors_are_added_by_themselves(own: BoardBench, predictions: Path) -> N
     assert set(result.files) >= {folder / first, folder / max(before)}
     assert {path.name for path in folder.iterdir()} == set(before)
     for path in folder.iterdir():
-        assert read_stored(path).scores.identity["method"] == path.stem
+        assert read_score_file(path).scores.identity["method"] == path.stem
     assert well(own)
 
 

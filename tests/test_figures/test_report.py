@@ -418,7 +418,7 @@ def test_models_are_compared_at_the_frame_of_the_thesis(
 def test_pictures_over_time_show_six_predicted_frames(split: str, size: str) -> None:
     """They ascend; the first and the last predicted frame are among them."""
     subject = subject_on(split, size)
-    predicted = subject.task.setting.predicted_frames
+    predicted = subject.task.config.predicted_frames
     assert len(subject.times) == 6
     assert subject.times[0] == predicted[0]
     assert subject.times[-1] == predicted[-1]

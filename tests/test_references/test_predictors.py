@@ -61,8 +61,9 @@ from lagbench.references.train_library import (
     mirrors_of,
     state_library,
 )
-from lagbench.scoring.card import SUBMISSION, best_floor
+from lagbench.scoring.card import SUBMISSION
 from lagbench.scoring.references import measurable
+from lagbench.scoring.skill import best_reference
 
 Floats = NDArray[np.float64]
 
@@ -502,7 +503,7 @@ def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
         assert score.mean > 0.0
         assert floor.correlation.shape == score.values.shape
     assert (
-        best_floor(
+        best_reference(
             {
                 name: scenario[name].scores[ranking]
                 for name in NAIVE.intersection(scenario)

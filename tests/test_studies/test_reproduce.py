@@ -354,7 +354,7 @@ def test_rollouts_show_truth_and_prediction(plan: Plan, cavity: ScoreBench) -> N
         assert np.allclose(scene.displacement, truth[6] - truth[5], atol=0)
         told = pair.truth.scenario
         again = fields(
-            truth[15], truth[15] - truth[14], told.setting.grid, full=told.full
+            truth[15], truth[15] - truth[14], told.config.grid, full=told.full_weight
         )
         assert np.array_equal(
             again.vorticity, pair.truth.fields.vorticity, equal_nan=True

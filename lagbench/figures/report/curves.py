@@ -200,7 +200,7 @@ def _perturbed_run(subject: Subject, name: str) -> list[Series]:
     """Return the error of a perturbed run of the solver, where there is one."""
     if name != POSITION_ERROR:
         return []
-    values = np.asarray(subject.task.twin_floor)
+    values = np.asarray(subject.task.predictability_limit)
     if len(values) != len(subject.frames):
         return []
     return [Series("perturbed run of the solver", "twin", values)]

@@ -86,8 +86,8 @@ _SEQUENTIAL = _build_palette(FAST, FAST)
 
 def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    axis = task.setting.grid.axis
-    slack = WALL_SHARE * task.setting.grid.spacing
+    axis = task.config.grid.axis
+    slack = WALL_SHARE * task.config.grid.spacing
     (left, right), (bottom, top) = task.size.bounds
     is_column_inside = (axis >= left - slack) & (axis <= right + slack)
     is_row_inside = (axis >= bottom - slack) & (axis <= top + slack)

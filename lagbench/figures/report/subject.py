@@ -18,7 +18,7 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.frame import FramePair, Snapshot
 from lagbench.metrics.metric import Metric
-from lagbench.scoring.card import SUBMISSION, ScoreCard, told_apart
+from lagbench.scoring.card import SUBMISSION, ScoreCard, number_methods
 from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.submission.predictions import Predictions, open_predictions
 
@@ -125,7 +125,7 @@ class Subject:
     @property
     def is_full_box(self) -> bool:
         """Whether the material fills the box: no surface, one material."""
-        return self.task.setting.full_box
+        return self.task.config.is_full_box
 
     @property
     def scenarios(self) -> tuple[int, ...]:
@@ -135,7 +135,7 @@ class Subject:
     @property
     def frames(self) -> NDArray[np.int64]:
         """Absolute numbers of the predicted frames, shape [frame]."""
-        return np.array(self.task.setting.predicted_frames)
+        return np.array(self.task.config.predicted_frames)
 
     @property
     def key_frame(self) -> int:
@@ -151,8 +151,8 @@ class Subject:
     @property
     def frames_of_interest(self) -> tuple[int, ...]:
         """Frames of interest, the last predicted one if there are none."""
-        predicted = self.task.setting.predicted_frames
-        frames = set(self.task.setting.frames_of_interest).intersection(predicted)
+        predicted = self.task.config.predicted_frames
+        frames = set(self.task.config.frames_of_interest).intersection(predicted)
         return tuple(sorted(frames)) or (predicted[-1],)
 
     @property
@@ -170,7 +170,7 @@ class Subject:
     @property
     def times(self) -> tuple[int, ...]:
         """Frames of the pictures over time, with the first and last predicted one."""
-        predicted = self.task.setting.predicted_frames
+        predicted = self.task.config.predicted_frames
         if len(self.frames_of_interest) >= TIMES:
             frames = _choose_evenly(self.frames_of_interest, TIMES - 1)
         else:
@@ -220,7 +220,7 @@ def load_subject(
     task = load_scored_task(splits.size(header.split, header.size), folder)
 
     methods = [card.header.method for card in cards]
-    names = told_apart(methods, taken=cards[0].scores)
+    names = number_methods(methods, taken=cards[0].scores)
     entries = []
     for number, name in enumerate(names):
         entry = ReportEntry(
@@ -361,9 +361,9 @@ def _read_pairs(
     true_snapshot = scenario.snapshot(now, before)
     pairs = []
     for file in files:
-        is_first_predicted = frame == scenario.setting.input_frames
+        is_first_predicted = frame == scenario.config.input_frames
         if is_first_predicted:
-            before = scenario.given[-1]
+            before = scenario.input_positions[-1]
             now = file.frames(number, frame, 1)[0]
         else:
             before, now = file.frames(number, frame - 1, 2)

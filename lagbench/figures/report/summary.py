@@ -54,10 +54,10 @@ def draw_head(subject: Subject) -> Markup:
     """Return the top of the page: methods, task and tiles."""
     size = subject.task.size
     header = subject.entries[0].card.header
-    setting = subject.task.setting
+    config = subject.task.config
     intro = (
-        f"Given {setting.input_frames} frames of each of {len(subject.scenarios)} test "
-        f"scenarios, predict the next {setting.horizon}. {subject.title}, "
+        f"Given {config.input_frames} frames of each of {len(subject.scenarios)} test "
+        f"scenarios, predict the next {config.horizon}. {subject.title}, "
         f"{size.particles} particles, data set version {header.dataset_version}."
     )
     brand = f"lagbench · score report · {size.split} {size.name}"
@@ -81,7 +81,7 @@ def _draw_tiles(subject: Subject) -> list[Markup]:
     tiles = []
     if best.entry is not None and best.entry.card.skill is not None:
         skill = best.entry.card.skill
-        note = f"1 - score / score of {skill.floor}"
+        note = f"1 - score / score of {skill.reference}"
         tiles.append(_draw_tile(f"{prefix}skill", skill.value, skill.interval, note))
     ranking_note = _compare_with_references(subject, best)
     title = f"{prefix}{words(ranking)}"

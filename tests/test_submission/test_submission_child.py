@@ -11,7 +11,7 @@ from submission_data import Bench, small
 
 from lagbench.errors import WorkFailedError
 from lagbench.submission import CHECKS, validation
-from lagbench.submission.findings import quoted
+from lagbench.submission.issues import quote
 from lagbench.work.machine import run_in_child
 
 ROOM = {"seconds": 5.0, "wall": 600.0}
@@ -55,11 +55,26 @@ def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("how", "said"),
     [
-        ("burn", "no end within the computing time"),
-        ("fill", "more than 768 MiB"),
-        ("exit", "exit code 0x5"),
-        ("SIGABRT", "crashed: Aborted"),
-        ("SIGSEGV", "crashed: Segmentation fault"),
+        (
+            "burn",
+            "no end within the computing time",
+        ),
+        (
+            "fill",
+            "more than 768 MiB",
+        ),
+        (
+            "exit",
+            "exit code 0x5",
+        ),
+        (
+            "SIGABRT",
+            "crashed: Aborted",
+        ),
+        (
+            "SIGSEGV",
+            "crashed: Segmentation fault",
+        ),
     ],
 )
 def test_what_stops_a_child_leaves_the_answers_before(how: str, said: str) -> None:
@@ -125,14 +140,14 @@ def test_a_stray_module_in_the_current_folder_is_not_run(
 
 def test_text_of_strangers_is_shown_escaped_and_short() -> None:
     """Control characters never reach the terminal."""
-    assert quoted("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
-    assert len(quoted("x" * 10**6)) == 80
-    assert len(quoted([16**5000])) < 80
+    assert quote("\x1b[2J\u202e") == r"'\x1b[2J\u202e'"
+    assert len(quote("x" * 10**6)) == 80
+    assert len(quote([16**5000])) < 80
 
 
 def test_the_document_names_every_check() -> None:
     """docs/predictions.md and the code do not drift apart."""
-    text = (Path(__file__).parents[1] / "docs" / "predictions.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "predictions.md").read_text()
     rows = [line.split("|") for line in text.splitlines() if line.startswith("| `")]
     severities = {"error", "warning", "error, warning"}
     assert [row[1].strip(" `") for row in rows if row[2].strip() in severities] == list(

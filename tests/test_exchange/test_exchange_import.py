@@ -43,13 +43,20 @@ def test_an_export_comes_back(
         "registry": unmeasured,
         "from_walls": bool(walls),
     }
-    export("curl-noise", "tiny", format=name, output=tmp_path / "out", **options)
-    made = import_split(
-        tmp_path / "out", format=name, output=tmp_path / "back", allow_pickle=True
+    export(
+        "curl-noise",
+        "tiny",
+        format=name,
+        output=tmp_path / "out",
+        **options,
     )
+    made = import_split(tmp_path / "out", format=name, output=tmp_path / "back")
     for subset in SUBSETS:
         with lagbench.open_split(
-            "curl-noise", subset=subset, size="tiny", root=generated.root
+            "curl-noise",
+            subset=subset,
+            size="tiny",
+            root=generated.root,
         ) as data:
             np.testing.assert_array_equal(
                 positions(made.folder, subset), data["position"].values
@@ -71,7 +78,7 @@ def test_imported_data_equal_the_source(tmp_path: Path, form: str) -> None:
     gns = form == "gns-npz"
     source = (write_gns if gns else write_h5)(tmp_path / "in", straight_runs(3))
     (source / "force.py").write_text(f"open({str(tmp_path / 'trace')!r}, 'w')")
-    made = import_split(source, format=form, output=tmp_path / "own", allow_pickle=gns)
+    made = import_split(source, format=form, output=tmp_path / "own")
     assert not (tmp_path / "trace").exists()
     read = (read_gns if gns else read_h5)(source / ("train.npz" if gns else "train.h5"))
     np.testing.assert_array_equal(positions(made.folder), [run for run, _ in read])
@@ -85,9 +92,7 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
     """
     hints = {"lagbench": {"horizon": 6, "frames_of_interest": [10]}}
     source = write_gns(tmp_path / "in", straight_runs(3), **hints)
-    kept = import_split(
-        source, format="gns-npz", output=tmp_path / "a", allow_pickle=True
-    )
+    kept = import_split(source, format="gns-npz", output=tmp_path / "a")
     # None says nothing: metadata do
     options: dict[str, Any] = {
         "horizon": 3,
@@ -95,7 +100,10 @@ def test_another_horizon_drops_the_frames_of_the_exported_task(tmp_path: Path) -
         "bounds": None,
     }
     own = import_split(
-        source, format="gns-npz", output=tmp_path / "b", allow_pickle=True, **options
+        source,
+        format="gns-npz",
+        output=tmp_path / "b",
+        **options,
     )
     interest = [
         locate(str(made.folder)).size.task.frames_of_interest for made in (kept, own)
@@ -116,12 +124,14 @@ def test_pickles_of_arrays_are_read(tmp_path: Path, protocol: int) -> None:
         zipfile.ZipFile(source / "train.npz", "w") as archive,
         archive.open("gns_data.npy", "w") as stream,
     ):
-        header = {"descr": "|O", "fortran_order": False, "shape": (2,)}
+        header = {
+            "descr": "|O",
+            "fortran_order": False,
+            "shape": (2,),
+        }
         np.lib.format.write_array_header_1_0(stream, header)
         pickle.dump(joint, stream, protocol=protocol)
-    made = import_split(
-        source, format="gns-npz", output=tmp_path / "own", allow_pickle=True
-    )
+    made = import_split(source, format="gns-npz", output=tmp_path / "own")
     assert made.scenarios["train"] == 2
     np.testing.assert_array_equal(
         positions(made.folder), np.stack(runs[:2]).astype(np.float32)
@@ -140,10 +150,16 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
     named = import_split(
-        source, format="lagrangebench-h5", output=tmp_path / "a", kinds={1: "rope"}
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "a",
+        kinds={1: "rope"},
     )
     dropped = import_split(
-        source, format="lagrangebench-h5", output=tmp_path / "b", kinds={1: "drop"}
+        source,
+        format="lagrangebench-h5",
+        output=tmp_path / "b",
+        kinds={1: "drop"},
     )
     assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
     np.testing.assert_array_equal(
@@ -210,7 +226,5 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
     for subset in SUBSETS:
         (tmp_path / f"{subset}.h5").touch()
     with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
-        import_split(
-            tmp_path, format="gns-npz", output=tmp_path / "own", allow_pickle=True
-        )
+        import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
     assert "--format lagrangebench-h5" in str(caught.value)

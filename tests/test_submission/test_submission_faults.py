@@ -146,7 +146,10 @@ def check_mutation(
 BYTES = given(changes=MUTATIONS, keep=st.just(1.0) | st.floats(0, 1))
 RELAXED = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 FEW = settings(
-    max_examples=15, deadline=None, database=None, suppress_health_check=RELAXED
+    max_examples=15,
+    deadline=None,
+    database=None,
+    suppress_health_check=RELAXED,
 )
 MANY = settings(FEW, max_examples=200)
 test_changed_bytes_never_escape_the_checks = FEW(BYTES(check_mutation))
@@ -158,9 +161,12 @@ test_many_changed_bytes_never_escape_the_checks = pytest.mark.slow(
 @pytest.mark.slow
 def test_the_script_makes_and_recognises_all_of_them(tmp_path: Path) -> None:
     """Every fault in a child process, within time and memory: exit code 0."""
-    script = Path(__file__).parent / "bad_submissions.py"
+    script = Path(__file__).parents[1] / "bad_submissions.py"
     done = subprocess.run(
-        [sys.executable, script, tmp_path], capture_output=True, text=True, check=False
+        [sys.executable, script, tmp_path],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert " 0 not recognised" in done.stdout

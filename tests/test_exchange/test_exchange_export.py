@@ -92,7 +92,11 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
         np.savez(folder / f"{number}.npz", position=run, material=np.arange(40) % 4)
     box = ((0.1, 0.9), (0.1, 0.9))
     return adopt(
-        folder, output=folder / "mixed", radius=0.1, frame_interval=0.1, bounds=box
+        folder,
+        output=folder / "mixed",
+        radius=0.1,
+        frame_interval=0.1,
+        bounds=box,
     )
 
 
@@ -100,7 +104,12 @@ def stored(split: str, root: Path, size: str) -> dict[str, list[np.ndarray]]:
     """Return the stored positions of every scenario, by subset."""
     found = {}
     for subset in SUBSETS:
-        with lagbench.open_split(split, subset=subset, size=size, root=root) as data:
+        with lagbench.open_split(
+            split,
+            subset=subset,
+            size=size,
+            root=root,
+        ) as data:
             frames = data["frame_count"].values
             found[subset] = [
                 data["position"].values[i, :count] for i, count in enumerate(frames)
@@ -137,7 +146,11 @@ def test_positions_are_those_stored(
     # Means and deviations are those computed in one go from the exported train file.
     for name, value in frame_statistics(files["train"]).items():
         np.testing.assert_allclose(
-            metadata[name], value, rtol=2e-8, atol=1e-14, err_msg=name
+            metadata[name],
+            value,
+            rtol=2e-8,
+            atol=1e-14,
+            err_msg=name,
         )
 
 
@@ -182,7 +195,11 @@ def test_lagrangebench_bounds(
     """Cells counted from 0 hold every particle, no bit is lost; a closed box has its
     walls as bounds.
     """
-    flow(format="lagrangebench-h5", output=tmp_path, from_walls=from_walls)
+    flow(
+        format="lagrangebench-h5",
+        output=tmp_path,
+        from_walls=from_walls,
+    )
     metadata = read_metadata(tmp_path)
     bounds = np.array(metadata["bounds"])
     np.testing.assert_allclose(
@@ -205,7 +222,11 @@ def test_walls_at_0_are_the_bounds_too(mixed: LocalSplit, tmp_path: Path) -> Non
     bounds = ((0.0, 0.95), (0.0, 0.95))
     paths = sorted(mixed.folder.parent.glob("[0-9].npz"))
     own = adopt(
-        paths, output=tmp_path / "corner", radius=0.1, frame_interval=0.1, bounds=bounds
+        paths,
+        output=tmp_path / "corner",
+        radius=0.1,
+        frame_interval=0.1,
+        bounds=bounds,
     )
     for from_walls, high in ((True, 0.95), (False, 1.0)):
         folder = tmp_path / f"{from_walls}"
@@ -236,7 +257,17 @@ def test_lagrangebench_layout(flows: dict[str, Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("form", "numbers"), [("gns-npz", [5, 7, 6, 8]), ("lagrangebench-h5", [0, 4, 5, 6])]
+    ("form", "numbers"),
+    [
+        (
+            "gns-npz",
+            [5, 7, 6, 8],
+        ),
+        (
+            "lagrangebench-h5",
+            [0, 4, 5, 6],
+        ),
+    ],
 )
 def test_each_material_has_its_number(
     mixed: LocalSplit, tmp_path: Path, form: str, numbers: list[int]
@@ -274,7 +305,12 @@ def test_an_export_that_breaks_off_is_not_whole(
         pickle, "dump", lambda *_, **__: (_ for _ in ()).throw(OSError(28, "full"))
     )
     with pytest.raises(WorkFailedError):
-        export(str(mixed.folder), format="gns-npz", output=tmp_path, force=True)
+        export(
+            str(mixed.folder),
+            format="gns-npz",
+            output=tmp_path,
+            force=True,
+        )
     assert not (tmp_path / "metadata.json").exists()
     assert not list(tmp_path.glob(".*"))
 
@@ -294,7 +330,12 @@ def test_the_same_data_give_the_same_bytes(
     ]
     with pytest.raises(UsageError, match="files of that name"):
         export(str(mixed.folder), format=form, output=tmp_path / "a")
-    export(str(mixed.folder), format=form, output=tmp_path / "a", force=True)
+    export(
+        str(mixed.folder),
+        format=form,
+        output=tmp_path / "a",
+        force=True,
+    )
 
 
 class _Names(pickle.Unpickler):
@@ -331,12 +372,22 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
         folder / "runs.npy", np.stack(straight_runs(12, frames=40, particles=5_000))
     )
     return adopt(
-        folder / "runs.npy", output=folder / "big", radius=0.02, frame_interval=0.1
+        folder / "runs.npy",
+        output=folder / "big",
+        radius=0.02,
+        frame_interval=0.1,
     )
 
 
 @pytest.mark.parametrize(
-    ("form", "most"), [("gns-npz", 4.5e6), ("lagrangebench-h5", 1.5e6)]
+    ("form", "most"),
+    [
+        ("gns-npz", 4.5e6),
+        (
+            "lagrangebench-h5",
+            1.5e6,
+        ),
+    ],
 )
 def test_memory_is_a_trajectory_or_a_few_frames(
     mixed: LocalSplit, big: LocalSplit, tmp_path: Path, form: str, most: float
@@ -368,12 +419,23 @@ def lid(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
         "full_box": True,
     }
     return adopt(
-        folder, output=folder / "lid", bounds=((0.1, 0.9), (0.1, 0.9)), **options
+        folder,
+        output=folder / "lid",
+        bounds=((0.1, 0.9), (0.1, 0.9)),
+        **options,
     )
 
 
 @pytest.mark.parametrize(
-    ("form", "still", "moving"), [("gns-npz", 3, 3), ("lagrangebench-h5", 1, 2)]
+    ("form", "still", "moving"),
+    [
+        ("gns-npz", 3, 3),
+        (
+            "lagrangebench-h5",
+            1,
+            2,
+        ),
+    ],
 )
 def test_readers_see_the_lid_move(
     lid: LocalSplit, tmp_path: Path, form: str, still: int, moving: int
@@ -381,7 +443,12 @@ def test_readers_see_the_lid_move(
     """Differences of lid particles are the wall's velocity, but for the one that comes
     in again.
     """
-    export(str(lid.folder), format=form, output=tmp_path / "out", wall_particles=True)
+    export(
+        str(lid.folder),
+        format=form,
+        output=tmp_path / "out",
+        wall_particles=True,
+    )
     metadata = read_metadata(tmp_path / "out")
     truth = stored("lid", lid.folder.parent, "full")
     raw, kinds = files_of(tmp_path / "out")["test"][0]
@@ -410,9 +477,7 @@ def test_readers_see_the_lid_move(
     if form == "lagrangebench-h5":
         assert ((raw >= 0) & (raw < np.array(metadata["bounds"])[:, 1])).all()
     # An import of our own export leaves them out: they are no material.
-    back = import_split(
-        tmp_path / "out", format=form, output=tmp_path / "back", allow_pickle=True
-    )
+    back = import_split(tmp_path / "out", format=form, output=tmp_path / "back")
     assert back.particles == (40, 40)
     came = stored("back", tmp_path, "full")
     np.testing.assert_allclose(came["train"][0], truth["train"][0], atol=1e-7)
@@ -420,7 +485,11 @@ def test_readers_see_the_lid_move(
 
 def test_walls_at_rest_are_solid(flow: Callable[..., object], tmp_path: Path) -> None:
     """A simulated box with slip walls gets particles of the kind that does not move."""
-    flow(format="lagrangebench-h5", output=tmp_path, wall_particles=True)
+    flow(
+        format="lagrangebench-h5",
+        output=tmp_path,
+        wall_particles=True,
+    )
     position, kinds = read_h5(tmp_path / "test.h5")[0]
     assert {*kinds[506:].tolist()} == {1}
     assert (position[:, 506:] == position[0, 506:]).all()
@@ -437,7 +506,12 @@ def test_wall_particles_need_walls(
         (lid, "gns-npz", {"from_walls": True}),
     ):
         with pytest.raises(UsageError):
-            export(str(made.folder), format=form, output=tmp_path, **options)
+            export(
+                str(made.folder),
+                format=form,
+                output=tmp_path,
+                **options,
+            )
 
 
 def test_a_program_beside_the_data_is_refused(
@@ -447,7 +521,10 @@ def test_a_program_beside_the_data_is_refused(
     (tmp_path / "force.py").write_text("raise SystemExit")
     with pytest.raises(UsageError, match="a program that readers"):
         export(
-            str(mixed.folder), format="lagrangebench-h5", output=tmp_path, force=True
+            str(mixed.folder),
+            format="lagrangebench-h5",
+            output=tmp_path,
+            force=True,
         )
     assert [path.name for path in tmp_path.iterdir()] == ["force.py"]
 
@@ -458,7 +535,10 @@ def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     """
     np.save(tmp_path / "runs.npy", np.stack(straight_runs(4)))
     made = adopt(
-        tmp_path / "runs.npy", output=tmp_path / "own", radius=0.1, frame_interval=0.1
+        tmp_path / "runs.npy",
+        output=tmp_path / "own",
+        radius=0.1,
+        frame_interval=0.1,
     )
     train = made.folder / "full" / "v1" / "train"
     (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())

@@ -136,7 +136,11 @@ def test_without_a_recorded_hash_one_must_be_given(
     with pytest.raises(DataError, match="hash of the data set is not known"):
         write(tmp_path / "p.nc", zeros, root=tmp_path, **more)
     path = write(
-        tmp_path / "p.nc", zeros, root=tmp_path, dataset_sha256="ab" * 32, **more
+        tmp_path / "p.nc",
+        zeros,
+        root=tmp_path,
+        dataset_sha256="ab" * 32,
+        **more,
     )
     with open_predictions(path) as predictions:
         assert predictions.header.dataset_sha256 == "ab" * 32
@@ -151,11 +155,31 @@ def _nan(values: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("values", "labels", "message"),
     [
-        ({3: truth(3), 4: truth(4)}, {}, "missing: 5"),
-        ({**{i: truth(i) for i in TESTS}, 9: truth(3)}, {}, "no test scenario"),
-        ({i: truth(i)[:5] for i in TESTS}, {}, "shape"),
-        ({i: truth(i).swapaxes(1, 2) for i in TESTS}, {}, "shape"),
-        ({i: _nan(truth(i)) for i in TESTS}, {}, "frame 5, particle 5"),
+        (
+            {3: truth(3), 4: truth(4)},
+            {},
+            "missing: 5",
+        ),
+        (
+            {**{i: truth(i) for i in TESTS}, 9: truth(3)},
+            {},
+            "no test scenario",
+        ),
+        (
+            {i: truth(i)[:5] for i in TESTS},
+            {},
+            "shape",
+        ),
+        (
+            {i: truth(i).swapaxes(1, 2) for i in TESTS},
+            {},
+            "shape",
+        ),
+        (
+            {i: _nan(truth(i)) for i in TESTS},
+            {},
+            "frame 5, particle 5",
+        ),
         (
             {i: truth(i).astype("f8") * 1e300 for i in TESTS},
             {},
@@ -165,33 +189,69 @@ def _nan(values: np.ndarray) -> np.ndarray:
             (np.zeros(shape), {}, "one entry per test scenario")
             for shape in ((2, *SHAPE), SHAPE)
         ),
-        ({}, {"sed": 3}, "did you mean 'seed'"),
+        (
+            {},
+            {"sed": 3},
+            "did you mean 'seed'",
+        ),
         *(({}, {"seed": odd}, "an integer") for odd in ("three", True, 2**70)),
-        ({}, {"parameters": -5}, "an integer >= 0"),
+        (
+            {},
+            {"parameters": -5},
+            "an integer >= 0",
+        ),
         *(
             ({}, {"seconds_per_frame": odd}, "positive")
             for odd in (10**400, -1, float("inf"))
         ),
         *(({}, {"device": odd}, "text") for odd in ("\udcff", "a\0b")),
-        ({}, {"training": "x" * 70_000}, "text"),
+        (
+            {},
+            {"training": "x" * 70_000},
+            "text",
+        ),
         *(
             ({}, {"method": name}, "printable text")
             for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)
         ),
         *(({}, {"dataset_sha256": held}, "64 hex digits") for held in ("zz", "", 5)),
         # no arrays of numbers: nothing is dropped in silence
-        (RIGHT | {3: np.ma.masked_less(truth(3), 0.5)}, {}, "no positions"),
+        (
+            RIGHT | {3: np.ma.masked_less(truth(3), 0.5)},
+            {},
+            "no positions",
+        ),
         *(
             (RIGHT | {3: truth(3).astype(kind)}, {}, "no positions")
             for kind in (complex, str)
         ),
-        (RIGHT | {3: [truth(3)[0], truth(3)[0, :2]]}, {}, "no positions"),
-        (RIGHT | {3: torch.ones(SHAPE, requires_grad=True)}, {}, "no positions"),
+        (
+            RIGHT | {3: [truth(3)[0], truth(3)[0, :2]]},
+            {},
+            "no positions",
+        ),
+        (
+            RIGHT | {3: torch.ones(SHAPE, requires_grad=True)},
+            {},
+            "no positions",
+        ),
         # rows instead of ids
-        (RIGHT, {"diverged_at": {0: 10}}, "by id"),
-        (RIGHT, {"velocities": RIGHT | {0: RIGHT[3]}}, "by id"),
+        (
+            RIGHT,
+            {"diverged_at": {0: 10}},
+            "by id",
+        ),
+        (
+            RIGHT,
+            {"velocities": RIGHT | {0: RIGHT[3]}},
+            "by id",
+        ),
         # a mark before motion that goes on, beyond the horizon, or in the given frames
-        (RIGHT, {"diverged_at": {4: 7}}, "frame 8 differs"),
+        (
+            RIGHT,
+            {"diverged_at": {4: 7}},
+            "frame 8 differs",
+        ),
         *(
             (RIGHT, {"diverged_at": {4: mark}}, "no such frame")
             for mark in (100_000, GIVEN - 1, -5)
@@ -257,7 +317,9 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         with pytest.raises(UsageError, match="written twice"):
             writer.add(3, truth(3))
         writer.label(
-            seconds_per_frame=np.float32(0.5), seed=np.int64(2), device="one core"
+            seconds_per_frame=np.float32(0.5),
+            seed=np.int64(2),
+            device="one core",
         )
     with open_predictions(path) as predictions:
         header = predictions.header
@@ -388,7 +450,11 @@ def test_the_content_hash_is_that_of_the_document(bench: Bench) -> None:
         return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
 
     values = np.stack([truth(i) for i in TESTS]).astype("<f4")
-    header = {"dims": list(DIMS), "dtype": "float32", "name": "position"}
+    header = {
+        "dims": list(DIMS),
+        "dtype": "float32",
+        "name": "position",
+    }
     variable = hashlib.sha256(
         spelt({**header, "shape": list(values.shape)}) + b"\n" + values.tobytes()
     )
@@ -418,8 +484,17 @@ def test_blocks_cover_a_scenario_in_order_and_in_bounded_memory(tmp_path: Path) 
     values = np.broadcast_to(
         np.arange(frames, dtype="f4")[:, None, None], (1, frames, particles, 2)
     )
-    named = {"lagbench_format": 1, "split": "a", "size": "b", "method": "c"}
-    attributes = {**named, "dataset_version": "1.0.0", "dataset_sha256": "d"}
+    named = {
+        "lagbench_format": 1,
+        "split": "a",
+        "size": "b",
+        "method": "c",
+    }
+    attributes = {
+        **named,
+        "dataset_version": "1.0.0",
+        "dataset_sha256": "d",
+    }
     coordinates = {"scenario": [1], "frame": np.arange(2, 2 + frames)}
     whole = xr.Dataset({"position": (DIMS, values)}, coordinates, attributes)
     whole.to_netcdf(path, encoding={"position": {"chunksizes": (1, 1, particles, 2)}})

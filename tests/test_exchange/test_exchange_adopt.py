@@ -28,9 +28,9 @@ from lagbench.errors import (
     WorkFailedError,
 )
 from lagbench.exchange import adopt, import_split, local_split
-from lagbench.exchange.adoption import _by_subset
+from lagbench.exchange.adoption import _divide_into_subsets
 from lagbench.exchange.local_split import LocalSplit
-from lagbench.exchange.trajectory import Measure, estimate_spacing
+from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
 from lagbench.work.progress import Progress
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
@@ -47,10 +47,10 @@ def save_runs(folder: Path, runs: Runs) -> list[Path]:
     return paths
 
 
-def adopted(folder: Path, runs: Runs, **wishes: Any) -> LocalSplit:
+def adopted(folder: Path, runs: Runs, **options: Any) -> LocalSplit:
     """Adopt each trajectory from a file of its own."""
     return adopt(
-        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **wishes}
+        save_runs(folder / "in", runs), output=folder / "mine", **{**BASIC, **options}
     )
 
 
@@ -99,7 +99,11 @@ def test_hashes_follow_from_the_files(own: LocalSplit) -> None:
     """
     size, root, _ = locate(str(own.folder))
     content = {i: check_scenario(size.path(root, i)) for i in range(6)}
-    parts = {"train": range(4), "valid": [4], "test": [5]}
+    parts = {
+        "train": range(4),
+        "valid": [4],
+        "test": [5],
+    }
     subsets = {
         name: subset_hash({i: content[i] for i in ids}) for name, ids in parts.items()
     }
@@ -134,7 +138,10 @@ def test_a_local_split_is_verified_templated_and_scored(
     target = tmp_path / "predictions.nc"
     lagbench.template(path, output=target)
     card = lagbench.score(
-        target, root=own.folder.parent, output_dir=tmp_path, workers=1
+        target,
+        root=own.folder.parent,
+        output_dir=tmp_path,
+        workers=1,
     )
     floor = card.scores["constant-velocity"]["position_rmse"]
     assert np.max(floor.per_frame) < 1e-5
@@ -170,13 +177,17 @@ def test_ten_comes_after_two(tmp_path: Path) -> None:
     for name in names:
         (tmp_path / name).write_bytes(b"1")
     given = [tmp_path / name for name in names]
-    wanted = {"train": ["run0", "run1", "run2"], "valid": ["run10"], "test": ["run11"]}
+    wanted = {
+        "train": ["run0", "run1", "run2"],
+        "valid": ["run10"],
+        "test": ["run11"],
+    }
     for paths in (given, [tmp_path]):
-        found = _by_subset(paths, valid=1, test=1)
+        found = _divide_into_subsets(paths, valid=1, test=1)
         assert {
             subset: [path.stem for path, _ in rows] for subset, rows in found.items()
         } == wanted
-    found = _by_subset(given[::-1], valid=1, test=1)
+    found = _divide_into_subsets(given[::-1], valid=1, test=1)
     assert [path.stem for path, _ in found["test"]] == ["run0"]
 
 
@@ -197,7 +208,12 @@ def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
         "wall_velocity": np.array([[0, 0], [0, 0], [0, 0], [0.5, 0]]),
     }
     for number, run in enumerate(runs[:3]):
-        np.savez(tmp_path / f"{number}.npz", position=run, velocity=-run, **named)
+        np.savez(
+            tmp_path / f"{number}.npz",
+            position=run,
+            velocity=-run,
+            **named,
+        )
     made = adopt(
         [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
     )
@@ -227,7 +243,11 @@ def test_netcdf(tmp_path: Path, runs: Runs) -> None:
         with netCDF4.Dataset(tmp_path / "in" / subset / "a.nc", "w") as file:
             variable(file, runs[0].shape, "f8")[:] = runs[number] + 1e-9
     made = adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
-    assert made.scenarios == {"train": 1, "valid": 1, "test": 1}
+    assert made.scenarios == {
+        "train": 1,
+        "valid": 1,
+        "test": 1,
+    }
     wanted = (runs[2].astype(np.float64) + 1e-9).astype(np.float32)
     np.testing.assert_array_equal(stored(made, 2, "position"), wanted)
 
@@ -264,7 +284,15 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     scenario.
     """
     shapes = [(12, 40), (20, 30), (15, 25), (30, 40), (18, 40)]
-    ragged = [straight_runs(1, frames=f, particles=p, seed=f)[0] for f, p in shapes]
+    ragged = [
+        straight_runs(
+            1,
+            frames=f,
+            particles=p,
+            seed=f,
+        )[0]
+        for f, p in shapes
+    ]
     made = adopted(tmp_path, ragged, test=2)
     assert (made.horizon, made.particles) == (12, (25, 40))
     with lagbench.open_split(str(made.folder), subset="train") as data:
@@ -290,7 +318,11 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
     """A box of 3 is divided by 4: times 4, every position is the source's."""
     wide = straight_runs(3, box=3.0)
     made = adopted(
-        tmp_path, wide, radius=0.3, bounds=((0.0, 3.0), (0.0, 3.0)), rescale=True
+        tmp_path,
+        wide,
+        radius=0.3,
+        bounds=((0.0, 3.0), (0.0, 3.0)),
+        rescale=True,
     )
     size = locate(str(made.folder)).size
     assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (
@@ -304,19 +336,37 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("bounds", "scale", "corner"),
     [
-        (((0.0, 1.0), (0.0, 0.5)), 1.0, (0.0, 0.0)),
-        (((0.1, 5.3), (0.0, 2.0)), 8.0, (0.0, 0.0)),
-        (((-1.0, 1.0), (0.0, 3.0)), 4.0, (-1.0, 0.0)),
-        (((7.0, 7.5), (7.0, 7.25)), 8.0, (0.0, 0.0)),
+        (
+            ((0.0, 1.0), (0.0, 0.5)),
+            1.0,
+            (0.0, 0.0),
+        ),
+        (
+            ((0.1, 5.3), (0.0, 2.0)),
+            8.0,
+            (0.0, 0.0),
+        ),
+        (
+            ((-1.0, 1.0), (0.0, 3.0)),
+            4.0,
+            (-1.0, 0.0),
+        ),
+        (
+            ((7.0, 7.5), (7.0, 7.25)),
+            8.0,
+            (0.0, 0.0),
+        ),
     ],
 )
-def test_measures_hold_the_box(
+def test_a_fitted_box_lies_in_the_unit_box(
     bounds: Any, scale: float, corner: tuple[float, float]
 ) -> None:
     """Scale and corner are the least that bring a box into the unit box."""
-    measure = Measure.fitting(bounds)
-    assert (measure.scale, measure.corner) == (scale, corner)
-    assert all(0.0 <= value <= 1.0 for pair in measure.box(bounds) for value in pair)
+    transform = BoxTransform.fit(bounds)
+    assert (transform.scale, transform.corner) == (scale, corner)
+    box = np.array(transform.transform_box(bounds))
+    assert box.min() >= 0.0
+    assert box.max() <= 1.0
 
 
 def test_the_spacing_of_a_lattice_is_found() -> None:
@@ -341,6 +391,7 @@ BROKEN: dict[
         DataError,
         "3 components",
     ),
+    "transposed": (lambda run: run.swapaxes(1, 2), DataError, "40 components"),
     "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
     "single": (lambda run: run[:1], DataError, "too little"),
     "missing": (lambda run: holed(run, 3, np.nan), DataError, "not finite"),
@@ -374,19 +425,55 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"radius": None}, "the radius is not known"),
-        ({"radius": -1.0}, "not a number above 0"),
-        ({"horizon": 7}, "too short for the task"),
+        (
+            {"radius": None},
+            "the radius is not known",
+        ),
+        (
+            {"radius": -1.0},
+            "not a number above 0",
+        ),
+        (
+            {"horizon": 7},
+            "too short for the task",
+        ),
         *(({"horizon": count}, "where: --horizon") for count in (0, -1)),
-        ({"input_frames": 1}, "where: --input-frames"),
-        ({"input_frames": 12}, "too short for the task"),
-        ({"test": 3, "valid": 3}, "each subset needs a trajectory"),
-        ({"rescale": True}, "fit the unit box"),
-        ({"bounds": ((1.0, 0.0), (0.0, 1.0))}, "low to high"),
-        ({"bounds": ((0.0, 0.3), (0.0, 1.0))}, "outside the stated bounds"),
-        ({"output": "My Data"}, "--output my-data"),
-        ({"output": "cavity"}, "one of the splits of lagbench"),
-        ({"output": "in"}, "there already"),
+        (
+            {"input_frames": 1},
+            "where: --input-frames",
+        ),
+        (
+            {"input_frames": 12},
+            "too short for the task",
+        ),
+        (
+            {"test": 3, "valid": 3},
+            "each subset needs a trajectory",
+        ),
+        (
+            {"rescale": True},
+            "where: --rescale",
+        ),
+        (
+            {"bounds": ((1.0, 0.0), (0.0, 1.0))},
+            "low to high",
+        ),
+        (
+            {"bounds": ((0.0, 0.3), (0.0, 1.0))},
+            "outside the stated bounds",
+        ),
+        (
+            {"output": "My Data"},
+            "--output my-data",
+        ),
+        (
+            {"output": "cavity"},
+            "one of the splits of lagbench",
+        ),
+        (
+            {"output": "in"},
+            "there already",
+        ),
     ],
 )
 def test_what_a_user_says_is_checked(
@@ -394,7 +481,11 @@ def test_what_a_user_says_is_checked(
 ) -> None:
     """Wrong options are usage errors that name the option, and no folder is made."""
     paths = save_runs(tmp_path / "in", straight_runs(4))
-    options = {"output": "mine", **BASIC, **changes}
+    options = {
+        "output": "mine",
+        **BASIC,
+        **changes,
+    }
     with pytest.raises(UsageError, match=words):
         adopt(paths, **{**options, "output": tmp_path / options["output"]})
     assert [path.name for path in tmp_path.iterdir()] == ["in"]
@@ -470,19 +561,55 @@ def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
 @pytest.mark.parametrize(
     ("wish", "key"),
     [
-        ({"radius": "far"}, "radius"),
-        ({"density": [1.0]}, "density"),
-        ({"cells": 16.5}, "cells"),
-        ({"horizon": "all"}, "horizon"),
-        ({"horizon": np.array([5])}, "horizon"),
-        ({"horizon": 10**5000}, "horizon"),
-        ({"frames_of_interest": 8}, "frames_of_interest"),
-        ({"frames_of_interest": [10**5000]}, "frames_of_interest.0"),
+        (
+            {"radius": "far"},
+            "radius",
+        ),
+        (
+            {"density": [1.0]},
+            "density",
+        ),
+        (
+            {"cells": 16.5},
+            "cells",
+        ),
+        (
+            {"horizon": "all"},
+            "horizon",
+        ),
+        (
+            {"horizon": np.array([5])},
+            "horizon",
+        ),
+        (
+            {"horizon": 10**5000},
+            "horizon",
+        ),
+        (
+            {"frames_of_interest": 8},
+            "frames_of_interest",
+        ),
+        (
+            {"frames_of_interest": [10**5000]},
+            "frames_of_interest.0",
+        ),
         ({"title": 3}, "title"),
-        ({"title": 10**5000}, "title"),
-        ({"bounds": ((0.0, 1.0),) * 3}, "bounds"),
-        ({"bounds": 1.0}, "bounds"),
-        ({"raduis": 0.1}, "raduis"),
+        (
+            {"title": 10**5000},
+            "title",
+        ),
+        (
+            {"bounds": ((0.0, 1.0),) * 3},
+            "bounds",
+        ),
+        (
+            {"bounds": 1.0},
+            "bounds",
+        ),
+        (
+            {"raduis": 0.1},
+            "raduis",
+        ),
     ],
 )
 def test_a_value_that_does_not_fit_names_its_key(
@@ -493,7 +620,10 @@ def test_a_value_that_does_not_fit_names_its_key(
         adopt(tmp_path / "none", output=tmp_path / "mine", **{**BASIC, **wish})
     with pytest.raises(UsageError) as imported:
         import_split(
-            tmp_path / "none", format="gns-npz", output=tmp_path / "mine", **wish
+            tmp_path / "none",
+            format="gns-npz",
+            output=tmp_path / "mine",
+            **wish,
         )
     assert adopted.value.where == imported.value.where == key
     assert not list(tmp_path.iterdir())

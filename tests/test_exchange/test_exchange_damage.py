@@ -45,17 +45,20 @@ def h5(tmp_path: Path) -> Path:
 def imported(source: Path) -> LocalSplit:
     """Import from the folder of a fixture."""
     form = "gns-npz" if list(source.glob("*.npz")) else "lagrangebench-h5"
-    return import_split(
-        source, format=form, output=source.parent / "own", allow_pickle=True
-    )
+    return import_split(source, format=form, output=source.parent / "own")
 
 
-def adopted(bad: Path, **wishes: Any) -> LocalSplit:
+def adopted(bad: Path, **options: Any) -> LocalSplit:
     """Adopt a file and, before it, two sound ones."""
     for number, run in enumerate(straight_runs(2)):
         np.save(bad.parent / f"{number}.npy", run)
     files = [*sorted(bad.parent.glob("?.npy")), bad]
-    return adopt(files, output=bad.parent / "own", **BASIC, **wishes)
+    return adopt(
+        files,
+        output=bad.parent / "own",
+        **BASIC,
+        **options,
+    )
 
 
 def save_parts(folder: Path, *parts: Any) -> None:
@@ -82,7 +85,11 @@ def array_file(
             )
             member = "simulation_0.npy" if kind == "|O" else "position.npy"
             stream = stack.enter_context(archive.open(member, "w"))
-        header = {"descr": kind, "fortran_order": False, "shape": shape}
+        header = {
+            "descr": kind,
+            "fortran_order": False,
+            "shape": shape,
+        }
         np.lib.format.write_array_header_1_0(stream, header)
         yield stream
 
@@ -108,27 +115,17 @@ class _Reduced:
         return self.reduced
 
 
-@pytest.mark.parametrize("allow", [False, True])
-def test_a_malicious_pickle_is_never_run(
-    gns: Path, tmp_path: Path, allow: bool
-) -> None:
-    """A pickle that calls anything but NumPy's constructors is refused even when
-    pickles are allowed.
-
-    Where they are not, nothing of gns-npz is read, and the message names the flag.
-    """
-    save_parts(gns, _Reduced(Path.write_text, (tmp_path / "trace", "run")))
-    with pytest.raises(LagbenchError) as caught:
-        import_split(gns, format="gns-npz", output=tmp_path / "own", allow_pickle=allow)
-    assert not (tmp_path / "trace").exists()
-    assert isinstance(caught.value, UnreadableFileError if allow else UsageError)
-    assert ("wants to call" if allow else "--allow-pickle") in str(caught.value)
-    assert not (tmp_path / "own").exists()
-    with np.load(
-        gns / "train.npz", allow_pickle=True
-    ) as file:  # numpy's own reader does run it
+def test_a_malicious_pickle_is_never_run(gns: Path, tmp_path: Path) -> None:
+    """A pickle that calls anything but NumPy's constructors is refused."""
+    trace = tmp_path / "trace"
+    save_parts(gns, _Reduced(Path.write_text, (trace, "run")))
+    with refused(tmp_path, "simulation_0"):
+        imported(gns)
+    assert not trace.exists()
+    # NumPy's own reader does run it.
+    with np.load(gns / "train.npz", allow_pickle=True) as file:
         file["simulation_0"]
-    assert (tmp_path / "trace").exists()
+    assert trace.exists()
 
 
 ADDRESSES = b"A" * 16
@@ -149,8 +146,14 @@ MANY = [np.zeros(1)] * 4
             _Reduced(np.float64(0).__reduce__()[0], (OBJECTS, ADDRESSES[:8])),
             "wants to call",
         ),
-        (_Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))), "make an array by itself"),
-        (_Reduced(codecs.encode, ("x", "punycode")), "wants to call"),
+        (
+            _Reduced(np.ndarray, ((1 << 45,), np.dtype("f8"))),
+            "make an array by itself",
+        ),
+        (
+            _Reduced(codecs.encode, ("x", "punycode")),
+            "wants to call",
+        ),
         ("text", "holds a str"),
         (MANY, "holds a list"),
     ],
@@ -220,7 +223,7 @@ def test_an_npz_file_that_unpacks_to_far_more_is_refused(
     gns: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A member of 8 MB of zeros in some 30 kB."""
-    monkeypatch.setattr(trajectory, "HARMLESS", 1 << 20)
+    monkeypatch.setattr(trajectory, "HARMLESS_BYTES", 1 << 20)
     with array_file(gns / "train.npz", (2,), "|O") as stream:
         stream.write(bytes(1 << 23))
     with pytest.raises(UnreadableFileError, match="far more than it holds"):
@@ -233,10 +236,16 @@ def test_an_empty_hdf5_file_of_many_particles_is_refused(
     """Arrays of 10^11 particles without a chunk."""
     with h5py.File(h5 / "train.h5", "w") as file:
         file.create_dataset(
-            "00000/position", shape=(12, 10**11, 2), dtype="f4", chunks=(1, 1000, 2)
+            "00000/position",
+            shape=(12, 10**11, 2),
+            dtype="f4",
+            chunks=(1, 1000, 2),
         )
         file.create_dataset(
-            "00000/particle_type", shape=(10**11,), dtype="i8", chunks=(1000,)
+            "00000/particle_type",
+            shape=(10**11,),
+            dtype="i8",
+            chunks=(1000,),
         )
     with refused(tmp_path, "00000/"):
         imported(h5)
@@ -265,11 +274,26 @@ def test_damaged_bytes_of_hdf5_are_told(h5: Path, place: int) -> None:
             {"lagbench": {"frames_of_interest": [-1]}},
             "frame of interest is not predicted",
         ),
-        ({"lagbench": {"cells": 10**9}}, "--cells"),
-        ({"bounds": [[-1e308, 1e308], [0, 1]]}, "--bounds"),
-        ({"default_connectivity_radius": 1e300}, "--radius"),
-        ({"default_connectivity_radius": 1e-20}, "have no neighbours"),
-        ({"dt": 1e-320}, "--frame-interval"),
+        (
+            {"lagbench": {"cells": 10**9}},
+            "--cells",
+        ),
+        (
+            {"bounds": [[-1e308, 1e308], [0, 1]]},
+            "--bounds",
+        ),
+        (
+            {"default_connectivity_radius": 1e300},
+            "--radius",
+        ),
+        (
+            {"default_connectivity_radius": 1e-20},
+            "have no neighbours",
+        ),
+        (
+            {"dt": 1e-320},
+            "--frame-interval",
+        ),
     ],
 )
 def test_numbers_that_do_not_compute(
@@ -286,18 +310,66 @@ def test_numbers_that_do_not_compute(
 @pytest.mark.parametrize(
     ("fault", "error", "words"),
     [
-        ("no metadata", UnreadableFileError, "cannot read the metadata"),
-        ("no json", UnreadableFileError, "cannot read the metadata"),
-        ("no radius", UnreadableFileError, "key default_connectivity_radius"),
-        ("array for a group", UnreadableFileError, "no trajectory"),
-        ("nothing in an array", UnreadableFileError, "no values"),
-        ("3D", UnreadableFileError, "not plane"),
-        ("no test", UnreadableFileError, "files are missing"),
-        ("half a file", UnreadableFileError, "cannot read the file"),
-        ("no positions", UnreadableFileError, "no trajectory"),
-        ("too few kinds", UnreadableFileError, "no kinds of particles"),
-        ("empty", DataError, "a subset is empty"),
-        ("no time", UsageError, "no time between frames"),
+        (
+            "no metadata",
+            UnreadableFileError,
+            "cannot read the metadata",
+        ),
+        (
+            "no json",
+            UnreadableFileError,
+            "cannot read the metadata",
+        ),
+        (
+            "no radius",
+            UnreadableFileError,
+            "key default_connectivity_radius",
+        ),
+        (
+            "array for a group",
+            UnreadableFileError,
+            "no trajectory",
+        ),
+        (
+            "nothing in an array",
+            UnreadableFileError,
+            "no values",
+        ),
+        (
+            "3D",
+            UnreadableFileError,
+            "not plane",
+        ),
+        (
+            "no test",
+            UnreadableFileError,
+            "files are missing",
+        ),
+        (
+            "half a file",
+            UnreadableFileError,
+            "cannot read the file",
+        ),
+        (
+            "no positions",
+            UnreadableFileError,
+            "no trajectory",
+        ),
+        (
+            "too few kinds",
+            UnreadableFileError,
+            "no kinds of particles",
+        ),
+        (
+            "empty",
+            DataError,
+            "a subset is empty",
+        ),
+        (
+            "no time",
+            UsageError,
+            "no time between frames",
+        ),
     ],
 )
 def test_damaged_sources_leave_nothing(
@@ -457,7 +529,11 @@ def test_every_netcdf_format_is_adopted(tmp_path: Path, form: Any) -> None:
                 ["x", "y"], object
             )
             file.createGroup("more").createVariable("note", "i4", ())
-    assert adopted(path).scenarios == {"train": 1, "valid": 1, "test": 1}
+    assert adopted(path).scenarios == {
+        "train": 1,
+        "valid": 1,
+        "test": 1,
+    }
 
 
 WALLS = np.zeros((4, 2))
@@ -467,18 +543,54 @@ WALLS = np.zeros((4, 2))
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("wall_velocity", np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS)),
-        ("wall_velocity", WALLS + np.inf),
-        ("wall_velocity", WALLS + 1e300),  # beyond float32, as which it is stored
-        ("wall_velocity", WALLS + 1j),
-        ("wall_velocity", WALLS.astype(str)),
-        ("wall_velocity", WALLS > 1),
-        ("wall_velocity", WALLS[:3]),
-        ("velocity", np.zeros((12, 40, 2), complex)),
-        ("velocity", np.full((12, 40, 2), "fast")),
-        ("velocity", np.full((12, 40, 2), np.nan)),
-        ("material", np.full(40, "liquid")),
-        ("position", np.full((12, 40, 2), "here")),
+        (
+            "wall_velocity",
+            np.where(np.arange(8).reshape(4, 2) == 3, np.nan, WALLS),
+        ),
+        (
+            "wall_velocity",
+            WALLS + np.inf,
+        ),
+        (
+            "wall_velocity",
+            WALLS + 1e300,
+        ),  # beyond float32, as which it is stored
+        (
+            "wall_velocity",
+            WALLS + 1j,
+        ),
+        (
+            "wall_velocity",
+            WALLS.astype(str),
+        ),
+        (
+            "wall_velocity",
+            WALLS > 1,
+        ),
+        (
+            "wall_velocity",
+            WALLS[:3],
+        ),
+        (
+            "velocity",
+            np.zeros((12, 40, 2), complex),
+        ),
+        (
+            "velocity",
+            np.full((12, 40, 2), "fast"),
+        ),
+        (
+            "velocity",
+            np.full((12, 40, 2), np.nan),
+        ),
+        (
+            "material",
+            np.full(40, "liquid"),
+        ),
+        (
+            "position",
+            np.full((12, 40, 2), "here"),
+        ),
     ],
 )
 def test_arrays_that_are_no_numbers_are_refused(
@@ -494,7 +606,7 @@ def test_arrays_that_are_no_numbers_are_refused(
             for key, array in arrays.items():
                 file[key] = array.astype(object) if array.dtype.kind == "U" else array
     with refused(tmp_path, bad.name, DataError):
-        adopted(bad, as_is=True)
+        adopted(bad)
 
 
 @pytest.mark.parametrize("ending", ["npz", "npy"])
@@ -549,7 +661,6 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
         str(source),
         "--format",
         "gns-npz",
-        "--allow-pickle",
         "-o",
         str(tmp_path / "own"),
     ]
@@ -571,8 +682,14 @@ def test_no_file_reaches_the_terminal(tmp_path: Path, place: str) -> None:
 @pytest.mark.parametrize(
     "parts",
     [
-        (5, (1, np.array([1.0, 2.0]))),  # ragged
-        ((1, np.array([1, 2])), 0.5),
+        (
+            5,
+            (1, np.array([1.0, 2.0])),
+        ),  # ragged
+        (
+            (1, np.array([1, 2])),
+            0.5,
+        ),
         (5, 10**400),  # beyond any float
         (10**5000, 0.5),  # beyond what Python spells
         (5, float("nan")),

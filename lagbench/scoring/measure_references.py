@@ -1,0 +1,139 @@
+"""Measure the reference predictors of data sets and write the scores that are shipped.
+
+usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
+           [--root FOLDER] [--workers 2] [--floor analog ...] [--solver]
+
+All splits and sizes whose data are there are measured, or those named. With --floor
+only these references are measured anew, from the start; the others, and all costs, stay
+as they are. Without it each measured scenario is saved under the root folder: an
+interrupted run continues where it stopped. Last the solver itself is timed (``lagbench
+bench solver``); with --solver nothing else is done. Shipped scores are checked by
+``lagbench leaderboard check --root FOLDER``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from lagbench.data.local import resolve_root
+from lagbench.data.registry import Size
+from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
+from lagbench.references.shipped import (
+    FOLDER,
+    shipped_path,
+    write_shipped,
+    write_solver_seconds,
+)
+from lagbench.references.table import REFERENCES, references_of
+
+from .references import measure, measured_sizes, saved_folder
+from .task import load_scored_task
+
+
+def measure_and_ship(
+    size: Size,
+    root: Path,
+    *,
+    workers: int = 1,
+    folder: Path = FOLDER,
+    names: Collection[str] | None = None,
+) -> Path:
+    """Measure references of a data set and write them to the folder of shipped scores.
+
+    Args:
+        size: the split and size.
+        root: folder of all data sets.
+        workers: worker processes.
+        folder: folder of shipped scores.
+        names: names of the references; by default all.
+
+    Raises:
+        DataError: the data set is not recorded in datasets.yaml, or its files are
+            missing.
+        UsageError: the data set has none of these references.
+    """
+    where = f"{size.split} {size.name}"
+    if names is not None:
+        known = {reference.name for reference in references_of(size)}
+        if known.isdisjoint(names):
+            raise UsageError(
+                "the data set has no such reference", where=where, got=names
+            )
+    if size.measured is None:
+        raise DataError("the data set has no recorded hash", where=where)
+
+    config = load_scored_task(size, root).config
+    reported = config.slow_frames.intersection(config.predicted_frames)
+    is_complete = names is None
+    scores = measure(size, root, names=names, workers=workers, resume=is_complete)
+    path = write_shipped(
+        size,
+        scores,
+        dataset_sha256=size.measured.dataset_sha256,
+        reported=sorted(reported),
+        folder=folder,
+        partial=not is_complete,
+    )
+    if is_complete:
+        shutil.rmtree(saved_folder(size, root))
+    return path
+
+
+def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
+    """Time the solver in a process of its own and write the cost of a frame.
+
+    Raises:
+        WorkFailedError: the solver fails.
+    """
+    options = ["--split", size.split, "--size", size.name, "--json"]
+    command = [sys.executable, "-m", "lagbench", "bench", "solver", *options]
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode != 0:
+        raise WorkFailedError(
+            "the solver could not be timed", got=process.stderr.strip()[-300:]
+        )
+    seconds = json.loads(process.stdout)["seconds_per_frame"]
+    return write_solver_seconds(size, seconds, folder)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line of this module; return its exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--split")
+    parser.add_argument("--size")
+    parser.add_argument("--root", type=Path)
+    parser.add_argument("--workers", type=int, default=1)
+    part = parser.add_mutually_exclusive_group()
+    part.add_argument("--floor", nargs="+", choices=sorted(REFERENCES))
+    part.add_argument("--solver", action="store_true")
+    options = parser.parse_args(arguments)
+
+    root = resolve_root(options.root)
+    try:
+        for size in measured_sizes(root, split=options.split, name=options.size):
+            if not options.solver:
+                measure_and_ship(
+                    size, root, workers=options.workers, names=options.floor
+                )
+            if not options.floor:
+                time_solver(size)
+            path = shipped_path(size)
+            length = path.stat().st_size
+            sys.stdout.write(f"{size.split} {size.name}: {path.name}, {length} bytes\n")
+            sys.stdout.flush()
+    except LagbenchError as error:
+        sys.stderr.write(f"measure_references: {error}\n")
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

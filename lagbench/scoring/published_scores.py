@@ -1,0 +1,171 @@
+"""Scores read from a scores.json, which may come from anybody: checked before use."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from lagbench.errors import UnreadableFileError, check_regular
+from lagbench.metrics.aggregate import LARGEST, Score
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import available
+from lagbench.submission.format import MAX_NAME
+
+from .card import FORMAT, IDENTITY
+
+MAX_BYTES = 64 << 20
+"""Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
+
+LARGEST_IN_FILE = float(f"{LARGEST:.9g}")
+"""Largest value of a score, as rounded in the file."""
+
+
+def require_printable(text: str) -> str:
+    """Return a text that terminals may show as it is.
+
+    It obeys the rule for attributes of predictions.
+
+    Raises:
+        ValueError: it is empty, too long or not printable.
+    """
+    if not text.strip() or len(text) > MAX_NAME or not text.isprintable():
+        raise ValueError(f"not printable text of 1 to {MAX_NAME} characters")
+    return text
+
+
+def _require_known_format(number: int) -> int:
+    if number != FORMAT:
+        raise ValueError(f"layout {number}, not {FORMAT}")
+    return number
+
+
+def _require_unique(ids: list[int]) -> list[int]:
+    if len(set(ids)) < len(ids):
+        raise ValueError("scenario ids that occur twice")
+    return ids
+
+
+Text = Annotated[str, AfterValidator(require_printable)]
+Count = Annotated[int, Field(ge=0, lt=2**31)]
+Value = Annotated[float, Field(ge=-LARGEST_IN_FILE, le=LARGEST_IN_FILE)]
+
+
+class _Content(BaseModel):
+    """A part of a scores.json; further keys are ignored."""
+
+    model_config = ConfigDict(strict=True, extra="ignore")
+
+
+class _TaskContent(_Content):
+    scenarios: Annotated[list[Count], AfterValidator(_require_unique)]
+
+
+class _ScoreContent(_Content):
+    values: list[Value | None]  # by scenario, null where undefined
+    undefined: list[Count]  # frames without a value by scenario
+
+
+class _ScoresContent(_Content):
+    lagbench_scores: Annotated[int, AfterValidator(_require_known_format)]
+    split: Text
+    size: Text
+    dataset_version: Text
+    dataset_sha256: Text
+    method: Text
+    predictions_sha256: Text
+    ranking_metric: Text
+    task: _TaskContent
+    rows: dict[str, dict[str, _ScoreContent]]  # by row and metric
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PublishedScores:
+    """Scores of a submission, as far as another one can be compared with it."""
+
+    # split, size, version and hash of the data set, and the method
+    identity: Mapping[str, str]
+    predictions_sha256: str  # content hash of the predicted positions
+    ranking: str  # name of the metric that ranks
+    # scores by row and metric, over the horizon; values per frame are not in the file
+    scores: Mapping[str, Mapping[str, Score]]
+
+
+def read_scores(path: Path) -> PublishedScores:
+    """Read a scores.json; metrics that are not installed here are left out.
+
+    Raises:
+        UnreadableFileError: it is no scores.json.
+    """
+    check_regular(path, longest=MAX_BYTES, fix="`lagbench score` writes it")
+    try:
+        return parse_scores(json.loads(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise unreadable_scores(path, error) from error
+    except RecursionError as error:
+        # its own trace is a thousand frames long and says no more
+        raise unreadable_scores(path, error) from None
+
+
+def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
+    """Return the error for a file that is no scores.json or scores.nc."""
+    return UnreadableFileError(
+        f"not a scores{path.suffix} of lagbench",
+        where=str(path),
+        expected="what `lagbench score` writes beside the predictions",
+        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
+        fix="score the predictions again: lagbench score predictions.nc",
+    )
+
+
+def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
+    """Return the scores of a :meth:`.card.ScoreCard.as_json`, or of a scores.json.
+
+    Raises:
+        ValueError: the content does not have the form of a scores.json.
+    """
+    try:
+        checked = _ScoresContent.model_validate(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        place = "/".join(map(str, first["loc"]))
+        raise ValueError(f"{place!a}: {first['msg']}") from error
+
+    metrics = available()
+    rows = {}
+    for row, scores in checked.rows.items():
+        rows[row] = {
+            name: _make_score(metrics[name], checked.task.scenarios, score)
+            for name, score in scores.items()
+            if name in metrics
+        }
+    return PublishedScores(
+        identity={name: getattr(checked, name) for name in IDENTITY},
+        predictions_sha256=checked.predictions_sha256,
+        ranking=checked.ranking_metric,
+        scores=rows,
+    )
+
+
+def _make_score(metric: Metric, ids: list[int], content: _ScoreContent) -> Score:
+    """Return the score of a metric, without values per frame."""
+    for numbers in (content.values, content.undefined):
+        if len(numbers) != len(ids):
+            raise ValueError(
+                f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios"
+            )
+    values = [math.nan if value is None else value for value in content.values]
+    return Score(
+        metric=metric,
+        scenarios=tuple(ids),
+        frames=(),
+        per_frame=np.empty((len(ids), 0)),
+        values=np.array(values, np.float64),
+        undefined=tuple(content.undefined),
+    )

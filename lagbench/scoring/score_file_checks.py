@@ -1,0 +1,275 @@
+"""Read a score file from anybody: bounded, self-contained, and of the task's shape.
+
+HDF5 lets a file show the bytes of other files as its own (external links, external
+storage, virtual data sets) and unpack a few bytes to gigabytes. The headers tell, and
+both are refused before a value is read. HDF5 is also C code that trusts its input, so
+foreign files are first read in a child process under limits.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.checksums import round_digits
+from lagbench.data.grid import Grid, Placement
+from lagbench.data.hdf5 import open_hdf5
+from lagbench.data.registry import Size
+from lagbench.data.structure import Structure, check_structure
+from lagbench.errors import UnreadableFileError, check_regular
+from lagbench.metrics.aggregate import Score
+from lagbench.metrics.distributions import BINS
+from lagbench.metrics.table import ranking_metric
+from lagbench.submission.task_checks import frames_to_predict
+from lagbench.work.machine import run_in_child
+
+from .card import FRAMES, PARTICLES, SUBMISSION, Preview
+from .published_scores import PublishedScores, unreadable_scores
+from .score_file import FILM_RANGE, SubmissionStatistics, read_statistics
+
+MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]
+# most that a score file may unpack to [bytes]; the largest of ours takes 3 MB
+MAX_UNPACKED = 32 << 20
+
+MAX_STATISTICS = 500
+
+FILM_TOLERANCE = 1e-3
+"""Rounding of packed positions beyond their range [length]."""
+
+GROUP = "preview"
+STRUCTURE = Structure(members=40, groups=(GROUP,), unpacked=MAX_UNPACKED)
+"""Content that a score file may have: plain numbers, in the root and one group."""
+
+# computing time of the child for every 50 files, its start aside [s]
+CPU_SECONDS = 10.0
+
+FILES_PER_PART = 50
+
+# files that may stop a child before the rest is left unread: each costs a child's whole
+# time
+MOST_STOPS = 5
+# time for every 50 files together [s]; a busy machine may need minutes
+WALL_SECONDS = 600.0
+
+UNREAD = (
+    "not read, because too many others had to be stopped or took all the time allowed"
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScoreFile:
+    """Content of a score file."""
+
+    scores: SubmissionStatistics  # identity and statistics
+    preview: Preview  # pictures of the first scenario
+    precision: float  # step of the packed vorticity maps [1/frame]
+
+
+def reported_frames(size: Size) -> tuple[int, ...]:
+    """Return the frames of interest and the last one, absolute."""
+    frames = tuple(frames_to_predict(size))
+    interesting = {*size.task.frames_of_interest, frames[-1]}
+    return tuple(sorted(interesting.intersection(frames)))
+
+
+def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
+    """Read a score file; with a size it must have the shape of that task.
+
+    Raises:
+        UnreadableFileError: it is no score file, or of another task.
+    """
+    if path.is_symlink():  # it could lead out of the folder
+        raise UnreadableFileError(
+            "not a score file", where=str(path), expected="a regular file", got="a link"
+        )
+    check_regular(
+        path,
+        longest=MAX_SCORE_BYTES,
+        fix="`lagbench submit` writes it beside the entry",
+    )
+    try:
+        with open_hdf5(path) as file:
+            check_structure(file, path, STRUCTURE)
+        scores = read_statistics(path)
+        _check_statistics(scores)
+        with open_hdf5(path) as file:
+            preview, precision = _read_preview(file[GROUP])
+        _check_shapes(preview)
+        if size is not None:
+            _check_task(scores, preview, size)
+    except UnreadableFileError:
+        raise
+    except Exception as error:  # HDF5 on damaged bytes raises nearly any type
+        raise unreadable_scores(path, error) from error
+    return ScoreFile(scores=scores, preview=preview, precision=precision)
+
+
+def read_published_scores(path: Path) -> PublishedScores:
+    """Return the scores of a score file as of a scores.json.
+
+    Of the references it has the best, in the ranking metric.
+    """
+    statistics = read_score_file(path).scores
+    submission: dict[str, Score] = {}
+    for name, score in statistics.scores().items():
+        values = [round_digits(value) for value in score.values.tolist()]
+        submission[name] = replace(score, values=np.array(values))
+
+    rows = {SUBMISSION: submission}
+    ranking = statistics.ranking
+    if statistics.best_reference is not None and ranking in submission:
+        reference = replace(
+            submission[ranking], values=statistics.best_reference_values
+        )
+        rows[statistics.best_reference] = {ranking: reference}
+    return PublishedScores(
+        identity=statistics.identity,
+        predictions_sha256=statistics.predictions_sha256,
+        ranking=ranking,
+        scores=rows,
+    )
+
+
+def _read_preview(group: h5py.Group) -> tuple[Preview, float]:
+    """Return the preview and the step of its vorticity maps [1/frame]."""
+    vorticity, precision = _unpack(group["vorticity"])
+    histogram, _ = _unpack(group["histogram"])
+    film, _ = _unpack(group["film"])
+    preview = Preview(
+        scenario=int(np.ravel(group.attrs["scenario"])[0]),
+        map_frames=_read_integers(group["map_frame"]),
+        vorticity=vorticity,
+        histogram=histogram,
+        histogram_range=np.asarray(group["histogram_range"][...], np.float32),
+        film_frames=_read_integers(group["film_frame"]),
+        particles=_read_integers(group["film_particle"]),
+        material=np.asarray(group["material"][...], np.int8),
+        film=film,
+    )
+    return preview, precision
+
+
+def _unpack(variable: h5py.Dataset) -> tuple[NDArray[np.float32], float]:
+    """Return packed values, NaN where missing, and the step of the packing."""
+    scale = float(np.ravel(variable.attrs["scale_factor"])[0])
+    offset = float(np.ravel(variable.attrs["add_offset"])[0])
+    fill = int(np.ravel(variable.attrs["_FillValue"])[0])
+    steps = variable[...]
+    has_valid_scale = np.isfinite([scale, offset]).all() and scale > 0.0
+    if steps.dtype != np.uint16 or not has_valid_scale:
+        raise ValueError(f"{variable.name} is not packed as it should be")
+    values = np.where(steps == fill, np.nan, steps * scale + offset)
+    return values.astype(np.float32), scale
+
+
+def _read_integers(variable: h5py.Dataset) -> tuple[int, ...]:
+    return tuple(variable[...].astype(np.int64).tolist())
+
+
+def _check_statistics(scores: SubmissionStatistics) -> None:
+    tallies = list(scores.tallies.values())
+    if not tallies or len(tallies[0].names) > MAX_STATISTICS:
+        raise ValueError("no scenarios, or too many statistics")
+    if not all(np.isfinite(tally.total).all() for tally in tallies):
+        raise ValueError("infinite statistics")
+
+
+def _check_shapes(preview: Preview) -> None:
+    map_count = len(preview.map_frames)
+    film_count = len(preview.film_frames)
+    particle_count = len(preview.particles)
+    nodes = preview.vorticity.shape[-1]
+    shapes = {
+        "vorticity": (preview.vorticity.shape, (2, map_count, nodes, nodes)),
+        "histogram": (preview.histogram.shape, (2, map_count, BINS)),
+        "histogram_range": (preview.histogram_range.shape, (map_count, 2)),
+        "material": (preview.material.shape, (particle_count,)),
+        "film": (preview.film.shape, (2, film_count, particle_count, 2)),
+    }
+    for name, (got, expected) in shapes.items():
+        if got != expected:
+            raise ValueError(f"{name} has shape {got}, not {expected}")
+
+    film = preview.film
+    is_long = film_count > FRAMES or particle_count > PARTICLES
+    if is_long or not np.isfinite(film).all():
+        raise ValueError("the film is longer than films are, or has holes")
+    if not film.size:
+        return
+    low, high = FILM_RANGE
+    if film.min() < low - FILM_TOLERANCE or film.max() > high + FILM_TOLERANCE:
+        raise ValueError("the film leaves its range")
+
+
+def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:
+    """Refuse a file that is not of the task of a split and size."""
+    frames = tuple(frames_to_predict(size))
+    ids = tuple(sorted(size.subsets["test"]))
+    scored_ids = tuple(sorted(scores.tallies))
+    scored_frames = next(iter(scores.tallies.values())).frames
+    if scored_ids != ids or scored_frames != frames:
+        raise ValueError(f"other scenarios or frames than {size.split} {size.name} has")
+    if scores.ranking != ranking_metric(size) or preview.scenario != ids[0]:
+        raise ValueError("another ranking metric or another pictured scenario")
+
+    score_grid = size.task.score_grid
+    nodes = Grid(score_grid.cells, Placement(score_grid.placement)).nodes
+    has_other_grid = preview.vorticity.shape[-1] != nodes
+    if has_other_grid or preview.map_frames != reported_frames(size):
+        raise ValueError("maps of another grid or of other frames")
+    film_frames = preview.film_frames
+    is_ordered = film_frames == tuple(sorted(film_frames))
+    if not set(film_frames).issubset(frames) or not is_ordered:
+        raise ValueError("a film of other frames")
+
+
+def find_unreadable(paths: Sequence[Path]) -> dict[Path, str]:
+    """Return the files that a child cannot read, and why.
+
+    A child that a file stops is started anew for the rest, :data:`MOST_STOPS` times at
+    most and within :data:`WALL_SECONDS` for every :data:`FILES_PER_PART` files,
+    whatever the files contain.
+    """
+    reasons: dict[Path, str] = {}
+    pending = list(paths)
+    stops = 0
+    parts = 1 + len(paths) // FILES_PER_PART
+    end = time.monotonic() + WALL_SECONDS * parts
+
+    while pending:
+        wall = end - time.monotonic()
+        if stops == MOST_STOPS or wall <= 0.0:
+            return reasons | dict.fromkeys(pending, UNREAD)
+        names = [str(path) for path in pending]
+        answers, stopped = run_in_child(
+            READ, names, seconds=CPU_SECONDS * parts, wall=wall
+        )
+
+        for path, reason in zip(pending, answers, strict=False):
+            if reason is not None:
+                reasons[path] = reason
+        if len(answers) < len(pending):
+            culprit = pending[len(answers)]
+            reasons[culprit] = f"reading it had to be stopped: {stopped}"
+            stops += 1
+        pending = pending[len(answers) + 1 :]
+    return reasons
+
+
+def explain_unreadable(path: str) -> str | None:
+    """Return the reason why a file cannot be read, for a parent; None if it can."""
+    try:
+        read_score_file(Path(path))
+    except UnreadableFileError as error:
+        return f"{error.what}: {error.got}"
+    return None
+
+
+READ = f"{__name__}.{explain_unreadable.__name__}"
+"""Dotted name of the function that a child calls."""

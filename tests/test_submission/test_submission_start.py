@@ -1,0 +1,300 @@
+"""How predictions begin: permuted truth is refused, bad models are scored.
+
+The tests run on the tiny data of all four splits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size, load
+from lagbench.data.scenario import read_scenario
+from lagbench.make.generate import GenerationResult
+from lagbench.submission import PredictionsWriter, ValidationResult, template, validate
+from lagbench.submission.truth import Truth
+
+Floats = NDArray[np.floating]
+Predict = Callable[["World", int], Floats]
+
+
+@dataclass(frozen=True)
+class World:
+    """The test subset of a tiny data set in memory."""
+
+    size: Size
+    root: Path
+    positions: Mapping[int, Floats]  # every frame, shape [frame, particle, 2]
+    material: Mapping[int, NDArray[np.int8]]
+
+    @property
+    def input_frames(self) -> int:
+        """Number of given frames."""
+        return self.size.task.input_frames
+
+    def truth(self, scenario: int, *, late: int = 0) -> Floats:
+        """The frames to predict, or those some frames later."""
+        first = self.input_frames + late
+        return self.positions[scenario][first : first + self.size.task.horizon]
+
+    def last(self, scenario: int) -> Floats:
+        """The last given frame."""
+        return self.positions[scenario][self.input_frames - 1]
+
+    def validate(self, path: Path, predict: Predict) -> ValidationResult:
+        """Write predictions and validate them."""
+        writer = PredictionsWriter(
+            path,
+            split=self.size.split,
+            size="tiny",
+            method="m",
+            root=self.root,
+        )
+        with writer:
+            for scenario in self.positions:
+                writer.add(scenario, predict(self, scenario))
+        return validate(path, root=self.root, isolated=False)
+
+
+@pytest.fixture(
+    scope="module", params=["cavity", "curl-noise", "fluid", "multimaterial"]
+)
+def world(
+    request: pytest.FixtureRequest, tiny_split: Callable[..., GenerationResult]
+) -> World:
+    """The test subset of each split."""
+    root = tiny_split(request.param).root
+    size = load().size(request.param, "tiny")
+    truth = Truth(size, root)
+    positions = {}
+    material = {}
+    for scenario in sorted(size.subsets["test"]):
+        with read_scenario(truth.path(scenario)) as file:
+            positions[scenario] = file.read("position")
+            material[scenario] = file.read("material")
+    return World(size, root, positions, material)
+
+
+def rng(scenario: int) -> np.random.Generator:
+    """Random numbers of a scenario."""
+    return np.random.Generator(np.random.PCG64(scenario))
+
+
+# --- refused ----------------------------------------------------------------------
+
+
+def permuted(world: World, scenario: int) -> Floats:
+    """The truth, all particles in another order."""
+    order = rng(scenario).permutation(world.size.particles)
+    return world.truth(scenario)[:, order]
+
+
+def permuted_within_materials(world: World, scenario: int) -> Floats:
+    """The truth, the particles of each material in another order."""
+    material = world.material[scenario]
+    order = np.arange(world.size.particles)
+    for kind in np.unique(material):
+        particles = np.flatnonzero(material == kind)
+        order[particles] = rng(scenario).permutation(particles)
+    return world.truth(scenario)[:, order]
+
+
+def a_third_permuted(world: World, scenario: int) -> Floats:
+    """The truth, a third of the particles in another order."""
+    order = np.arange(world.size.particles)
+    particles = rng(scenario).choice(order, len(order) // 3, replace=False)
+    order[np.sort(particles)] = particles
+    return world.truth(scenario)[:, order]
+
+
+def under_the_next_number(world: World, scenario: int) -> Floats:
+    """The truth, every particle stored as the next one."""
+    return np.roll(world.truth(scenario), 1, axis=1)
+
+
+def two_particles_exchanged(world: World, scenario: int) -> Floats:
+    """The truth, but for the first two particles."""
+    order = np.arange(world.size.particles)
+    order[:2] = 1, 0
+    return world.truth(scenario)[:, order]
+
+
+def permuted_and_at_rest(world: World, scenario: int) -> Floats:
+    """The last given frame in another order of the particles, repeated."""
+    order = rng(scenario).permutation(world.size.particles)
+    shape = world.truth(scenario).shape
+    return np.broadcast_to(world.last(scenario)[order], shape)
+
+
+@pytest.mark.parametrize(
+    "predict",
+    [
+        permuted,
+        permuted_within_materials,
+        a_third_permuted,
+        under_the_next_number,
+        two_particles_exchanged,
+        permuted_and_at_rest,
+    ],
+)
+def test_permuted_truth_is_refused(
+    world: World, tmp_path: Path, predict: Predict
+) -> None:
+    """The check ``start`` rejects every scenario; nothing else does."""
+    result = world.validate(tmp_path / "p.nc", predict)
+    assert {issue.check for issue in result.errors} == {"start"}
+    assert len(result.errors) == len(world.positions)
+    assert result.exit_code == 1
+
+
+# --- scored, however bad ----------------------------------------------------------
+
+
+def mean_over_scenarios(world: World, _: int) -> Floats:
+    """The same for every scenario."""
+    return np.mean([world.truth(other) for other in world.positions], axis=0)
+
+
+def noise(world: World, scenario: int) -> Floats:
+    """Normal numbers for every position."""
+    return rng(scenario).normal(size=world.truth(scenario).shape)
+
+
+def noisy(amplitude: float) -> Predict:
+    """The truth with noise of an amplitude [length]."""
+    return lambda world, scenario: (
+        world.truth(scenario) + amplitude * noise(world, scenario)
+    )
+
+
+def turned(world: World, scenario: int) -> Floats:
+    """Turned and shrunk, with noise: what a network trained too little does."""
+    matrix = np.array([[0.9, 0.1], [-0.1, 0.8]])
+    return world.truth(scenario) @ matrix + 0.05 + 0.03 * noise(world, scenario)
+
+
+def twice_as_far(world: World, scenario: int) -> Floats:
+    """Particles go twice as far from the last given frame as they should."""
+    return 2 * world.truth(scenario) - world.last(scenario)
+
+
+def partly_lost(world: World, scenario: int) -> Floats:
+    """A third of the particles anywhere within a twentieth of the box."""
+    position = world.truth(scenario).copy()
+    is_lost = rng(scenario).random(position.shape[1]) < 1 / 3
+    shape = position[:, is_lost].shape
+    position[:, is_lost] += rng(scenario).uniform(-0.05, 0.05, shape)
+    return position
+
+
+def shifted_right(world: World, scenario: int) -> Floats:
+    """A tenth of the box off."""
+    return world.truth(scenario) + np.array([0.1, 0.0])
+
+
+def anywhere(world: World, scenario: int) -> Floats:
+    """Random places in the unit box."""
+    return rng(scenario).random(world.truth(scenario).shape)
+
+
+def in_one_point(world: World, scenario: int) -> Floats:
+    """All particles in the middle of the box."""
+    return np.full(world.truth(scenario).shape, 0.5)
+
+
+def y_first(world: World, scenario: int) -> Floats:
+    """The components swapped."""
+    return world.truth(scenario)[..., ::-1]
+
+
+def one_frame_early(world: World, scenario: int) -> Floats:
+    """The last given frame first, then the truth."""
+    return world.truth(scenario, late=-1)
+
+
+def one_frame_late(world: World, scenario: int) -> Floats:
+    """The truth without its first frame; the last one is repeated."""
+    truth = world.truth(scenario)
+    return np.concatenate([truth[1:], truth[-1:]])
+
+
+def displacements(world: World, scenario: int) -> Floats:
+    """Steps instead of positions."""
+    frames = np.concatenate([world.last(scenario)[None], world.truth(scenario)])
+    return np.diff(frames, axis=0)
+
+
+def standardised(world: World, scenario: int) -> Floats:
+    """Mean 0 and deviation 1."""
+    truth = world.truth(scenario)
+    return (truth - truth.mean((0, 1))) / truth.std((0, 1))
+
+
+def another_scenario(world: World, scenario: int) -> Floats:
+    """The truth of the next scenario."""
+    scenarios = list(world.positions)
+    following = (scenarios.index(scenario) + 1) % len(scenarios)
+    return world.truth(scenarios[following])
+
+
+@pytest.mark.parametrize(
+    "predict",
+    [
+        mean_over_scenarios,
+        noisy(0.01),
+        noisy(0.1),
+        noisy(0.5),
+        turned,
+        twice_as_far,
+        partly_lost,
+        shifted_right,
+        anywhere,
+        in_one_point,
+        y_first,
+        one_frame_early,
+        one_frame_late,
+        displacements,
+        standardised,
+        another_scenario,
+    ],
+)
+def test_a_bad_model_is_scored_and_its_jump_flagged(
+    world: World, tmp_path: Path, predict: Predict
+) -> None:
+    """Nothing rejects it; a jump at the start is a warning with its size."""
+    result = world.validate(tmp_path / "p.nc", predict)
+    assert result.valid
+    flagged = {}
+    for issue in result.warnings:
+        if issue.check == "discontinuous_start":
+            scenario = int(issue.where.split()[1].rstrip(","))
+            flagged[scenario] = float(issue.got)
+    for scenario, position in world.positions.items():
+        first = predict(world, scenario)[0].astype("f4")
+        jump = root_mean_square(first - world.last(scenario))
+        frames = position[: world.input_frames + world.size.task.horizon]
+        steps = np.diff(frames, axis=0).astype("f8")
+        limit = 10 * np.sqrt((steps**2).sum(-1).max())
+        assert (jump > limit) == (scenario in flagged)
+        if scenario in flagged:
+            assert flagged[scenario] == pytest.approx(jump, rel=0.01)
+
+
+def root_mean_square(vectors: Floats) -> float:
+    """Root mean square length of vectors."""
+    return float(np.sqrt((vectors**2).sum(-1).mean()))
+
+
+def test_persistence_and_the_truth_pass_all_checks(
+    world: World, tmp_path: Path
+) -> None:
+    """What stands still from the start is a naive baseline, and no mistake."""
+    made = template(world.size.split, "tiny", output=tmp_path / "t.nc", root=world.root)
+    assert not validate(made.path, root=world.root, isolated=False).findings
+    result = world.validate(tmp_path / "p.nc", lambda world, i: world.truth(i))
+    assert not result.findings
