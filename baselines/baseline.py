@@ -1,16 +1,16 @@
 """The contract of a baseline: loss terms of a batch, and a rollout step by step.
 
-A baseline is one file: a subclass of :class:`Baseline` with its options, named by an
-entry point of the group ``lagbench.baselines``. Training, checkpoints, rollouts,
-predictions and scores then work without another line. It may know a data set's public
-figures, of datasets.yaml, and never a test scenario.
+A baseline is one file: a subclass of :class:`Baseline` with its options. An entry point
+of the group ``lagbench.baselines`` names it. Training, checkpoints, rollouts,
+predictions and scores then work without another line. A baseline may know the public
+figures of a data set in datasets.yaml, and never a test scenario.
 """
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Self
 
@@ -30,48 +30,55 @@ from lagbench.tensors import Batch
 __all__ = [
     "Baseline",
     "Batch",
-    "Facts",
+    "DatasetInfo",
     "Options",
     "Settings",
     "check_moving_walls",
     "last_velocities",
-    "rescaled",
+    "rescale",
 ]
 
 
 class Settings(BaseModel):
-    """Base of what recipes and ``--set`` fill: frozen; unknown keys and yes for a
-    number are errors.
+    """Base of the options that recipes and ``--set`` fill.
+
+    They are frozen. Unknown keys, and yes or no for a number, are errors.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _no_number(cls, value: object, handler: ValidatorFunctionWrapHandler) -> object:
-        found: object = handler(value)
-        if _counted(value, found):
+    def _refuse_boolean_numbers(
+        cls, value: object, handler: ValidatorFunctionWrapHandler
+    ) -> object:
+        parsed: object = handler(value)
+        if _has_boolean_number(value, parsed):
             raise ValueError("a number, not yes or no")
-        return found
+        return parsed
 
 
-def _counted(given: object, found: object) -> bool:
-    """Tell whether a yes or no became 1 or 0 anywhere in a value that was checked."""
-    if isinstance(given, bool):
-        return isinstance(found, int | float) and not isinstance(found, bool)
-    if isinstance(given, Mapping) and isinstance(found, Mapping):
-        return any(_counted(value, found.get(name)) for name, value in given.items())
-    if isinstance(given, list | tuple) and isinstance(found, list | tuple):
-        return any(map(_counted, given, found))
-    return False
+def _has_boolean_number(value: object, parsed: object) -> bool:
+    """Return whether a yes or no became 1 or 0 anywhere in a parsed value."""
+    if isinstance(value, bool):
+        return isinstance(parsed, int | float) and not isinstance(parsed, bool)
+
+    pairs: Iterable[tuple[object, object]] = ()
+    if isinstance(value, Mapping) and isinstance(parsed, Mapping):
+        pairs = [(part, parsed.get(name)) for name, part in value.items()]
+    elif isinstance(value, list | tuple) and isinstance(parsed, list | tuple):
+        pairs = zip(value, parsed, strict=False)
+    return any(_has_boolean_number(*pair) for pair in pairs)
 
 
 class Options(Settings):
     """Base of the options of a model.
 
-    Class attributes: in_training: names of the options of the training; a trained model
-        refuses changes of them. of_weights: names of options that say what weights mean
-        where their shapes do not tell; likewise.
+    Class attributes:
+        in_training: names of options of the training. A trained model refuses changes
+            of them.
+        of_weights: names of options that say what weights mean where the shapes of the
+            weights do not. A trained model refuses changes of them too.
     """
 
     in_training: ClassVar[frozenset[str]] = frozenset()
@@ -81,37 +88,39 @@ class Options(Settings):
 class Baseline(nn.Module):
     """A surrogate: the next positions from the last ones.
 
-    Class attributes: Options: the model's options, a subclass of :class:`Options`;
-        recipes fill it. method: what the board calls it. any_size: whether weights of
-        one size can be run at another: other particles, other distances.
+    Class attributes:
+        Options: the model's options, a subclass of :class:`Options`; recipes fill it.
+        method: name of the model on the board.
+        any_size: whether weights of one size can be run at another, with other
+            particles and other distances.
 
     Args:
         options: the model's options.
-        facts: public figures of the data set.
+        info: public figures of the data set.
     """
 
     Options: ClassVar[type[Options]] = Options
     method: ClassVar[str]
     any_size: ClassVar[bool] = False
 
-    def __init__(self, options: Any, facts: Facts) -> None:  # noqa: ANN401 (each has its own)
+    def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
         self.options = options
-        self.facts = facts
+        self.info = info
 
     @classmethod
-    def build(cls, options: Mapping[str, object], facts: Facts) -> Self:
+    def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:
         """Return an untrained model; options are checked by pydantic."""
-        return cls(cls.Options.model_validate(dict(options)), facts)
+        return cls(cls.Options.model_validate(dict(options)), info)
 
-    def adapted(
+    def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any]
     ) -> tuple[Mapping[str, Tensor], Mapping[str, Any]]:
-        """Return weights that a training starts from, and their options, as this model
-        takes them on.
+        """Return the weights that a training starts from, and their options.
 
-        As they are by default. Weights are refused whose shapes are not this model's,
-        or whose options, those returned, differ in what says what weights mean.
+        A model may change both to fit itself; by default they stay as they are. The
+        training refuses weights of other shapes than this model's, and returned options
+        that differ in one of ``of_weights``.
 
         Args:
             weights: parameters and buffers by name, of a model with those options.
@@ -122,15 +131,11 @@ class Baseline(nn.Module):
     @property
     @abstractmethod
     def history(self) -> int:
-        """Frames that a training window gives to the model, before those that it must
-        predict.
-        """
+        """Frames that a training window gives to the model, before those to predict."""
 
     @property
     def future(self) -> int:
-        """Frames of a training window after the given ones: 1, or more with rollout
-        losses.
-        """
+        """Frames to predict of a training window: 1, or more with rollout losses."""
         return 1
 
     @property
@@ -142,10 +147,10 @@ class Baseline(nn.Module):
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return every term of the training loss, raw: weights are applied by the
-        trainer.
+        """Return every term of the training loss; the training applies the weights.
 
-        All model mathematics of a training step happen here, so that DDP sees them.
+        All mathematics of the model in a training step happen here, so that DDP sees
+        them.
 
         Args:
             batch: windows of ``history + future`` frames.
@@ -154,16 +159,17 @@ class Baseline(nn.Module):
 
     @property
     def weights(self) -> Mapping[str, float]:
-        """Weight of each loss term; terms that are missing have weight 1, weight 0 is
-        only logged.
+        """Weight of each loss term.
+
+        A term without a weight has weight 1; a term of weight 0 is only logged.
         """
         return {}
 
     def compile_layers(self) -> None:
-        """Compile, in place, what a training step repeats.
+        """Compile the layers that a training step repeats, in place.
 
         Raises:
-            UsageError: by default, the model has nothing to compile.
+            UsageError: the model has no layers to compile; this is the default.
         """
         raise UsageError(
             f"{self.method} has no layers to compile",
@@ -179,16 +185,17 @@ class Baseline(nn.Module):
 
     @abstractmethod
     def advance(self, state: Any) -> tuple[Any, Tensor]:  # noqa: ANN401
-        """Advance by one frame: the next state and positions [length], shape [particle,
-        2].
-        """
+        """Return the next state and positions [length], shape [particle, 2]."""
 
 
 def last_velocities(position: Tensor, count: int) -> Tensor:
-    """Return the last velocities [length/frame], shape [particle, count, 2], oldest
-    first, of given frames.
+    """Return the last velocities of given frames, oldest first.
 
-    Where the frames are few, the first velocity repeats.
+    They have shape [particle, count, 2] and the unit length/frame. Where the frames are
+    few, the first velocity repeats.
+
+    Raises:
+        UsageError: there are fewer than two frames.
     """
     velocity = position[:, -count - 1 :].diff(dim=1)
     if not velocity.shape[1]:
@@ -197,15 +204,16 @@ def last_velocities(position: Tensor, count: int) -> Tensor:
             expected=f"2 or more, {count + 1} for all",
             got=position.shape[1],
         )
-    missing = count - velocity.shape[1]
-    return torch.cat([velocity[:, :1].expand(-1, missing, -1), velocity], dim=1)
+    missing_count = count - velocity.shape[1]
+    repeated = velocity[:, :1].expand(-1, missing_count, -1)
+    return torch.cat([repeated, velocity], dim=1)
 
 
-def check_moving_walls(asked: bool, facts: Facts) -> None:
-    """Refuse a model that wants the velocities of walls where none moves."""
-    if asked and not facts.moving_walls:
+def check_moving_walls(sees_wall_velocity: bool, info: DatasetInfo) -> None:
+    """Refuse a model that sees the velocities of walls where no wall moves."""
+    if sees_wall_velocity and not info.moving_walls:
         raise UsageError(
-            f"the walls of {facts.split} do not move",
+            f"the walls of {info.split} do not move",
             where="model.wall_velocity",
             expected=False,
             got=True,
@@ -213,8 +221,8 @@ def check_moving_walls(asked: bool, facts: Facts) -> None:
         )
 
 
-# Checked where facts are read from a file, which may be a stranger's: names are no
-# paths.
+# Checkpoints hold these values. A checkpoint may come from a stranger, so a name must
+# not be a path.
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -223,8 +231,8 @@ Pair = tuple[Finite, Finite]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Facts:
-    """Public figures of one size of a split; they travel in every checkpoint."""
+class DatasetInfo:
+    """Public figures of one size of a split; every checkpoint holds them."""
 
     split: Name  # name of the split
     size: Name  # name of the size
@@ -246,13 +254,12 @@ class Facts:
     statistics: Mapping[str, Pair]
 
 
-def rescaled(trained: Facts, here: Facts) -> Facts:
-    """Return the facts of a size for weights of another: what they multiply stays as it
-    was trained.
+def rescale(trained: DatasetInfo, target: DatasetInfo) -> DatasetInfo:
+    """Return the info of a size for weights that were trained at another size.
 
-    Statistics [length, length/frame, length/frame^2] are those of the training. Bodies
+    Statistics [length, length/frame, length/frame^2] stay those of the training. Bodies
     fill the same area with more or fewer particles, so the radius [length] goes with
-    the root of that.
+    the square root of the area per particle.
     """
-    radius = trained.radius * math.sqrt(trained.particles / here.particles)
-    return replace(here, radius=radius, statistics=trained.statistics)
+    radius = trained.radius * math.sqrt(trained.particles / target.particles)
+    return replace(target, radius=radius, statistics=trained.statistics)

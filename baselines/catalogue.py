@@ -1,9 +1,9 @@
-"""The baselines by name: those that entry points of installed packages name.
+"""The baselines by name, from the entry points of installed packages.
 
 An entry point of the group ``lagbench.baselines`` names a subclass of
 :class:`~lagbench.baselines.baseline.Baseline`, or one of
-:class:`~lagbench.baselines.operators.operator.Operator`, which becomes a graph network
-that gathers by it.
+:class:`~lagbench.baselines.operators.operator.Operator`. An operator becomes a graph
+network with that operator.
 """
 
 from __future__ import annotations
@@ -16,146 +16,154 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from lagbench.data.registry import PluginWarning, list_entry_points
-from lagbench.errors import LagbenchError, UsageError, load_entry_point, suggest_name
+from lagbench.errors import (
+    LagbenchError,
+    UsageError,
+    load_entry_point,
+    suggest_name,
+)
 
 from .baseline import Baseline
+from .operators.operator import Operator
+from .simulator import GraphNetwork
 
-GROUP = "lagbench.baselines"  # of entry points; where ours lie
+GROUP = "lagbench.baselines"  # of entry points; the modules of this package lie there
 RECIPES = Path(__file__).parent / "recipes"
 NAME = re.compile("[a-z0-9]+(-[a-z0-9]+)*")  # of a baseline: it names folders
-REQUIRED = (
-    "history",
-    "forward",
-    "start",
-    "advance",
-)  # what a subclass of Baseline defines
-# recipe file that all operators share, so that they differ in the operator only
+# what a subclass of Baseline defines
+REQUIRED = ("history", "forward", "start", "advance")
+# recipe file of all operators, so that they differ in the operator only
 OPERATOR_RECIPES = "gns"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
-    """A baseline as an entry point names it."""
+class CatalogueEntry:
+    """A baseline that an entry point names."""
 
     name: str  # name on the command line
     model: type[Baseline]  # its class
     recipes: Path | None  # YAML file of its recipes; None where there is none
 
 
-def names() -> tuple[str, ...]:
+def list_names() -> tuple[str, ...]:
     """Return the names of all baselines, sorted; nothing is imported."""
-    return tuple(sorted(_points()))
+    return tuple(sorted(_find_points()))
 
 
-def find(name: str) -> Entry:
-    """Return a baseline by name."""
-    points = _points()
+def find(name: str) -> CatalogueEntry:
+    """Return a baseline by name.
+
+    Raises:
+        UsageError: there is no such baseline, or its package cannot be imported.
+    """
+    points = _find_points()
     if name not in points:
         raise UsageError(
             f"no baseline {name!r}", where="--baseline", fix=suggest_name(name, points)
         )
     try:
-        return _entry(points[name])
-    except Exception as error:  # a stranger's module: importing it may raise anything
+        return _load_entry(points[name])
+    except Exception as error:  # importing a stranger's module may raise anything
         raise UsageError(
             f"the baseline {name!r} cannot be loaded",
-            where=_package(points[name]),
-            got=_reason(error),
+            where=_package_name(points[name]),
+            got=_describe_error(error),
             fix="mend or uninstall that package",
         ) from error
 
 
-def every_entry() -> dict[str, Entry]:
-    """Return every baseline that can be loaded; others are left out with a
-    PluginWarning.
-    """
-    found = {}
-    for name, point in _points().items():
+def load_all() -> dict[str, CatalogueEntry]:
+    """Return every baseline that can be loaded; warn of others with PluginWarning."""
+    entries = {}
+    for name, point in _find_points().items():
         try:
-            found[name] = _entry(point)
-        except Exception as error:  # as above
-            message = (
-                f"package {_package(point)} adds no baseline {name!r}: {_reason(error)}"
-            )
-            warnings.warn(message, PluginWarning, stacklevel=2)
-    return found
+            entries[name] = _load_entry(point)
+        except Exception as error:  # importing a stranger's module may raise anything
+            _warn_of_point(point, _describe_error(error))
+    return entries
 
 
-def _points() -> dict[str, EntryPoint]:
-    """Return the entry points by name; ours are not to be replaced."""
-    found: dict[str, EntryPoint] = {}
-    for point in sorted(
-        list_entry_points(GROUP),
-        key=lambda point: not point.value.startswith(f"{GROUP}."),
-    ):
-        reason = "a name has small letters, digits and single hyphens"
-        if NAME.fullmatch(point.name):
-            if found.setdefault(point.name, point).value != point.value:
-                reason = "its name is taken"
-            else:
-                reason = ""
-        if reason:
-            message = (
-                f"package {_package(point)} adds no baseline {point.name!r}: {reason}"
-            )
-            warnings.warn(message, PluginWarning, stacklevel=3)
-    return found
+def _find_points() -> dict[str, EntryPoint]:
+    """Return the entry points by name; those of this package cannot be replaced."""
+    points: dict[str, EntryPoint] = {}
+    for point in sorted(list_entry_points(GROUP), key=_is_foreign):
+        if not NAME.fullmatch(point.name):
+            reason = "a name has small letters, digits and single hyphens"
+            _warn_of_point(point, reason)
+            continue
+        holder = points.setdefault(point.name, point)
+        if holder.value != point.value:
+            _warn_of_point(point, "its name is taken")
+    return points
 
 
-def _entry(point: EntryPoint) -> Entry:
-    found = load_entry_point(point)
-    if not inspect.isclass(found):
+def _is_foreign(point: EntryPoint) -> bool:
+    return not point.value.startswith(f"{GROUP}.")
+
+
+def _warn_of_point(point: EntryPoint, reason: str) -> None:
+    package = _package_name(point)
+    message = f"package {package} adds no baseline {point.name!r}: {reason}"
+    warnings.warn(message, PluginWarning, stacklevel=4)
+
+
+def _load_entry(point: EntryPoint) -> CatalogueEntry:
+    loaded_class = load_entry_point(point)
+    if not inspect.isclass(loaded_class):
         raise UsageError(
             f"{point.value} is no class", expected="a subclass of Baseline or Operator"
         )
-    if issubclass(found, Baseline):
-        bare = [
-            name for name in REQUIRED if getattr(found, name) is getattr(Baseline, name)
-        ]
-        if bare:
-            raise UsageError(
-                f"{point.value} lacks {', '.join(bare)}", expected=", ".join(REQUIRED)
-            )
-        return Entry(name=point.name, model=found, recipes=_recipes(found, point.name))
-    from lagbench.baselines.operators.operator import Operator
-
-    from .simulator import GraphNetwork
-
-    if not issubclass(found, Operator):
-        raise UsageError(
-            f"{point.value} is no baseline",
-            expected="a subclass of Baseline or Operator",
-        )
-    model = GraphNetwork.with_operator(found)
-    return Entry(
-        name=point.name, model=model, recipes=_recipes(found, OPERATOR_RECIPES)
+    if issubclass(loaded_class, Baseline):
+        _check_complete(loaded_class, point)
+        recipes = _find_recipes(loaded_class, point.name)
+        return CatalogueEntry(name=point.name, model=loaded_class, recipes=recipes)
+    if issubclass(loaded_class, Operator):
+        model = GraphNetwork.with_operator(loaded_class)
+        recipes = _find_recipes(loaded_class, OPERATOR_RECIPES)
+        return CatalogueEntry(name=point.name, model=model, recipes=recipes)
+    raise UsageError(
+        f"{point.value} is no baseline", expected="a subclass of Baseline or Operator"
     )
 
 
-def _recipes(found: type, name: str) -> Path | None:
-    """Return the file that a class names as ``recipes``, from its module's folder, else
-    ours of that name.
+def _check_complete(model: type[Baseline], point: EntryPoint) -> None:
+    """Refuse a baseline that lacks a method of the contract."""
+    missing = []
+    for name in REQUIRED:
+        if getattr(model, name) is getattr(Baseline, name):
+            missing.append(name)
+    if missing:
+        raise UsageError(
+            f"{point.value} lacks {', '.join(missing)}", expected=", ".join(REQUIRED)
+        )
+
+
+def _find_recipes(model: type, name: str) -> Path | None:
+    """Return the recipe file of a class.
+
+    A class attribute ``recipes`` names it, from the folder of its module; else it is
+    the file of that name in this package, if there is one.
     """
-    given = getattr(found, "recipes", None)
-    if given:
-        path = Path(given)
-    else:
+    stated: str | Path | None = getattr(model, "recipes", None)
+    if not stated:
         path = RECIPES / f"{name}.yaml"
-    if not path.is_absolute():
-        owner = next(base for base in found.__mro__ if "recipes" in vars(base))
-        path = Path(inspect.getfile(owner)).parent / path
-    if given or path.is_file():
+        if path.is_file():
+            return path
+        return None
+    path = Path(stated)
+    if path.is_absolute():
         return path
-    return None
+    owner = next(base for base in model.__mro__ if "recipes" in vars(base))
+    return Path(inspect.getfile(owner)).parent / path
 
 
-def _package(point: EntryPoint) -> str:
+def _package_name(point: EntryPoint) -> str:
     if point.dist:
         return point.dist.name
     return point.value.partition(".")[0]
 
 
-def _reason(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     if isinstance(error, LagbenchError):
         return str(error)
     return f"{type(error).__name__}: {error}"

@@ -1,13 +1,12 @@
 """Checkpoints: tensors and JSON text in a file that cannot run code.
 
 A file of ``torch.save`` with plain entries: ``lagbench_checkpoint`` (format number),
-``about`` (JSON: baseline, model options, facts of the data set, training so far),
-``weights``, and, for resuming, ``optimizer``. It is read with ``weights_only=True``: a
-file with any other object in it, which unpickling would run, is refused.
-
-Options come with a checkpoint, which may be a stranger's: a few bytes of text can ask
-for a model of any size. How large it would be is told before it takes any memory: built
-on torch's device ``meta``, it has shapes and no numbers.
+``about`` (JSON: baseline, model options, dataset info, training log), ``weights``, and,
+for resuming, ``optimizer``. It is read with ``weights_only=True``, which refuses a file
+with any other object in it. So a stranger's file runs no code. The one threat that is
+left is memory: an archive of a few kilobytes may unpack to more than the machine has.
+So the size that its members state is limited. Options may ask for a model beyond all
+memory; building it fails, and so does :func:`restore`.
 """
 
 from __future__ import annotations
@@ -19,15 +18,12 @@ import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from torch import Tensor, nn
-from torch.nn.modules.module import register_module_parameter_registration_hook
-from torch.nn.parameter import is_lazy
 
 from lagbench.atomic import atomic_path
 from lagbench.data.registry import Registry
@@ -41,154 +37,93 @@ from lagbench.errors import (
 )
 from lagbench.submission.budget import Budget, parse_budget
 
-from .baseline import Baseline, Facts
+from .baseline import Baseline, DatasetInfo
 from .catalogue import find
-from .facts import facts_of
-
-# numbers that a model may have beside those of its file: buffers that are not stored
-SPARE = 2**20
-
-
-def check_footprint(
-    model: type[Baseline],
-    options: Mapping[str, object],
-    facts: Facts,
-    weights: Mapping[str, Tensor],
-    *,
-    where: str,
-) -> None:
-    """Refuse to build a model that is larger than the weights that are meant for it.
-
-    A model that cannot be built without numbers, as a stranger's baseline may be,
-    passes.
-    """
-
-    def too_large(expected: str, got: str) -> UnreadableFileError:
-        return UnreadableFileError(
-            "the options ask for a larger model than the weights that come with them",
-            where=where,
-            expected=expected,
-            got=got,
-            fix="do not trust the file, or train anew",
-        )
-
-    stored = {  # tensors that share their bytes count once
-        value.untyped_storage().data_ptr(): value.untyped_storage().nbytes()
-        // value.element_size()
-        for value in weights.values()
-    }
-    held = sum(stored.values())
-    parts = 0
-    most = len(weights) + 1000
-
-    def counted(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
-        nonlocal parts
-        parts += parameter is not None
-        if parts > most:  # layers without number take memory too
-            raise too_large(
-                f"weights for {len(weights)} tensors", f"options for more than {most}"
-            )
-
-    hook = register_module_parameter_registration_hook(counted)
-    try:
-        with torch.device("meta"):
-            built = model.build(options, facts)
-        asked = sum(
-            one.numel()
-            for one in chain(built.parameters(), built.buffers())
-            if not is_lazy(one)
-        )
-    except (RuntimeError, TypeError) as error:
-        if "overflow" not in str(error):
-            return
-        raise too_large(
-            f"weights of {held} numbers", str(error).split("\n")[0][:200]
-        ) from None
-    finally:
-        hook.remove()
-    if asked > held + SPARE:
-        raise too_large(f"weights of {held} numbers", f"options for {asked}")
-
+from .dataset_info import read_dataset_info
 
 FORMAT = 1
 KEY = "lagbench_checkpoint"
-SAFE = "a checkpoint that lagbench train wrote"
+EXPECTED = "a checkpoint that lagbench train wrote"
 RECIPE_NAME = r"^[A-Za-z0-9._/*-]{1,100}$"  # in a file of weights to start from
-# how torch's refusal names what a pickle would call
-_FOREIGN = re.compile(r"GLOBAL ([\w.]+)")
+MOST_BYTES = 4 << 30  # of an unpacked checkpoint
+# the name of a foreign function in torch's refusal of a pickle
+_FOREIGN_NAME = re.compile(r"GLOBAL ([\w.]+)")
+# the first bytes of a pickle
+_PICKLE_HEADS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Checkpoint:
-    """A model with all that it needs to predict, and to be trained on."""
+    """A model with all that it needs to predict, and to train on."""
 
     baseline: str  # name of the baseline
     options: Mapping[str, Any]  # options of the model, plain values
-    facts: Facts  # public figures of the data set that it was trained on
+    info: DatasetInfo  # public figures of the data set of its training
     weights: Mapping[str, Tensor]  # parameters and buffers by name
-    # what training has done so far, plain values
+    # log of the training so far, plain values
     training: Mapping[str, Any] = field(default_factory=dict)
     # state of the optimiser; None in a file that is for predictions only
     optimizer: Mapping[str, Any] | None = None
 
     @property
     def budget(self) -> Budget | None:
-        """What the training took; None where that is not known."""
+        """Budget of the training; None where it is unknown."""
         return parse_budget(json.dumps(self.training.get("budget")))
 
 
-class _Read(BaseModel):
-    """What a file says of a training, as far as it is read again; the rest passes as it
-    is.
-    """
+class _LogPart(BaseModel):
+    """The keys of a training log that are read again; other keys pass unchecked."""
 
     model_config = ConfigDict(extra="allow")
 
 
-class _Options(_Read):
+class _LoggedOptions(_LogPart):
     seed: int = Field(default=0, ge=0, lt=2**63)
     windows: tuple[str, ...] = ("train",)
 
 
-class _Start(_Read):
+class _LoggedStart(_LogPart):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
     recipe: str = Field(pattern=RECIPE_NAME)
 
 
-class _Recipe(_Read):
+class _LoggedRecipe(_LogPart):
     name: str = Field(default="", max_length=200)
-    training: _Options = _Options()
-    start: _Start | None = None
+    training: _LoggedOptions = _LoggedOptions()
+    start: _LoggedStart | None = None
 
 
-class _Training(_Read):
+class _LoggedTraining(_LogPart):
     step: int = Field(default=0, ge=0)
-    recipe: _Recipe = _Recipe()
+    recipe: _LoggedRecipe = _LoggedRecipe()
 
 
 def save(path: Path, checkpoint: Checkpoint) -> None:
-    """Write a checkpoint; it appears whole or not at all."""
+    """Write a checkpoint; it appears whole or not at all.
+
+    Raises:
+        WorkFailedError: the disk is full, or nobody may write there.
+    """
     about = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
-        "facts": asdict(checkpoint.facts),
+        "facts": asdict(checkpoint.info),
         "training": dict(checkpoint.training),
     }
+    weights = {}
+    for name, tensor in checkpoint.weights.items():
+        weights[name] = tensor.detach().cpu()
     content: dict[str, Any] = {
         KEY: FORMAT,
         "about": json.dumps(about, sort_keys=True),
-        "weights": {
-            name: tensor.detach().cpu() for name, tensor in checkpoint.weights.items()
-        },
+        "weights": weights,
     }
     if checkpoint.optimizer is not None:
         content["optimizer"] = dict(checkpoint.optimizer)
     with atomic_path(path, option="--output") as temporary:
         try:
             torch.save(content, temporary)
-        except (
-            RuntimeError
-        ) as error:  # torch's name for whatever the operating system refuses
+        except RuntimeError as error:  # torch raises it for any error of the system
             raise WorkFailedError(
                 "cannot write there",
                 where=str(path),
@@ -198,52 +133,124 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
 
 
 def load(path: str | Path) -> Checkpoint:
-    """Read a checkpoint; nothing in the file is run."""
+    """Read a checkpoint; nothing in the file is run.
+
+    Raises:
+        UnreadableFileError: the file is no checkpoint, damaged, or too large.
+    """
     file = Path(path)
-    content = _content(file)
+    content = _load_content(file)
     try:
         if type(content[KEY]) is not int or content[KEY] != FORMAT:
-            raise _unfit(file, f"format {FORMAT}", f"format {content[KEY]!r}")
+            raise _unreadable(file, f"format {FORMAT}", f"format {content[KEY]!r}")
         about = json.loads(content["about"])
-        _Training.model_validate(about["training"])
-        weights = content["weights"]
-        if not isinstance(weights, Mapping):
-            raise TypeError("weights are no mapping")
-        for name, value in weights.items():
-            fit = (
-                isinstance(name, str)
-                and isinstance(value, Tensor)
-                and value.layout is torch.strided
-            )
-            fit = fit and not (
-                value.is_quantized or value.is_complex() or value.is_meta
-            )
-            if (
-                not fit
-                or value.numel() * value.element_size()
-                > value.untyped_storage().nbytes()
-            ):
-                raise TypeError(
-                    f"weight {name!r} is no tensor of plain numbers that the file holds"
-                )
+        _LoggedTraining.model_validate(about["training"])
         return Checkpoint(
             baseline=str(about["baseline"]),
             options=dict(about["options"]),
-            facts=TypeAdapter(Facts).validate_python(about["facts"]),
-            weights=dict(weights),
+            info=TypeAdapter(DatasetInfo).validate_python(about["facts"]),
+            weights=_check_tensors(content["weights"]),
             training=dict(about["training"]),
             optimizer=content.get("optimizer"),
         )
     except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise _unfit(
-            file, SAFE, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        ) from None
+        reason = " ".join(str(error).split())[:200]
+        raise _unreadable(file, EXPECTED, f"{type(error).__name__}: {reason}") from None
+
+
+def _check_tensors(weights: object) -> dict[str, Tensor]:
+    """Return weights that are plain tensors by name.
+
+    Raises:
+        TypeError: they are something else, or a tensor states more numbers than it has.
+    """
+    if not isinstance(weights, Mapping):
+        raise TypeError("weights are no mapping")
+    for name, value in weights.items():
+        if not isinstance(name, str) or not isinstance(value, Tensor):
+            raise TypeError(f"weight {name!r} is no tensor")
+        is_dense = value.layout is torch.strided and not value.is_meta
+        if not is_dense or value.is_quantized or value.is_complex():
+            raise TypeError(f"weight {name!r} is no tensor of plain numbers")
+        stated_bytes = value.numel() * value.element_size()
+        if stated_bytes > value.untyped_storage().nbytes():
+            raise TypeError(f"weight {name!r} has more numbers than the file holds")
+    return dict(weights)
+
+
+def _load_content(file: Path) -> dict[str, Any]:
+    """Return the content of a file, if it is a dict with the key of checkpoints."""
+    _check_archive(file)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            content = torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        foreign = _FOREIGN_NAME.search(str(error))
+        if foreign is None:
+            raise _unsafe(file, "a pickle of something else") from None
+        raise _unsafe(file, f"a pickle that names {foreign[1][:100]!a}") from None
+    except Exception as error:  # damaged archives raise nearly any type
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise _unreadable(file, EXPECTED, reason) from None
+    if not isinstance(content, dict) or KEY not in content:
+        raise _unreadable(file, EXPECTED, type(content).__name__)
+    return content
+
+
+def _check_archive(file: Path) -> None:
+    """Refuse a file that is no archive, is damaged, or unpacks to too much memory."""
+    hint = None
+    if (file / "weights.pt").is_file():
+        hint = f"name the file: {file / 'weights.pt'}"
+    check_regular(file, longest=MOST_BYTES, fix=hint)
+    try:
+        if not zipfile.is_zipfile(file):
+            with file.open("rb") as stream:
+                head = stream.read(2)
+            if head in _PICKLE_HEADS:
+                raise _unsafe(file, "a pickle of something else")
+            raise _unreadable(file, EXPECTED, "something else")
+        with zipfile.ZipFile(file) as archive:
+            unpacked_bytes = sum(member.file_size for member in archive.infolist())
+            if unpacked_bytes > MOST_BYTES:
+                raise _unreadable(
+                    file, f"at most {MOST_BYTES} bytes", f"{unpacked_bytes} bytes"
+                )
+            damaged_member = archive.testzip()
+    except LagbenchError:
+        raise
+    except Exception as error:  # damaged archives raise nearly any type
+        reason = f"{type(error).__name__}: {str(error)[:200]}"
+        raise _unreadable(file, EXPECTED, reason) from None
+    if damaged_member is not None:
+        reason = f"{damaged_member[:100]!a} has another checksum than it states"
+        raise _unreadable(file, EXPECTED, reason)
+
+
+def _unsafe(file: Path, got: str) -> UnreadableFileError:
+    return UnreadableFileError(
+        "the file holds more than tensors and plain values, and was not opened",
+        where=str(file),
+        expected=EXPECTED,
+        got=got,
+        fix="do not load it otherwise either: such a file can run code",
+    )
+
+
+def _unreadable(file: Path, expected: str, got: str) -> UnreadableFileError:
+    return UnreadableFileError(
+        "not a checkpoint of lagbench", where=str(file), expected=expected, got=got
+    )
 
 
 def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baseline:
-    """Return the model of a checkpoint, in float32, ready to predict."""
-    options = checkpoint.options
-    facts = checkpoint.facts
+    """Return the model of a checkpoint, in float32, ready to predict.
+
+    Raises:
+        UsageError: the baseline is not installed.
+        UnreadableFileError: options or weights do not fit the model.
+    """
     try:
         entry = find(checkpoint.baseline)
     except UsageError as error:
@@ -251,22 +258,29 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
             error.what, where=where, fix="install the package that adds it"
         ) from error
     try:
-        check_footprint(entry.model, options, facts, checkpoint.weights, where=where)
-        model = entry.model.build(options, facts)
+        model = entry.model.build(checkpoint.options, checkpoint.info)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
+        detail = error.errors()[0]
+        key = ".".join(map(str, detail["loc"]))
         raise UnreadableFileError(
             f"option {key!r} of the model does not fit",
             where=where,
-            got=first["msg"],
+            got=detail["msg"],
             fix=f"it is from another version of {checkpoint.baseline}; train anew",
         ) from None
-    except (KeyError, TypeError, ValueError, ArithmeticError) as error:
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        ArithmeticError,
+        MemoryError,
+        RuntimeError,
+    ) as error:
+        reason = str(error).split("\n")[0][:200]
         raise UnreadableFileError(
             "no model can be built from it",
             where=where,
-            got=f"{type(error).__name__}: {error}",
+            got=f"{type(error).__name__}: {reason}",
         ) from None
     load_weights(model, checkpoint.weights, where=where)
     return model.eval()
@@ -275,15 +289,18 @@ def restore(checkpoint: Checkpoint, *, where: str = "the checkpoint") -> Baselin
 def load_weights(
     model: nn.Module, weights: Mapping[str, Tensor], *, where: str
 ) -> None:
-    """Copy weights into a model; those in bfloat16 become float32."""
-    broken = [
-        name
-        for name, value in weights.items()
-        if not value.to(torch.float32).isfinite().all()
-    ]
-    if broken:
+    """Copy weights into a model; those in bfloat16 become float32.
+
+    Raises:
+        UnreadableFileError: weights are not finite, or do not fit the model.
+    """
+    infinite = []
+    for name, value in weights.items():
+        if not value.to(torch.float32).isfinite().all():
+            infinite.append(name)
+    if infinite:
         raise UnreadableFileError(
-            "weights are not finite", where=where, got=", ".join(broken[:3])
+            "weights are not finite", where=where, got=", ".join(infinite[:3])
         )
     try:
         model.load_state_dict(dict(weights))
@@ -295,26 +312,22 @@ def load_weights(
         ) from None
 
 
-def rounded_weights(model: nn.Module) -> dict[str, Tensor]:
-    """Return parameters in bfloat16, and buffers (statistics, closed forms) as they
-    are.
-    """
-    trained = {name for name, _ in model.named_parameters()}
-    return {
-        name: value.detach().to(torch.bfloat16) if name in trained else value.detach()
-        for name, value in model.state_dict().items()
-    }
+def round_weights(model: nn.Module) -> dict[str, Tensor]:
+    """Return parameters in bfloat16; buffers (statistics, closed forms) stay exact."""
+    parameter_names = {name for name, _ in model.named_parameters()}
+    rounded = {}
+    for name, value in model.state_dict().items():
+        if name in parameter_names:
+            rounded[name] = value.detach().to(torch.bfloat16)
+        else:
+            rounded[name] = value.detach()
+    return rounded
 
 
-def rounded_parameters(checkpoint: Checkpoint) -> int:
-    """Return how many parameters a file holds by :func:`rounded_weights`; 0 where they
-    are not rounded.
-    """
-    return sum(
-        value.numel()
-        for value in checkpoint.weights.values()
-        if value.dtype == torch.bfloat16
-    )
+def count_rounded_parameters(checkpoint: Checkpoint) -> int:
+    """Return how many parameters of a file :func:`round_weights` has rounded."""
+    rounded = [w for w in checkpoint.weights.values() if w.dtype == torch.bfloat16]
+    return sum(value.numel() for value in rounded)
 
 
 def check_data(
@@ -324,143 +337,88 @@ def check_data(
     registry: Registry,
     size: str | None = None,
     where: str,
-) -> Facts:
-    """Check that a model can be run on the data at hand, of its own or another size;
-    return their facts.
+) -> DatasetInfo:
+    """Check that a model can be run on the data at hand, and return their info.
+
+    ``size`` may be another size than that of the training.
+
+    Raises:
+        DataError: the data set is missing, or of another version than the training's.
+        UsageError: the model cannot be run at that size.
     """
-    trained = checkpoint.facts
+    trained = checkpoint.info
     try:
         registry.split(trained.split)
     except UsageError as error:
-        what = f"{trained.split}, which the model was trained on, is not there"
         raise DataError(
-            what, where=where, got=f"in {root}", fix="name its folder: --root"
+            f"{trained.split}, which the model was trained on, is not there",
+            where=where,
+            got=f"in {root}",
+            fix="name its folder: --root",
         ) from error
-    if size in (None, trained.size):
-        here = facts_of(trained.split, trained.size, root=root, registry=registry)
+    if size is None or size == trained.size:
+        target = read_dataset_info(
+            trained.split, trained.size, root=root, registry=registry
+        )
         expected = trained.dataset_sha256
-        got = here.dataset_sha256
+        got = target.dataset_sha256
     else:
-        size = registry.size(trained.split, str(size)).name
-        entry = find(checkpoint.baseline)
-        train = f"train it there: lagbench train --baseline {entry.name} {trained.split} --size {size}"
-        if not entry.model.any_size:
-            message = f"{entry.model.method} has weights for the particles of one size"
-            raise UsageError(
-                message, where="--size", expected=trained.size, got=size, fix=train
-            )
-        here = facts_of(trained.split, size, root=root, registry=registry)
-        if (here.bounds, here.frame_interval) != (
-            trained.bounds,
-            trained.frame_interval,
-        ):
-            raise UsageError(
-                f"sizes {trained.size} and {size} of {trained.split} differ in more "
-                f"than resolution",
-                where="--size",
-                expected=f"box {trained.bounds}, {trained.frame_interval:g} s "
-                f"between frames",
-                got=f"box {here.bounds}, {here.frame_interval:g} s",
-                fix=train,
-            )
-        measured = registry.size(trained.split, trained.size).measured
-        if measured is not None:
-            expected = trained.dataset_sha256
-            got = measured.dataset_sha256
-        else:
-            expected, got = (one.version.partition(".")[0] for one in (trained, here))
+        target = _check_other_size(checkpoint, size, root=root, registry=registry)
+        expected, got = _versions_of_training(trained, target, registry)
     if expected != got:
         raise DataError(
             "the model was trained on another version of the data set",
             where=where,
             expected=f"{trained.split} {trained.size} {trained.version}, {expected}",
-            got=f"{here.version}, {got}",
-            fix="train again on the data at hand, or generate the version that it was "
-            "trained on",
+            got=f"{target.version}, {got}",
+            fix="train again on the data at hand, or generate the version of the "
+            "training",
         )
-    return here
+    return target
 
 
-def _unsafe(file: Path, got: str) -> LagbenchError:
-    return UnreadableFileError(
-        "the file holds more than tensors and plain values, and was not opened",
-        where=str(file),
-        expected=SAFE,
-        got=got,
-        fix="do not load it otherwise either: such a file can run code",
-    )
+def _check_other_size(
+    checkpoint: Checkpoint, size: str, *, root: Path, registry: Registry
+) -> DatasetInfo:
+    """Return the info of another size, if the model can be run there."""
+    trained = checkpoint.info
+    size = registry.size(trained.split, size).name
+    entry = find(checkpoint.baseline)
+    command = f"lagbench train --baseline {entry.name} {trained.split} --size {size}"
+    if not entry.model.any_size:
+        raise UsageError(
+            f"{entry.model.method} has weights for the particles of one size",
+            where="--size",
+            expected=trained.size,
+            got=size,
+            fix=f"train it there: {command}",
+        )
+    target = read_dataset_info(trained.split, size, root=root, registry=registry)
+    same_box = target.bounds == trained.bounds
+    same_interval = target.frame_interval == trained.frame_interval
+    if not same_box or not same_interval:
+        raise UsageError(
+            f"sizes {trained.size} and {size} of {trained.split} differ in more than "
+            f"resolution",
+            where="--size",
+            expected=f"box {trained.bounds}, {trained.frame_interval:g} s between "
+            f"frames",
+            got=f"box {target.bounds}, {target.frame_interval:g} s",
+            fix=f"train it there: {command}",
+        )
+    return target
 
 
-def _content(file: Path) -> dict[str, Any]:
-    """Read what is an archive as torch writes them; what is none is refused before it
-    is unpickled.
+def _versions_of_training(
+    trained: DatasetInfo, target: DatasetInfo, registry: Registry
+) -> tuple[str, str]:
+    """Return the version of the training's data, and its version today.
 
-    Members are stored as they are, so all of them together are no longer than the file,
-    and each has the checksum that it states: nothing unpacks to more, and no damaged
-    byte is read.
+    They are hashes where datasets.yaml has one of that size, else major versions.
     """
-    try:
-        if (file / "weights.pt").is_file():
-            inside = f"name the file: {file / 'weights.pt'}"
-        else:
-            inside = None
-        length = check_regular(file, fix=inside)
-        if not zipfile.is_zipfile(file):
-            with file.open("rb") as stream:
-                head = stream.read(2)
-            if head in {b"\x80" + bytes([protocol]) for protocol in range(2, 6)}:
-                raise _unsafe(file, "a pickle of something else")
-            raise _unfit(file, SAFE, "something else")
-        with zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            packed = [
-                one.filename
-                for one in members
-                if one.compress_type != zipfile.ZIP_STORED
-            ]
-            total = sum(max(one.file_size, one.compress_size) for one in members)
-            if (
-                packed
-                or total > length
-                or len({one.filename for one in members}) < len(members)
-            ):
-                sizes = f"members of {total} bytes in {length}"
-                if packed:
-                    got = f"{packed[0][:100]!a} is compressed"
-                else:
-                    got = sizes
-                raise _unfit(
-                    file,
-                    "an archive whose members are stored as they are, each once",
-                    got,
-                )
-            broken = archive.testzip()
-        if broken is not None:
-            raise _unfit(
-                file, SAFE, f"{broken[:100]!a} has another checksum than it states"
-            )
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            content = torch.load(file, map_location="cpu", weights_only=True)
-    except LagbenchError:
-        raise
-    except pickle.UnpicklingError as error:
-        named = _FOREIGN.search(str(error))
-        if named:
-            got = f"a pickle that names {named[1][:100]!a}"
-        else:
-            got = "a pickle of something else"
-        raise _unsafe(file, got) from None
-    except Exception as error:  # damaged archives raise nearly any type
-        raise _unfit(
-            file, SAFE, f"{type(error).__name__}: {str(error)[:200]}"
-        ) from None
-    if not isinstance(content, dict) or KEY not in content:
-        raise _unfit(file, SAFE, type(content).__name__)
-    return content
-
-
-def _unfit(file: Path, expected: str, got: str) -> LagbenchError:
-    return UnreadableFileError(
-        "not a checkpoint of lagbench", where=str(file), expected=expected, got=got
-    )
+    measured = registry.size(trained.split, trained.size).measured
+    if measured is not None:
+        return trained.dataset_sha256, measured.dataset_sha256
+    trained_major, _, _ = trained.version.partition(".")
+    target_major, _, _ = target.version.partition(".")
+    return trained_major, target_major

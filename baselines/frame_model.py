@@ -1,12 +1,12 @@
-"""A model of whole frames: the next state from the last few, fed with its own
-predictions.
+"""A model of whole frames: the next state from the last few states.
 
-A model is a file with its layers and :meth:`FrameModel.next_state`, for training and
-rollouts. A state is positions and velocities of all particles, standardised.
+A model is a file with its layers and :meth:`FrameModel.next_state`, which serves
+training and rollouts. A state is positions and velocities of all particles,
+standardised:
 
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
-with the public statistics of the training scenarios, one figure per feature. The first
+with the public statistics of the training scenarios, one number per feature. The first
 frame of a window has no frame before it: it takes the velocity of the second.
 """
 
@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from lagbench.errors import DataError
 
 from . import baseline
-from .baseline import Baseline, Batch, Facts
+from .baseline import Baseline, Batch, DatasetInfo
 from .graph import MATERIALS
 
 FEATURES = 4  # x, y and the two components of the velocity per frame
@@ -36,60 +36,65 @@ class FrameState(nn.Module):
     mean: Tensor
     std: Tensor
 
-    def __init__(self, facts: Facts) -> None:
+    def __init__(self, info: DatasetInfo) -> None:
         super().__init__()
-        known = facts.statistics
-        mean = (*known["position_mean"], *known["velocity_mean"])
-        std = (*known["position_std"], *known["velocity_std"])
-        self.register_buffer(
-            "mean", torch.tensor(mean, dtype=torch.float64), persistent=False
-        )
-        self.register_buffer(
-            "std", torch.tensor(std, dtype=torch.float64), persistent=False
-        )
+        statistics = info.statistics
+        mean = (*statistics["position_mean"], *statistics["velocity_mean"])
+        std = (*statistics["position_std"], *statistics["velocity_std"])
+        mean_tensor = torch.tensor(mean, dtype=torch.float64)
+        std_tensor = torch.tensor(std, dtype=torch.float64)
+        self.register_buffer("mean", mean_tensor, persistent=False)
+        self.register_buffer("std", std_tensor, persistent=False)
 
-    def of(self, position: Tensor) -> Tensor:
-        """Return the states [1], shape [..., frame, particle, 4], of two consecutive
-        frames or more.
+    def standardise(self, position: Tensor) -> Tensor:
+        """Return the states [1], shape [..., frame, particle, 4].
+
+        Raises:
+            DataError: there are fewer than two consecutive frames.
         """
-        if position.shape[-3] < 2:
+        frame_count = position.shape[-3]
+        if frame_count < 2:
             raise DataError(
-                "a velocity needs two frames",
-                expected="2 or more",
-                got=position.shape[-3],
+                "a velocity needs two frames", expected="2 or more", got=frame_count
             )
-        later = position[..., 1:, :, :] - position[..., :-1, :, :]
-        velocity = torch.cat([later[..., :1, :, :], later], dim=-3)
+        velocity = position[..., 1:, :, :] - position[..., :-1, :, :]
+        velocity = torch.cat([velocity[..., :1, :, :], velocity], dim=-3)
         state = torch.cat([position, velocity], dim=-1)
         return (state - self.mean.to(state.dtype)) / self.std.to(state.dtype)
 
     def position(self, state: Tensor) -> Tensor:
         """Return the positions of states [length], shape [..., 2] from [..., 4]."""
-        return state[..., :2] * self.std[:2].to(state.dtype) + self.mean[:2].to(
-            state.dtype
-        )
+        mean = self.mean[:2].to(state.dtype)
+        std = self.std[:2].to(state.dtype)
+        return state[..., :2] * std + mean
 
 
-def side_by_side(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
-    """Return positions [length], shape [window, frame, particle, 2], and materials,
-    [window, particle].
+def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
+    """Return positions and materials of a batch, window by window.
+
+    Positions [length] have shape [window, frame, particle, 2], materials shape [window,
+    particle].
+
+    Raises:
+        DataError: a window has another number of particles.
     """
-    counts = set(torch.bincount(batch.sample, minlength=batch.windows).tolist())
-    if counts != {particles}:
+    counts = torch.bincount(batch.sample, minlength=batch.windows).tolist()
+    if set(counts) != {particles}:
         raise DataError(
             "a model of whole frames needs every particle",
             where="batch",
             expected=f"{particles} particles in each window",
-            got=", ".join(map(str, sorted(counts))),
+            got=", ".join(map(str, sorted(set(counts)))),
             fix="use a graph network for scenarios of other sizes",
         )
     position = batch.position.view(batch.windows, particles, batch.frames, -1)
-    return position.transpose(1, 2), batch.material.view(batch.windows, particles)
+    material = batch.material.view(batch.windows, particles)
+    return position.transpose(1, 2), material
 
 
 @dataclass(frozen=True)
 class FrameWindow:
-    """The state of a rollout: what :meth:`FrameModel.next_state` is given."""
+    """The state of a rollout: the input of :meth:`FrameModel.next_state`."""
 
     # the last standardised states [1], shape [window, frame, particle, 4]
     state: Tensor
@@ -97,9 +102,7 @@ class FrameWindow:
 
 
 def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
-    """Return the mean squared errors of positions and of velocities, the two halves of
-    Eq. 4.16 [1].
-    """
+    """Return squared errors of positions and velocities [1], halves of Eq. 4.16."""
     error = (predicted - truth).square()
     return {"position": error[..., :2].mean(), "velocity": error[..., 2:].mean()}
 
@@ -113,9 +116,9 @@ class FrameModel(Baseline):
 
     precision: ClassVar[torch.dtype] = torch.float32
 
-    def __init__(self, options: Any, facts: Facts) -> None:  # noqa: ANN401 (each has its own)
-        super().__init__(options, facts)
-        self.frame_state = FrameState(facts)
+    def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
+        super().__init__(options, info)
+        self.frame_state = FrameState(info)
 
     @property
     @abstractmethod
@@ -128,64 +131,63 @@ class FrameModel(Baseline):
 
     @property
     def history(self) -> int:
-        """One frame more than the states that are given: the first has a velocity,
-        too.
-        """
+        """One frame more than the input states: the first has a velocity, too."""
         return self.inputs + 1
 
     @property
     def features(self) -> int:
         """Numbers that describe a frame: 4 per particle."""
-        return FEATURES * self.facts.particles
+        return FEATURES * self.info.particles
 
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return the mean squared errors of position and velocity after one step
-        [1].
-        """
-        return squared_errors(*self.one_step(batch, generator))
+        """Return the squared errors of position and velocity after one step [1]."""
+        truth, predicted = self.predict_last_frame(batch, generator)
+        return squared_errors(truth, predicted)
 
-    def one_step(
+    def predict_last_frame(
         self, batch: Batch, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
         """Return the true and the predicted state of the last frame."""
-        window = self._states(batch)
-        given = self.disturbed(window.state[:, -1 - self.inputs : -1], generator)
-        return window.state[:, -1], self.next_state(FrameWindow(given, window.material))
+        window = self._standardise(batch)
+        truth = window.state[:, -1]
+        inputs = window.state[:, -1 - self.inputs : -1]
+        noisy_inputs = self.add_noise(inputs, generator)
+        predicted = self.next_state(FrameWindow(noisy_inputs, window.material))
+        return truth, predicted
 
-    def _states(self, batch: Batch) -> FrameWindow:
-        position, material = side_by_side(batch, self.facts.particles)
-        return FrameWindow(self.frame_state.of(position.to(self.precision)), material)
+    def _standardise(self, batch: Batch) -> FrameWindow:
+        position, material = arrange_in_frames(batch, self.info.particles)
+        state = self.frame_state.standardise(position.to(self.precision))
+        return FrameWindow(state, material)
 
-    def disturbed(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
+    def add_noise(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
         """Return the inputs of training: a model with noise adds it here."""
         del generator
         return state
 
     def start(self, given: Batch) -> FrameWindow:
-        """Return the last states of the given frames; where too few are given, the
-        first repeats.
+        """Return the last states of the given frames.
+
+        Where too few frames are given, the first one repeats.
         """
-        window = self._states(given)
+        window = self._standardise(given)
         state = window.state[:, -self.inputs :]
-        missing = self.inputs - state.shape[1]
-        first = state[:, :1].expand(-1, missing, -1, -1)
-        return FrameWindow(torch.cat([first, state], dim=1), window.material)
+        missing_frames = self.inputs - state.shape[1]
+        repeated = state[:, :1].expand(-1, missing_frames, -1, -1)
+        return FrameWindow(torch.cat([repeated, state], dim=1), window.material)
 
     def advance(self, state: FrameWindow) -> tuple[FrameWindow, Tensor]:
-        """Advance by one frame: the next window and positions [length], shape
-        [particle, 2].
-        """
-        new = self.next_state(state)
-        window = FrameWindow(
-            torch.cat([state.state[:, 1:], new.unsqueeze(1)], dim=1), state.material
-        )
-        return window, self.frame_state.position(new).flatten(0, 1).to(torch.float32)
+        """Return the next window and positions [length], shape [particle, 2]."""
+        new_state = self.next_state(state)
+        states = torch.cat([state.state[:, 1:], new_state.unsqueeze(1)], dim=1)
+        position = self.frame_state.position(new_state).flatten(0, 1)
+        return FrameWindow(states, state.material), position.to(torch.float32)
 
 
-class Target(enum.StrEnum):
-    """What the output of a network means."""
+class FrameTarget(enum.StrEnum):
+    """What the output of a network of whole frames means."""
 
     STATE = "state"
     CHANGE = "change"
@@ -195,16 +197,16 @@ class FrameNetworkOptions(baseline.Options):
     """Options of a network of whole frames.
 
     The thesis's networks predict the next state itself, without noise;
-    ``target: change`` and ``noise_std`` are ours. A state is made anew in every frame,
-    so that even the first step is off by the error of the whole state; a change keeps
-    what it does not know.
+    ``target: change`` and ``noise_std`` are ours. A network that predicts states forms
+    each one anew, so that even its first step is off by the error of a whole state. A
+    network that predicts changes keeps the features that it cannot predict.
     """
 
     in_training = frozenset({"noise_std"})
     of_weights = frozenset({"target"})
 
     # the next state, or its change in units of the change's deviation over train
-    target: Target = Target.STATE
+    target: FrameTarget = FrameTarget.STATE
     # give the material as a fifth, constant feature of every particle
     material: bool = False
     # of the noise on the states that training gives to the network [standardised]
@@ -212,29 +214,28 @@ class FrameNetworkOptions(baseline.Options):
 
 
 class FrameNetwork(FrameModel):
-    """Base of the networks: their inputs are states, with the material where the recipe
-    wants it.
-    """
+    """Base of the networks: inputs are states, and materials if the recipe says so."""
 
     options: FrameNetworkOptions
     typical_change: Tensor
 
-    def __init__(self, options: FrameNetworkOptions, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: FrameNetworkOptions, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         self.input_features = FEATURES + options.material
         # the standard deviation of a state's change per frame [standardised]
-        known = facts.statistics
-        moved = zip(known["velocity_std"], known["position_std"], strict=True)
-        pushed = zip(known["acceleration_std"], known["velocity_std"], strict=True)
-        typical = torch.tensor(
-            [change / spread for change, spread in (*moved, *pushed)]
-        )
-        self.register_buffer("typical_change", typical, persistent=False)
+        statistics = info.statistics
+        ratios = []
+        for change_name, state_name in (
+            ("velocity_std", "position_std"),
+            ("acceleration_std", "velocity_std"),
+        ):
+            pairs = zip(statistics[change_name], statistics[state_name], strict=True)
+            ratios += [change_std / state_std for change_std, state_std in pairs]
+        typical_change = torch.tensor(ratios)
+        self.register_buffer("typical_change", typical_change, persistent=False)
 
-    def disturbed(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Return the states with independent normal noise; unchanged without a
-        generator.
-        """
+    def add_noise(self, state: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return the states with independent normal noise; none without a generator."""
         if generator is None or self.options.noise_std == 0.0:
             return state
         noise = torch.randn(
@@ -242,23 +243,25 @@ class FrameNetwork(FrameModel):
         )
         return state + self.options.noise_std * noise
 
-    def given(self, window: FrameWindow) -> Tensor:
-        """Return the inputs of the network [1], shape [window, frame, particle, 4 or
-        5].
+    def network_inputs(self, window: FrameWindow) -> Tensor:
+        """Return the network's inputs [1], shape [window, frame, particle, 4 or 5].
+
+        The fifth feature is the material, with 0 ... 3 mapped to -1 ... 1.
         """
         if not self.options.material:
             return window.state
-        # 0 ... 3 to -1 ... 1
-        constant = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
-        constant = constant[:, None, :, None].expand(-1, window.state.shape[1], -1, -1)
-        return torch.cat([window.state, constant], dim=-1)
+        frame_count = window.state.shape[1]
+        material = window.material.to(torch.float32) * (2.0 / (MATERIALS - 1)) - 1.0
+        material = material[:, None, :, None].expand(-1, frame_count, -1, -1)
+        return torch.cat([window.state, material], dim=-1)
 
-    def meant(self, output: Tensor, window: FrameWindow) -> Tensor:
-        """Return the state that an output of shape [window, feature] means, shape
-        [window, particle, 4].
+    def decode_state(self, output: Tensor, window: FrameWindow) -> Tensor:
+        """Return the next state [1], shape [window, particle, 4], from an output.
+
+        The output of the network has shape [window, feature].
         """
-        last = window.state[:, -1]
-        output = output.view(last.shape).to(last.dtype)
-        if self.options.target is Target.STATE:
+        last_state = window.state[:, -1]
+        output = output.view(last_state.shape).to(last_state.dtype)
+        if self.options.target is FrameTarget.STATE:
             return output
-        return last + self.typical_change * output
+        return last_state + self.typical_change * output

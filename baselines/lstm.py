@@ -1,5 +1,6 @@
-"""LSTM in a learned latent space, with and without an MLP between its layers (thesis
-section 4.7).
+"""LSTM in a learned latent space, and one with an MLP between its layers.
+
+Source: thesis section 4.7.
 """
 
 from __future__ import annotations
@@ -13,19 +14,19 @@ from torch import Tensor, nn
 
 from lagbench.data.grid import Grid, Placement
 
-from .baseline import Batch, Facts
+from .baseline import Batch, DatasetInfo
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
 from .mlp import Activation, dense
 from .torch_grid import transfer
 
-Share = Annotated[float, Field(ge=0, lt=1)]
+DropoutRate = Annotated[float, Field(ge=0, lt=1)]
 
 
 class LSTM(FrameNetwork):
     """Two frames in, the next one out (Table 4.6).
 
-    Each frame is encoded particle by particle and averaged over the particles; two LSTM
-    layers read the latent vectors, each followed by dropout; a decoder turns the last
+    Each frame is encoded particle by particle and averaged over the particles. Two LSTM
+    layers read the latent vectors, each followed by dropout. A decoder turns the last
     output into the states of all particles. LSTM cells use tanh, as PyTorch's do; the
     table's ELU stands in encoder, interleaved MLP and decoder.
     """
@@ -43,33 +44,30 @@ class LSTM(FrameNetwork):
         latent: PositiveInt = 1250
         # widths of pointwise layers before the latent one
         encoder: tuple[PositiveInt, ...] = ()
-        decoder: tuple[PositiveInt, ...] = (
-            1250,
-        )  # widths of hidden layers after the second LSTM layer
+        # widths of hidden layers after the second LSTM layer
+        decoder: tuple[PositiveInt, ...] = (1250,)
         # after the first and after the second LSTM layer
-        dropout: tuple[Share, Share] = 0.2, 0.1
+        dropout: tuple[DropoutRate, DropoutRate] = (0.2, 0.1)
         # of the density term in the loss. The thesis states none; with 1 the gradient
         # within a cell drowns that of the positions, which then are not learned.
         density_weight: float = Field(default=0.03, ge=0, allow_inf_nan=False)
 
     options: Options
 
-    def __init__(self, options: Options, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Options, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         latent = options.latent
-        pointwise = dense(
-            (self.input_features, *options.encoder, latent), Activation.ELU
-        )
-        self.encoder = nn.Sequential(*pointwise, nn.ELU())
+        encoder_widths = (self.input_features, *options.encoder, latent)
+        decoder_widths = (latent, *options.decoder, self.features)
+
+        self.encoder = nn.Sequential(*dense(encoder_widths, Activation.ELU), nn.ELU())
         self.first = nn.LSTM(latent, latent, batch_first=True)
-        self.between = (
-            nn.Sequential(nn.Linear(latent, latent), nn.ELU())
-            if self.interleaved
-            else None
-        )
+        self.between: nn.Module | None = None
+        if self.interleaved:
+            self.between = nn.Sequential(nn.Linear(latent, latent), nn.ELU())
         self.second = nn.LSTM(latent, latent, batch_first=True)
-        self.dropout = nn.ModuleList(nn.Dropout(share) for share in options.dropout)
-        self.decoder = dense((latent, *options.decoder, self.features), Activation.ELU)
+        self.dropout = nn.ModuleList(nn.Dropout(rate) for rate in options.dropout)
+        self.decoder = dense(decoder_widths, Activation.ELU)
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -79,25 +77,39 @@ class LSTM(FrameNetwork):
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return the errors of position and velocity, and that of the density map
-        [1].
+        """Return the errors of position, velocity and density map [1].
+
+        The density error is relative over the nodes of the scorer's grid: it is 1 for
+        an empty map.
         """
-        truth, predicted = self.one_step(batch, generator)
-        grid = Grid(self.facts.score_cells, Placement(self.facts.score_placement))
-        places = (self.frame_state.position(state) for state in (truth, predicted))
-        density, guess = (transfer(x, torch.zeros_like(x), grid).weight for x in places)
-        # over the nodes of the scorer's grid: 1 for an empty map
-        error = (guess - density).square().sum() / density.square().sum()
-        return {**squared_errors(truth, predicted), "density": error}
+        truth, predicted = self.predict_last_frame(batch, generator)
+        true_density = self._density(truth)
+        predicted_density = self._density(predicted)
+
+        squared_error = (predicted_density - true_density).square().sum()
+        density_error = squared_error / true_density.square().sum()
+        return {**squared_errors(truth, predicted), "density": density_error}
+
+    def _density(self, state: Tensor) -> Tensor:
+        """Return the weights at the nodes of the scorer's grid [1]."""
+        grid = Grid(self.info.score_cells, Placement(self.info.score_placement))
+        position = self.frame_state.position(state)
+        at_rest = torch.zeros_like(position)
+        return transfer(position, at_rest, grid).weight
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
-        latent = self.encoder(self.given(window)).mean(dim=2)
-        latent = self.dropout[0](self.first(latent)[0])
+        encoded = self.encoder(self.network_inputs(window))
+        latent = encoded.mean(dim=2)  # over the particles, [window, frame, latent]
+
+        latent, _ = self.first(latent)
+        latent = self.dropout[0](latent)
         if self.between is not None:
             latent = self.between(latent)
-        last = self.dropout[1](self.second(latent)[0][:, -1])
-        return self.meant(self.decoder(last), window)
+        latent, _ = self.second(latent)
+
+        last_frame = self.dropout[1](latent[:, -1])
+        return self.decode_state(self.decoder(last_frame), window)
 
 
 class LSTMWithMLP(LSTM):

@@ -17,38 +17,46 @@ from lagbench.errors import UsageError, WorkFailedError
 from lagbench.work.machine import available_cores
 
 
-def chosen_device(name: str) -> str:
-    """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU that is there."""
-    there = torch.cuda.is_available()
-    if name == "auto":
-        if there:
-            return "cuda"
+def choose_device(name: str) -> str:
+    """Return ``cpu`` or ``cuda``; ``auto`` takes a GPU if there is one.
+
+    Raises:
+        UsageError: there is no such device here.
+    """
+    has_gpu = torch.cuda.is_available()
+    if name == "cpu" or (name == "auto" and not has_gpu):
         return "cpu"
-    if name not in ("cpu", "cuda") or (name == "cuda" and not there):
-        if there:
-            expected = "cpu, cuda or auto"
-        else:
-            expected = "cpu or auto: torch sees no GPU"
-        raise UsageError(
-            f"no device {name!r} here", where="--device", expected=expected
-        )
-    return name
+    if name in ("cuda", "auto") and has_gpu:
+        return "cuda"
+    expected = "cpu or auto: torch sees no GPU"
+    if has_gpu:
+        expected = "cpu, cuda or auto"
+    raise UsageError(f"no device {name!r} here", where="--device", expected=expected)
 
 
 def is_helper() -> bool:
-    """Return whether this process helps another, the first, to train: it writes and
-    says nothing.
+    """Return whether this process only helps another, the first, to train.
+
+    A helper writes no files and prints nothing.
     """
-    return any(os.environ.get(name, "0") != "0" for name in ("LOCAL_RANK", "RANK"))
+    ranks = [os.environ.get(name, "0") for name in ("LOCAL_RANK", "RANK")]
+    return any(rank != "0" for rank in ranks)
 
 
 @contextmanager
-def threads_used(count: int | None, *, processes: int = 1) -> Iterator[None]:
-    """Use so many threads for a while."""
+def use_threads(count: int | None, *, processes: int = 1) -> Iterator[None]:
+    """Use so many threads for a while.
+
+    By default it is OMP_NUM_THREADS, else a process's share of the cores.
+    """
     before = torch.get_num_threads()
-    asked = os.environ.get("OMP_NUM_THREADS", "")
-    share = max(1, available_cores() // processes)
-    torch.set_num_threads(count or (max(1, int(asked)) if asked.isdecimal() else share))
+    if not count:
+        environment = os.environ.get("OMP_NUM_THREADS", "")
+        if environment.isdecimal():
+            count = max(1, int(environment))
+        else:
+            count = max(1, available_cores() // processes)
+    torch.set_num_threads(count)
     try:
         yield
     finally:
@@ -66,41 +74,39 @@ def bound_memory() -> None:
 
 
 def return_memory() -> None:
-    """Give freed memory back to the system: blocks of ever new sizes leave holes
-    behind.
-    """
+    """Give freed memory back to the system: blocks of ever new sizes leave holes."""
     # Windows has no library of the process itself; macOS has one without this function.
-    if os.name == "posix":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    else:
-        trim = None
+    if os.name != "posix":
+        return
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 @contextmanager
-def memory_errors_told(fix: str) -> Iterator[None]:
-    """Turn whatever torch raises when memory is full into an error that says what to
-    lower.
-    """
+def explain_memory_errors(hint: str) -> Iterator[None]:
+    """Turn torch's errors of full memory into one that says which option to lower."""
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        full = isinstance(error, (MemoryError, torch.OutOfMemoryError))
-        if not full and "can't allocate memory" not in str(error):
+        is_full = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+        if not is_full and "can't allocate memory" not in str(error):
             raise
         raise WorkFailedError(
-            "out of memory", got=str(error).split("\n")[0][:200], fix=fix
+            "out of memory", got=str(error).split("\n")[0][:200], fix=hint
         ) from error
 
 
 def hardware(device: str = "cpu") -> dict[str, Any]:
-    """Return what the machine is, without its name."""
+    """Return processor, cores, threads and device, without the machine's name."""
+    device_name = "cpu"
+    if device == "cuda":
+        device_name = torch.cuda.get_device_name()
     return {
-        "processor": _processor() or architecture(),
+        "processor": _read_processor("model name") or architecture(),
         "cores": available_cores(),
         "threads": torch.get_num_threads(),
-        "device": torch.cuda.get_device_name() if device == "cuda" else "cpu",
+        "device": device_name,
     }
 
 
@@ -108,10 +114,8 @@ def multiplies_bfloat16(device: str) -> bool:
     """Return whether the device has instructions for products of bfloat16."""
     if device == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    flags = {
-        flag for name in ("flags", "Features") for flag in _processor(name).split()
-    }
-    return not flags.isdisjoint({"avx512_bf16", "amx_bf16", "bf16"})
+    flags = _read_processor("flags").split() + _read_processor("Features").split()
+    return not {"avx512_bf16", "amx_bf16", "bf16"}.isdisjoint(flags)
 
 
 def check_compiler(device: str) -> None:
@@ -127,15 +131,14 @@ def check_compiler(device: str) -> None:
         )
 
 
-def _processor(field: str = "model name") -> str:
-    """Return what Linux tells of the first processor; nothing where it tells
-    nothing.
-    """
+def _read_processor(field: str) -> str:
+    """Return a field of Linux's first processor; nothing on other systems."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return ""
-    parts = (line.partition(":") for line in lines)
-    return next(
-        (value.strip() for name, _, value in parts if name.strip() == field), ""
-    )
+    for line in lines:
+        name, _, value = line.partition(":")
+        if name.strip() == field:
+            return value.strip()
+    return ""

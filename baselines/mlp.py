@@ -9,7 +9,7 @@ from itertools import pairwise
 from pydantic import PositiveInt
 from torch import Tensor, nn
 
-from .baseline import Facts
+from .baseline import DatasetInfo
 from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 
 
@@ -22,24 +22,30 @@ class Activation(enum.StrEnum):
     SIGMOID = "sigmoid"
 
 
-LAYERS = dict(zip(Activation, (nn.ELU, nn.ReLU, nn.Tanh, nn.Sigmoid), strict=True))
+ACTIVATION_LAYERS: Mapping[Activation, type[nn.Module]] = {
+    Activation.ELU: nn.ELU,
+    Activation.RELU: nn.ReLU,
+    Activation.TANH: nn.Tanh,
+    Activation.SIGMOID: nn.Sigmoid,
+}
 
 
 def dense(widths: tuple[int, ...], activation: Activation) -> nn.Sequential:
-    """Return linear layers, each but the last with the activation, from the first width
-    to the last.
+    """Return linear layers from the first width to the last.
+
+    Every layer but the last is followed by the activation.
     """
     layers: list[nn.Module] = []
-    for before, after in pairwise(widths):
-        layers += [nn.Linear(before, after), LAYERS[activation]()]
+    for inputs, outputs in pairwise(widths):
+        layers.append(nn.Linear(inputs, outputs))
+        layers.append(ACTIVATION_LAYERS[activation]())
     return nn.Sequential(*layers[:-1])
 
 
 class MLP(FrameNetwork):
-    """``z(f+1) = W_n a(... a(W_1 z(f) + b_1) ...) + b_n`` over all particles of a frame
-    at once.
+    """``z(f+1) = W_n a(... a(W_1 z(f) + b_1) ...) + b_n`` of all particles at once.
 
-    Particles are told apart by their place in the file.
+    The place of a particle in the file says which inputs and outputs are its own.
     """
 
     method = "mlp"
@@ -50,22 +56,17 @@ class MLP(FrameNetwork):
 
         of_weights = FrameNetworkOptions.of_weights | {"activation"}
 
-        widths: tuple[PositiveInt, ...] = (
-            2500,
-            1250,
-            1250,
-            2500,
-        )  # units of each hidden layer
+        # units of each hidden layer
+        widths: tuple[PositiveInt, ...] = (2500, 1250, 1250, 2500)
         activation: Activation = Activation.ELU  # elu, relu, tanh or sigmoid
 
     options: Options
 
-    def __init__(self, options: Options, facts: Facts) -> None:
-        super().__init__(options, facts)
-        inputs = self.input_features * facts.particles
-        self.network = dense(
-            (inputs, *options.widths, self.features), options.activation
-        )
+    def __init__(self, options: Options, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        inputs = self.input_features * info.particles
+        widths = (inputs, *options.widths, self.features)
+        self.network = dense(widths, options.activation)
 
     @property
     def weights(self) -> Mapping[str, float]:
@@ -74,4 +75,6 @@ class MLP(FrameNetwork):
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
-        return self.meant(self.network(self.given(window)[:, -1].flatten(1)), window)
+        last_frame = self.network_inputs(window)[:, -1]
+        output = self.network(last_frame.flatten(1))
+        return self.decode_state(output, window)

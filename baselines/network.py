@@ -1,5 +1,6 @@
-"""Encode, process, decode: the graph network that all six operators share, and its
-layers for CPUs.
+"""Encode, process, decode: the graph network that all operators share.
+
+The layers below it are those of torch with faster or more exact kernels for CPUs.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lagbench.baselines.operators.operator import Losses, Operator, summed
+from lagbench.baselines.operators.operator import Losses, Operator, sum_edges
 from lagbench.errors import UsageError
 
 
@@ -52,51 +53,58 @@ class ProcessorLayer(nn.Module):
     ) -> tuple[Tensor, Tensor, Losses]:
         """Return updated nodes and edges and the operator's own losses."""
         message = self.message(edge, node, edge_index)
-        given = node
+        operator_input = node
         if self.sum_messages and self.operator.reads_nodes:
-            given = torch.cat([node, summed(edge_index, message, len(node))], dim=-1)
-        answer = self.operator(given, edge_index, message, generator=generator)
-        if (
-            not torch.compiler.is_compiling()
-        ):  # an operator of a user's own may return anything
-            pair = (
-                isinstance(answer, tuple)
-                and len(answer) == 2
-                and isinstance(answer[1], Mapping)
-            )
-            if pair:
-                held = [answer[0], *answer[1].values()]
-            else:
-                held = [answer]
-            shapes = [
-                tuple(one.shape) if isinstance(one, Tensor) else type(one).__name__
-                for one in held
-            ]
-            wanted = (len(node), self.operator.latent)
-            if (
-                not pair
-                or shapes[0] != wanted
-                or any(shape != () for shape in shapes[1:])
-            ):
-                raise UsageError(
-                    "an operator returned no pair of what is gathered and losses",
-                    where=f"{type(self.operator).__qualname__}.forward",
-                    expected=f"a tensor of shape {wanted}, and a dict of losses of "
-                    f"shape (),"
-                    " which may be empty",
-                    got=("" if pair else "alone: ") + ", ".join(map(str, shapes)),
-                    fix="mend that class; docs/extending.md has an example",
-                )
-        gathered, losses = answer
-        update = self.update(torch.cat([node, gathered], dim=-1))
+            message_sum = sum_edges(edge_index, message, len(node))
+            operator_input = torch.cat([node, message_sum], dim=-1)
+
+        output = self.operator(operator_input, edge_index, message, generator=generator)
+        if not torch.compiler.is_compiling():
+            _check_output(output, self.operator, nodes=len(node))
+        aggregate, losses = output
+
+        update = self.update(torch.cat([node, aggregate], dim=-1))
         return node + update, edge + message, losses
+
+
+def _check_output(output: object, operator: Operator, *, nodes: int) -> None:
+    """Refuse an operator's output that is no pair of aggregates and losses.
+
+    The operator may be a user's own, so it may return anything.
+    """
+    values: list[object] = [output]
+    prefix = "alone: "
+    if isinstance(output, tuple) and len(output) == 2:
+        aggregate, losses = output
+        if isinstance(losses, Mapping):
+            values = [aggregate, *losses.values()]
+            prefix = ""
+    shapes: list[object] = []
+    for value in values:
+        if isinstance(value, Tensor):
+            shapes.append(tuple(value.shape))
+        else:
+            shapes.append(type(value).__name__)
+
+    expected_shape = (nodes, operator.latent)
+    has_scalar_losses = all(shape == () for shape in shapes[1:])
+    if not prefix and shapes[0] == expected_shape and has_scalar_losses:
+        return
+    raise UsageError(
+        "an operator returned no pair of aggregates and losses",
+        where=f"{type(operator).__qualname__}.forward",
+        expected=f"a tensor of shape {expected_shape}, and a dict of losses of shape "
+        f"(), which may be empty",
+        got=prefix + ", ".join(map(str, shapes)),
+        fix="mend that class; docs/extending.md has an example",
+    )
 
 
 class EncodeProcessDecode(nn.Module):
     """A graph network after Sanchez-Gonzalez et al. (2020), section 3.
 
-    Two MLPs encode nodes and edges, processor layers of their own weights update both,
-    an MLP decodes the nodes. With latent 128 and 10 layers it has about 1.6 M
+    Two MLPs encode nodes and edges, processor layers with weights of their own update
+    both, an MLP decodes the nodes. With latent 128 and 10 layers it has about 1.6 M
     parameters.
     """
 
@@ -113,19 +121,19 @@ class EncodeProcessDecode(nn.Module):
         super().__init__()
         self.node_encoder = mlp([node_features, latent, latent, latent])
         self.edge_encoder = mlp([edge_features, latent, latent, latent])
-        self.processor = nn.ModuleList(
-            ProcessorLayer(
+        self.processor = nn.ModuleList()
+        for _ in range(layers):
+            layer = ProcessorLayer(
                 operator, latent=latent, hidden=latent, sum_messages=sum_messages
             )
-            for _ in range(layers)
-        )
+            self.processor.append(layer)
         self.decoder = mlp([latent, latent, latent, 2], norm=False)
 
     def compile_layers(self) -> None:
         """Compile the edges' encoder and the processor layers, for any number of edges.
 
-        The layers are compiled once for all: their code is the same. All hidden layers
-        are then kept.
+        The layers have the same code, so one compilation serves all. All hidden layers
+        then stay in memory until the backward pass.
         """
         for part in (self.edge_encoder, *self.processor):
             part.compile(dynamic=True)
@@ -137,28 +145,32 @@ class EncodeProcessDecode(nn.Module):
         edge: Tensor,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the prediction, shape [particle, 2], and the operators' own losses,
-        layer means.
+        """Return the prediction, shape [particle, 2], and the operators' own losses.
+
+        Losses are means over the layers.
         """
-        given = node.dtype
+        input_dtype = node.dtype
         node = self.node_encoder(node)
         edge = self.edge_encoder(edge)
-        losses: list[Losses] = []
+        layer_losses: list[Losses] = []
         for layer in self.processor:
-            node, edge, own = layer(node, edge_index, edge, generator)
-            losses.append(own)
-        means = {
-            name: torch.stack([own[name] for own in losses]).mean()
-            for name in losses[0]
-        }
-        # Three digits of bfloat16 are too few for what is added to velocities every
-        # frame.
+            node, edge, losses = layer(node, edge_index, edge, generator)
+            layer_losses.append(losses)
+
+        mean_losses = {}
+        for name in layer_losses[0]:
+            values = [losses[name] for losses in layer_losses]
+            mean_losses[name] = torch.stack(values).mean()
+
+        # Every frame adds the output to velocities: the three digits of bfloat16 are
+        # too few for that.
         with torch.autocast(node.device.type, enabled=False):
-            return self.decoder(node.to(given)), means
+            prediction = self.decoder(node.to(input_dtype))
+        return prediction, mean_losses
 
 
 class _OneDNNLinear(torch.autograd.Function):
-    """A product by oneDNN, whose kernels go by what a CPU can do.
+    """A product by oneDNN, which chooses its kernels by the instructions of the CPU.
 
     MKL, which torch calls for float32, keeps to AVX2 on CPUs that are not Intel's: half
     as fast.
@@ -167,20 +179,27 @@ class _OneDNNLinear(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:  # noqa: ANN401
         ctx.save_for_backward(x, weight)
-        return _product(x, weight, bias)
+        return _multiply(x, weight, bias)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
-        (grad,), (x, weight) = grads, ctx.saved_tensors
-        of_x, of_weight, of_bias = ctx.needs_input_grad
-        return (
-            _product(grad, weight.t(), None) if of_x else None,
-            grad.t() @ x if of_weight else None,
-            grad.sum(dim=0) if of_bias else None,
-        )
+        (grad,) = grads
+        x, weight = ctx.saved_tensors
+        needs_x, needs_weight, needs_bias = ctx.needs_input_grad
+        x_grad = None
+        weight_grad = None
+        bias_grad = None
+        if needs_x:
+            x_grad = _multiply(grad, weight.t(), None)
+        if needs_weight:
+            weight_grad = grad.t() @ x
+        if needs_bias:
+            bias_grad = grad.sum(dim=0)
+        return x_grad, weight_grad, bias_grad
 
 
-def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+def _multiply(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    """Return ``x W^T + b`` by oneDNN."""
     # Views of wider matrices would take a path a thousand times slower.
     x = x.contiguous()
     weight = weight.contiguous()
@@ -191,25 +210,25 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
-    """Return ``x W^T + b``, as ``torch.nn.functional.linear`` does; shapes [row,
-    input], [output, input].
+    """Return ``x W^T + b``, as ``torch.nn.functional.linear`` does.
+
+    The shapes are [row, input] and [output, input].
     """
-    if _fast(x, weight):
+    if _suits_onednn(x, weight):
         product: Tensor = _OneDNNLinear.apply(x, weight, bias)  # type: ignore[no-untyped-call]
         return product
     return nn.functional.linear(x, weight, bias)
 
 
-def _fast(x: Tensor, weight: Tensor) -> bool:
-    """Return whether oneDNN can and should do it: rows of float32 on a CPU."""
-    rows = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
-    exact = x.dtype == weight.dtype == torch.float32 and not torch.is_autocast_enabled(
-        "cpu"
-    )
-    known = not torch.compiler.is_compiling() and hasattr(
-        torch.ops.mkldnn, "_linear_pointwise"
-    )
-    return rows and exact and known
+def _suits_onednn(x: Tensor, weight: Tensor) -> bool:
+    """Return whether oneDNN can and should multiply: rows of float32 on a CPU."""
+    is_cpu_matrix = x.device.type == "cpu" and x.dim() == 2 and x.numel() > 0
+    is_float32 = x.dtype == weight.dtype == torch.float32
+    if not is_cpu_matrix or not is_float32 or torch.is_autocast_enabled("cpu"):
+        return False
+    if torch.compiler.is_compiling():
+        return False
+    return hasattr(torch.ops.mkldnn, "_linear_pointwise")
 
 
 class Linear(nn.Linear):
@@ -232,9 +251,9 @@ class LayerNorm(nn.LayerNorm):
         if input.device.type != "cpu" or input.dtype != torch.bfloat16:
             return super().forward(input)
         normal = nn.functional.layer_norm(input, self.normalized_shape, eps=self.eps)
-        return torch.addcmul(
-            self.bias.to(input.dtype), normal, self.weight.to(input.dtype)
-        )
+        weight = self.weight.to(input.dtype)
+        bias = self.bias.to(input.dtype)
+        return torch.addcmul(bias, normal, weight)
 
 
 # edges at a time: a hidden layer of 128 then has 4 MB and stays in the cache
@@ -251,24 +270,28 @@ def edge_map(
 ) -> Tensor:
     """Return ``f(s_j + r_i + W_e e_ij)``, shape [edge, output].
 
-    f is the rest of an MLP from its first hidden layer on, of which s and r, shape
-    [particle, hidden], are the parts of a particle.
+    Args:
+        rest: f, the rest of an MLP from its first hidden layer on.
+        edge_index: senders j and receivers i, shape [2, edge].
+        edge: latents e of the edges, shape [edge, latent].
+        sender: parts s of the hidden layer, shape [particle, hidden].
+        receiver: parts r of the hidden layer, shape [particle, hidden].
+        weight: W_e, shape [hidden, latent].
     """
-    hidden = _gathered(edge_index, sender, receiver)
-    hidden += linear(
-        edge, weight
-    )  # In place: an edge tensor of a full scenario is 32 MB.
+    hidden = _sum_of_ends(edge_index, sender, receiver)
+    # In place: an edge tensor of a full scenario has 32 MB.
+    hidden += linear(edge, weight)
     update: Tensor = rest(hidden)
     return update
 
 
-def _gathered(edge_index: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
-    both = receiver.index_select(0, edge_index[1])
-    both += sender.index_select(0, edge_index[0])
-    return both
+def _sum_of_ends(edge_index: Tensor, sender: Tensor, receiver: Tensor) -> Tensor:
+    sums = receiver.index_select(0, edge_index[1])
+    sums += sender.index_select(0, edge_index[0])
+    return sums
 
 
-def _pieces(edges: int) -> list[slice]:
+def _split_edges(edges: int) -> list[slice]:
     return [slice(start, start + PIECE) for start in range(0, edges, PIECE)]
 
 
@@ -277,59 +300,64 @@ class Recomputed(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rest: nn.Module, *tensors: Tensor) -> Tensor:  # noqa: ANN401
-        """Return the update of each edge; arguments are those of :func:`edge_map` and
-        f's parameters.
+        """Return the update of each edge.
+
+        The tensors are the arguments of :func:`edge_map` and the parameters of f.
         """
         ctx.save_for_backward(*tensors)
         ctx.rest = rest
-        ctx.autocast = torch.is_autocast_enabled("cpu"), torch.get_autocast_dtype("cpu")
+        ctx.autocast_enabled = torch.is_autocast_enabled("cpu")
+        ctx.autocast_dtype = torch.get_autocast_dtype("cpu")
         edge_index, edge, sender, receiver, weight = tensors[:5]
-        updates = [
-            edge_map(rest, edge_index[:, piece], edge[piece], sender, receiver, weight)
-            for piece in _pieces(len(edge))
-        ]
+        updates = []
+        for piece in _split_edges(len(edge)):
+            index = edge_index[:, piece]
+            update = edge_map(rest, index, edge[piece], sender, receiver, weight)
+            updates.append(update)
         return torch.cat(updates)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:  # noqa: ANN401
         """Return the gradients of all tensors."""
+        (update_grad,) = grads
         edge_index, edge, sender, receiver, weight, *parameters = ctx.saved_tensors
-        of_edge = torch.empty_like(edge)
-        of_sender = torch.zeros_like(sender)
-        of_receiver = torch.zeros_like(receiver)
-        of_weights = [torch.zeros_like(weight) for weight in (weight, *parameters)]
-        enabled, dtype = ctx.autocast
-        for piece in _pieces(len(edge)):
+        edge_grad = torch.empty_like(edge)
+        sender_grad = torch.zeros_like(sender)
+        receiver_grad = torch.zeros_like(receiver)
+        weight_grads = [torch.zeros_like(each) for each in (weight, *parameters)]
+
+        for piece in _split_edges(len(edge)):
             index = edge_index[:, piece]
-            with torch.enable_grad(), torch.autocast("cpu", dtype, enabled=enabled):
-                some = edge[piece].detach().requires_grad_()
-                hidden = _gathered(
-                    index, sender.detach(), receiver.detach()
-                ).requires_grad_()
-                update = ctx.rest(hidden + linear(some, weight))
-            wanted = [hidden, some, weight, *parameters]
-            of_hidden, of_edge[piece], *own = torch.autograd.grad(
-                update, wanted, grads[0][piece]
+            with (
+                torch.enable_grad(),
+                torch.autocast("cpu", ctx.autocast_dtype, enabled=ctx.autocast_enabled),
+            ):
+                piece_edge = edge[piece].detach().requires_grad_()
+                ends = _sum_of_ends(index, sender.detach(), receiver.detach())
+                ends = ends.requires_grad_()
+                update = ctx.rest(ends + linear(piece_edge, weight))
+            ends_grad, edge_grad[piece], *piece_grads = torch.autograd.grad(
+                update, [ends, piece_edge, weight, *parameters], update_grad[piece]
             )
-            of_sender.index_add_(0, index[0], of_hidden)
-            of_receiver.index_add_(0, index[1], of_hidden)
-            torch._foreach_add_(of_weights, own)
-        return None, None, of_edge, of_sender, of_receiver, *of_weights
+            sender_grad.index_add_(0, index[0], ends_grad)
+            receiver_grad.index_add_(0, index[1], ends_grad)
+            torch._foreach_add_(weight_grads, piece_grads)
+        return None, None, edge_grad, sender_grad, receiver_grad, *weight_grads
 
 
-# edge tensors above this size on a CPU are recomputed, not kept [byte]
+# larger edge tensors on a CPU are recomputed in the backward pass [byte]
 LARGEST_KEPT = 24e6
 
 
 def mlp(widths: list[int], *, norm: bool = True) -> nn.Sequential:
     """Return linear layers with ReLU between them, LayerNorm after the last."""
     layers: list[nn.Module] = []
-    for width, following in pairwise(widths):
-        layers += [Linear(width, following), nn.ReLU(inplace=True)]
+    for inputs, outputs in pairwise(widths):
+        layers.append(Linear(inputs, outputs))
+        layers.append(nn.ReLU(inplace=True))
+    layers.pop()
     if norm:
-        layers[-1:] = [LayerNorm(widths[-1])]
-    else:
-        layers[-1:] = []
+        layers.append(LayerNorm(widths[-1]))
     return nn.Sequential(*layers)
 
 
@@ -354,20 +382,25 @@ class EdgeMLP(nn.Module):
 
     def forward(self, edge: Tensor, node: Tensor, edge_index: Tensor) -> Tensor:
         """Return the update of each edge, shape [edge, latent]."""
-        of_edge, of_receiver, of_sender = self.first.weight.tensor_split(3, dim=1)
-        ends = linear(node, of_sender), linear(node, of_receiver, self.first.bias)
-        mixed = torch.is_autocast_enabled(edge.device.type)
-        if mixed:
-            dtype = torch.get_autocast_dtype(edge.device.type)
-        else:
-            dtype = edge.dtype
-        kept = len(edge) * self.first.out_features * dtype.itemsize
-        if (
-            edge.device.type == "cpu"
-            and kept > LARGEST_KEPT
-            and not torch.compiler.is_compiling()
-        ):
-            tensors = edge_index, edge, *ends, of_edge, *self.rest.parameters()
-            update: Tensor = Recomputed.apply(self.rest, *tensors)  # type: ignore[no-untyped-call]
+        edge_weight, receiver_weight, sender_weight = self.first.weight.tensor_split(
+            3, dim=1
+        )
+        sender = linear(node, sender_weight)
+        receiver = linear(node, receiver_weight, self.first.bias)
+        if self._is_too_large(edge):
+            tensors = (edge_index, edge, sender, receiver, edge_weight)
+            update: Tensor = Recomputed.apply(  # type: ignore[no-untyped-call]
+                self.rest, *tensors, *self.rest.parameters()
+            )
             return update
-        return edge_map(self.rest, edge_index, edge, *ends, of_edge)
+        return edge_map(self.rest, edge_index, edge, sender, receiver, edge_weight)
+
+    def _is_too_large(self, edge: Tensor) -> bool:
+        """Return whether a hidden layer of these edges is not to be kept in memory."""
+        if edge.device.type != "cpu" or torch.compiler.is_compiling():
+            return False
+        dtype = edge.dtype
+        if torch.is_autocast_enabled("cpu"):
+            dtype = torch.get_autocast_dtype("cpu")
+        hidden_bytes = len(edge) * self.first.out_features * dtype.itemsize
+        return hidden_bytes > LARGEST_KEPT

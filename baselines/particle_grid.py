@@ -3,7 +3,7 @@
     spread:  g_ij = sum_p b(x_p - x_i) b(y_p - y_j) v_p        (P2G)
     gather:  v_p  = sum_ij b(x_p - x_i) b(y_p - y_j) g_ij      (G2P)
 
-with the b of :mod:`lagbench.data.grid`. Both share one :class:`Stencil` and have
+with the b of :mod:`lagbench.data.grid`. Both take one :class:`Stencil` and have
 gradients to positions and values.
 """
 
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from .graph import Bounds, wall_distance
-from .torch_grid import nine_nodes, spline_slopes, spline_weights
+from .torch_grid import number_nine_nodes, spline_slopes, spline_weights
 
 __all__ = ["ParticleGrid", "Stencil"]
 
@@ -30,8 +30,7 @@ class Stencil(NamedTuple):
 
 
 class ParticleGrid(nn.Module):
-    """Square cells that lie in a box as its images do: walls between two nodes, the
-    centre in the middle.
+    """Square cells, symmetric about the middle of the box; walls lie between two nodes.
 
     Particles that do not mix, those of several windows or materials, each have a layer
     of nodes.
@@ -51,16 +50,21 @@ class ParticleGrid(nn.Module):
         super().__init__()
         self.bounds = bounds
         self.spacing = max(high - low for low, high in bounds) / cells
-        for name, (low, high) in zip(("axis_x", "axis_y"), bounds, strict=True):
-            nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
-            nodes += -nodes % multiple
-            places = (
-                torch.arange(nodes, dtype=torch.float64) - (nodes - 1) / 2
-            ) * self.spacing
-            axis = ((low + high) / 2 + places).to(torch.float32)
-            self.register_buffer(name, axis, persistent=False)
+        axis_x = self._node_places(bounds[0], multiple)
+        axis_y = self._node_places(bounds[1], multiple)
+        self.register_buffer("axis_x", axis_x, persistent=False)
+        self.register_buffer("axis_y", axis_y, persistent=False)
         self.register_buffer("low", torch.tensor(bounds)[:, 0], persistent=False)
         self.register_buffer("high", torch.tensor(bounds)[:, 1], persistent=False)
+
+    def _node_places(self, interval: tuple[float, float], multiple: int) -> Tensor:
+        """Return the nodes' places along an axis [length], shape [node]."""
+        low, high = interval
+        nodes = math.ceil((high - low) / self.spacing - 1e-6) + 2
+        nodes += -nodes % multiple
+        steps = torch.arange(nodes, dtype=torch.float64) - (nodes - 1) / 2
+        places = (low + high) / 2 + steps * self.spacing
+        return places.to(torch.float32)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -68,122 +72,128 @@ class ParticleGrid(nn.Module):
         return len(self.axis_x), len(self.axis_y)
 
     def stencil(self, position: Tensor, layer: Tensor) -> Stencil:
-        """Return the nodes around positions [length], shape [particle, 2], in layers,
-        int64, [particle].
-        """
-        base, s = self._corner(position)
-        column, row = base.long().unbind(dim=1)
-        node = nine_nodes(layer, column, row, self.shape)
-        return Stencil(spline_weights(s).flatten(1), node.flatten())
+        """Return the nine nodes around each particle.
 
-    def _corner(self, position: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first of the nodes around particles, and where they lie from it on
-        [cell].
+        Args:
+            position: positions [length], shape [particle, 2].
+            layer: layer of nodes of each particle, int64, shape [particle].
         """
+        corner, offset = self._locate(position)
+        column, row = corner.long().unbind(dim=1)
+        node = number_nine_nodes(layer, column, row, self.shape)
+        return Stencil(spline_weights(offset).flatten(1), node.flatten())
+
+    def _locate(self, position: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the first node around each particle, and the way from it [cell]."""
         columns, rows = self.shape
-        s = (position - torch.stack([self.axis_x[0], self.axis_y[0]])) / self.spacing
+        origin = torch.stack([self.axis_x[0], self.axis_y[0]])
+        s = (position - origin) / self.spacing
         # On the far wall the third node has weight 0 and may not exist; NaN must not
         # become an index.
-        last = s.new_tensor([columns - 3, rows - 3])
-        base = (
-            torch.floor(s.detach() - 0.5).nan_to_num(0.0).clamp(min=0.0).minimum(last)
-        )
-        return base, s - base
+        last_corner = s.new_tensor([columns - 3, rows - 3])
+        corner = torch.floor(s.detach() - 0.5).nan_to_num(0.0)
+        corner = corner.clamp(min=0.0).minimum(last_corner)
+        return corner, s - corner
 
     def spread(self, stencil: Stencil, value: Tensor, layers: int) -> Tensor:
-        """Return sums at the nodes, [layer, channel, x node, y node], of values
-        [particle, channel].
+        """Return sums at the nodes, shape [layer, channel, x node, y node].
+
+        ``value`` has shape [particle, channel].
         """
         columns, rows = self.shape
-        parts = (stencil.weight[:, :, None] * value[:, None]).flatten(0, 1)
-        sums = value.new_zeros(layers * columns * rows, value.shape[1]).index_add(
-            0, stencil.node, parts
-        )
+        contributions = stencil.weight[:, :, None] * value[:, None]
+        sums = value.new_zeros(layers * columns * rows, value.shape[1])
+        sums = sums.index_add(0, stencil.node, contributions.flatten(0, 1))
         return sums.view(layers, columns, rows, -1).permute(0, 3, 1, 2)
 
     def gather(self, stencil: Stencil, field: Tensor) -> Tensor:
-        """Return a field, [layer, channel, x node, y node], at the particles,
-        [particle, channel].
+        """Return a field at the particles, shape [particle, channel].
+
+        ``field`` has shape [layer, channel, x node, y node].
         """
         channels = field.shape[1]
-        nodes = (
-            field.permute(0, 2, 3, 1)
-            .reshape(-1, channels)
-            .index_select(0, stencil.node)
-        )
-        return (stencil.weight[:, :, None] * nodes.view(-1, 9, channels)).sum(dim=1)
+        by_node = field.permute(0, 2, 3, 1).reshape(-1, channels)
+        nearby = by_node.index_select(0, stencil.node).view(-1, 9, channels)
+        return (stencil.weight[:, :, None] * nearby).sum(dim=1)
 
-    def pushed(
+    def accelerate(
         self, stencil: Stencil, position: Tensor, stress: Tensor, mass: Tensor
     ) -> Tensor:
-        """Return accelerations (x, y) of nodes of matter under stress, [layer, 2 frame,
-        x node, y node].
+        """Return accelerations (x, y) of nodes of matter under stress.
 
             m_i a_i = -sum_p s_p grad b_i(x_p),   m_i = sum_p b_i(x_p)
 
-        the weak form of the material-point method (Sulsky, Chen and Schreyer 1994),
-        with grad per cell; 0 where there is no matter. As the b_i sum to 1 and the s_p
-        are symmetric, momentum and angular momentum of the nodes are kept. ``stress``
-        has components (xx, xy, yy), shape [particle, frame, 3]; the stencil is that of
-        ``position``; ``mass`` is what :meth:`spread` returns of 1.
+        This is the weak form of the material-point method (Sulsky, Chen and Schreyer
+        1994), with grad per cell; a is 0 where there is no matter. As the b_i sum to 1
+        and the s_p are symmetric, momentum and angular momentum of the nodes are
+        conserved. The result has shape [layer, 2 frame, x node, y node].
+
+        Args:
+            stencil: nodes around ``position``.
+            position: positions [length], shape [particle, 2].
+            stress: components (xx, xy, yy), shape [particle, frame, 3].
+            mass: result of :meth:`spread` for values of 1.
         """
         columns, rows = self.shape
-        along_x, along_y = (
-            spline_slopes(self._corner(position)[1]).flatten(2)[..., None].unbind(dim=1)
-        )
-        xx, xy, yy = stress[:, None].unbind(dim=3)
-        force = -torch.stack(
-            [xx * along_x + xy * along_y, xy * along_x + yy * along_y], dim=3
-        )
-        parts = force.flatten(2).flatten(0, 1)
-        sums = force.new_zeros(mass.numel(), parts.shape[1]).index_add(
-            0, stencil.node, parts
-        )
-        sums = sums / mass.flatten().clamp(min=1e-9)[:, None]
-        return sums.view(len(mass), columns, rows, -1).permute(0, 3, 1, 2)
+        _, offset = self._locate(position)
+        slopes = spline_slopes(offset).flatten(2)[..., None]  # [particle, 2, 9, 1]
+        slope_x, slope_y = slopes.unbind(dim=1)
+        xx, xy, yy = stress[:, None].unbind(dim=3)  # each [particle, 1, frame]
+
+        pull_x = xx * slope_x + xy * slope_y
+        pull_y = xy * slope_x + yy * slope_y
+        force = -torch.stack([pull_x, pull_y], dim=3)  # [particle, 9, frame, 2]
+        contributions = force.flatten(2).flatten(0, 1)
+        sums = force.new_zeros(mass.numel(), contributions.shape[1])
+        sums = sums.index_add(0, stencil.node, contributions)
+
+        node_mass = mass.flatten().clamp(min=1e-9)
+        acceleration = sums / node_mass[:, None]
+        return acceleration.view(len(mass), columns, rows, -1).permute(0, 3, 1, 2)
 
     def offsets(self, stencil: Stencil, position: Tensor) -> Tensor:
-        """Return how far the nine nodes lie from each particle [length], shape
-        [particle, 9, 2].
-        """
+        """Return the way from each particle to its nodes [length], [particle, 9, 2]."""
         columns, rows = self.shape
         node = stencil.node.view(-1, 9) % (columns * rows)
-        places = torch.stack(
-            [self.axis_x[node // rows], self.axis_y[node % rows]], dim=2
-        )
-        return places - position[:, None]
+        x = self.axis_x[node // rows]
+        y = self.axis_y[node % rows]
+        return torch.stack([x, y], dim=2) - position[:, None]
 
     def wall_distance(self, reach: float) -> Tensor:
-        """Return the nodes' distances to the walls as particles see theirs, shape
-        [wall, x node, y node].
-        """
-        places = torch.stack(
-            torch.meshgrid(self.axis_x, self.axis_y, indexing="ij"), dim=-1
-        )
-        return wall_distance(places, self.bounds, reach).permute(2, 0, 1).contiguous()
+        """Return the nodes' distances to the walls, shape [wall, x node, y node].
 
-    def inside(self) -> Tensor:
-        """Return the shares of the nodes' splines that lie in the box [1], shape [x
-        node, y node].
+        They are those of :func:`~lagbench.baselines.graph.wall_distance`.
         """
-        of_x, of_y = (
-            _below((high - axis) / self.spacing) - _below((low - axis) / self.spacing)
-            for axis, low, high in zip(
-                (self.axis_x, self.axis_y), self.low, self.high, strict=True
-            )
-        )
-        return of_x[:, None] * of_y
+        x, y = torch.meshgrid(self.axis_x, self.axis_y, indexing="ij")
+        distance = wall_distance(torch.stack([x, y], dim=-1), self.bounds, reach)
+        return distance.permute(2, 0, 1).contiguous()
+
+    def share_inside(self) -> Tensor:
+        """Return the shares of the nodes' splines in the box [1], [x node, y node]."""
+        low_x, low_y = self.low
+        high_x, high_y = self.high
+        share_x = self._axis_share_inside(self.axis_x, low_x, high_x)
+        share_y = self._axis_share_inside(self.axis_y, low_y, high_y)
+        return share_x[:, None] * share_y
+
+    def _axis_share_inside(self, axis: Tensor, low: Tensor, high: Tensor) -> Tensor:
+        below_high = _integrate_spline((high - axis) / self.spacing)
+        below_low = _integrate_spline((low - axis) / self.spacing)
+        return below_high - below_low
 
     def beside_walls(self) -> Tensor:
-        """Return 1 at the two rows of nodes beside each wall, else 0, shape [wall, x
-        node, y node].
+        """Return 1 at the two rows of nodes beside each wall, else 0.
+
+        The shape is [wall, x node, y node].
         """
-        return (self.wall_distance(self.spacing).abs() < 1.0).to(torch.float32)
+        is_beside = self.wall_distance(self.spacing).abs() < 1.0
+        return is_beside.to(torch.float32)
 
 
-def _below(s: Tensor) -> Tensor:
-    """Return the integral of the spline up to a distance from its node [cell]."""
+def _integrate_spline(s: Tensor) -> Tensor:
+    """Return the integral of the spline up to a distance s from its node [cell]."""
     s = s.clamp(-1.5, 1.5)
-    near = 0.5 + s * (0.75 - s * s / 3.0)
-    far = (1.5 - s.abs()) ** 3 / 6.0
-    return torch.where(s.abs() < 0.5, near, torch.where(s < 0.0, far, 1.0 - far))
+    inner = 0.5 + s * (0.75 - s * s / 3.0)
+    tail = (1.5 - s.abs()) ** 3 / 6.0
+    outer = torch.where(s < 0.0, tail, 1.0 - tail)
+    return torch.where(s.abs() < 0.5, inner, outer)

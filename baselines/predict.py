@@ -1,7 +1,7 @@
 """Predict: roll a trained model out over the test scenarios into a predictions.nc.
 
-Of the test subset only the given frames are read. Time is taken of rollouts alone,
-after one step to warm up; that of the neighbour search is measured on frames of the
+Only the given frames of the test subset are read. Times are those of rollouts alone,
+after one step to warm up; the time of the neighbour search is measured on frames of the
 same rollouts.
 """
 
@@ -24,44 +24,47 @@ from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.provenance import StartWeights, TrainingProvenance
 from lagbench.submission.writer import PredictionsWriter
+from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, Facts, rescaled
+from .baseline import Baseline, DatasetInfo, rescale
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
-from .job import MOST_RECORD, RunFolder, parameter_count, settings_of
+from .job import count_parameters
 from .machine import (
     bound_memory,
-    chosen_device,
+    choose_device,
+    explain_memory_errors,
     hardware,
-    memory_errors_told,
-    threads_used,
+    use_threads,
 )
-from .recipe import changed_options
+from .recipe import change_options
+from .recipe_changes import list_settings
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
+from .run_folder import LARGEST_LOG, RunFolder
 from .start import warn_of_last_state
 
 START_DIGITS = 12  # digits of a SHA-256 that provenance names
 
-SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
+TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
 
 class UnfinishedWarning(UserWarning):
-    """The weights are those of a training that did not come to its end."""
+    """The weights are those of a training that is not over."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PredictionResult:
-    """What a prediction made and cost."""
+    """Predictions and their costs."""
 
     path: Path  # the predictions.nc
     split: str  # name of the split
     size: str  # name of the size
     trained_size: str  # name of the size that the model was trained at
     settings: tuple[str, ...]  # changes of its options, as in model.average=true
-    method: str  # what made it
+    method: str  # name of the method
     scenarios: int  # scenarios predicted
     frames: int  # frames of each
     batch: int  # scenarios that were rolled out side by side
@@ -89,7 +92,7 @@ def predict(
     threads: int | None = None,
     batch: int | None = None,
     method: str | None = None,
-    solver: Callable[[str, str], float | None] | None = None,
+    time_solver: Callable[[str, str], float | None] | None = None,
     progress: Callable[[Progress], None] | None = None,
     registry: Registry | None = None,
 ) -> PredictionResult:
@@ -99,9 +102,9 @@ def predict(
     At another size the connectivity radius keeps its ratio to the distance of
     particles, and statistics stay those of the training.
 
-    Where a training.json beside the checkpoint says that its training is not over,
-    there is an :class:`UnfinishedWarning`; where it holds the last state beside the
-    best weights, a :class:`~lagbench.baselines.start.LastStateWarning`.
+    An :class:`UnfinishedWarning` tells of a training.json beside the checkpoint whose
+    training is not over, a :class:`~lagbench.baselines.start.LastStateWarning` of a
+    checkpoint with the last state beside the best weights.
 
     Args:
         checkpoint: weights.pt or checkpoint.pt of a training.
@@ -113,9 +116,11 @@ def predict(
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
         batch: scenarios side by side; 1 on a CPU and all on a GPU by default.
-        method: what to call it; the model's own name by default.
-        solver: called with split and size after the rollouts: time of our solver for a
-            frame on one core of this machine [s], None where it cannot be told.
+        method: name of the method; the model's own by default.
+        time_solver: function that returns the solver's time for a frame of a split and
+            size on one core of this machine [s], or None where it cannot run. It is
+            called after the rollouts. The caller gives it because baselines may not
+            import the solver.
         progress: called as the work advances.
         registry: where splits are described; ours when None.
 
@@ -123,195 +128,248 @@ def predict(
         UnreadableFileError: the checkpoint is damaged or unsafe.
         DataError: the data set is missing, damaged, or of another version than that of
             the training.
-        UsageError: the baseline is not installed, no such device, weights of no use at
-            the size or as set, or the output would replace something else, as the
-            weights themselves.
+        UsageError: the baseline is not installed, there is no such device, the weights
+            cannot be run at that size or with those settings, or the output would
+            replace another file, such as the weights.
         WorkFailedError: out of memory, or the disk is full.
     """
-    check_replaceable(Path(output))
-    found = load(checkpoint)
-    warn_of_last_state(found, Path(checkpoint))
-    # Weights of the best validation say 'running' for good: what became of the training
-    # stands beside them.
-    path = Path(checkpoint)
-    if (reached := RunFolder(path.parent).unfinished(found.training)) is not None:
-        warnings.warn(
-            f"the training behind {path} stands at step {reached[0]} of {reached[1]}; "
-            f"to go on with it"
-            f" give its `lagbench train` command again, with --output {path.parent}",
-            UnfinishedWarning,
-            stacklevel=2,
-        )
-    home = resolve_root(root)
-    known = load_rooted_registry(home, registry)
-    facts = check_data(
-        found, root=home, registry=known, size=size, where=str(checkpoint)
+    output_path = Path(output)
+    check_replaceable(output_path)
+    checkpoint_path = Path(checkpoint)
+    trained = load(checkpoint)
+    warn_of_last_state(trained, checkpoint_path)
+    _warn_of_unfinished(trained, checkpoint_path)
+    root_folder = resolve_root(root)
+    known_splits = load_rooted_registry(root_folder, registry)
+    info = check_data(
+        trained,
+        root=root_folder,
+        registry=known_splits,
+        size=size,
+        where=str(checkpoint),
     )
-    machine = chosen_device(device)
+    machine = choose_device(device)
     bound_memory()
     tests = scenario_paths(
-        facts.split, subset="test", size=facts.size, root=home, registry=known
+        info.split,
+        subset="test",
+        size=info.size,
+        root=root_folder,
+        registry=known_splits,
     )
     paths = list(tests.values())
-    side = min(batch or (1 if machine == "cpu" else len(paths)), len(paths))
-    with threads_used(threads), memory_errors_told("lower --batch"):
-        model = _model(found, facts, settings, known, where=str(checkpoint)).to(machine)
-        work = _Rollouts(model, facts, paths, side, machine)
+    side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
+
+    with use_threads(threads), explain_memory_errors("lower --batch"):
+        model = _restore_model(
+            trained, info, settings, known_splits, where=str(checkpoint)
+        ).to(machine)
+        rollouts = _TimedRollouts(model, info, paths, side_by_side, machine)
         label = method or model.method
-        count = parameter_count(model)
-        here = hardware(machine)
-        on_cpu = f"{here['processor']}, {here['threads']} thread{'s' if here['threads'] > 1 else ''}"
-        if machine == "cuda":
-            hardware_label = str(here["device"])
-        else:
-            hardware_label = on_cpu
+        parameters = count_parameters(model)
+        hardware_label = _describe_hardware(machine)
         writer = PredictionsWriter(
             output,
-            split=facts.split,
-            size=facts.size,
+            split=info.split,
+            size=info.size,
             method=label,
-            dataset_sha256=facts.dataset_sha256,
-            registry=known,
+            dataset_sha256=info.dataset_sha256,
+            registry=known_splits,
             device=hardware_label,
-            parameters=count,
-            **_provenance(found, facts, settings),
+            parameters=parameters,
+            **_training_attributes(trained, info, settings),
         )
         meter = Meter(progress)
-        timed = None
         meter.begin("predicting", total=len(paths), scenarios=len(paths))
+        solver_seconds_per_frame = None
         with writer:
-            for rollout in work:
-                writer.add(
-                    rollout.scenario,
-                    rollout.position.numpy(),
-                    diverged_at=rollout.diverged_at,
-                )
+            for rollout in rollouts:
+                position = rollout.position.numpy()
+                writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
                 meter.count(1, scenarios=1)
-            writer.label(seconds_per_frame=work.seconds_per_frame)
-            if (
-                solver is not None
-                and (timed := solver(facts.split, facts.size)) is not None
-            ):
-                writer.label(solver_seconds_per_frame=timed)
+            writer.label(seconds_per_frame=rollouts.seconds_per_frame)
+            if time_solver is not None:
+                solver_seconds_per_frame = time_solver(info.split, info.size)
+            if solver_seconds_per_frame is not None:
+                writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
+
     result = PredictionResult(
-        path=Path(output),
-        split=facts.split,
-        size=facts.size,
-        trained_size=found.facts.size,
+        path=output_path,
+        split=info.split,
+        size=info.size,
+        trained_size=trained.info.size,
         settings=tuple(settings),
         method=label,
         scenarios=len(paths),
-        frames=facts.horizon,
-        batch=side,
-        seconds_per_frame=work.seconds_per_frame,
-        seconds_without_search=work.seconds_per_frame - work.search_per_frame,
-        clock=work.clock,
-        solver_seconds_per_frame=timed,
+        frames=info.horizon,
+        batch=side_by_side,
+        seconds_per_frame=rollouts.seconds_per_frame,
+        seconds_without_search=rollouts.seconds_per_frame - rollouts.search_per_frame,
+        clock=rollouts.clock,
+        solver_seconds_per_frame=solver_seconds_per_frame,
         device=hardware_label,
-        parameters=count,
-        diverged=work.diverged,
+        parameters=parameters,
+        diverged=rollouts.diverged,
     )
-    plain = json.dumps(
-        {**asdict(result), "path": result.path.name}, indent=2, sort_keys=True
-    )
-    write_atomically(
-        result.path.with_suffix(".json"), plain.encode() + b"\n", option="--output"
-    )
+    _write_costs(result)
     return result
 
 
-def check_replaceable(output: Path) -> None:
-    """Refuse to write predictions, and what they cost beside them, over files that are
-    something else.
+def _warn_of_unfinished(checkpoint: Checkpoint, path: Path) -> None:
+    """Warn of weights whose training is not over.
+
+    The log in the weights of the best validation always says 'running'; the log beside
+    them tells the state of today.
     """
-    # a folder may have no name of its own
-    cost = output if output.is_dir() else output.with_suffix(".json")
-    if cost.is_dir():
-        fix = f"name a file, as in -o {cost / 'predictions.nc'}"
-        raise UsageError(
-            "the output is a folder", where="--output", got=str(cost), fix=fix
-        )
-    if output == cost:
-        fix = f"name it {output.with_suffix('.nc').name}: what the predictions cost goes to {cost.name}"
-        raise UsageError(
-            "predictions are no JSON", where="--output", got=str(output), fix=fix
-        )
-    # scores have no format of data, scenarios no hash of the whole data set
-    of_predictions = (b"lagbench_format", b"dataset_sha256")
-    of_cost = (b"seconds_without_search",)
-    for path, ours in ((output, of_predictions), (cost, of_cost)):
-        if not path.is_file():
-            continue
-        with path.open("rb") as stream:
-            held = stream.read(MOST_RECORD)
-        if held and not all(sign in held for sign in ours):
-            raise UsageError(
-                "the output would replace a file that is something else",
-                where="--output",
-                got=str(path),
-                fix="name another file: -o predictions.nc",
-            )
+    folder = RunFolder(path.parent)
+    reached = folder.unfinished_steps(checkpoint.training)
+    if reached is None:
+        return
+    step, steps = reached
+    message = (
+        f"the training behind {path} stands at step {step} of {steps}; to go on with "
+        f"it give its `lagbench train` command again, with --output {path.parent}"
+    )
+    warnings.warn(message, UnfinishedWarning, stacklevel=3)
 
 
-class _Rollouts:
+def _choose_batch(batch: int | None, machine: str, *, scenarios: int) -> int:
+    """Return how many scenarios to roll out side by side."""
+    if not batch:
+        batch = scenarios
+        if machine == "cpu":
+            batch = 1
+    return min(batch, scenarios)
+
+
+def _describe_hardware(machine: str) -> str:
+    """Return the GPU, or the processor and its threads."""
+    found_hardware = hardware(machine)
+    if machine == "cuda":
+        return str(found_hardware["device"])
+    threads = found_hardware["threads"]
+    unit = "thread"
+    if threads > 1:
+        unit = "threads"
+    return f"{found_hardware['processor']}, {threads} {unit}"
+
+
+def _write_costs(result: PredictionResult) -> None:
+    """Write the result as JSON beside the predictions."""
+    values = {**asdict(result), "path": result.path.name}
+    text = json.dumps(values, indent=2, sort_keys=True)
+    path = result.path.with_suffix(".json")
+    write_atomically(path, text.encode() + b"\n", option="--output")
+
+
+def check_replaceable(output: Path) -> None:
+    """Refuse to write predictions and their costs over files of another kind.
+
+    Raises:
+        UsageError: the output is a folder, a JSON file, or a file of another kind.
+    """
+    costs = output  # a folder may have no name of its own
+    if not output.is_dir():
+        costs = output.with_suffix(".json")
+    if costs.is_dir():
+        raise UsageError(
+            "the output is a folder",
+            where="--output",
+            got=str(costs),
+            fix=f"name a file, as in -o {costs / 'predictions.nc'}",
+        )
+    if output == costs:
+        raise UsageError(
+            "predictions are no JSON",
+            where="--output",
+            got=str(output),
+            fix=f"name it {output.with_suffix('.nc').name}: the costs of the "
+            f"predictions go to {costs.name}",
+        )
+    # Scores have no format of data, scenarios no hash of the whole data set.
+    _check_kind(output, signs=(b"lagbench_format", b"dataset_sha256"))
+    _check_kind(costs, signs=(b"seconds_without_search",))
+
+
+def _check_kind(path: Path, *, signs: tuple[bytes, ...]) -> None:
+    """Refuse to replace a file that lacks one of the signs of its kind."""
+    if not path.is_file():
+        return
+    with path.open("rb") as stream:
+        content = stream.read(LARGEST_LOG)
+    if content and not all(sign in content for sign in signs):
+        raise UsageError(
+            "the output would replace a file that is something else",
+            where="--output",
+            got=str(path),
+            fix="name another file: -o predictions.nc",
+        )
+
+
+class _TimedRollouts:
     """Rolls scenarios out, some side by side, and takes the time."""
 
     def __init__(
-        self, model: Baseline, facts: Facts, paths: list[Path], side: int, machine: str
+        self,
+        model: Baseline,
+        info: DatasetInfo,
+        paths: list[Path],
+        side_by_side: int,
+        machine: str,
     ) -> None:
         self.seconds = 0.0  # time of the rollouts [s]
-        # the time that is taken, 'processor' or 'wall'
+        self.clock = "wall"  # clock of the times, 'processor' or 'wall'
         if machine == "cpu" and torch.get_num_threads() == 1:
             self.clock = "processor"
-        else:
-            self.clock = "wall"
-        # frames that the model was asked for, of all scenarios; frozen ones cost
-        # nothing
+        # frames that the model predicted, of all scenarios; frozen ones cost nothing
         self.frames = 0
         # scenario id to the absolute frame from which its rollout is frozen
         self.diverged: dict[int, int] = {}
         self._model = model
-        self._facts = facts
+        self._info = info
         self._machine = machine
-        self._groups = [
-            paths[first : first + side] for first in range(0, len(paths), side)
-        ]
-        self._searches: list[float] = []
+        self._groups = []
+        for first in range(0, len(paths), side_by_side):
+            self._groups.append(paths[first : first + side_by_side])
+        self._search_seconds: list[float] = []  # per frame of one scenario
 
     def __iter__(self) -> Iterator[Rollout]:
         """Yield the rollout of every scenario."""
+        input_frames = slice(0, self._info.input_frames)
         for number, group in enumerate(self._groups):
-            given = scenario_batch(group, slice(0, self._facts.input_frames)).to(
-                self._machine
-            )
+            given = scenario_batch(group, input_frames).to(self._machine)
             if number == 0:
-                roll_out(self._model, given, 1)
-            started = self._now()
-            found = roll_out(self._model, given, self._facts.horizon)
-            self.seconds += self._now() - started
-            for one in found:
-                if one.diverged_at is None:
-                    self.frames += self._facts.horizon
-                else:  # the first frame that is not finite was made, too
-                    self.frames += one.diverged_at - self._facts.input_frames + 1
-                    self.diverged[one.scenario] = one.diverged_at
-            radius = getattr(self._model, "radius", None)
-            if (
-                radius is not None
-            ):  # search neighbours once more in some frames, and take the time
-                positions = torch.cat([one.position for one in found], dim=1).to(
-                    self._machine
-                )
-                most = getattr(self._model.options, "neighbours", None)
-                for frame in range(
-                    0, len(positions), max(1, len(positions) // SEARCHES)
-                ):
-                    started = self._now()
-                    radius_graph(
-                        positions[frame], float(radius), given.sample, most=most
-                    )
-                    self._searches.append((self._now() - started) / len(found))
-            yield from found
+                roll_out(self._model, given, 1)  # to warm up
+            started = self._read_clock()
+            rollouts = roll_out(self._model, given, self._info.horizon)
+            self.seconds += self._read_clock() - started
+            for rollout in rollouts:
+                self._count_frames(rollout)
+            self._time_searches(given, rollouts)
+            yield from rollouts
+
+    def _count_frames(self, rollout: Rollout) -> None:
+        if rollout.diverged_at is None:
+            self.frames += self._info.horizon
+            return
+        # The model predicted the first frame that is not finite, too.
+        self.frames += rollout.diverged_at - self._info.input_frames + 1
+        self.diverged[rollout.scenario] = rollout.diverged_at
+
+    def _time_searches(self, given: Batch, rollouts: list[Rollout]) -> None:
+        """Search neighbours once more in some frames, and take the time."""
+        radius = getattr(self._model, "radius", None)
+        if radius is None:
+            return
+        most = getattr(self._model.options, "neighbours", None)
+        positions = torch.cat([rollout.position for rollout in rollouts], dim=1)
+        positions = positions.to(self._machine)
+        stride = max(1, len(positions) // TIMED_SEARCHES)
+        for frame in range(0, len(positions), stride):
+            started = self._read_clock()
+            radius_graph(positions[frame], float(radius), given.sample, most=most)
+            elapsed = self._read_clock() - started
+            self._search_seconds.append(elapsed / len(rollouts))
 
     @property
     def seconds_per_frame(self) -> float:
@@ -321,11 +379,11 @@ class _Rollouts:
     @property
     def search_per_frame(self) -> float:
         """Time of the neighbour search in it [s]; 0 for a model without one."""
-        if self._searches:
-            return sum(self._searches) / len(self._searches)
-        return 0.0
+        if not self._search_seconds:
+            return 0.0
+        return sum(self._search_seconds) / len(self._search_seconds)
 
-    def _now(self) -> float:
+    def _read_clock(self) -> float:
         if self._machine == "cuda":
             torch.cuda.synchronize()
         if self.clock == "processor":
@@ -333,23 +391,23 @@ class _Rollouts:
         return time.perf_counter()
 
 
-def _model(
-    found: Checkpoint,
-    facts: Facts,
+def _restore_model(
+    checkpoint: Checkpoint,
+    info: DatasetInfo,
     settings: Sequence[str],
-    known: Registry,
+    registry: Registry,
     *,
     where: str,
 ) -> Baseline:
-    """Return the model of a checkpoint for the size that facts tell of, with
-    settings.
-    """
-    scaled = replace(found, facts=rescaled(found.facts, facts))
-    model = restore(scaled, where=where)  # refuses a damaged file, whatever is set
+    """Return the model of a checkpoint for a size, with settings."""
+    scaled = replace(checkpoint, info=rescale(checkpoint.info, info))
+    # Without settings first, so that a damaged file is refused as such.
+    model = restore(scaled, where=where)
     if not settings:
         return model
-    options = changed_options(find(found.baseline), found.options, settings)
-    check_symmetry(options.get("symmetry"), known.size(facts.split, facts.size))
+    entry = find(checkpoint.baseline)
+    options = change_options(entry, checkpoint.options, settings)
+    check_symmetry(options.get("symmetry"), registry.size(info.split, info.size))
     try:
         return restore(replace(scaled, options=options), where=where)
     except UnreadableFileError as error:
@@ -357,7 +415,7 @@ def _model(
             "the weights do not fit the model with these settings",
             where="--set",
             got=", ".join(settings),
-            fix="set what changes no weights, or train with these settings",
+            fix="set options without weights, or train with these settings",
         ) from error
 
 
@@ -365,61 +423,63 @@ def provenance_of(checkpoint: Checkpoint) -> TrainingProvenance:
     """Return the training behind weights.
 
     Raises:
-        UnreadableFileError: what the weights record of their training cannot be told.
+        UnreadableFileError: the record of the training in the weights is damaged.
     """
-    facts = checkpoint.facts
+    info = checkpoint.info
     recipe = checkpoint.training.get("recipe", {})
-    subsets = recipe.get("training", {}).get("windows", ("train",))
     start = recipe.get("start")
+    start_weights = None
     try:
-        start_weights = None
         if start:
             start_weights = StartWeights(
                 recipe=start["recipe"], weights=start["sha256"][:START_DIGITS]
             )
         return TrainingProvenance(
-            split=facts.split,
-            size=facts.size,
-            subsets=tuple(subsets),
+            split=info.split,
+            size=info.size,
+            subsets=tuple(recipe.get("training", {}).get("windows", ("train",))),
             recipe=str(recipe.get("name")),
             step=checkpoint.training.get("step", 0),
-            overrides=settings_of(recipe),
+            overrides=list_settings(recipe),
             start=start_weights,
         )
     except (ValidationError, TypeError, KeyError) as error:
         raise UnreadableFileError(
-            "the weights record a training that cannot be told",
-            where=f"{facts.split} {facts.size}",
+            "the weights record a damaged training",
+            where=f"{info.split} {info.size}",
             expected="a recipe, subsets and a step, as `lagbench train` records them",
             got=type(error).__name__,
             fix="train the model with `lagbench train`",
         ) from error
 
 
-def _provenance(
-    checkpoint: Checkpoint, here: Facts, settings: Sequence[str]
+def _training_attributes(
+    checkpoint: Checkpoint, target: DatasetInfo, settings: Sequence[str]
 ) -> dict[str, Any]:
-    """Return seed, training as data and in words, and its budget, for the file's attributes.
+    """Return the file's attributes of the training: provenance, seed and budget.
 
-    Validations at another size than the one predicted are left out: they compare with
-    none there.
+    The validations of another size are left out: they compare with nothing here.
     """
-    facts = checkpoint.facts
-    done = checkpoint.training
     provenance = provenance_of(checkpoint).model_copy(
         update={"prediction_overrides": tuple(settings)}
     )
-    seed = done.get("recipe", {}).get("training", {}).get("seed", 0)
-    found: dict[str, Any] = {
+    recipe = checkpoint.training.get("recipe", {})
+    seed = recipe.get("training", {}).get("seed", 0)
+    attributes: dict[str, Any] = {
         "training": provenance.describe(),
         "provenance": provenance.to_json(),
         "seed": int(seed),
     }
-    if budget := checkpoint.budget:
-        unknown = {"metric": None, "best": None, "best_step": None, "validations": ()}
-        if here.size == facts.size:
-            budget = budget
-        else:
+
+    budget = checkpoint.budget
+    if budget is not None:
+        if target.size != checkpoint.info.size:
+            unknown = {
+                "metric": None,
+                "best": None,
+                "best_step": None,
+                "validations": (),
+            }
             budget = budget.model_copy(update=unknown)
-        found["budget"] = budget.model_dump_json(exclude_defaults=True)
-    return found
+        attributes["budget"] = budget.model_dump_json(exclude_defaults=True)
+    return attributes

@@ -1,19 +1,17 @@
-"""Projections: what positions are drawn to in every frame, whatever a network has said
-of forces.
+"""Projections: corrections of the positions in every frame, whatever the forces are.
 
-Waves cross a stiff body or a liquid within few frames. From one to the next its parts
-move almost rigidly, or without being pressed together, which forces that are told once
-a frame on a coarse grid do not achieve. Constraints on positions do (position-based
-dynamics, Mueller et al. 2007, doi 10.1016/j.jvcir.2007.01.005); velocities are then
-those of the positions. Where all particles have one mass and walls are far, no
-projection moves a centre of mass.
+Waves cross a stiff body or a liquid within few frames. From one frame to the next its
+parts move almost rigidly, or without being compressed. Forces that a coarse grid gives
+once a frame do not achieve this. Constraints on positions do (position-based dynamics,
+Mueller et al. 2007, doi 10.1016/j.jvcir.2007.01.005); velocities are then those of the
+positions. Where all particles have one mass and walls are far, no projection moves a
+centre of mass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import takewhile
 from typing import Any, cast
 
 import torch
@@ -23,28 +21,25 @@ from .graph import MATERIALS, Bounds
 from .particle_grid import ParticleGrid, Stencil
 
 ELASTIC = (1, 3)  # jelly and rope, the materials that come back to their shape
-# what a weight counts for: the few here are to be learned as fast as thousands of
-# others
-HEAVY = 30.0
-# log-odds of the share of the way to their shape that bodies go, before training
-HELD = 3.0
-MOST_PUSH = 2.0  # greatest k of Density
-# what a change of 1 is to the density that is not too much; with more, bodies are blown
-# up
-LIMIT = 0.2
+# scale of the learned numbers: the few here then learn as fast as thousands of others
+LEARNING_SCALE = 30.0
+# log-odds, before training, of the share of the way to their shape that bodies go
+INITIAL_SHARE = 3.0
+LARGEST_PUSH = 2.0  # greatest k of DensityProjection
+# change of the density limit by a learned number of 1; more would blow up bodies
+LIMIT_SCALE = 0.2
 
 TINY = 1e-16  # square of a cluster's moment [length^4] below which it has no direction
-# least share of a node's spline inside the box that divides its weight; in reach none
-# is less
-LEAST = 4e-4
-# excess of density beyond which matter is pushed no farther at once [1]
-MOST_EXCESS = 1.0
+# the least share of a node's spline inside the box to divide by; nodes in reach of
+# particles have more
+LEAST_SHARE_INSIDE = 4e-4
+# excess of density beyond which the pressure rises no more [1]
+LARGEST_EXCESS = 1.0
 
 
 @dataclass(frozen=True)
-class Shape:
-    """Overlapping clusters of a body's particles, one around each node of its first
-    frame.
+class ShapeMatching:
+    """Overlapping clusters of a body's particles, one around each node.
 
         x'_p = sum_i b_i(X_p) (c_i + R_i (X_p - C_i))
 
@@ -52,269 +47,300 @@ class Shape:
     b_i, and R_i the rotation that fits a cluster's motion best: shape matching (Mueller
     et al. 2005, doi 10.1145/1073204.1073216) by overlapping regions (Rivers and James
     2007, doi 10.1145/1276377.1276480). As the b_i sum to 1 and the R_i fit best, the
-    sums of x' - x and of x cross (x' - x) over a body are 0: it is neither moved nor
-    turned.
+    sums of x' - x and of x cross (x' - x) over a body are 0: the correction neither
+    moves nor turns it.
     """
 
     stencil: Stencil  # nodes around X
     layer: Tensor  # layer of each particle, int64, shape [particle]
-    count: Tensor  # particles of each layer, at least 1, shape [layer, 1]
-    nodes: int  # of all layers
-    inverse: Tensor  # 1 over the sum of the weights at a node [1], shape [node, 1]
+    particle_count: Tensor  # particles of each layer, at least 1, shape [layer, 1]
+    node_count: int  # of all layers
+    inverse_weight: Tensor  # 1 over the sum of weights at a node [1], shape [node, 1]
     arm: Tensor  # X_p - C_i [length], shape [particle, 9, 2]
 
     @classmethod
-    def of(
+    def build(
         cls, grid: ParticleGrid, position: Tensor, layer: Tensor, layers: int
-    ) -> Shape:
-        """Return the clusters of bodies at X [length], [particle, 2], each in a layer
-        of its own.
+    ) -> ShapeMatching:
+        """Return the clusters of bodies at X [length], shape [particle, 2].
 
-        They reach one and a half cells.
+        Each body is in a layer of its own. Clusters reach one and a half cells.
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
+
         # A cluster whose arms do not add up to 0 turns a little in every frame:
-        # rounding would spin bodies.
-        exact = position.double()
-        one = torch.ones_like(position[:, :1])
+        # rounding would spin bodies. So the means are in float64.
+        exact_position = position.double()
         exact_stencil = Stencil(stencil.weight.double(), stencil.node)
-        sums = grid.spread(
-            exact_stencil, torch.cat([one.double(), exact], dim=1), layers
-        )
-        sums = sums.permute(0, 2, 3, 1).reshape(-1, 3)
-        inverse = 1.0 / sums[:, :1].clamp(min=1e-6)
-        arm = exact[:, None] - (sums[:, 1:] * inverse).index_select(
-            0, stencil.node
-        ).view(-1, 9, 2)
-        count = position.new_zeros(layers, 1).index_add(0, layer, one).clamp(min=1.0)
+        one = torch.ones_like(exact_position[:, :1])
+        value = torch.cat([one, exact_position], dim=1)
+        sums = grid.spread(exact_stencil, value, layers)
+        sums = sums.permute(0, 2, 3, 1).reshape(-1, 3)  # [node, (weight, x, y)]
+        inverse_weight = 1.0 / sums[:, :1].clamp(min=1e-6)
+        centre = sums[:, 1:] * inverse_weight  # C_i, shape [node, 2]
+        nearby_centre = centre.index_select(0, stencil.node).view(-1, 9, 2)
+        arm = exact_position[:, None] - nearby_centre
+
+        particle_count = position.new_zeros(layers, 1)
+        particle_count = particle_count.index_add(0, layer, one.to(position))
         return cls(
-            stencil, layer, count, len(inverse), inverse.to(position), arm.to(position)
+            stencil=stencil,
+            layer=layer,
+            particle_count=particle_count.clamp(min=1.0),
+            node_count=len(inverse_weight),
+            inverse_weight=inverse_weight.to(position),
+            arm=arm.to(position),
         )
 
-    def matched(self, position: Tensor) -> Tensor:
-        """Return x', the mean of where the clusters of a particle have it, from x
-        [length], [particle, 2].
+    def match(self, position: Tensor) -> Tensor:
+        """Return x' from x [length], both of shape [particle, 2].
+
+        It is the mean of the places that the clusters of a particle have for it.
         """
-        weight, (along_x, along_y) = self.stencil.weight, self.arm.unbind(dim=2)
-        # Moments are taken about the middle of each body: about a far point they would
-        # be rounded more.
-        mean = (
-            position.new_zeros(len(self.count), 2).index_add(0, self.layer, position)
-            / self.count
-        )
-        middle = mean.index_select(0, self.layer)
-        x, y = (position - middle)[:, None].unbind(dim=2)
-        cosine = x * along_x + y * along_y
-        sine = y * along_x - x * along_y
+        weight = self.stencil.weight
+        arm_x, arm_y = self.arm.unbind(dim=2)
+        # Moments are taken about the middle of each body: about a far point rounding
+        # would be larger.
+        middle = self._body_middle(position)
+        x, y = (position - middle)[:, None].unbind(dim=2)  # each [particle, 1]
+
+        # Sums over the particles around each node: mean place and rotation.
+        cosine = x * arm_x + y * arm_y
+        sine = y * arm_x - x * arm_y
         moments = torch.stack(
             [x.expand_as(weight), y.expand_as(weight), cosine, sine], dim=2
         )
-        parts = (weight[..., None] * moments).flatten(0, 1)
-        sums = parts.new_zeros(self.nodes, 4).index_add(0, self.stencil.node, parts)
+        weighted = (weight[..., None] * moments).flatten(0, 1)
+        sums = weighted.new_zeros(self.node_count, 4)
+        sums = sums.index_add(0, self.stencil.node, weighted)
+        centre = sums[:, :2] * self.inverse_weight  # c_i
         # A lone particle turns nothing: the root's gradient must not be infinite there.
-        length = (sums[:, 2:].square().sum(dim=1, keepdim=True) + TINY).sqrt()
-        motion = torch.cat([sums[:, :2] * self.inverse, sums[:, 2:] / length], dim=1)
-        x, y, cosine, sine = (
-            motion.index_select(0, self.stencil.node).view(-1, 9, 4).unbind(dim=2)
-        )
-        there = [
-            x + cosine * along_x - sine * along_y,
-            y + sine * along_x + cosine * along_y,
-        ]
-        return middle + (weight[..., None] * torch.stack(there, dim=2)).sum(dim=1)
+        square = sums[:, 2:].square().sum(dim=1, keepdim=True)
+        rotation = sums[:, 2:] / (square + TINY).sqrt()  # (cosine, sine) of R_i
+        motion = torch.cat([centre, rotation], dim=1)
+
+        # Back at the particles: c_i + R_i (X_p - C_i) of their nine nodes.
+        nearby = motion.index_select(0, self.stencil.node).view(-1, 9, 4)
+        centre_x, centre_y, cosine, sine = nearby.unbind(dim=2)
+        place_x = centre_x + cosine * arm_x - sine * arm_y
+        place_y = centre_y + sine * arm_x + cosine * arm_y
+        places = torch.stack([place_x, place_y], dim=2)
+        return middle + (weight[..., None] * places).sum(dim=1)
+
+    def _body_middle(self, position: Tensor) -> Tensor:
+        """Return the mean position of each particle's body, shape [particle, 2]."""
+        sums = position.new_zeros(len(self.particle_count), 2)
+        sums = sums.index_add(0, self.layer, position)
+        mean = sums / self.particle_count
+        return mean.index_select(0, self.layer)
 
 
 @dataclass(frozen=True)
-class Density:
-    """How dense matter was at most in the first frame, and a push out of where it is
-    too dense beside that.
+class DensityProjection:
+    """A push out of regions that are denser than the first frame was anywhere.
 
         x' = x + d G2P(a),   m_i a_i = k sum_p min(max(rho_p - l_p, 0), 1) grad b_i(x_p)
         rho = G2P(P2G(1) / V) / (its greatest value in the window's first frame)
 
-    with d the width of a cell, a from :meth:`ParticleGrid.pushed` by that pressure, and
-    V the share of a node's spline inside the box: what density constraints of particles
+    with d the width of a cell, a from :meth:`ParticleGrid.accelerate` by that pressure,
+    and V the share of a node's spline inside the box. Density constraints of particles
     (Macklin and Mueller 2013, doi 10.1145/2461912.2461984) and density projection on
-    grids (Kugelstadt et al. 2019, doi 10.1109/TVCG.2019.2947437) do, by one explicit
-    step. Away from walls momentum is kept.
+    grids (Kugelstadt et al. 2019, doi 10.1109/TVCG.2019.2947437) do the same; this is
+    one explicit step. Away from walls momentum is conserved.
     """
 
     grid: ParticleGrid  # where density is measured
-    inverse: Tensor  # 1 / V [1], shape [x node, y node]
+    inverse_share: Tensor  # 1 / V [1], shape [x node, y node]
     sample: Tensor  # window of each particle, int64, shape [particle]
     # greatest density in the first frame of each window [particle/cell], shape [window]
-    most: Tensor
+    greatest: Tensor
 
     @classmethod
-    def of(
+    def build(
         cls, grid: ParticleGrid, position: Tensor, sample: Tensor, windows: int
-    ) -> Density:
-        """Return the density in windows of positions in the first frame [length], shape
-        [particle, 2].
-        """
-        inverse = 1.0 / grid.inside().clamp(min=LEAST)
-        empty = cls(grid, inverse, sample, position.new_ones(windows))
-        found, _ = empty.relative(
-            grid.stencil(position.clamp(grid.low, grid.high), sample)
-        )
-        most = position.new_zeros(windows).scatter_reduce(0, sample, found, "amax")
-        return cls(grid, inverse, sample, most)
+    ) -> DensityProjection:
+        """Return the projection of windows from positions in their first frame.
 
-    def relative(self, stencil: Stencil) -> tuple[Tensor, Tensor]:
-        """Return rho of particles whose nodes these are [1], shape [particle], and
-        P2G(1).
+        Positions [length] have shape [particle, 2].
+        """
+        inverse_share = 1.0 / grid.share_inside().clamp(min=LEAST_SHARE_INSIDE)
+        unscaled = cls(grid, inverse_share, sample, position.new_ones(windows))
+        stencil = grid.stencil(position.clamp(grid.low, grid.high), sample)
+        density, _ = unscaled.relative_density(stencil)
+        greatest = position.new_zeros(windows).scatter_reduce(
+            0, sample, density, "amax"
+        )
+        return cls(grid, inverse_share, sample, greatest)
+
+    def relative_density(self, stencil: Stencil) -> tuple[Tensor, Tensor]:
+        """Return rho of the particles with these nodes [1], and P2G(1).
+
+        Their shapes are [particle] and [window, 1, x node, y node].
         """
         one = torch.ones_like(stencil.weight[:, :1])
-        mass = self.grid.spread(stencil, one, len(self.most))
-        return self.grid.gather(stencil, mass * self.inverse)[:, 0] / self.most[
-            self.sample
-        ], mass
+        mass = self.grid.spread(stencil, one, len(self.greatest))
+        density = self.grid.gather(stencil, mass * self.inverse_share)[:, 0]
+        return density / self.greatest[self.sample], mass
 
-    def eased(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
-        """Return x' [length] from x, both of shape [particle, 2], with l [1], shape
-        [particle], as the limit.
+    def correct(self, position: Tensor, push: Tensor, limit: Tensor) -> Tensor:
+        """Return x' from x [length], both of shape [particle, 2].
 
-        A push k of about 1 takes away what is too much within a few steps.
+        Args:
+            position: x; positions beyond a wall are put on it.
+            push: k [1]; about 1 removes the excess within a few steps.
+            limit: l [1], shape [particle].
         """
         position = position.clamp(self.grid.low, self.grid.high)
         stencil = self.grid.stencil(position, self.sample)
-        rho, mass = self.relative(stencil)
-        pressure = push * (rho - limit).clamp(0.0, MOST_EXCESS)
-        none = torch.zeros_like(pressure)
-        stress = -torch.stack([pressure, none, pressure], dim=1)[:, None]
-        moved = self.grid.gather(
-            stencil, self.grid.pushed(stencil, position, stress, mass)
-        )
-        return position + self.grid.spacing * moved
+        density, mass = self.relative_density(stencil)
+        pressure = push * (density - limit).clamp(0.0, LARGEST_EXCESS)
+        shear = torch.zeros_like(pressure)
+        stress = -torch.stack([pressure, shear, pressure], dim=1)[:, None]
+        acceleration = self.grid.accelerate(stencil, position, stress, mass)
+        return position + self.grid.spacing * self.grid.gather(stencil, acceleration)
 
 
 @dataclass(frozen=True)
-class Drawn:
-    """What a batch of windows is drawn to."""
+class ProjectionState:
+    """First frame of a batch of windows, prepared for the projections."""
 
-    elastic: Tensor  # numbers of the particles that come back to their shape, int64, shape [elastic particle]
-    # where their materials stand in ELASTIC, int64, shape [elastic particle]
-    kind: Tensor
-    shapes: tuple[Shape, ...]
-    densities: tuple[Density, ...]
+    # numbers of the particles that come back to their shape, int64, [elastic particle]
+    elastic: Tensor
+    # place of their materials in ELASTIC, int64, shape [elastic particle]
+    elastic_kind: Tensor
+    shapes: tuple[ShapeMatching, ...]
+    densities: tuple[DensityProjection, ...]
     material: Tensor  # of each particle, int64, shape [particle]
 
 
 class Projection(nn.Module):
-    """Matter pushed out of where it is too dense, then elastic bodies drawn to their
-    shape.
+    """Density projection of all matter, then shape matching of elastic bodies.
 
-    How far is learned, for each grid, and so is which share of the first frame's
-    greatest density is too dense for a material: a little below 1 a liquid is under
-    pressure, which the network learns to bear.
+    The network learns how far each grid corrects. It also learns the density limit of
+    each material, as a share of the first frame's greatest density. A limit a little
+    below 1 puts a liquid under pressure, and the network learns to bear it.
 
     Args:
         bounds: box (low, high) along x and y [length].
-        shape: cells across the box of the grids of :class:`Shape`, one after the other.
-        density: the same of :class:`Density`.
+        shape: cells across the box of the grids of :class:`ShapeMatching`, in turn.
+        density: cells across the box of the grids of :class:`DensityProjection`.
     """
 
     def __init__(
         self, bounds: Bounds, *, shape: Sequence[int], density: Sequence[int]
     ) -> None:
         super().__init__()
-        self.across = {"shape": tuple(shape), "density": tuple(density)}
+        self.grid_cells = {"shape": tuple(shape), "density": tuple(density)}
         self.clusters = nn.ModuleList(ParticleGrid(bounds, cells) for cells in shape)
         self.cells = nn.ModuleList(ParticleGrid(bounds, cells) for cells in density)
-        # Weights that no grid needs would get no gradient, which training on several
-        # devices refuses.
+        # The names of the parameters are those in files of weights. A parameter without
+        # a gradient would stop training on several devices, so there are none without
+        # grids.
         if shape:
-            self.held = nn.Parameter(
-                torch.full((len(shape), len(ELASTIC)), HELD / HEAVY)
+            share = torch.full(
+                (len(shape), len(ELASTIC)), INITIAL_SHARE / LEARNING_SCALE
             )
+            self.held = nn.Parameter(share)
         if density:
             self.push = nn.Parameter(torch.zeros(len(density)))
             self.limit = nn.Parameter(torch.zeros(MATERIALS))
 
-    def adapted(
+    def adapt_weights(
         self, weights: Mapping[str, Tensor], options: Mapping[str, Any], *, prefix: str
     ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return weights and options with our own start for all grids but those that
-        stand first in both.
+        """Return the weights and options of a model, adapted to the grids of this one.
 
-        ``held`` has shape [grid, elastic material], ``push`` [grid]; ``limit``,
-        [material], is kept. ``prefix`` is this module's name in the model of weights
-        and options, and a dot.
+        Grids that stand first in both keep their weights, the others start anew. The
+        weight ``held`` has shape [grid, elastic material], ``push`` [grid]; ``limit``,
+        [material], is of no grid and stays.
+
+        Args:
+            weights: weights of the model by name.
+            options: its options by name.
+            prefix: name of this module in the model, and a dot.
         """
         weights = dict(weights)
         options = dict(options)
-        own = self.state_dict(prefix=prefix)
-        for option, name in (
-            ("shape", "held"),
-            ("density", "push"),
-        ):  # what is of one grid each
-            ours = list(self.across[option])
-            known = list(options[option])
-            shared = len(
-                list(
-                    takewhile(
-                        lambda pair: pair[0] == pair[1], zip(ours, known, strict=False)
-                    )
-                )
-            )
-            options[option] = ours
+        initial = self.state_dict(prefix=prefix)
+        for option, name in (("shape", "held"), ("density", "push")):
+            grids = self.grid_cells[option]
+            shared_count = _count_shared(grids, options[option])
+            options[option] = list(grids)
             learned = weights.pop(prefix + name, None)
-            if learned is not None and ours:
-                weights[prefix + name] = torch.cat(
-                    [learned[:shared], own[prefix + name][shared:]]
-                )
-        kept = {
-            name: value
-            for name, value in weights.items()
-            if name in own or not name.startswith(prefix)
-        }
-        return {**own, **kept}, options
+            if learned is not None and grids:
+                rest = initial[prefix + name][shared_count:]
+                weights[prefix + name] = torch.cat([learned[:shared_count], rest])
+
+        adapted = dict(initial)
+        for name, value in weights.items():
+            if name in initial or not name.startswith(prefix):
+                adapted[name] = value
+        return adapted, options
 
     def start(
         self, first: Tensor, material: Tensor, sample: Tensor, windows: int
-    ) -> Drawn:
-        """Return what windows are drawn to, from first frames [length], shape
-        [particle, 2].
+    ) -> ProjectionState:
+        """Return the state of the projections from the first frames of windows.
 
-        Materials and windows (``sample``) are int64, [particle]; particles of one
-        material are one body.
+        Particles of one material in one window are one body.
+
+        Args:
+            first: positions in the first frame [length], shape [particle, 2].
+            material: material of each particle, int64, shape [particle].
+            sample: window of each particle, int64, shape [particle].
+            windows: number of windows.
         """
-        kind = torch.full((MATERIALS,), -1, device=material.device)
-        kind[list(ELASTIC)] = torch.arange(len(ELASTIC), device=material.device)
-        elastic = (kind[material] >= 0).nonzero()[:, 0]
-        kind = kind[material[elastic]]
-        layer = sample[elastic] * len(ELASTIC) + kind
-        bodies = windows * len(ELASTIC)
-        shapes = [
-            Shape.of(cast(ParticleGrid, grid), first[elastic], layer, bodies)
-            for grid in self.clusters
-        ]
-        densities = [
-            Density.of(cast(ParticleGrid, grid), first, sample, windows)
-            for grid in self.cells
-        ]
-        return Drawn(elastic, kind, tuple(shapes), tuple(densities), material)
+        kind_of_material = torch.full((MATERIALS,), -1, device=material.device)
+        kinds = torch.arange(len(ELASTIC), device=material.device)
+        kind_of_material[list(ELASTIC)] = kinds
+        elastic = (kind_of_material[material] >= 0).nonzero()[:, 0]
+        elastic_kind = kind_of_material[material[elastic]]
+        layer = sample[elastic] * len(ELASTIC) + elastic_kind
+        layers = windows * len(ELASTIC)
 
-    def forward(self, drawn: Drawn, position: Tensor) -> Tensor:
-        """Return the positions that a frame comes to [length], shape [particle, 2].
+        shapes = []
+        for module in self.clusters:
+            grid = cast(ParticleGrid, module)
+            shapes.append(ShapeMatching.build(grid, first[elastic], layer, layers))
+        densities = []
+        for module in self.cells:
+            grid = cast(ParticleGrid, module)
+            densities.append(DensityProjection.build(grid, first, sample, windows))
+        return ProjectionState(
+            elastic=elastic,
+            elastic_kind=elastic_kind,
+            shapes=tuple(shapes),
+            densities=tuple(densities),
+            material=material,
+        )
 
-        They may lie beyond walls; where densities are asked for, what lies there is put
-        back first.
+    def forward(self, state: ProjectionState, position: Tensor) -> Tensor:
+        """Return the corrected positions of a frame [length], shape [particle, 2].
+
+        The result may lie beyond walls. Where there are density projections, positions
+        beyond walls are first put on them.
         """
-        if drawn.densities:
-            limit = (1.0 + LIMIT * self.limit)[drawn.material]
-            for push, density in zip(
-                MOST_PUSH * (HEAVY * self.push).sigmoid(), drawn.densities, strict=True
-            ):
-                position = density.eased(position, push, limit)
-        if drawn.shapes:
-            there = position.index_select(0, drawn.elastic)
-            for share, shape in zip(
-                (HEAVY * self.held).sigmoid(), drawn.shapes, strict=True
-            ):
-                there = there + share[drawn.kind][:, None] * (
-                    shape.matched(there) - there
-                )
-            position = position.index_copy(0, drawn.elastic, there)
+        if state.densities:
+            limit = (1.0 + LIMIT_SCALE * self.limit)[state.material]
+            pushes = LARGEST_PUSH * (LEARNING_SCALE * self.push).sigmoid()
+            for push, density in zip(pushes, state.densities, strict=True):
+                position = density.correct(position, push, limit)
+        if state.shapes:
+            elastic = position.index_select(0, state.elastic)
+            shares = (LEARNING_SCALE * self.held).sigmoid()
+            for share, shape in zip(shares, state.shapes, strict=True):
+                correction = shape.match(elastic) - elastic
+                elastic = elastic + share[state.elastic_kind][:, None] * correction
+            position = position.index_copy(0, state.elastic, elastic)
         return position
+
+
+def _count_shared(first: Sequence[int], second: Sequence[int]) -> int:
+    """Return how many numbers at the start of two sequences are the same."""
+    count = 0
+    for one_cells, other_cells in zip(first, second, strict=False):
+        if one_cells != other_cells:
+            break
+        count += 1
+    return count

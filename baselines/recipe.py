@@ -1,9 +1,7 @@
-"""Recipes: the options of a model and of its training for one split and size, from
-YAML.
+"""Recipes: the options of a model and of its training for one split and size.
 
-A training's options are its budget, its optimiser, and how often it is looked at.
-
-A file of recipes holds defaults and what differs from them::
+The options of a training are its budget, its optimiser, and its validations. A YAML
+file of recipes holds defaults and the differences of each recipe::
 
     format: 1
     model: {latent: 128}
@@ -14,8 +12,8 @@ A file of recipes holds defaults and what differs from them::
       "*/tiny": {model: {latent: 16}, training: {steps: 50}}
       fluid/mini: {training: {steps: 900}, baselines: {gat: {training: {steps: 500}}}}
 
-Later layers win: defaults, recipe, what it says of the baseline by name, ``--set``.
-``steps`` and ``epochs`` replace each other.
+Later layers win: defaults, the recipe, its part for the baseline, ``--set``. ``steps``
+and ``epochs`` replace each other.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import LagbenchError, UnreadableFileError, UsageError, suggest_name
 
 from .baseline import Settings
-from .catalogue import Entry, names
+from .catalogue import CatalogueEntry, list_names
 
 
 class Schedule(Settings):
@@ -52,12 +50,14 @@ class Schedule(Settings):
     # share of the rate that the cosine ends at
     floor: float = Field(default=0.01, ge=0, le=1)
 
-    def at(self, step: int, *, steps: int, warmup: int = 0) -> float:
+    def factor_at(self, step: int, *, steps: int, warmup: int = 0) -> float:
         """Return the factor on the learning rate at a step, counted from 0.
 
-        >>> [Schedule(kind="cosine", floor=0).at(step, steps=4) for step in (0, 2, 4)]
+        >>> cosine = Schedule(kind="cosine", floor=0)
+        >>> [cosine.factor_at(step, steps=4) for step in (0, 2, 4)]
         [1.0, 0.5, 0.0]
-        >>> Schedule(kind="exponential", factor=0.1, every=100).at(200, steps=1000)
+        >>> decay = Schedule(kind="exponential", factor=0.1, every=100)
+        >>> decay.factor_at(200, steps=1000)
         0.010000000000000002
         """
         rise = min(1.0, (step + 1) / (warmup + 1))
@@ -65,10 +65,9 @@ class Schedule(Settings):
             return float(rise * self.factor ** (step / self.every))
         if self.kind == "constant":
             return rise
-        done = min(1.0, max(0, step - warmup) / max(1, steps - warmup))
-        return rise * (
-            self.floor + (1 - self.floor) * (1 + math.cos(math.pi * done)) / 2
-        )
+        progress = min(1.0, max(0, step - warmup) / max(1, steps - warmup))
+        cosine = (1 + math.cos(math.pi * progress)) / 2
+        return rise * (self.floor + (1 - self.floor) * cosine)
 
 
 # share of a training's processor time that validations may take
@@ -82,6 +81,13 @@ Measured on mini: graph networks 1.5 to 2.4 (with bfloat16 in training alone), N
 """
 
 
+def _expand_schedule(value: object) -> object:
+    """Return the options of a schedule; a recipe may give its kind alone."""
+    if isinstance(value, str):
+        return {"kind": value}
+    return value
+
+
 class TrainingOptions(Settings):
     """Options of a training; recipes fill them."""
 
@@ -93,28 +99,24 @@ class TrainingOptions(Settings):
     learning_rate: float = Field(default=1e-4, gt=0, allow_inf_nan=False)
     # decoupled (AdamW) where it is above 0
     weight_decay: float = Field(default=0.0, ge=0, allow_inf_nan=False)
-    schedule: Annotated[
-        Schedule,
-        BeforeValidator(
-            lambda value: {"kind": value} if isinstance(value, str) else value
-        ),
-    ] = Schedule()  # the rate over the steps
+    # the rate over the steps
+    schedule: Annotated[Schedule, BeforeValidator(_expand_schedule)] = Schedule()
     warmup_steps: int = Field(default=0, ge=0)  # steps over which the rate rises from 0
     # share of itself that the running mean of the weights keeps in a step, less at
-    # first: n / (n + 9) after n steps. The mean is validated and published; with 0 the
-    # weights themselves are
+    # first: n / (n + 9) after n steps. The mean is validated and published; with 0
+    # there is no mean, and the weights themselves are
     ema: float = Field(default=0.0, ge=0.0, lt=1.0)
     # largest norm of the gradient; None clips nothing
     clip: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     # 'bf16' runs matrix products in bfloat16, weights stay float32; 'auto' does so
     # where the hardware multiplies in it
     precision: Literal["float32", "bf16", "auto"] = "float32"
-    # fuse what a processor layer of a graph network does, by torch.compile; needs a C++
-    # compiler on CPUs
+    # fuse the operations of a graph network's processor layers by torch.compile; needs
+    # a C++ compiler on CPUs
     compile: bool = False
     windows: tuple[str, ...] = ("train",)  # subsets to train on
-    # share of the windows that are drawn from those that begin in a scenario's first
-    # frames, so many of them: bodies meet once, and rest for hundreds of frames
+    # share of the windows that are drawn from those that begin in the first
+    # `opening_frames` frames: bodies meet once, and rest for hundreds of frames
     opening_share: float = Field(default=0.0, ge=0.0, le=1.0, allow_inf_nan=False)
     opening_frames: int = Field(default=40, gt=0)
     # steps between validations, 0 never; by default up to eight, as many as take 15 %
@@ -133,18 +135,17 @@ class TrainingOptions(Settings):
 
     @model_validator(mode="before")
     @classmethod
-    def _one_budget(cls, data: object) -> object:
+    def _check_length(cls, data: object) -> object:
         if isinstance(data, Mapping) and data.get("steps") and data.get("epochs"):
             raise ValueError("give steps or epochs, not both")
         return data
 
     @model_validator(mode="after")
-    def _own_subsets(self) -> TrainingOptions:
+    def _check_subsets(self) -> TrainingOptions:
         if {"test", "valid"} & set(self.windows) or not self.windows:
             raise ValueError(
                 f"windows={self.windows}: a model is trained on train (and extra), "
-                f"never on test, and not on"
-                " valid, by which its weights are chosen"
+                f"never on test, and not on valid, by which its weights are chosen"
             )
         return self
 
@@ -152,33 +153,42 @@ class TrainingOptions(Settings):
         """Return the optimiser steps of the training."""
         if self.steps is not None:
             return self.steps
-        return max(
-            1, math.ceil((self.epochs or 1.0) * windows / (self.batch * processes))
-        )
+        windows_per_step = self.batch * processes
+        epochs = self.epochs or 1.0
+        return max(1, math.ceil(epochs * windows / windows_per_step))
 
-    def validations(self, steps: int, *, trained: int, rolled: int) -> int:
-        """Return how many validations take at most 15 % of a training: 8, 4 or 2, and 1
-        in any case.
+    def count_validations(self, steps: int, *, trained: int, rolled: int) -> int:
+        """Return how many validations take at most 15 % of a training.
 
-        A function of numbers alone, so that a training ends with the same bits on every
-        machine: its steps, the frames that a step predicts, of all windows of a
-        process, and those that a validation predicts.
+        These are 8, 4 or 2, and 1 in any case. The count is a function of numbers
+        alone, so that a training ends with the same bits on every machine.
+
+        Args:
+            steps: steps of the training.
+            trained: frames that a step predicts, of all windows of a process.
+            rolled: frames that a validation predicts.
         """
         affordable = VALIDATION_SHARE * STEP_COST * trained * steps / rolled
-        return next((count for count in (8, 4, 2) if count <= affordable), 1)
+        for count in (8, 4, 2):
+            if count <= affordable:
+                return count
+        return 1
 
     def is_validated(self, step: int, *, steps: int, validations: int) -> bool:
-        """Return whether a step is followed by a validation; the last one is unless
-        none is wanted.
+        """Return whether a validation follows a step.
+
+        One follows the last step, unless the options ask for none.
         """
         if self.validate_every is None:
-            return step * validations // steps > (step - 1) * validations // steps
-        return self.validate_every > 0 and (
-            step >= steps or step % self.validate_every == 0
-        )
+            done = step * validations // steps
+            done_before = (step - 1) * validations // steps
+            return done > done_before
+        if self.validate_every == 0:
+            return False
+        return step >= steps or step % self.validate_every == 0
 
 
-LATER: Mapping[str, Mapping[str, object]] = {
+LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
     "training": {
         "compile": False,
         "ema": 0.0,
@@ -197,77 +207,86 @@ LATER: Mapping[str, Mapping[str, object]] = {
         "neighbours": None,
     },
 }
-"""Options that records of earlier trainings lack, with what they did: such trainings
-can go on.
+"""Options that the logs of earlier trainings lack, with the values of that time.
+
+With them such trainings can go on.
 """
 
 Layer = dict[str, Any]
 ANY = "*"
-Checked = TypeVar("Checked", bound=BaseModel)
+OptionsT = TypeVar("OptionsT", bound=BaseModel)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What a model is and how it is trained; checked, with every default filled in."""
+    """A model and its training; checked, with every default filled in."""
 
     baseline: str  # name of the baseline
     name: str  # name of the recipe, as in cavity/mini
     model: Mapping[str, Any]  # options of the model, plain values
     training: TrainingOptions  # options of the training
-    # what is known of the weights that the training starts from, their SHA-256 among
-    # it; None for random ones
+    # log of the weights that the training starts from, their SHA-256 among it; None for
+    # random ones
     start: Mapping[str, Any] | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Return plain values."""
-        parts = {"model": self.model, "training": self.training.model_dump(mode="json")}
-        told = {
-            group: {
-                key: value
-                for key, value in part.items()
-                if (key, value) not in LATER[group].items()
-            }
-            for group, part in parts.items()
+        values = {
+            "baseline": self.baseline,
+            "name": self.name,
+            "model": _drop_later_defaults("model", self.model),
+            "training": _drop_later_defaults(
+                "training", self.training.model_dump(mode="json")
+            ),
         }
         if self.start:
-            start = {"start": dict(self.start)}
-        else:
-            start = {}
-        return {"baseline": self.baseline, "name": self.name, **told, **start}
+            values["start"] = dict(self.start)
+        return values
+
+
+def _drop_later_defaults(group: str, options: Mapping[str, Any]) -> Layer:
+    """Return options without those that earlier logs lack, where they are as then."""
+    later = LATER_OPTIONS[group]
+    stated = {}
+    for name, value in options.items():
+        if name not in later or later[name] != value:
+            stated[name] = value
+    return stated
 
 
 class _Part(Settings):
-    """One recipe: what differs from the defaults of its file."""
+    """One recipe: its differences from the defaults of its file."""
 
     model: Layer = Field(default_factory=dict)
     training: Layer = Field(default_factory=dict)
 
 
-class _Shared(_Part):
-    """A recipe of several baselines, with what differs for some of them by name."""
+class _SharedRecipe(_Part):
+    """A recipe of several baselines, with the differences of some of them by name."""
 
     baselines: dict[str, _Part] = Field(default_factory=dict)
 
 
-class _File(_Part):
+class _RecipeFile(_Part):
     """A whole file of recipes."""
 
     format: Literal[1]
     family: str = ""
-    recipes: dict[str, _Shared] = Field(default_factory=dict)
+    recipes: dict[str, _SharedRecipe] = Field(default_factory=dict)
 
 
-def recipe_names(entry: Entry) -> tuple[str, ...]:
-    """Return the names of a baseline's recipes, as in ``cavity/mini``, in the order of
-    its file.
+def recipe_names(entry: CatalogueEntry) -> tuple[str, ...]:
+    """Return the names of a baseline's recipes, as in ``cavity/mini``.
+
+    They are in the order of its file.
     """
     if entry.recipes:
-        return tuple(_read(entry.recipes).recipes)
+        return tuple(_read_file(entry.recipes).recipes)
     return ()
 
 
 def recipe_for(
-    entry: Entry,
+    entry: CatalogueEntry,
     split: str,
     size: str,
     *,
@@ -278,166 +297,217 @@ def recipe_for(
 ) -> Recipe:
     """Return the recipe of a baseline for a split and size.
 
-    ``learned`` are options of a trained model to go on with: above the recipe's, below
-    ``settings``.
+    Args:
+        entry: the baseline.
+        split: name of the split.
+        size: name of the size.
+        variant: variant of the recipe, or a YAML file of recipes.
+        settings: changes, as in ``training.steps=100``.
+        seed: seed in place of the recipe's.
+        learned: options of a trained model to go on with. They win over the recipe, and
+            ``settings`` over them.
+
+    Raises:
+        UsageError: there is no such recipe, or an option does not fit.
+        UnreadableFileError: the file of recipes does not fit.
     """
-    own_file = variant is not None and variant.endswith((".yaml", ".yml"))
-    path = Path(str(variant)) if own_file else entry.recipes
+    path = entry.recipes
+    if variant is not None and variant.endswith((".yaml", ".yml")):
+        path = Path(variant)
+        variant = None
+    file = _RecipeFile(format=1)
     if path:
-        file = _read(path)
-    else:
-        file = _File(format=1)
-    if own_file or not variant:
-        wanted = size
-    else:
-        wanted = f"{size}-{variant}"
-    name = f"{split}/{wanted}"
-    part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{wanted}")
-    if part is None and (file.recipes or (variant and not own_file)):
-        same_split = [other for other in file.recipes if other.split("/")[0] == split]
-        if file.recipes:
-            fix = f"{suggest_name(name, same_split or file.recipes)}; or "
-        else:
-            fix = "leave --recipe out; or "
-        if variant and not own_file:
-            parts = [
-                other.split("/")[1]
-                for other in file.recipes
-                if other.split("/")[0] in (split, ANY)
-            ]
-            variants = [
-                other.removeprefix(f"{size}-")
-                for other in parts
-                if other.startswith(f"{size}-")
-            ]
-            if variants:
-                fix = f"{suggest_name(variant, variants)}; or "
-            else:
-                fix = "" if size in parts else fix
-            held = [
-                other.removesuffix(f"-{variant}")
-                for other in parts
-                if other.endswith(f"-{variant}")
-            ]
-            if held and size in parts:
-                fix = f"--size {' or '.join(held)} has it; or "
-            fix += (
-                f"leave --recipe out, for that of {size}; or " if size in parts else ""
-            )
-        raise UsageError(
-            f"{entry.name} has no recipe {name!r}",
-            where="--split, --size, --recipe",
-            fix=f"{fix}write your own: --recipe FILE.yaml, see docs/baselines.md",
-        )
-    part = part or _Shared()
-    for other in part.baselines:
-        if other not in names():
-            where = f"{path}, {name}, baselines"
-            raise UnreadableFileError(
-                f"unknown baseline {other!r}",
-                where=where,
-                fix=suggest_name(other, names()),
-            )
+        file = _read_file(path)
+
+    size_name = size
+    if variant:
+        size_name = f"{size}-{variant}"
+    name = f"{split}/{size_name}"
+    part = file.recipes.get(name) or file.recipes.get(f"{ANY}/{size_name}")
+    if part is None:
+        if file.recipes or variant:
+            raise _missing_recipe(entry, name, variant, file)
+        part = _SharedRecipe()
+    _check_baselines(part, where=f"{path}, {name}, baselines")
+
     layers: Layer = {"model": file.model, "training": file.training}
-    own = part.baselines.get(entry.name, _Part())
-    settings = tuple(settings)
-    for above in (part, own, _Part(model=dict(learned or {}))):
+    baseline_part = part.baselines.get(entry.name, _Part())
+    for above in (part, baseline_part, _Part(model=dict(learned or {}))):
         layers = _merge(layers, {"model": above.model, "training": above.training})
-    where = f"{path.name if path else entry.name}, {name}" + (
-        ", and --set" if settings else ""
-    )
+    where = f"{entry.name}, {name}"
+    if path:
+        where = f"{path.name}, {name}"
+    settings = tuple(settings)
+    if settings:
+        where += ", and --set"
     for setting in settings:
-        layers = _merge(layers, _setting(setting))
+        layers = _merge(layers, _parse_setting(setting))
     if seed is not None:
         layers["training"]["seed"] = seed
+
+    model = _check_options(entry.model.Options, layers["model"], "model", where)
+    training = _check_options(TrainingOptions, layers["training"], "training", where)
     return Recipe(
         baseline=entry.name,
         name=name,
-        model=_checked(entry.model.Options, layers["model"], "model", where).model_dump(
-            mode="json"
-        ),
-        training=_checked(TrainingOptions, layers["training"], "training", where),
+        model=model.model_dump(mode="json"),
+        training=training,
     )
 
 
-def changed_options(
-    entry: Entry, options: Mapping[str, Any], settings: Iterable[str]
+def _missing_recipe(
+    entry: CatalogueEntry, name: str, variant: str | None, file: _RecipeFile
+) -> UsageError:
+    """Return the error of a recipe that a file does not hold."""
+    split, _, size_name = name.partition("/")
+    if variant:
+        size = size_name.removesuffix(f"-{variant}")
+        hint = _variant_hint(size, variant, split, file)
+    else:
+        hint = _recipe_hint(name, split, file)
+    return UsageError(
+        f"{entry.name} has no recipe {name!r}",
+        where="--split, --size, --recipe",
+        fix=f"{hint}write your own: --recipe FILE.yaml, see docs/baselines.md",
+    )
+
+
+def _recipe_hint(name: str, split: str, file: _RecipeFile) -> str:
+    """Return the nearest recipe, of the same split if it has any."""
+    if not file.recipes:
+        return "leave --recipe out; or "
+    same_split = [other for other in file.recipes if other.split("/")[0] == split]
+    return f"{suggest_name(name, same_split or file.recipes)}; or "
+
+
+def _variant_hint(size: str, variant: str, split: str, file: _RecipeFile) -> str:
+    """Return the nearest variant of the size, or the sizes that have this variant."""
+    size_names = []
+    for recipe in file.recipes:
+        recipe_split, _, size_name = recipe.partition("/")
+        if recipe_split in (split, ANY):
+            size_names.append(size_name)
+    variants = []
+    sizes = []
+    for size_name in size_names:
+        if size_name.startswith(f"{size}-"):
+            variants.append(size_name.removeprefix(f"{size}-"))
+        if size_name.endswith(f"-{variant}"):
+            sizes.append(size_name.removesuffix(f"-{variant}"))
+
+    has_size = size in size_names
+    if has_size and sizes:
+        hint = f"--size {' or '.join(sizes)} has it; or "
+    elif variants:
+        hint = f"{suggest_name(variant, variants)}; or "
+    elif has_size:
+        hint = ""
+    else:
+        hint = _recipe_hint(f"{split}/{size}-{variant}", split, file)
+    if has_size:
+        hint += f"leave --recipe out, for that of {size}; or "
+    return hint
+
+
+def _check_baselines(part: _SharedRecipe, *, where: str) -> None:
+    """Refuse a recipe with a part for an unknown baseline."""
+    names = list_names()
+    for name in part.baselines:
+        if name not in names:
+            raise UnreadableFileError(
+                f"unknown baseline {name!r}", where=where, fix=suggest_name(name, names)
+            )
+
+
+def change_options(
+    entry: CatalogueEntry, options: Mapping[str, Any], settings: Iterable[str]
 ) -> Layer:
-    """Return the options of a trained model with settings such as
-    ``model.average=true``.
+    """Return the options of a trained model with settings.
+
+    A setting is a text as in ``model.average=true``.
+
+    Raises:
+        UsageError: an option is unknown, or only a training can change it.
     """
-    given: Layer = {"model": dict(options)}
-    changed = given
+    layers: Layer = {"model": dict(options)}
     for setting in settings:
-        changed = _merge(changed, _setting(setting))
-        if "training" in changed:
-            fix = "set options of the model: --set model.KEY=VALUE"
+        layers = _merge(layers, _parse_setting(setting))
+        if "training" in layers:
             raise UsageError(
-                "the training is over", where="--set", got=setting, fix=fix
-            )
-    before, after = (
-        _checked(entry.model.Options, layers["model"], "model", "--set").model_dump(
-            mode="json"
-        )
-        for layers in (given, changed)
-    )
-    kinds = {
-        "training": entry.model.Options.in_training,
-        "weights": entry.model.Options.of_weights,
-    }
-    for kind, fixed in kinds.items():
-        if other := sorted(name for name in fixed if before[name] != after[name]):
-            expected, got = (
-                ", ".join(f"model.{name}={layer[name]}" for name in other)
-                for layer in (before, after)
-            )
-            fix = "leave it out, or train with it; docs/baselines.md says what a trained model takes"
-            raise UsageError(
-                f"an option of the {kind}",
+                "the training is over",
                 where="--set",
-                expected=expected,
-                got=got,
-                fix=fix,
+                got=setting,
+                fix="set options of the model: --set model.KEY=VALUE",
             )
-    return after
+    model_options = entry.model.Options
+    before = _check_options(model_options, dict(options), "model", "--set")
+    after = _check_options(model_options, layers["model"], "model", "--set")
+    before_values = before.model_dump(mode="json")
+    after_values = after.model_dump(mode="json")
+    _check_unchanged("training", model_options.in_training, before_values, after_values)
+    _check_unchanged("weights", model_options.of_weights, before_values, after_values)
+    return after_values
 
 
-def _read(path: Path) -> _File:
-    return _checked(_File, read_yaml(path), "", str(path), UnreadableFileError)
+def _check_unchanged(
+    kind: str, names: Iterable[str], before: Layer, after: Layer
+) -> None:
+    """Refuse changes of options that only a training can change."""
+    changed = sorted(name for name in names if before[name] != after[name])
+    if not changed:
+        return
+    raise UsageError(
+        f"an option of the {kind}",
+        where="--set",
+        expected=", ".join(f"model.{name}={before[name]}" for name in changed),
+        got=", ".join(f"model.{name}={after[name]}" for name in changed),
+        fix="leave it out, or train with it; docs/baselines.md says which options a "
+        "trained model takes",
+    )
+
+
+def _read_file(path: Path) -> _RecipeFile:
+    return _check_options(
+        _RecipeFile, read_yaml(path), "", str(path), error_class=UnreadableFileError
+    )
 
 
 def _merge(below: Layer, above: Layer) -> Layer:
     """Return two layers joined; mappings are joined key by key."""
     joined = dict(below)
     for key, value in above.items():
-        held = joined.get(key)
-        if key == "schedule" and isinstance(held, str):  # its kind alone
-            held = {"kind": held}
-        both = isinstance(value, Mapping) and isinstance(held, Mapping)
-        if both:
-            joined[key] = _merge(dict(held or {}), dict(value))
+        lower_value = joined.get(key)
+        if key == "schedule":
+            lower_value = _expand_schedule(lower_value)
+        if isinstance(value, Mapping) and isinstance(lower_value, Mapping):
+            joined[key] = _merge(dict(lower_value), dict(value))
         else:
             joined[key] = value
-    for key, other in (("steps", "epochs"), ("epochs", "steps")):
-        if above.get(key) is not None and above.get(other) is None:
-            joined.pop(other, None)
+    if above.get("steps") is not None and above.get("epochs") is None:
+        joined.pop("epochs", None)
+    if above.get("epochs") is not None and above.get("steps") is None:
+        joined.pop("steps", None)
     return joined
 
 
-def _setting(text: str) -> Layer:
+def _parse_setting(text: str) -> Layer:
     """Return the change by a text such as ``training.schedule.every=100``."""
-    key, equals, value = text.partition("=")
+    key, equals, value_text = text.partition("=")
     group, *path = key.strip().split(".")
-    if not equals or not path or group not in ("model", "training"):
+    groups = ("model", "training")
+    if not equals or not path or group not in groups:
+        hint = None
+        if equals and path:
+            hint = suggest_name(group, groups)
         raise UsageError(
             "cannot understand the setting",
             where="--set",
             expected="model.KEY=VALUE or training.KEY=VALUE",
             got=text,
-            fix=suggest_name(group, ("model", "training")) if equals and path else None,
+            fix=hint,
         )
     try:
-        layer: Any = yaml.safe_load(value)
+        layer: Any = yaml.safe_load(value_text)
     except yaml.YAMLError as error:
         raise UsageError(
             "the value is no YAML",
@@ -449,41 +519,49 @@ def _setting(text: str) -> Layer:
     return dict(layer)
 
 
-def _checked(
-    options: type[Checked],
+def _check_options(
+    options: type[OptionsT],
     values: object,
     group: str,
     where: str,
-    kind: type[LagbenchError] = UsageError,
-) -> Checked:
-    """Return options, or say what is wrong with them first, with the nearest key for an
-    unknown one.
-    """
+    *,
+    error_class: type[LagbenchError] = UsageError,
+) -> OptionsT:
+    """Return checked options; raise the first error that pydantic reports."""
     try:
         return options.model_validate(values)
     except ValidationError as error:
-        first = error.errors()[0]
-    key = ".".join(str(part) for part in (group, *first["loc"]) if part != "")
-    if first["type"] == "extra_forbidden":
-        holder: type[BaseModel] = options
-        for step in first["loc"][:-1]:  # the keys of options nested below a path
-            field = holder.model_fields.get(str(step))
-            if field:
-                inner = field.annotation
-            else:
-                inner = None
-            if isinstance(inner, type) and issubclass(inner, BaseModel):
-                holder = inner
-            elif step == "recipes" or holder is _File:
-                holder = _Shared
-        fix = suggest_name(str(first["loc"][-1]), list(holder.model_fields))
-        raise kind(f"unknown key {key!r}", where=where, fix=fix)
-    expected = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "tuple_type":
+        detail = error.errors()[0]
+    path = [str(part) for part in (group, *detail["loc"]) if part != ""]
+    key = ".".join(path)
+    if detail["type"] == "extra_forbidden":
+        known_keys = _known_keys(options, detail["loc"][:-1])
+        raise error_class(
+            f"unknown key {key!r}",
+            where=where,
+            fix=suggest_name(str(detail["loc"][-1]), known_keys),
+        )
+
+    expected = detail["msg"].removeprefix("Value error, ")
+    if detail["type"] == "tuple_type":
         expected = "a list in brackets"
-    whole = isinstance(first["input"], Mapping) and not first["type"].endswith("_type")
-    if whole:
-        got = None
-    else:
-        got = repr(first["input"])[:80]
-    raise kind(f"{key} does not fit", where=where, expected=expected, got=got)
+    got: str | None = repr(detail["input"])[:80]
+    is_type_error = detail["type"].endswith("_type")
+    if isinstance(detail["input"], Mapping) and not is_type_error:
+        got = None  # the error is of the mapping as a whole
+    raise error_class(f"{key} does not fit", where=where, expected=expected, got=got)
+
+
+def _known_keys(options: type[BaseModel], path: Iterable[int | str]) -> list[str]:
+    """Return the keys of the options below a path."""
+    holder = options
+    for step in path:
+        field = holder.model_fields.get(str(step))
+        inner = None
+        if field:
+            inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            holder = inner
+        elif step == "recipes" or holder is _RecipeFile:
+            holder = _SharedRecipe
+    return list(holder.model_fields)

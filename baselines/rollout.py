@@ -1,20 +1,21 @@
-"""Rollouts: a model fed with its own predictions, frozen where it ceases to be finite
-or leaves for far.
+"""Rollouts: a model fed with its own predictions, and their validation.
 
-One function serves the predictions that are scored and validation while a model is
-trained: rollouts of every scenario of ``valid`` by the metric that ranks. Files, metric
-and its rounding are the scorer's: were ``valid`` the test subset, the score card would
-have the same digits. ``test`` is never read. Scenarios come whole, as batches; training
-windows are `lagbench.torch`'s.
+A rollout is frozen where it ceases to be finite or leaves the box for far. One function
+serves predictions and validations. A validation rolls out every scenario of ``valid``
+and takes the metric that ranks. Files, metric and rounding are the scorer's: were
+``valid`` the test subset, the scores would have the same digits. A validation never
+reads ``test``. Scenarios are batches of whole scenarios; training windows are those of
+`lagbench.torch`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,14 +28,14 @@ from lagbench.errors import UsageError
 from lagbench.metrics.aggregate import Tally, round_statistics, score, tally
 from lagbench.metrics.frame import FramePair, snapshots
 from lagbench.metrics.table import METRICS, ranking_metric, select
-from lagbench.scoring.task import ScoredTask, load_scored_task
+from lagbench.scoring.task import OpenScenario, ScoredTask, load_scored_task
 from lagbench.store.copy import scenario_files
 from lagbench.store.windows import copy_window
 from lagbench.submission.checks import MAX_DISTANCE
 from lagbench.tensors import TensorWindow, collate
 from lagbench.torch import tensors
 
-from .baseline import Baseline, Batch, Facts
+from .baseline import Baseline, Batch, DatasetInfo
 from .recipe import TrainingOptions
 
 
@@ -60,148 +61,159 @@ def roll_out(model: Baseline, given: Batch, frames: int) -> list[Rollout]:
     was_training = model.training
     model.eval()
     try:
-        predicted, finite = _advance(model, given, frames)
-        if finite < frames and given.windows > 1:
-            alone = (single(given, window) for window in range(given.windows))
-            return [
-                rollout
-                for window in alone
-                for rollout in roll_out(model, window, frames)
-            ]
+        predicted, finite_frames = _advance(model, given, frames)
+        is_diverged = finite_frames < frames
+        if is_diverged and given.windows > 1:
+            rollouts = []
+            for window in range(given.windows):
+                rollouts += roll_out(model, select_window(given, window), frames)
+            return rollouts
     finally:
         model.train(was_training)
-    mark = None
-    if finite < frames:
-        if finite:
-            predicted[finite:] = predicted[finite - 1]
+
+    diverged_at = None
+    if is_diverged:
+        if finite_frames:
+            last_finite = predicted[finite_frames - 1]
         else:
-            predicted[finite:] = given.position[:, -1].cpu().float()
-        mark = int(given.frame[0]) + given.frames + finite
+            last_finite = given.position[:, -1].cpu().float()
+        predicted[finite_frames:] = last_finite
+        diverged_at = int(given.frame[0]) + given.frames + finite_frames
+
     sample = given.sample.cpu()
-    return [
-        Rollout(
+    rollouts = []
+    for window, scenario in enumerate(given.scenario):
+        rollout = Rollout(
             scenario=int(scenario),
             position=predicted[:, sample == window],
-            diverged_at=mark,
+            diverged_at=diverged_at,
         )
-        for window, scenario in enumerate(given.scenario)
-    ]
+        rollouts.append(rollout)
+    return rollouts
 
 
-def single(batch: Batch, window: int) -> Batch:
+def select_window(batch: Batch, window: int) -> Batch:
     """Return one window of a batch as a batch of its own."""
-    mine = batch.sample == window
+    is_inside = batch.sample == window
     walls = batch.wall_velocity
+    if walls is not None:
+        walls = walls[window : window + 1]
+    origin = batch.origin
+    if origin is not None:
+        origin = origin[is_inside]
     return Batch(
-        position=batch.position[mine],
-        sample=torch.zeros_like(batch.sample[mine]),
-        material=batch.material[mine],
-        wall_velocity=None if walls is None else walls[window : window + 1],
+        position=batch.position[is_inside],
+        sample=torch.zeros_like(batch.sample[is_inside]),
+        material=batch.material[is_inside],
+        wall_velocity=walls,
         scenario=batch.scenario[window : window + 1],
         frame=batch.frame[window : window + 1],
-        origin=None if batch.origin is None else batch.origin[mine],
+        origin=origin,
     )
 
 
 def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
-    """Return positions, shape [frame, particle, 2], and how many frames are finite and
-    near the box.
+    """Return positions, and how many of the frames are finite and near the box.
+
+    Positions have shape [frame, particle, 2].
     """
     predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
-        found: object = model.advance(state)
-        if isinstance(found, tuple | list):
-            parts = found
-        else:
-            parts = (found,)
-        # What has another shape a frame could be broadcast from.
-        shape = predicted[frame].shape
-        if len(parts) == 2:
-            position = parts[1]
-        else:
-            position = None
-        if not isinstance(position, Tensor) or position.shape != shape:
-            raise UsageError(
-                "a model returned no positions of the next frame",
-                where=f"{type(model).__qualname__}.advance",
-                expected=f"the next state and a tensor of shape {list(shape)}: "
-                f"[particle, 2]",
-                got=", ".join(
-                    str(getattr(part, "shape", type(part).__name__)) for part in parts
-                ),
-                fix="mend that class",
-            )
-        state = parts[0]
+        output: object = model.advance(state)
+        state, position = _check_advance(model, output, predicted[frame].shape)
         predicted[frame] = position
-        # The scorer refuses what lies farther out; of NaN nothing is true.
-        if not ((predicted[frame] - 0.5).abs() <= MAX_DISTANCE).all():
+        # The scorer refuses positions farther out. Comparisons with NaN are false.
+        distance = (predicted[frame] - 0.5).abs()
+        if not (distance <= MAX_DISTANCE).all():
             return predicted, frame
     return predicted, frames
 
 
-@contextmanager
-def replaced(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
-    """Give parameters other values for a while."""
-    kept = {parameter: parameter.detach().clone() for parameter in values}
-    with torch.no_grad():
-        for parameter, value in values.items():
-            parameter.copy_(value)
-    try:
-        yield
-    finally:
-        with torch.no_grad():
-            for parameter, value in kept.items():
-                parameter.copy_(value)
+def _check_advance(
+    model: Baseline, output: object, shape: torch.Size
+) -> tuple[Any, Tensor]:
+    """Return state and positions; refuse other outputs of a stranger's model.
 
-
-def as_published(model: nn.Module) -> AbstractContextManager[None]:
-    """Round the parameters to bfloat16 for a while."""
-    return replaced(
-        {
-            parameter: parameter.detach().to(torch.bfloat16)
-            for parameter in model.parameters()
-        }
+    Positions of another shape could be broadcast to a frame.
+    """
+    if not isinstance(output, tuple | list):
+        output = (output,)
+    if len(output) == 2:
+        state, position = output
+        if isinstance(position, Tensor) and position.shape == shape:
+            return state, position
+    shapes = []
+    for part in output:
+        shapes.append(str(getattr(part, "shape", type(part).__name__)))
+    raise UsageError(
+        "a model returned no positions of the next frame",
+        where=f"{type(model).__qualname__}.advance",
+        expected=f"the next state and a tensor of shape {list(shape)}: [particle, 2]",
+        got=", ".join(shapes),
+        fix="mend that class",
     )
 
 
+@contextmanager
+def replace_parameters(values: Mapping[Tensor, Tensor]) -> Iterator[None]:
+    """Give parameters other values for a while."""
+    originals = {parameter: parameter.detach().clone() for parameter in values}
+    _copy_to_parameters(values)
+    try:
+        yield
+    finally:
+        _copy_to_parameters(originals)
+
+
+@torch.no_grad()
+def _copy_to_parameters(values: Mapping[Tensor, Tensor]) -> None:
+    for parameter, value in values.items():
+        parameter.copy_(value)
+
+
+def round_parameters(model: nn.Module) -> AbstractContextManager[None]:
+    """Round the parameters to bfloat16 for a while."""
+    rounded: dict[Tensor, Tensor] = {}
+    for parameter in model.parameters():
+        rounded[parameter] = parameter.detach().to(torch.bfloat16)
+    return replace_parameters(rounded)
+
+
 def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
-    """Return the same frames of one or several whole scenarios, read without a
-    cache.
+    """Return the same frames of whole scenarios, read without a cache.
+
+    Raises:
+        UsageError: the frames are not consecutive ones of a scenario.
     """
-    windows: list[TensorWindow] = []
-    for path in [paths] if isinstance(paths, Path) else paths:
-        with read_scenario(path) as file:
-            numbers = range(file.header.frames)[frames]
-            if not numbers or numbers.step != 1:
-                raise UsageError(
-                    "no consecutive frames",
-                    where=str(path),
-                    expected=f"frames of 0:{file.header.frames}",
-                    got=frames,
-                )
-            run = slice(numbers.start, numbers.stop)
-            held = file.variables
-            position = file.read("position", run)
-            if "material" in held:
-                material = file.read("material")
-            else:
-                material = np.zeros(position.shape[1], np.int8)
-            # The forcing is given for all frames, so that a rollout from these knows
-            # what comes.
-            if "wall_velocity" in held:
-                walls = file.read("wall_velocity", slice(run.start, None))
-            else:
-                walls = None
-            scenario = file.header.key.scenario
-            windows.append(
-                tensors(
-                    copy_window(
-                        list(position), material, walls, scenario, numbers.start
-                    )
-                )
+    if isinstance(paths, Path):
+        paths = [paths]
+    return collate([_read_window(path, frames) for path in paths])
+
+
+def _read_window(path: Path, frames: slice) -> TensorWindow:
+    """Return frames of a scenario as a window."""
+    with read_scenario(path) as file:
+        numbers = range(file.header.frames)[frames]
+        if not numbers or numbers.step != 1:
+            raise UsageError(
+                "no consecutive frames",
+                where=str(path),
+                expected=f"frames of 0:{file.header.frames}",
+                got=frames,
             )
-    return collate(windows)
+        position = file.read("position", slice(numbers.start, numbers.stop))
+        if "material" in file.variables:
+            material = file.read("material")
+        else:
+            material = np.zeros(position.shape[1], np.int8)
+        walls = None
+        if "wall_velocity" in file.variables:
+            # The forcing of all later frames too: a rollout from these knows it.
+            walls = file.read("wall_velocity", slice(numbers.start, None))
+        scenario = file.header.key.scenario
+    window = copy_window(list(position), material, walls, scenario, numbers.start)
+    return tensors(window)
 
 
 def scenario_paths(
@@ -213,83 +225,94 @@ def scenario_paths(
     registry: Registry | None = None,
 ) -> dict[int, Path]:
     """Return the files of a subset by scenario id; all of them exist."""
-    entry, folder, _ = locate(split, size, root=root, registry=registry)
-    return scenario_files(entry, folder, (subset,))
+    tier, root_folder, _ = locate(split, size, root=root, registry=registry)
+    return scenario_files(tier, root_folder, (subset,))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Validation:
-    """The scenarios that a training is validated on; calling it validates."""
+    """The scenarios that a training is validated on."""
 
     task: ScoredTask  # the valid subset
     # frames to predict, by scenario id: later ones do not count
     frames: Mapping[int, int]
-    compiled: bool = False  # whether the training compiles layers
+    is_compiled: bool = False  # whether the training compiles layers
 
     @property
     def metric(self) -> str:
         """Name of the metric that ranks; lower is better."""
         return ranking_metric(self.task.size)
 
-    def __call__(self, model: Baseline) -> float:
+    def measure(self, model: Baseline) -> float:
         """Return the metric, the mean over scenarios; NaN where it is undefined.
 
-        The model is rolled out with its weights rounded to bfloat16, as predictions use
-        them, on a CPU one scenario after the other, as predictions are. A rollout that
-        diverges counts with its frozen frames.
+        The model is rolled out with its weights rounded to bfloat16, and on a CPU one
+        scenario after the other, as predictions are. A rollout that diverges counts
+        with its frozen frames.
         """
         device = next((p.device for p in model.parameters()), torch.device("cpu"))
         ids = list(self.frames)
+        groups = [ids]
         if device.type == "cpu":
-            groups = [[i] for i in ids]
-        else:
-            groups = [ids]
-        tallies: dict[int, Tally] = {}
+            groups = [[scenario] for scenario in ids]
         # A rollout needs no gradients: its layers would be compiled anew.
-        if self.compiled:
+        stance: AbstractContextManager[Any] = nullcontext()
+        if self.is_compiled:
             stance = torch.compiler.set_stance("force_eager")
-        else:
-            stance = nullcontext()
-        with as_published(model), stance:
+
+        tallies: dict[int, Tally] = {}
+        with round_parameters(model), stance:
             for group in groups:
-                paths = [self.task.truth.path(i) for i in group]
-                given = scenario_batch(
-                    paths, slice(0, self.task.config.input_frames)
-                ).to(device)
-                for rollout in roll_out(
-                    model, given, max(self.frames[i] for i in group)
-                ):
-                    with self.task.opened(rollout.scenario) as truth:
-                        scenario = truth.scenario
-                        frames = self.task.config.predicted_frames
-                        predicted = snapshots(scenario, rollout.position.numpy())
-                        states = zip(frames, predicted, truth.snapshots(), strict=False)
-                        pairs = (
-                            FramePair(scenario, frame, true, guess)
-                            for frame, guess, true in states
-                        )
-                        measured = tally(pairs, select([self.metric]), frames)
-                        # rounded as score files hold them
-                        tallies[rollout.scenario] = round_statistics(measured)
-        found = score(METRICS[self.metric], tallies)
-        if found is None:
+                for rollout in self._roll_out(model, group, device):
+                    tallies[rollout.scenario] = self._compare(rollout)
+        result = score(METRICS[self.metric], tallies)
+        if result is None:
             return math.nan
-        return found.mean
+        return result.mean
+
+    def _roll_out(
+        self, model: Baseline, scenarios: Sequence[int], device: torch.device
+    ) -> Iterable[Rollout]:
+        """Return rollouts of scenarios side by side."""
+        paths = [self.task.truth.path(scenario) for scenario in scenarios]
+        input_frames = slice(0, self.task.config.input_frames)
+        given = scenario_batch(paths, input_frames).to(device)
+        horizon = max(self.frames[scenario] for scenario in scenarios)
+        return roll_out(model, given, horizon)
+
+    def _compare(self, rollout: Rollout) -> Tally:
+        """Return the tally of a rollout against the truth, rounded as in a file."""
+        frames = self.task.config.predicted_frames
+        with self.task.opened(rollout.scenario) as truth:
+            # A generator, so that one pair of frames is in memory at a time.
+            pairs = _pair_frames(rollout, truth, frames)
+            return round_statistics(tally(pairs, select([self.metric]), frames))
 
 
-def validation_of(
-    options: TrainingOptions, facts: Facts, *, root: Path, registry: Registry
+def _pair_frames(
+    rollout: Rollout, truth: OpenScenario, frames: Sequence[int]
+) -> Iterator[FramePair]:
+    """Yield true and predicted frames."""
+    scenario = truth.scenario
+    predicted_frames = snapshots(scenario, rollout.position.numpy())
+    for frame, predicted, true in zip(
+        frames, predicted_frames, truth.snapshots(), strict=False
+    ):
+        yield FramePair(scenario, frame, true, predicted)
+
+
+def load_validation(
+    options: TrainingOptions, info: DatasetInfo, *, root: Path, registry: Registry
 ) -> Validation | None:
-    """Return the validation of a training; None where the recipe wants none."""
+    """Return the validation of a training; None where the recipe asks for none."""
     if options.validate_every == 0:
         return None
-    task = load_scored_task(
-        registry.size(facts.split, facts.size), root, subset="valid"
-    )
-    horizon = min(options.validation_frames or facts.horizon, facts.horizon)
+    size = registry.size(info.split, info.size)
+    task = load_scored_task(size, root, subset="valid")
+    horizon = min(options.validation_frames or info.horizon, info.horizon)
     task = replace(task, config=replace(task.config, horizon=horizon))
     frames = {}
-    for i in task.scenarios[: options.validation_scenarios]:
-        with task.opened(i) as truth:
-            frames[i] = len(truth.scenario.moving_frames)
-    return Validation(task=task, frames=frames, compiled=options.compile)
+    for scenario in task.scenarios[: options.validation_scenarios]:
+        with task.opened(scenario) as truth:
+            frames[scenario] = len(truth.scenario.moving_frames)
+    return Validation(task=task, frames=frames, is_compiled=options.compile)

@@ -1,17 +1,17 @@
-"""Graph networks that move particles: one step from features to positions, rolled out
-or trained.
+"""Graph networks that move particles: one step of features, network and integration.
 
     a = S^-1(network(features(x, v)))        or  v' = S^-1(network(features(x, v)))
     v' = v + a,   x' = x + v'                semi-implicit Euler, time in frames
 
-after Sanchez-Gonzalez et al. (2020) and thesis §§5.6-5.7. Training and rollouts share
-:meth:`GraphNetwork.step`. The network's last layer starts at zero: an untrained model
-with target acceleration keeps every velocity, and training starts from there.
+after Sanchez-Gonzalez et al. (2020) and thesis sections 5.6 and 5.7. Training and
+rollouts share :meth:`GraphNetwork.step`. The network's last layer starts at zero. So an
+untrained model with target acceleration keeps every velocity, and training starts from
+there.
 
 The loss has six terms of motion, density and flow (thesis Eqs. 5.29-5.35) in normalise
 units, as in the thesis: accelerations, velocities and positions over their deviations
 in train; the grid's velocities too, so that vorticity and divergence have the unit
-1/length; density over that around a particle. Weights are applied by the trainer.
+1/length; density over that around a particle. The training applies the weights.
 """
 
 from __future__ import annotations
@@ -29,18 +29,24 @@ from lagbench.baselines.operators.operator import Losses, Operator
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
 
-from .augmentation import Symmetry, disturbed
+from .augmentation import Symmetry, augment
 from .baseline import (
     Baseline,
     Batch,
-    Facts,
+    DatasetInfo,
     Options,
     check_moving_walls,
     last_velocities,
 )
-from .graph import EDGE_FEATURES, NodeFeatures, Scale, edge_features, radius_graph
+from .graph import (
+    EDGE_FEATURES,
+    NodeFeatures,
+    Standardisation,
+    edge_features,
+    radius_graph,
+)
 from .network import EncodeProcessDecode
-from .torch_grid import fields, transfer
+from .torch_grid import TensorFields, tensor_fields, transfer
 
 
 class Motion(NamedTuple):
@@ -48,14 +54,14 @@ class Motion(NamedTuple):
 
     position: Tensor  # x(f) [length], shape [particle, 2]
     velocity: Tensor  # x(f) - x(f-1) [length/frame], shape [particle, 2]
-    # velocity less that of the frame before, in target and prediction the same frame,
-    # which is the model's input [length/frame^2], shape [particle, 2]
+    # velocity less that of the frame before [length/frame^2], shape [particle, 2]; in
+    # target and prediction that is the same frame, the model's input
     acceleration: Tensor
 
 
 @dataclass(frozen=True, kw_only=True)
-class State:
-    """What a step starts from."""
+class ParticleState:
+    """Input of a step."""
 
     position: Tensor  # last positions [length], shape [particle, 2]
     # last velocities, oldest first [length/frame], shape [particle, velocities, 2]
@@ -64,16 +70,18 @@ class State:
     sample: Tensor  # window of each particle, ascending, int64, shape [particle]
     # velocity of the walls in the coming frames, the next one first [length/frame],
     # shape [window, frame, 4, 2]; beyond them the last one stays. None where walls rest
-    # or do not matter.
+    # or the model does not see them.
     wall_velocity: Tensor | None
 
-    def moved(self, position: Tensor, velocity: Tensor) -> Self:
+    def move(self, position: Tensor, velocity: Tensor) -> Self:
         """Return the state one frame on."""
-        last = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
+        velocities = torch.cat([self.velocity[:, 1:], velocity.unsqueeze(1)], dim=1)
         walls = self.wall_velocity
         if walls is not None and walls.shape[1] > 1:
             walls = walls[:, 1:]
-        return replace(self, position=position, velocity=last, wall_velocity=walls)
+        return replace(
+            self, position=position, velocity=velocities, wall_velocity=walls
+        )
 
 
 PARTICLE_TERMS = ("acceleration", "velocity", "position")
@@ -92,16 +100,18 @@ class LossNorm(enum.StrEnum):
 def mean_norm(
     error: Tensor, norm: LossNorm, count: Tensor | int | None = None
 ) -> Tensor:
-    """Return ``(1/N) sum_i ||e_i||_p`` of normalise errors, shape [..., component]
-    (Eqs. 5.29-5.34).
+    """Return ``(1/N) sum_i ||e_i||_p`` of normalise errors (Eqs. 5.29-5.34).
 
-    0 is perfect; N counts particles or nodes, by default those of the array.
+    The errors have shape [..., component]. N counts particles or nodes, by default
+    those of the array.
     """
     if norm is LossNorm.L2:
-        each = error**2
+        magnitude = error**2
     else:
-        each = error.abs()
-    return each.sum() / (each[..., 0].numel() if count is None else count)
+        magnitude = error.abs()
+    if count is None:
+        count = magnitude[..., 0].numel()
+    return magnitude.sum() / count
 
 
 def loss_terms(
@@ -114,51 +124,77 @@ def loss_terms(
     norm: LossNorm,
     weights: Mapping[str, float],
 ) -> dict[str, Tensor]:
-    """Return the six terms, raw; those of weight 0 without a graph. Missing weights are
-    1.
+    """Return the six terms without their weights.
 
-    Errors are divided by ``scales``, deviations (x, y) by the names in :class:`Motion`.
+    Terms of weight 0 have no graph of gradients.
+
+    Args:
+        predicted: predicted motion.
+        target: true motion.
+        sample: window of each particle, shape [particle].
+        grid: grid of density, divergence and vorticity.
+        scales: deviations (x, y) of errors, by the names in :class:`Motion`.
+        norm: norm of the errors.
+        weights: weights by term; a missing one is 1.
     """
     terms = {}
     for name in PARTICLE_TERMS:
-        with _graph(weights, name):
+        with _record_graph(weights, name):
             error = getattr(predicted, name) - getattr(target, name)
             terms[name] = mean_norm(error / scales[name], norm)
-    windows = int(sample[-1]) + 1
+
     with torch.no_grad():
-        sums = transfer(
-            target.position, target.velocity, grid, sample=sample, windows=windows
-        )
-        # A node's weight around a particle, on the average: the full weight of a box
-        # that is full, and defined for a splash too, whose area is not known here.
-        full = float((sums.weight**2).sum() / sums.weight.sum())
-        true = fields(sums, grid, full)
-    with _graph(
-        weights, *GRID_TERMS
-    ):  # the prediction's fields at the nodes that count in the truth
-        sums = transfer(
-            predicted.position, predicted.velocity, grid, sample=sample, windows=windows
-        )
-        own = fields(sums, grid, full, true.counted)
-    with _graph(weights, "density"):
-        terms["density"] = mean_norm((own.density - true.density).unsqueeze(-1), norm)
-    count = true.differentiable.sum().clamp(min=1)
+        true_fields = _target_fields(target, grid, sample)
+    with _record_graph(weights, *GRID_TERMS):
+        predicted_fields = _predicted_fields(predicted, true_fields, sample)
+
+    with _record_graph(weights, "density"):
+        error = predicted_fields.density - true_fields.density
+        terms["density"] = mean_norm(error.unsqueeze(-1), norm)
+    node_count = true_fields.differentiable.sum().clamp(min=1)
     speed = (scales["velocity"] ** 2).mean().sqrt()
     for name in ("divergence", "vorticity"):
-        with _graph(weights, name):
-            error = (getattr(own, name) - getattr(true, name)) / speed
-            terms[name] = mean_norm(error.unsqueeze(-1), norm, count)
+        with _record_graph(weights, name):
+            difference = getattr(predicted_fields, name) - getattr(true_fields, name)
+            error = difference / speed
+            terms[name] = mean_norm(error.unsqueeze(-1), norm, node_count)
     return terms
 
 
-def _graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
-    """Record a graph only if one is recorded at all and one of the terms counts."""
-    counts = any(weights.get(name, 1.0) != 0.0 for name in names)
-    return torch.set_grad_enabled(torch.is_grad_enabled() and counts)
+def _target_fields(target: Motion, grid: Grid, sample: Tensor) -> TensorFields:
+    """Return the fields of the truth, over the mean node weight around a particle.
+
+    That is the full weight of a box that is full, and it is defined for a splash too,
+    whose area is not known here.
+    """
+    windows = int(sample[-1]) + 1
+    sums = transfer(
+        target.position, target.velocity, grid, sample=sample, windows=windows
+    )
+    full_weight = float((sums.weight**2).sum() / sums.weight.sum())
+    return tensor_fields(sums, grid, full_weight)
 
 
-class Target(enum.StrEnum):
-    """What the network predicts; untrained, it gives the train mean of it."""
+def _predicted_fields(
+    predicted: Motion, true_fields: TensorFields, sample: Tensor
+) -> TensorFields:
+    """Return the fields of the prediction at the nodes that count in the truth."""
+    windows = int(sample[-1]) + 1
+    grid = true_fields.grid
+    sums = transfer(
+        predicted.position, predicted.velocity, grid, sample=sample, windows=windows
+    )
+    return tensor_fields(sums, grid, true_fields.full_weight, true_fields.counted)
+
+
+def _record_graph(weights: Mapping[str, float], *names: str) -> torch.set_grad_enabled:
+    """Record a graph only if torch records one and one of the terms has a weight."""
+    is_weighted = any(weights.get(name, 1.0) != 0.0 for name in names)
+    return torch.set_grad_enabled(torch.is_grad_enabled() and is_weighted)
+
+
+class GraphTarget(enum.StrEnum):
+    """Meaning of the network's output; untrained, it is the train mean of it."""
 
     ACCELERATION = "acceleration"
     VELOCITY = "velocity"
@@ -167,9 +203,10 @@ class Target(enum.StrEnum):
 class LossWeights(Options):
     """Weights of Eq. 5.35; a term of weight 0 is logged and not learnt from.
 
-    By default those that count start between 0.01 and 1. Over one step, errors of
-    velocity and position are that of acceleration in other units, and density errors
-    start at 1e-5: they have weight 0. The thesis weighs all terms by 1.
+    With the default weights, the weighted terms start between 0.01 and 1. Over one
+    step, errors of velocity and position are that of acceleration in other units, and
+    density errors start at 1e-5: they have weight 0. The thesis weighs all terms by
+    1.
     """
 
     acceleration: float = Field(default=0.5, ge=0.0, allow_inf_nan=False)
@@ -202,31 +239,29 @@ class GraphNetworkOptions(Options):
     # which is the sum itself
     sum_messages: bool = True
     velocities: int = Field(default=5, ge=1)  # last velocities that a particle shows
-    # share of training windows that know but some of their last velocities, as rollouts
-    # do at their start
+    # share of training windows in which the oldest velocities are repeats of a later
+    # one, as they are at the start of rollouts
     forgetful: float = Field(default=0.0, ge=0.0, le=1.0)
-    target: Target = Target.ACCELERATION  # what the network predicts
+    target: GraphTarget = GraphTarget.ACCELERATION  # what the network predicts
     # deviation of the noise on the last given velocity, per component [length/frame];
-    # some times the one of an acceleration is good: rollouts of models that saw less
-    # drift away
+    # some times that of an acceleration is good: with less, rollouts drift away
     noise_std: float = Field(default=6.7e-4, ge=0.0, allow_inf_nan=False)
     loss: LossWeights = LossWeights()  # weights of the six terms
     loss_norm: LossNorm = LossNorm.L2  # L2 or L1
     # weight of an operator's link prediction; the operator's own when None
     link_weight: float | None = Field(default=None, ge=0.0, allow_inf_nan=False)
-    # own steps that the loss is averaged over; gradients pass through all
+    # steps over which the loss is a mean; gradients pass through all
     rollout_loss_steps: int = Field(default=1, ge=1)
     # whether the velocities of moving walls in the next frame are features
     wall_velocity: bool = False
     # how far a particle sees a wall [radius]; the solver's grid carries a wall's effect
     # beyond one radius
     wall_reach: float = Field(default=3.0, gt=0.0, allow_inf_nan=False)
-    # images that training windows are replaced by at random
+    # training windows are replaced by random ones of these mirror images
     symmetry: Symmetry = Symmetry.NONE
     # connectivity radius [length]; the data set's when None
     radius: float | None = Field(default=None, gt=0.0, allow_inf_nan=False)
-    # neighbours that a particle hears at most, the nearest; all within the radius when
-    # None
+    # neighbours of a particle at most, the nearest; all within the radius when None
     neighbours: int | None = Field(default=None, ge=1)
     # keep particles in the box, and their velocities true to that, in training and in
     # rollouts
@@ -234,10 +269,10 @@ class GraphNetworkOptions(Options):
 
 
 class GraphNetwork(Baseline):
-    """A graph network that gathers by an operator; :meth:`with_operator` names it.
+    """A graph network with an operator; :meth:`with_operator` makes its class.
 
     Class attributes:
-        operator: what every processor layer gathers by.
+        operator: the aggregation of every processor layer.
     """
 
     Options = GraphNetworkOptions
@@ -245,9 +280,9 @@ class GraphNetwork(Baseline):
     any_size = True
     operator: ClassVar[type[Operator]]
 
-    def __init__(self, options: GraphNetworkOptions, facts: Facts) -> None:
-        super().__init__(options, facts)
-        check_moving_walls(options.wall_velocity, facts)
+    def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        check_moving_walls(options.wall_velocity, info)
         if options.link_weight is not None and "link" not in self.operator.weights:
             raise UsageError(
                 f"{self.method} predicts no links",
@@ -256,23 +291,18 @@ class GraphNetwork(Baseline):
                 got=options.link_weight,
                 fix="leave the option out, or train supergat",
             )
-        noise = options.noise_std
-        statistics = facts.statistics
-        if options.radius is None:
-            self.radius = facts.radius
-        else:
+        self.radius = info.radius
+        if options.radius is not None:
             self.radius = options.radius
-        self.grid = Grid(facts.score_cells, Placement(facts.score_placement))
-        self.position, self.velocity, self.acceleration = (
-            Scale(statistics[f"{name}_mean"], statistics[f"{name}_std"], noise=widening)
-            for name, widening in (
-                ("position", 0.0),
-                ("velocity", noise),
-                ("acceleration", noise),
-            )
+        self.grid = Grid(info.score_cells, Placement(info.score_placement))
+        # Noise on the inputs widens velocities and accelerations.
+        self.position = self._standardisation("position", noise=0.0)
+        self.velocity = self._standardisation("velocity", noise=options.noise_std)
+        self.acceleration = self._standardisation(
+            "acceleration", noise=options.noise_std
         )
         self.features = NodeFeatures(
-            facts.bounds,
+            info.bounds,
             self.velocity,
             self.acceleration,
             options.wall_reach * self.radius,
@@ -290,19 +320,26 @@ class GraphNetwork(Baseline):
         for parameter in self.network.decoder[-1].parameters():
             nn.init.zeros_(parameter)
 
+    def _standardisation(self, name: str, *, noise: float) -> Standardisation:
+        statistics = self.info.statistics
+        mean = statistics[f"{name}_mean"]
+        std = statistics[f"{name}_std"]
+        return Standardisation(mean, std, noise=noise)
+
     @classmethod
     def with_operator(cls, operator: type[Operator]) -> type[GraphNetwork]:
-        """Return the graph network with an operator; the same class for the same
-        operator.
+        """Return the class of the graph network with an operator.
+
+        It is the same class for the same operator.
         """
         key = (cls, operator)
         if key not in _CLASSES:
-            names = {
+            attributes = {
                 "operator": operator,
                 "method": operator.method,
                 "__doc__": operator.__doc__,
             }
-            _CLASSES[key] = type(f"{operator.__name__}Network", (cls,), names)
+            _CLASSES[key] = type(f"{operator.__name__}Network", (cls,), attributes)
         return _CLASSES[key]
 
     @property
@@ -318,10 +355,10 @@ class GraphNetwork(Baseline):
     @property
     def weights(self) -> Mapping[str, float]:
         """Weight of each term of the loss, the operator's own included."""
-        own = dict(self.operator.weights)
+        operator_weights = dict(self.operator.weights)
         if self.options.link_weight is not None:
-            own["link"] = self.options.link_weight
-        return self.options.loss.model_dump() | own
+            operator_weights["link"] = self.options.link_weight
+        return self.options.loss.model_dump() | operator_weights
 
     def compile_layers(self) -> None:
         """Compile the network's layers."""
@@ -330,78 +367,102 @@ class GraphNetwork(Baseline):
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
-        """Return the six terms of Eq. 5.35 and the operator's own, raw, means over the
-        steps.
-        """
-        options = self.options
-        if generator is not None:
-            batch = disturbed(self, batch, generator)
-            if options.noise_std > 0.0:
-                batch = replace(batch, position=self._inside(batch.position))
-        state = self.start(batch.part(slice(self.history)))
-        if generator is not None and options.forgetful > 0.0 and options.velocities > 1:
-            # Some windows know but their last velocities, of which the first repeats.
-            last = options.velocities
-            device = generator.device
-            forgotten = torch.randint(
-                1, last, (batch.windows,), generator=generator, device=device
-            )
-            forgotten *= (
-                torch.rand(batch.windows, generator=generator, device=device)
-                < options.forgetful
-            )
-            first = forgotten.to(state.sample.device)[state.sample, None]
-            index = (
-                torch.arange(last, device=first.device)
-                .expand(len(first), -1)
-                .clamp(min=first)
-            )
-            known = state.velocity.gather(1, index[..., None].expand(-1, -1, 2))
-            state = replace(state, velocity=known)
-        scales = {name: getattr(self, name).std for name in PARTICLE_TERMS}
-        steps = []
-        for frame in range(self.history, self.history + self.future):
-            following, own = self.step(state, generator)
-            target = batch.position[:, frame]
-            velocity = target - batch.position[:, frame - 1]
-            # both accelerations start from the state's velocity
-            before = state.velocity[:, -1]
-            predicted = following.velocity[:, -1]
-            terms = loss_terms(
-                Motion(following.position, predicted, predicted - before),
-                Motion(target, velocity, velocity - before),
-                state.sample,
-                grid=self.grid,
-                scales=scales,
-                norm=options.loss_norm,
-                weights=self.weights,
-            )
-            if taken := terms.keys() & own.keys():
-                raise UsageError(
-                    "an operator's loss has the name of one of ours",
-                    where=f"{self.operator.__qualname__}.forward",
-                    got=", ".join(sorted(taken)),
-                    fix="rename it",
-                )
-            steps.append(terms | dict(own))
-            state = following
-        return {
-            name: torch.stack([terms[name] for terms in steps]).mean()
-            for name in steps[0]
-        }
+        """Return the six terms of Eq. 5.35 and the operator's own, without weights.
 
-    def start(self, given: Batch) -> State:
-        """Return the state after the given frames; where they are few, the first
-        velocity repeats.
+        They are means over the steps.
+        """
+        if generator is not None:
+            batch = augment(self, batch, generator)
+            if self.options.noise_std > 0.0:
+                batch = replace(batch, position=self._keep_inside(batch.position))
+        state = self.start(batch.part(slice(self.history)))
+        if generator is not None:
+            state = self._forget(state, batch.windows, generator)
+
+        step_terms = []
+        for frame in range(self.history, self.history + self.future):
+            following, operator_losses = self.step(state, generator)
+            terms = self._step_terms(state, following, batch, frame)
+            self._check_names(terms, operator_losses)
+            step_terms.append(terms | dict(operator_losses))
+            state = following
+
+        means = {}
+        for name in step_terms[0]:
+            values = [terms[name] for terms in step_terms]
+            means[name] = torch.stack(values).mean()
+        return means
+
+    def _step_terms(
+        self, state: ParticleState, following: ParticleState, batch: Batch, frame: int
+    ) -> dict[str, Tensor]:
+        """Return the terms of one step to a frame of the batch."""
+        target_position = batch.position[:, frame]
+        target_velocity = target_position - batch.position[:, frame - 1]
+        predicted_velocity = following.velocity[:, -1]
+        # Both accelerations start from the state's velocity.
+        last_velocity = state.velocity[:, -1]
+        return loss_terms(
+            Motion(
+                following.position,
+                predicted_velocity,
+                predicted_velocity - last_velocity,
+            ),
+            Motion(target_position, target_velocity, target_velocity - last_velocity),
+            state.sample,
+            grid=self.grid,
+            scales={name: getattr(self, name).std for name in PARTICLE_TERMS},
+            norm=self.options.loss_norm,
+            weights=self.weights,
+        )
+
+    def _check_names(self, terms: Mapping[str, Tensor], losses: Losses) -> None:
+        """Refuse an operator's loss with the name of another term."""
+        repeated = terms.keys() & losses.keys()
+        if repeated:
+            raise UsageError(
+                "an operator's loss has the name of one of ours",
+                where=f"{self.operator.__qualname__}.forward",
+                got=", ".join(sorted(repeated)),
+                fix="rename it",
+            )
+
+    def _forget(
+        self, state: ParticleState, windows: int, generator: torch.Generator
+    ) -> ParticleState:
+        """Return the state in which some windows have fewer velocities.
+
+        The option ``forgetful`` says how many windows. The first velocity that is left
+        stands in place of the forgotten ones before it.
+        """
+        velocities = self.options.velocities
+        if self.options.forgetful == 0.0 or velocities == 1:
+            return state
+        device = generator.device
+        forgotten = torch.randint(
+            1, velocities, (windows,), generator=generator, device=device
+        )
+        chance = torch.rand(windows, generator=generator, device=device)
+        forgotten *= chance < self.options.forgetful
+
+        first = forgotten.to(state.sample.device)[state.sample, None]  # [particle, 1]
+        places = torch.arange(velocities, device=first.device).expand(len(first), -1)
+        index = places.clamp(min=first)
+        velocity = state.velocity.gather(1, index[..., None].expand(-1, -1, 2))
+        return replace(state, velocity=velocity)
+
+    def start(self, given: Batch) -> ParticleState:
+        """Return the state after the given frames.
+
+        Where they are few, the first velocity repeats.
         """
         walls = None
         if self.options.wall_velocity and given.wall_velocity is not None:
-            known = given.wall_velocity.shape[1]
-            walls = (
-                given.wall_velocity[:, min(given.frames, known - 1) :]
-                * self.facts.frame_interval
-            )
-        return State(
+            known_frames = given.wall_velocity.shape[1]
+            next_frame = min(given.frames, known_frames - 1)
+            per_second = given.wall_velocity[:, next_frame:]
+            walls = per_second * self.info.frame_interval
+        return ParticleState(
             position=given.position[:, -1],
             velocity=last_velocities(given.position, self.options.velocities),
             material=given.material,
@@ -409,56 +470,65 @@ class GraphNetwork(Baseline):
             wall_velocity=walls,
         )
 
-    def advance(self, state: State) -> tuple[State, Tensor]:
-        """Advance by one frame: the next state and positions [length], shape [particle,
-        2].
-        """
+    def advance(self, state: ParticleState) -> tuple[ParticleState, Tensor]:
+        """Return the next state and positions [length], shape [particle, 2]."""
         following, _ = self.step(state)
         return following, following.position
 
     def step(
-        self, state: State, generator: torch.Generator | None = None
-    ) -> tuple[State, Losses]:
+        self, state: ParticleState, generator: torch.Generator | None = None
+    ) -> tuple[ParticleState, Losses]:
         """Return the state one frame on and the operator's own losses."""
-        output, own = self.predict(state, self.edges(state), generator)
-        if self.options.target is Target.VELOCITY:
+        edge_index = self.find_edges(state)
+        output, losses = self.predict(state, edge_index, generator)
+        if self.options.target is GraphTarget.VELOCITY:
             velocity = self.velocity.inverse(output)
         else:
             velocity = state.velocity[:, -1] + self.acceleration.inverse(output)
-        position = state.position + velocity
-        inside = self._inside(position)
-        return state.moved(inside, velocity + (inside - position).detach()), own
 
-    def edges(self, state: State) -> Tensor:
-        """Search the neighbours: senders and receivers, int64, shape [2, edge]."""
-        most = self.options.neighbours
+        position = state.position + velocity
+        inside = self._keep_inside(position)
+        velocity = velocity + (inside - position).detach()
+        return state.move(inside, velocity), losses
+
+    def find_edges(self, state: ParticleState) -> Tensor:
+        """Return senders and receivers of neighbours, int64, shape [2, edge]."""
         return radius_graph(
-            state.position.detach(), self.radius, state.sample, most=most
+            state.position.detach(),
+            self.radius,
+            state.sample,
+            most=self.options.neighbours,
         )
 
     def predict(
-        self, state: State, edge_index: Tensor, generator: torch.Generator | None = None
+        self,
+        state: ParticleState,
+        edge_index: Tensor,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return the standardised target [1], shape [particle, 2], and the operator's
-        own losses.
+        """Return the standardised target [1], shape [particle, 2], and losses.
+
+        The losses are those of the operator.
         """
-        if state.wall_velocity is None:
-            walls = None
-        else:
-            walls = state.wall_velocity[:, 0][state.sample]
+        walls = None
+        if state.wall_velocity is not None:
+            next_frame = state.wall_velocity[:, 0]
+            walls = next_frame[state.sample]
         node = self.features(state.position, state.velocity, state.material, walls)
         edge = edge_features(state.position, edge_index, self.radius)
         output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
         return output
 
-    def _inside(self, position: Tensor) -> Tensor:
-        """Return positions in the box, with the gradient of those given: a wall would
-        stop it.
+    def _keep_inside(self, position: Tensor) -> Tensor:
+        """Return positions in the box, with the gradient of those given.
+
+        A clamp would have no gradient at a wall.
         """
         if not self.options.clamp:
             return position
-        low, high = position.new_tensor(self.facts.bounds).T
-        return position.detach().clamp(low, high) + (position - position.detach())
+        low, high = position.new_tensor(self.info.bounds).T
+        clamped = position.detach().clamp(low, high)
+        return clamped + (position - position.detach())
 
 
 _CLASSES: dict[tuple[type[GraphNetwork], type[Operator]], type[GraphNetwork]] = {}

@@ -1,8 +1,7 @@
-"""Weights that a training starts from: those of an earlier one, of the same size or of
-another.
+"""The start of a training from weights of an earlier one, perhaps of another size.
 
 A model that knows the velocities and distances of one size goes on in their units at
-another, and with the options that it has, so that its first step there predicts what
+another, and with the options that it has. So its first step there predicts what
 ``lagbench predict --size`` does.
 """
 
@@ -22,142 +21,192 @@ from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.submission.budget import Budget
 
-from .baseline import Baseline, Facts, rescaled
-from .catalogue import Entry
+from .baseline import Baseline, DatasetInfo, rescale
+from .catalogue import CatalogueEntry
 from .checkpoint import RECIPE_NAME, Checkpoint, check_data, load, load_weights, restore
 
 WHERE = "--start"
+# larger numbers in a stranger's file are not believed
 MOST_HOURS = 1e9
-MOST_STEPS = 10**12  # more are not believed
+MOST_STEPS = 10**12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Start:
-    """Weights to start from."""
+class TrainingStart:
+    """Weights that a training starts from."""
 
     path: Path  # their file
-    # public figures of the data at hand, in the units that the weights know
-    facts: Facts
+    # public figures of the data at hand, in the units of the weights
+    info: DatasetInfo
     weights: Mapping[str, Tensor]
-    # options of the model that they are of, without those of its training
+    # options of the model of the weights, without those of its training
     options: Mapping[str, Any]
-    # what records say of them: recipe, sha256, and what they took
+    # entry of training logs: recipe, sha256 and budget
     record: Mapping[str, Any]
 
-    def fill(self, model: Baseline) -> None:
-        """Copy the weights into a model; refuse those of another network or of another
-        meaning there.
+    def load_into(self, model: Baseline) -> None:
+        """Copy the weights into a model.
+
+        Raises:
+            UsageError: they are of another network, or mean something else there.
         """
-        ours = model.options.model_dump(mode="json")
-        adapted, options = model.adapted(self.weights, self.options)
-        other = sorted(name for name, value in options.items() if ours[name] != value)
-        held, needed = (
-            {name: value.shape for name, value in weights.items()}
-            for weights in (adapted, model.state_dict())
-        )
-        if held != needed or model.options.of_weights.intersection(other):
+        model_options = model.options.model_dump(mode="json")
+        adapted, options = model.adapt_weights(self.weights, self.options)
+        changed = []
+        for name, value in options.items():
+            if model_options[name] != value:
+                changed.append(name)
+
+        shapes = {name: value.shape for name, value in adapted.items()}
+        state = model.state_dict()
+        expected_shapes = {name: value.shape for name, value in state.items()}
+        changes_meaning = model.options.of_weights.intersection(changed)
+        if shapes != expected_shapes or changes_meaning:
+            settings = [
+                f"model.{name}={self.options[name]}" for name in sorted(changed)
+            ]
             raise UsageError(
                 "the weights do not fit the model",
                 where=WHERE,
                 expected="weights of the network that is trained",
-                got="weights of one with "
-                + ", ".join(f"model.{name}={self.options[name]}" for name in other)[
-                    :500
-                ],
+                got="weights of one with " + ", ".join(settings)[:500],
                 fix="leave out what was --set of these, or start from other weights",
             )
         load_weights(model, adapted, where=str(self.path))
 
 
 class LastStateWarning(UserWarning):
-    """What is taken are not the best weights of a training."""
+    """The weights are not the best ones of a training."""
 
 
 def warn_of_last_state(checkpoint: Checkpoint, path: Path) -> None:
-    """Warn where a file holds the last state of a training whose best weights lie
-    beside it.
-    """
+    """Warn of a training's last state if its best weights lie beside the file."""
     best = path.with_name("weights.pt")
     if checkpoint.optimizer is not None and best.is_file():
-        message = f"{path} holds the last state of a training; the best weights on valid are {best}"
+        message = (
+            f"{path} holds the last state of a training; the best weights on valid "
+            f"are {best}"
+        )
         warnings.warn(message, LastStateWarning, stacklevel=3)
 
 
 def start_from(
-    path: str | Path, entry: Entry, size: Size, *, root: Path, registry: Registry
-) -> Start:
-    """Return the weights of a file, perhaps of another size, for a training on the data
-    at hand.
+    path: str | Path,
+    entry: CatalogueEntry,
+    size: Size,
+    *,
+    root: Path,
+    registry: Registry,
+) -> TrainingStart:
+    """Return the weights of a file, for a training on the data at hand.
+
+    Args:
+        path: the file; its weights may be of another size.
+        entry: the baseline to train.
+        size: the size to train on.
+        root: folder of all data sets.
+        registry: where splits are described.
+
+    Raises:
+        UsageError: the weights are of another baseline or split, or cannot be run at
+            this size.
+        UnreadableFileError: the file is no checkpoint, or changed while it was read.
+        DataError: the data set is missing, or of another version than the weights'.
     """
     if getattr(entry.model, "closed_form", False):
-        message = f"{entry.model.method} is fitted as a whole, without steps"
         raise UsageError(
-            message, where=WHERE, got=str(path), fix="leave the option out"
+            f"{entry.model.method} is fitted as a whole, without steps",
+            where=WHERE,
+            got=str(path),
+            fix="leave the option out",
         )
     file = Path(path)
-    found = load(file)
-    before = file.stat()
-    warn_of_last_state(found, file)
-    sha256 = file_sha256(file)
-    after = file.stat()
-    if any(
-        getattr(before, name) != getattr(after, name)
-        for name in ("st_ino", "st_size", "st_mtime_ns")
-    ):
-        raise UnreadableFileError(
-            "the file changed while it was read",
-            where=str(file),
-            fix="start from a copy",
-        )
-    for what, asked, got in (
-        ("baseline", entry.name, found.baseline),
-        ("split", size.split, found.facts.split),
-    ):
-        if asked != got:
-            fix = f"start from weights of {asked}"
-            raise UsageError(
-                f"weights of another {what}",
-                where=WHERE,
-                expected=asked,
-                got=got,
-                fix=fix,
-            )
+    checkpoint, sha256 = _load_and_hash(file)
+    _check_same("baseline", entry.name, checkpoint.baseline)
+    _check_same("split", size.split, checkpoint.info.split)
     try:
-        here = check_data(
-            found, root=root, registry=registry, size=size.name, where=f"{WHERE} {file}"
+        target = check_data(
+            checkpoint,
+            root=root,
+            registry=registry,
+            size=size.name,
+            where=f"{WHERE} {file}",
         )
     except UsageError as error:
-        fix = f"start from weights of {size.name}"
         raise UsageError(
-            error.what, where=WHERE, expected=error.expected, got=error.got, fix=fix
+            error.what,
+            where=WHERE,
+            expected=error.expected,
+            got=error.got,
+            fix=f"start from weights of {size.name}",
         ) from error
-    facts = rescaled(found.facts, here)
-    options = restore(replace(found, facts=facts), where=str(file)).options
-    name = str(found.training.get("recipe", {}).get("name", ""))
-    if re.fullmatch(RECIPE_NAME, name):
-        name = name
-    else:
-        name = "unnamed"
-    budget = found.budget or Budget()
-    hours = {
-        each: getattr(budget, each)
-        for each in ("cpu_hours", "validation_hours", "gpu_hours")
-    }
-    if any(value is None or value > MOST_HOURS for value in hours.values()):
-        hours = dict.fromkeys(hours)  # where one is not known, their sum is not
-    if budget.steps is None:
-        made = found.training.get("step", 0)
-    else:
-        made = budget.steps
-    steps = int(made) + (budget.start_steps or 0)
-    return Start(
+
+    info = rescale(checkpoint.info, target)
+    model = restore(replace(checkpoint, info=info), where=str(file))
+    in_training = set(model.options.in_training)
+    options = model.options.model_dump(mode="json", exclude=in_training)
+    return TrainingStart(
         path=file,
-        facts=facts,
-        weights=found.weights,
-        options=options.model_dump(mode="json", exclude=set(options.in_training)),
+        info=info,
+        weights=checkpoint.weights,
+        options=options,
         record={
-            "recipe": name,
+            "recipe": _recipe_name(checkpoint),
             "sha256": sha256,
-            "took": {**hours, "steps": min(steps, MOST_STEPS)},
+            "took": _read_costs(checkpoint),
         },
     )
+
+
+def _load_and_hash(file: Path) -> tuple[Checkpoint, str]:
+    """Return a checkpoint and the SHA-256 of its file."""
+    checkpoint = load(file)
+    before = file.stat()
+    warn_of_last_state(checkpoint, file)
+    sha256 = file_sha256(file)
+    after = file.stat()
+    for name in ("st_ino", "st_size", "st_mtime_ns"):
+        if getattr(before, name) != getattr(after, name):
+            raise UnreadableFileError(
+                "the file changed while it was read",
+                where=str(file),
+                fix="start from a copy",
+            )
+    return checkpoint, sha256
+
+
+def _check_same(kind: str, expected: str, got: str) -> None:
+    if expected != got:
+        raise UsageError(
+            f"weights of another {kind}",
+            where=WHERE,
+            expected=expected,
+            got=got,
+            fix=f"start from weights of {expected}",
+        )
+
+
+def _recipe_name(checkpoint: Checkpoint) -> str:
+    """Return the name of the recipe of the weights, if it is one."""
+    name = str(checkpoint.training.get("recipe", {}).get("name", ""))
+    if re.fullmatch(RECIPE_NAME, name):
+        return name
+    return "unnamed"
+
+
+def _read_costs(checkpoint: Checkpoint) -> dict[str, float | int | None]:
+    """Return hours and steps behind the weights; no hours where some are unknown."""
+    budget = checkpoint.budget or Budget()
+    costs: dict[str, float | int | None] = {
+        "cpu_hours": budget.cpu_hours,
+        "validation_hours": budget.validation_hours,
+        "gpu_hours": budget.gpu_hours,
+    }
+    hours = list(costs.values())
+    if any(value is None or value > MOST_HOURS for value in hours):
+        costs = dict.fromkeys(costs)
+    steps = budget.steps
+    if steps is None:
+        steps = int(checkpoint.training.get("step", 0))
+    costs["steps"] = min(steps + (budget.start_steps or 0), MOST_STEPS)
+    return costs

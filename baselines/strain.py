@@ -1,13 +1,12 @@
-"""How far a body is strained since the scenario's first frame, from positions there and
-now.
+"""Strain of bodies since the scenario's first frame, from positions then and now.
 
     F = dx/dX,   e = (F F^T - 1) / 2
 
 with X the positions in the first frame. A model that carries no stress of its own, as
 grids and graphs do not, can tell by it which way elastic bodies push back. F is the
-least-squares gradient of the mean displacements at the nodes around X, good for affine
-motion up to the edges of a body. What is thinner than a cell and turns far looks
-strained.
+least-squares gradient of the mean displacements at the nodes around X. It is exact for
+affine motion up to the edges of a body. A body that is thinner than a cell and turns
+far looks strained.
 """
 
 from __future__ import annotations
@@ -23,69 +22,75 @@ from .baseline import Batch
 from .particle_grid import ParticleGrid, Stencil
 
 UNIT = 0.2  # strain that looks like 1 [1]; far beyond it all strains look alike
-# share of a cell's square on top of the nodes' spread: bounds F where they lie on a
-# line
+# share of a cell's square that is added to the nodes' spread: it bounds F where the
+# nodes lie on a line
 SLACK = 1e-3
 
 
 @dataclass(frozen=True)
-class Rest:
-    """The first frame of a batch's scenarios, and all that F needs of it."""
+class RestShape:
+    """The first frame of a batch's scenarios, prepared for the gradient F."""
 
     grid: ParticleGrid  # where displacements are averaged
     position: Tensor  # X [length], shape [particle, 2]
     stencil: Stencil  # nodes around them
     # sums of the weights at the nodes [1], shape [layer, 1, x node, y node]
-    count: Tensor
+    weight_sum: Tensor
     # offsets of the nodes, weighted, times the inverse of their spread [1/length],
     # shape [particle, 9, 2]
     lever: Tensor
 
     @classmethod
-    def of(
+    def build(
         cls,
         grid: ParticleGrid,
         position: Tensor,
         layer: Tensor,
         layers: int,
         *,
-        solid: Tensor | None = None,
-    ) -> Rest:
-        """Return what F needs of X [length], shape [particle, 2].
+        is_solid: Tensor | None = None,
+    ) -> RestShape:
+        """Return the rest shape of bodies at X [length], shape [particle, 2].
 
-        Bodies that do not mix have layers of their own. ``solid`` says who shows a
-        strain, bool, shape [particle]; all by default.
+        Bodies that do not mix have layers of their own. ``is_solid``, bool, shape
+        [particle], names the particles that show a strain; all of them by default.
         """
         position = position.clamp(grid.low, grid.high)
         stencil = grid.stencil(position, layer)
-        count = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
-        offsets = stencil.weight[:, :, None] * grid.offsets(stencil, position)
+        weight_sum = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
+        offset = stencil.weight[:, :, None] * grid.offsets(stencil, position)
         slack = SLACK * grid.spacing**2 * torch.eye(2, device=position.device)
-        with torch.autocast(
-            position.device.type, enabled=False
-        ):  # three digits are too few for a strain
-            spread = torch.einsum(
-                "pnd,pne->pde", _around(grid, stencil, count, position), offsets
-            )
-            lever = offsets @ torch.linalg.inv(spread + slack)
-        if solid is not None:
-            lever = lever * solid[:, None, None]
-        return cls(grid, position, stencil, count, lever)
+
+        # The three digits of bfloat16 are too few for a strain.
+        with torch.autocast(position.device.type, enabled=False):
+            mean_offset = _relative_means(grid, stencil, weight_sum, position)
+            spread = torch.einsum("pnd,pne->pde", mean_offset, offset)
+            lever = offset @ torch.linalg.inv(spread + slack)
+        if is_solid is not None:
+            lever = lever * is_solid[:, None, None]
+        return cls(grid, position, stencil, weight_sum, lever)
 
     def strain(self, position: Tensor) -> Tensor:
-        """Return ``tanh(e / 0.2)`` at positions x as (xx, xy, yy) [1], shape [particle,
-        3].
+        """Return ``tanh(e / 0.2)`` as (xx, xy, yy) [1], shape [particle, 3].
+
+        ``position`` is x, the positions now [length], shape [particle, 2].
         """
-        moved = _around(self.grid, self.stencil, self.count, position - self.position)
+        displacement = position - self.position
+        mean_offset = _relative_means(
+            self.grid, self.stencil, self.weight_sum, displacement
+        )
         with torch.autocast(position.device.type, enabled=False):
-            gradient = torch.einsum("pnd,pne->pde", moved, self.lever)  # F - 1
+            gradient = torch.einsum("pnd,pne->pde", mean_offset, self.lever)  # F - 1
             strain = 0.5 * (gradient + gradient.mT + gradient @ gradient.mT)
-        return (strain.flatten(1)[:, [0, 1, 3]] / UNIT).tanh()
+        components = strain.flatten(1)[:, [0, 1, 3]]
+        return (components / UNIT).tanh()
 
 
 def first_frame(given: Batch) -> Tensor:
-    """Return the positions in the scenario's first frame [length], shape [particle,
-    2].
+    """Return positions in the scenario's first frame [length], shape [particle, 2].
+
+    Raises:
+        UsageError: the batch does not hold them.
     """
     if given.origin is not None:
         return given.origin
@@ -100,16 +105,15 @@ def first_frame(given: Batch) -> Tensor:
     return given.position[:, 0]
 
 
-def _around(
-    grid: ParticleGrid, stencil: Stencil, count: Tensor, value: Tensor
+def _relative_means(
+    grid: ParticleGrid, stencil: Stencil, weight_sum: Tensor, value: Tensor
 ) -> Tensor:
-    """Return mean values at the nodes around each particle less its own, shape
-    [particle, 9, channel].
+    """Return mean values at the nodes around each particle less the particle's value.
+
+    ``value`` has shape [particle, channel], the result shape [particle, 9, channel].
     """
-    mean = grid.spread(stencil, value, len(count)) / count.clamp(min=1e-6)
-    nodes = (
-        mean.permute(0, 2, 3, 1)
-        .reshape(-1, value.shape[1])
-        .index_select(0, stencil.node)
-    )
-    return nodes.view(len(value), 9, -1) - value[:, None]
+    channels = value.shape[1]
+    mean = grid.spread(stencil, value, len(weight_sum)) / weight_sum.clamp(min=1e-6)
+    by_node = mean.permute(0, 2, 3, 1).reshape(-1, channels)
+    nearby = by_node.index_select(0, stencil.node)
+    return nearby.view(len(value), 9, -1) - value[:, None]

@@ -1,10 +1,11 @@
-"""Differentiable twin of :mod:`lagbench.data.grid`: the fields of the training loss.
+"""The fields of :mod:`lagbench.data.grid` in torch, for the training loss.
 
-The same quadratic B-splines, counted nodes and central differences, in torch, with
-gradients to positions and velocities. Arrays of particles have shape [..., particle, 2]
-and fields [..., x node, y node]; or windows lie side by side in one row, as in
-:class:`~lagbench.baselines.baseline.Batch`: particles then have shape [particle, 2] and
-`sample` says which window each belongs to, fields have shape [window, x node, y node].
+The same quadratic B-splines, counted nodes and central differences, with gradients to
+positions and velocities. Arrays of particles have shape [..., particle, 2] and fields
+[..., x node, y node]. Or windows lie side by side in one row, as in
+:class:`~lagbench.baselines.baseline.Batch`: particles then have shape [particle, 2],
+`sample` names the window of each particle, and fields have shape [window, x node, y
+node].
 """
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ from torch.nn.functional import pad
 from lagbench.data.grid import COUNTED_SHARE, EMPTY_SHARE, Grid
 from lagbench.errors import UsageError
 
-_LOW = 1
-_HIGH = 2  # rows that the stencil of a particle in the unit box can reach past the grid
+# rows of nodes that a particle in the unit box can reach beyond the grid's own nodes
+_ROWS_BELOW = 1
+_ROWS_ABOVE = 2
 
 
 @dataclass(frozen=True)
-class Transfer:
-    """Sums over the particles around each node."""
+class TensorTransfer:
+    """Sums over the particles around each node, as tensors."""
 
     weight: Tensor  # sum(w) [1], shape [..., x node, y node]
     momentum: Tensor  # sum(w u) [unit of u], shape [..., x node, y node, 2]
 
 
 @dataclass(frozen=True)
-class Fields:
+class TensorFields:
     """Grid fields with gradients."""
 
     grid: Grid  # where the nodes lie
@@ -41,66 +43,80 @@ class Fields:
     # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
     velocity: Tensor
     counted: Tensor  # nodes that count, bool, shape [..., x node, y node]
-    full: float  # weight of a full interior node [1]
+    full_weight: float  # weight of a full interior node [1]
 
     @property
     def density(self) -> Tensor:
         """Density relative to the initial one [1], shape [..., x node, y node]."""
-        return self.weight / self.full
+        return self.weight / self.full_weight
 
     @cached_property
     def differentiable(self) -> Tensor:
-        """Nodes at which vorticity and divergence stand, bool, shape [..., x node, y
-        node].
+        """Nodes whose four neighbours exist and count, bool, [..., x node, y node].
+
+        Vorticity and divergence are defined at these nodes.
         """
-        # the four neighbours exist and count
-        across = self.counted[..., 2:, 1:-1] & self.counted[..., :-2, 1:-1]
-        along = self.counted[..., 1:-1, 2:] & self.counted[..., 1:-1, :-2]
-        return pad(across & along, (1, 1, 1, 1))
+        along_x = self.counted[..., 2:, 1:-1] & self.counted[..., :-2, 1:-1]
+        along_y = self.counted[..., 1:-1, 2:] & self.counted[..., 1:-1, :-2]
+        return pad(along_x & along_y, (1, 1, 1, 1))
 
     @cached_property
     def vorticity(self) -> Tensor:
-        """``dv/dx - du/dy`` (Eq. 5.19) [unit of u / length]; 0, not NaN, where not
-        differentiable.
+        """``dv/dx - du/dy`` (Eq. 5.19) [unit of u / length].
+
+        It is 0, not NaN, where the fields are not differentiable.
         """
         u, v = self.velocity.unbind(dim=-1)
-        return (self._differences(v)[0] - self._differences(u)[1]) * self.differentiable
+        _, du_dy = self._differentiate(u)
+        dv_dx, _ = self._differentiate(v)
+        return (dv_dx - du_dy) * self.differentiable
 
     @cached_property
     def divergence(self) -> Tensor:
-        """``du/dx + dv/dy`` [unit of u / length]; 0, not NaN, where not
-        differentiable.
+        """``du/dx + dv/dy`` [unit of u / length].
+
+        It is 0, not NaN, where the fields are not differentiable.
         """
         u, v = self.velocity.unbind(dim=-1)
-        return (self._differences(u)[0] + self._differences(v)[1]) * self.differentiable
+        du_dx, _ = self._differentiate(u)
+        _, dv_dy = self._differentiate(v)
+        return (du_dx + dv_dy) * self.differentiable
 
-    def _differences(self, field: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ``df/dx`` and ``df/dy``, 0 on the rim of the grid where no central
-        difference exists.
-        """
-        along_x = (field[..., 2:, :] - field[..., :-2, :]) / (2.0 * self.grid.spacing)
-        along_y = (field[..., :, 2:] - field[..., :, :-2]) / (2.0 * self.grid.spacing)
+    def _differentiate(self, field: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``df/dx`` and ``df/dy`` by central differences; 0 on the rim."""
+        double_spacing = 2.0 * self.grid.spacing
+        along_x = (field[..., 2:, :] - field[..., :-2, :]) / double_spacing
+        along_y = (field[..., :, 2:] - field[..., :, :-2]) / double_spacing
         return pad(along_x, (0, 0, 1, 1)), pad(along_y, (1, 1))
 
 
-def fields(
-    sums: Transfer, grid: Grid, full: float, counted: Tensor | None = None
-) -> Fields:
-    """Return the grid fields of particles, at the nodes that count: by default their
-    own.
+def tensor_fields(
+    sums: TensorTransfer,
+    grid: Grid,
+    full_weight: float,
+    counted: Tensor | None = None,
+) -> TensorFields:
+    """Return the grid fields of particles.
 
-    ``full`` is the weight of a full interior node; a prediction is judged at the nodes
-    of the truth. Velocity is ``sum(w u) / sum(w)``, 0 where the weight is below
-    EMPTY_SHARE of full.
+    Velocity is ``sum(w u) / sum(w)``, and 0 where the weight is below EMPTY_SHARE of
+    full.
+
+    Args:
+        sums: sums over the particles around each node.
+        grid: where the nodes lie.
+        full_weight: weight of a full interior node [1].
+        counted: nodes that count; by default those of the particles. The fields of a
+            prediction take the nodes of the truth.
     """
     if counted is None:
-        counted = sums.weight.detach() >= COUNTED_SHARE * full
-    filled = (sums.weight >= EMPTY_SHARE * full) & (sums.weight > 0.0)
-    # Empty nodes divide by 1: a quotient that is thrown away must not have an infinite
+        counted = sums.weight.detach() >= COUNTED_SHARE * full_weight
+    is_filled = (sums.weight >= EMPTY_SHARE * full_weight) & (sums.weight > 0.0)
+    # Empty nodes divide by 1: a quotient that `where` drops must not have an infinite
     # gradient.
-    weight = torch.where(filled, sums.weight, 1.0)
-    velocity = torch.where(filled[..., None], sums.momentum / weight[..., None], 0.0)
-    return Fields(grid, sums.weight, velocity, counted, full)
+    divisor = torch.where(is_filled, sums.weight, 1.0)
+    quotient = sums.momentum / divisor[..., None]
+    velocity = torch.where(is_filled[..., None], quotient, 0.0)
+    return TensorFields(grid, sums.weight, velocity, counted, full_weight)
 
 
 def transfer(
@@ -110,91 +126,116 @@ def transfer(
     *,
     sample: Tensor | None = None,
     windows: int | None = None,
-) -> Transfer:
+) -> TensorTransfer:
     """Sum weights and momenta of the particles at the nodes.
 
     Particles outside the unit box, or with a position that is no number, carry no
     weight and get no gradient. Without ``windows`` their number is one more than the
-    largest sample, which a GPU has to be waited for.
+    largest sample; a GPU makes the caller wait for it.
+
+    Raises:
+        UsageError: the shapes do not fit each other.
     """
-    if sample is None:
-        axes = position.ndim >= 2
-    else:
-        axes = position.shape[:1] == sample.shape and position.ndim == 2
-    if position.shape != velocity.shape or not axes or position.shape[-1] != 2:
-        raise UsageError(
-            "positions, velocities and windows do not fit",
-            expected="two tensors of one shape [..., particle, 2], or [particle, 2] "
-            "with sample [particle]",
-            got=f"{tuple(position.shape)}, {tuple(velocity.shape)}"
-            + ("" if sample is None else f" and sample {tuple(sample.shape)}"),
-        )
+    _check_shapes(position, velocity, sample)
+    leading: tuple[int, ...]
     if sample is None:
         leading = tuple(position.shape[:-2])
         windows = math.prod(leading)
-        particles = position.shape[-2]
-        sample = torch.arange(windows, device=position.device).repeat_interleave(
-            particles
-        )
+        window_numbers = torch.arange(windows, device=position.device)
+        sample = window_numbers.repeat_interleave(position.shape[-2])
     else:
         if windows is None:
-            if len(sample):
-                windows = int(sample.max()) + 1
-            else:
-                windows = 0
+            windows = _count_windows(sample)
         leading = (windows,)
+
     x = position.reshape(-1, 2)
     u = velocity.reshape(-1, 2)
-    inside = ((x >= 0.0) & (x <= 1.0)).all(dim=-1, keepdim=True)
+    is_inside = ((x >= 0.0) & (x <= 1.0)).all(dim=-1, keepdim=True)
     # Replaced before any arithmetic: 0 times NaN would be NaN, in the gradient too.
-    x = torch.where(inside, x, 0.5)
-    u = torch.where(inside, u, 0.0)
-    s = x * grid.cells - grid.origin
+    x = torch.where(is_inside, x, 0.5)
+    u = torch.where(is_inside, u, 0.0)
+
+    s = x * grid.cells - grid.origin  # position in cells, counted from node 0
     base = torch.floor(s.detach() - 0.5)
-    side = grid.nodes + _LOW + _HIGH
-    column, row = (base.long() + _LOW).unbind(dim=-1)
-    node = nine_nodes(sample, column, row, (side, side))
-    w = spline_weights(s - base) * inside[..., None]
-    carried = torch.cat([torch.ones_like(u[:, :1]), u], dim=-1)
-    values = w[..., None] * carried[:, None, None]
-    sums = values.new_zeros(windows * side * side, 3).index_add(
-        0, node.flatten(), values.reshape(-1, 3)
-    )
-    sums = sums.reshape(windows, side, side, 3)[:, _LOW:-_HIGH, _LOW:-_HIGH]
+    side = grid.nodes + _ROWS_BELOW + _ROWS_ABOVE
+    column, row = (base.long() + _ROWS_BELOW).unbind(dim=-1)
+    node = number_nine_nodes(sample, column, row, (side, side))
+    weight = spline_weights(s - base) * is_inside[..., None]  # [particle, 3, 3]
+
+    carried = torch.cat([torch.ones_like(u[:, :1]), u], dim=-1)  # (1, u, v)
+    contributions = weight[..., None] * carried[:, None, None]
+    node_count = windows * side * side
+    sums = contributions.new_zeros(node_count, 3)
+    sums = sums.index_add(0, node.flatten(), contributions.reshape(-1, 3))
+    sums = sums.reshape(windows, side, side, 3)
+    sums = sums[:, _ROWS_BELOW:-_ROWS_ABOVE, _ROWS_BELOW:-_ROWS_ABOVE]
     sums = sums.reshape(*leading, grid.nodes, grid.nodes, 3)
-    return Transfer(sums[..., 0], sums[..., 1:])
+    return TensorTransfer(sums[..., 0], sums[..., 1:])
+
+
+def _check_shapes(position: Tensor, velocity: Tensor, sample: Tensor | None) -> None:
+    """Refuse positions, velocities and windows whose shapes do not fit each other."""
+    if sample is None:
+        axes_fit = position.ndim >= 2
+    else:
+        axes_fit = position.ndim == 2 and position.shape[:1] == sample.shape
+    if axes_fit and position.shape == velocity.shape and position.shape[-1] == 2:
+        return
+
+    shapes = f"{tuple(position.shape)}, {tuple(velocity.shape)}"
+    if sample is not None:
+        shapes += f" and sample {tuple(sample.shape)}"
+    raise UsageError(
+        "positions, velocities and windows do not fit",
+        expected="two tensors of one shape [..., particle, 2], or [particle, 2] with "
+        "sample [particle]",
+        got=shapes,
+    )
+
+
+def _count_windows(sample: Tensor) -> int:
+    if not len(sample):
+        return 0
+    return int(sample.max()) + 1
 
 
 def spline_weights(s: Tensor) -> Tensor:
-    """Return the spline's weights of the nine nodes around particles, shape [particle,
-    3, 3].
+    """Return the weights of the nine nodes around particles, shape [particle, 3, 3].
+
+    ``s`` is where particles lie from the first of their nodes on [cell].
     """
-    b = torch.stack(
-        [0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1
-    )
+    b = _spline_values(s)
     return b[:, :, None, 0] * b[:, None, :, 1]
 
 
 def spline_slopes(s: Tensor) -> Tensor:
-    """Return the slopes of those weights along x and y [1/cell], shape [particle, 2, 3,
-    3].
+    """Return the slopes of the nine weights along x and y [1/cell].
+
+    The shape is [particle, 2, 3, 3]; ``s`` is that of :func:`spline_weights`.
     """
-    b = torch.stack(
-        [0.5 * (1.5 - s) ** 2, 0.75 - (s - 1.0) ** 2, 0.5 * (s - 0.5) ** 2], dim=1
-    )
-    d = torch.stack([s - 1.5, 2.0 - 2.0 * s, s - 0.5], dim=1)
-    along_x = d[:, :, None, 0] * b[:, None, :, 1]
-    along_y = b[:, :, None, 0] * d[:, None, :, 1]
+    b = _spline_values(s)
+    slope = torch.stack([s - 1.5, 2.0 - 2.0 * s, s - 0.5], dim=1)
+    along_x = slope[:, :, None, 0] * b[:, None, :, 1]
+    along_y = b[:, :, None, 0] * slope[:, None, :, 1]
     return torch.stack([along_x, along_y], dim=1)
 
 
-def nine_nodes(
+def _spline_values(s: Tensor) -> Tensor:
+    """Return the spline at three nodes along each axis, shape [particle, 3, 2]."""
+    first = 0.5 * (1.5 - s) ** 2
+    second = 0.75 - (s - 1.0) ** 2
+    third = 0.5 * (s - 0.5) ** 2
+    return torch.stack([first, second, third], dim=1)
+
+
+def number_nine_nodes(
     layer: Tensor, column: Tensor, row: Tensor, shape: tuple[int, int]
 ) -> Tensor:
-    """Return the numbers of the nine nodes from a corner on, among those of all layers
-    of a shape.
+    """Return the numbers of the nine nodes from a corner on, shape [particle, 3, 3].
+
+    Nodes are numbered through all layers of ``shape`` (columns, rows).
     """
     columns, rows = shape
-    three = torch.arange(3, device=row.device)
+    offset = torch.arange(3, device=row.device)
     corner = (layer * columns + column) * rows + row
-    return corner[:, None, None] + (three[:, None] * rows + three)
+    return corner[:, None, None] + (offset[:, None] * rows + offset)

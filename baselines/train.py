@@ -1,9 +1,9 @@
 """Train a baseline: seeded, resumable, on one device or several.
 
-Most descend over windows, by pytorch-lightning; models with a closed form are fitted to
-whole scenarios instead. A step draws its windows and its noise from (seed, step,
-process) alone, so that a training that was interrupted and resumed ends, on one thread,
-with the same bits as one that was not.
+Most baselines take steps over windows; models with a closed form are fitted to whole
+scenarios instead. A step draws its windows and its noise from (seed, step, process)
+alone. So a training that was interrupted and resumed ends, on one thread, with the bits
+of an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -11,14 +11,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from itertools import chain, count, islice, pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pytorch_lightning import Trainer
-from pytorch_lightning.loggers import TensorBoardLogger
 from torch.utils.data import DataLoader, Sampler
 
 from lagbench.atomic import check_writable
@@ -33,43 +30,37 @@ from lagbench.work.progress import Meter, Progress
 from .augmentation import check_symmetry
 from .baseline import Baseline
 from .catalogue import find
-from .checkpoint import load_weights, rounded_weights, save
-from .facts import facts_of
-from .job import (
-    STOPPED_EARLY,
-    RunFolder,
-    TrainingJob,
-    TrainingRecord,
-    parameter_count,
-    start_words,
-)
+from .checkpoint import load_weights, round_weights, save
+from .dataset_info import read_dataset_info
+from .job import TrainingJob, count_parameters
 from .machine import (
     bound_memory,
     check_compiler,
-    chosen_device,
+    choose_device,
+    explain_memory_errors,
     is_helper,
-    memory_errors_told,
-    multiplies_bfloat16,
-    threads_used,
+    use_threads,
 )
-from .module import (
-    TrainingCallback,
-    TrainingModule,
-    generators_kept,
-    quiet,
-    reseed,
-    seed_of,
-)
-from .recipe import TrainingOptions, recipe_for
-from .rollout import scenario_batch, scenario_paths, validation_of
-from .start import start_from
+from .optimisation import Optimisation
+from .randomness import derive_seed, preserve_generators, seed_generators
+from .recipe import Recipe, TrainingOptions, recipe_for
+from .recipe_changes import describe_start
+from .rollout import load_validation, scenario_batch, scenario_paths
+from .run_folder import RunFolder
+from .start import TrainingStart, start_from
+from .training_log import STOPPED_EARLY, TrainingLog
+from .training_loop import TrainingLoop, launch_fabric, silence_lightning
 
-SMALLER = "lower --set training.batch=1, then the model: model.latent, .layers, .widths or .lags"
+MEMORY_HINT = (
+    "lower --set training.batch=1, then the model: model.latent, .layers, .widths or "
+    ".lags"
+)
+FIT_STEPS = 1  # a closed form counts as one step
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingResult:
-    """What a training made."""
+    """Files, state and costs of a training."""
 
     baseline: str  # name of the baseline
     split: str  # name of the split
@@ -79,7 +70,7 @@ class TrainingResult:
     weights: Path  # weights to predict from
     checkpoint: Path  # last state, to go on from
     state: str  # finished, stopped early or interrupted
-    start: str  # weights that it started from, in words; empty for random ones
+    start: str  # weights of its start; empty for random ones
     first_step: int  # optimiser steps that were there when this call began
     step: int  # optimiser steps made
     steps: int  # steps of the whole training
@@ -88,7 +79,7 @@ class TrainingResult:
     loss: dict[str, float]
     windows_seen: int  # training windows of all steps
     epochs: float  # the same over the windows of the training subsets
-    # what was validated by, lower is better; None without a validation
+    # metric of validations, lower is better; None without a validation
     metric: str | None
     best_value: float | None  # its least value
     best_step: int | None
@@ -97,7 +88,7 @@ class TrainingResult:
     track: Track | None  # equal compute, converged or none
     cpu_seconds: float  # processor time in all runs [s]
     validation_cpu_seconds: float  # of it that of validations [s]
-    gpu_seconds: float  # time times the GPUs that were held [s]
+    gpu_seconds: float  # time times the GPUs in use [s]
     wall_seconds: float  # time of all runs [s]
 
 
@@ -137,7 +128,7 @@ def train(
         output: folder of the run; ``runs/<split>/<size>/<baseline>[-further]-<seed>``
             by default.
         resume: go on with what an earlier run left there.
-        fresh: train anew whatever is there.
+        fresh: train anew, and remove an earlier training there.
         device: ``cpu``, ``cuda`` or ``auto``.
         processes: processes, one device each (torchrun's own number where that started
             us).
@@ -156,15 +147,14 @@ def train(
         KeyboardInterrupt: interrupted; the state after the last step is stored.
     """
     entry = find(baseline)
-    tier, home, known = locate(split, size, root=root, registry=registry)
-    if start is None:
-        initial = None
-    else:
-        initial = start_from(start, entry, tier, root=home, registry=known)
-    if initial:
-        learned = initial.options
-    else:
-        learned = None
+    tier, root_folder, known_splits = locate(split, size, root=root, registry=registry)
+    initial = None
+    learned_options = None
+    if start is not None:
+        initial = start_from(
+            start, entry, tier, root=root_folder, registry=known_splits
+        )
+        learned_options = initial.options
     plan = recipe_for(
         entry,
         tier.split,
@@ -172,89 +162,119 @@ def train(
         variant=recipe,
         settings=settings,
         seed=seed,
-        learned=learned,
+        learned=learned_options,
     )
     check_symmetry(plan.model.get("symmetry"), tier)
-    if initial:
-        facts = initial.facts
-    else:
-        facts = facts_of(tier.split, tier.name, root=home, registry=known)
-    if initial:
+    if initial is not None:
+        info = initial.info
         plan = replace(plan, start=initial.record)
     else:
-        plan = plan
-    if initial:
-        name = f"{plan.baseline}-further"
-    else:
-        name = plan.baseline
-    own = Path("runs") / plan.name / f"{name}-{plan.training.seed}"
-    folder = RunFolder(Path(output) if output else own)
+        info = read_dataset_info(
+            tier.split, tier.name, root=root_folder, registry=known_splits
+        )
+
+    folder = _open_folder(output, plan, initial)
+    # torchrun's number of processes where it started us
+    world_size = int(os.environ.get("WORLD_SIZE", processes))
+    local_world_size = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
+    earlier = folder.find_checkpoint(
+        plan, info, processes=world_size, resume=resume, fresh=fresh
+    )
+    job = TrainingJob(
+        recipe=plan,
+        info=info,
+        folder=folder,
+        earlier=earlier,
+        root=root_folder,
+        registry=known_splits,
+        device=choose_device(device),
+        processes=world_size,
+        workers=workers,
+        meter=Meter(progress),
+    )
+    bound_memory()
+    with (
+        preserve_generators(),
+        use_threads(threads, processes=local_world_size),
+        explain_memory_errors(MEMORY_HINT),
+    ):
+        model = _build_model(job, entry.model, initial)
+        if earlier is None and not is_helper():
+            folder.clear()
+        if getattr(model, "closed_form", False):
+            log, steps = fit(job, model)
+        else:
+            log, steps = descend(job, model)
+        return _result(job, model, log, steps)
+
+
+def _open_folder(
+    output: str | Path | None, recipe: Recipe, initial: TrainingStart | None
+) -> RunFolder:
+    """Return the folder of a run, if it can be written and holds no start of it."""
+    if output is None:
+        name = recipe.baseline
+        if initial is not None:
+            name += "-further"
+        output = Path("runs") / recipe.name / f"{name}-{recipe.training.seed}"
+    folder = RunFolder(Path(output))
     check_writable(folder.path, option="--output")
     if initial is not None and folder.holds(initial.path):
         raise UsageError(
             "the weights to start from lie in the folder of the training",
             where="--start",
-            got=str(start),
+            got=str(initial.path),
             fix="name another folder with --output",
         )
-    shared = int(os.environ.get("WORLD_SIZE", processes))
-    earlier = folder.earlier(plan, facts, processes=shared, resume=resume, fresh=fresh)
-    job = TrainingJob(
-        recipe=plan,
-        facts=facts,
-        folder=folder,
-        earlier=earlier,
-        root=home,
-        registry=known,
-        device=chosen_device(device),
-        processes=shared,
-        workers=workers,
-        meter=Meter(progress),
+    return folder
+
+
+def _build_model(
+    job: TrainingJob, model_class: type[Baseline], initial: TrainingStart | None
+) -> Baseline:
+    """Return the model with the weights of checkpoint or start, else random ones."""
+    seed_generators(derive_seed(job.recipe.training.seed))
+    model = model_class.build(job.recipe.model, job.info)
+    if job.earlier is not None:
+        load_weights(model, job.earlier.weights, where=str(job.folder.checkpoint))
+    elif initial is not None:
+        initial.load_into(model)
+    return model
+
+
+def _result(
+    job: TrainingJob, model: Baseline, log: TrainingLog, steps: int
+) -> TrainingResult:
+    """Return the result of a training, with the log but for its validations."""
+    first_step = 0
+    if job.earlier is not None:
+        first_step = int(job.earlier.training.get("step", 0))
+    budget = job.budget(log)
+    log_values = asdict(log)
+    del log_values["validation"]
+    return TrainingResult(
+        baseline=job.recipe.baseline,
+        split=job.info.split,
+        size=job.info.size,
+        recipe=job.recipe.name,
+        folder=job.folder.path,
+        weights=job.folder.weights,
+        checkpoint=job.folder.checkpoint,
+        steps=steps,
+        parameters=count_parameters(model),
+        device=budget.device or "",
+        threads=budget.threads or 0,
+        track=track_of(job.info.size, budget),
+        start=describe_start(job.recipe.start),
+        first_step=first_step,
+        **log_values,
     )
-    bound_memory()
-    here = int(os.environ.get("LOCAL_WORLD_SIZE", processes))
-    with (
-        generators_kept(),
-        threads_used(threads, processes=here),
-        memory_errors_told(SMALLER),
-    ):
-        reseed(seed_of(plan.training.seed))
-        model = entry.model.build(plan.model, facts)
-        if earlier is not None:
-            load_weights(model, earlier.weights, where=str(folder.checkpoint))
-        elif initial is not None:
-            initial.fill(model)
-        if earlier is None and not is_helper():
-            folder.clear()
-        ledger, steps = (fit if getattr(model, "closed_form", False) else descend)(
-            job, model
-        )
-        budget = job.budget(ledger)
-        done = asdict(ledger)
-        del done["validation"]
-        return TrainingResult(
-            baseline=plan.baseline,
-            split=facts.split,
-            size=facts.size,
-            recipe=plan.name,
-            folder=folder.path,
-            weights=folder.weights,
-            checkpoint=folder.checkpoint,
-            steps=steps,
-            parameters=parameter_count(model),
-            device=budget.device or "",
-            threads=budget.threads or 0,
-            track=track_of(facts.size, budget),
-            start=start_words(plan.start),
-            first_step=int(earlier.training.get("step", 0)) if earlier else 0,
-            **done,
-        )
 
 
 class StepBatches(Sampler[list[int]]):
     """Windows of each step of a training, from any step on.
 
-    Some of them, at random, are others: windows that begin in the first frames of a
+    A random share of them is replaced by windows that begin in the first frames of a
     scenario, evenly drawn.
     """
 
@@ -264,13 +284,12 @@ class StepBatches(Sampler[list[int]]):
         self.sampler = sampler  # draws the windows of one process, epoch after epoch
         self.batch = options.batch  # windows of a step
         self.steps = range(first, last)
-        self.share = options.opening_share  # share of the windows that are others
-        ends = (
-            (start, min(start + options.opening_frames, stop))
-            for start, stop in pairwise(sampler.data.starts)
-        )
-        # those others
-        self.openings = np.concatenate([np.arange(*each) for each in ends])
+        self.opening_share = options.opening_share  # share that is replaced
+        openings = []
+        for start, stop in pairwise(sampler.data.starts):
+            last_opening = min(start + options.opening_frames, stop)
+            openings.append(np.arange(start, last_opening))
+        self.openings = np.concatenate(openings)  # windows that replace others
 
     def __len__(self) -> int:
         """Return the number of steps."""
@@ -278,30 +297,37 @@ class StepBatches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         """Yield the windows of each step."""
-        epoch, used = divmod(self.steps.start * self.batch, len(self.sampler))
+        windows_before = self.steps.start * self.batch
+        epoch, used = divmod(windows_before, len(self.sampler))
         self.sampler.seek(epoch, used * self.sampler.ranks)
-        drawn = chain.from_iterable(self.sampler for _ in count())
+        endless = chain.from_iterable(self.sampler for _ in count())
         for step in self.steps:
-            windows = np.array([*islice(drawn, self.batch)])
-            own = np.random.SeedSequence(
-                [self.sampler.seed, step, self.sampler.rank, self.sampler.ranks]
-            )
-            # NumPy promises the same bits for `random` alone
-            chance, place = np.random.Generator(np.random.PCG64(own)).random(
-                (2, self.batch)
-            )
-            others = self.openings[(place * len(self.openings)).astype(np.intp)]
-            yield np.where(chance < self.share, others, windows).tolist()
+            windows = np.array(list(islice(endless, self.batch)))
+            yield self._replace_some(windows, step).tolist()
+
+    def _replace_some(self, windows: NDArray[np.intp], step: int) -> NDArray[np.intp]:
+        """Return the windows of a step, some of them replaced."""
+        sampler = self.sampler
+        seed = np.random.SeedSequence([sampler.seed, step, sampler.rank, sampler.ranks])
+        generator = np.random.Generator(np.random.PCG64(seed))
+        # NumPy promises the same bits for `random` alone.
+        chance, place = generator.random((2, self.batch))
+        index = (place * len(self.openings)).astype(np.intp)
+        return np.where(chance < self.opening_share, self.openings[index], windows)
 
 
-def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Train a model; return the ledger and the steps of the whole training."""
-    facts = job.facts
+def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
+    """Train a model by steps; return the log and the steps of the whole training.
+
+    Raises:
+        KeyboardInterrupt: a user interrupted it; the state is stored.
+    """
+    info = job.info
     options = job.recipe.training
     data = WindowDataset(
-        facts.split,
+        info.split,
         subset=options.windows,
-        size=facts.size,
+        size=info.size,
         root=job.root,
         registry=job.registry,
         history=model.history,
@@ -309,129 +335,124 @@ def descend(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
         origin=model.origin,
     )
     steps = options.total_steps(len(data), processes=job.processes)
-    ledger = job.ledger()
-    if ledger.state != STOPPED_EARLY:
-        if ledger.step >= steps:
-            ledger.state = "finished"
-        else:
-            ledger.state = "running"
-    if ledger.state != "running":
-        return ledger, steps
+    log = job.start_log()
+    if log.state == STOPPED_EARLY:
+        return log, steps
+    if log.step >= steps:
+        log.state = "finished"
+        return log, steps
+    log.state = "running"
     if options.compile:
         check_compiler(job.device)
         model.compile_layers()
 
-    def loader(rank: int, ranks: int) -> DataLoader[TensorWindow]:
-        sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
-        batches = StepBatches(sampler, options, first=ledger.step, last=steps)
-        return DataLoader(
-            data,
-            batch_sampler=batches,
-            collate_fn=collate,
-            num_workers=job.workers,
-            persistent_workers=job.workers > 0,
-            multiprocessing_context="spawn" if job.workers else None,
+    validation = load_validation(options, info, root=job.root, registry=job.registry)
+    with silence_lightning():
+        fabric = launch_fabric(job)
+        optimizer_state = None
+        if job.earlier is not None:
+            optimizer_state = job.earlier.optimizer
+        optimisation = Optimisation(
+            model.to(fabric.device),
+            options,
+            steps=steps,
+            processes=job.processes,
+            step=log.step,
+            optimizer_state=optimizer_state,
+        )
+        loop = TrainingLoop(
+            job,
+            log,
+            fabric=fabric,
+            optimisation=optimisation,
+            validation=validation,
+            windows=len(data),
         )
 
-    module = TrainingModule(
-        model,
-        options,
-        loader=loader,
-        steps=steps,
-        processes=job.processes,
-        step=ledger.step,
-        optimizer=job.earlier.optimizer if job.earlier else None,
-    )
-    validation = validation_of(options, facts, root=job.root, registry=job.registry)
-    keeper = TrainingCallback(job, ledger, validation=validation, windows=len(data))
-    half = options.precision == "auto" and multiplies_bfloat16(job.device)
-    with quiet():
-        trainer = Trainer(
-            accelerator="gpu" if job.device == "cuda" else "cpu",
-            # the processes on this machine: torchrun's number where it started us
-            devices=int(os.environ.get("LOCAL_WORLD_SIZE", job.processes)),
-            num_nodes=int(os.environ.get("GROUP_WORLD_SIZE", "1")),
-            strategy="ddp" if job.processes > 1 else "auto",
-            precision="bf16-mixed"
-            if half or options.precision == "bf16"
-            else "32-true",
-            max_epochs=1,
-            logger=TensorBoardLogger(
-                job.folder.path, name="", version=job.folder.logs.name
-            ),
-            callbacks=[keeper],
-            default_root_dir=job.folder.path,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-            use_distributed_sampler=False,
-        )
-        try:
-            trainer.fit(module)
-        except SystemExit:  # what Lightning makes of a second Ctrl-C
-            raise KeyboardInterrupt from None
-    if ledger.state == "interrupted":
+        def load_batches(rank: int, ranks: int) -> DataLoader[TensorWindow]:
+            sampler = WindowSampler(data, seed=options.seed, rank=rank, ranks=ranks)
+            batches = StepBatches(sampler, options, first=log.step, last=steps)
+            return _make_loader(data, batches, workers=job.workers)
+
+        loop.run(load_batches)
+    if log.state == "interrupted":
         raise KeyboardInterrupt
-    return ledger, steps
+    return log, steps
 
 
-STEPS = 1  # a closed form counts as one step
+def _make_loader(
+    data: WindowDataset, batches: StepBatches, *, workers: int
+) -> DataLoader[TensorWindow]:
+    """Return a loader of batches, with processes that read ahead if asked."""
+    if not workers:
+        return DataLoader(data, batch_sampler=batches, collate_fn=collate)
+    return DataLoader(
+        data,
+        batch_sampler=batches,
+        collate_fn=collate,
+        num_workers=workers,
+        persistent_workers=True,
+        multiprocessing_context="spawn",
+    )
 
 
-def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingRecord, int]:
-    """Fit a model to every scenario, validate and store it; return the ledger and its
-    one step.
+def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
+    """Fit a model to every scenario; return the log and its one step.
 
-    A baseline with ``closed_form = True`` has ``fit`` beside the contract: it sets the
-    coefficients from positions, shape [frame, particle, 2], of each scenario, and
-    returns figures to log.
+    A baseline with ``closed_form = True`` has a method ``fit`` beside the contract. It
+    sets the coefficients from positions of each scenario, shape [frame, particle, 2],
+    and returns numbers to log.
     """
-    ledger = job.ledger()
+    log = job.start_log()
     if job.earlier is not None:
-        ledger.state = "finished"
-        return ledger, STEPS
-    if job.recipe.training.compile:
+        log.state = "finished"
+        return log, FIT_STEPS
+    options = job.recipe.training
+    if options.compile:
         model.compile_layers()  # refuses: a closed form has none
-    if job.recipe.training.ema:
+    if options.ema:
         raise UsageError(
             f"{model.method} takes no steps to average over",
             where="training.ema",
             expected=0.0,
-            got=job.recipe.training.ema,
+            got=options.ema,
             fix="leave the option out",
         )
 
-    def scenarios() -> Iterator[NDArray[np.float32]]:
-        find_in = partial(
-            scenario_paths, job.facts.split, size=job.facts.size, root=job.root
-        )
-        parts = (
-            find_in(subset=one, registry=job.registry)
-            for one in job.recipe.training.windows
-        )
-        paths = [path for part in parts for path in part.values()]
-        job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
-        for path in paths:
-            yield scenario_batch(path).position.transpose(0, 1).numpy()
-            job.meter.count(1, scenarios=1)
-
-    figures = model.fit(scenarios())  # type: ignore[operator]
-    ledger.step = STEPS
-    ledger.loss = {name: float(value) for name, value in figures.items()}
-    ledger.epochs = 1.0
-    validation = validation_of(
-        job.recipe.training, job.facts, root=job.root, registry=job.registry
+    numbers = model.fit(_read_scenarios(job))  # type: ignore[operator]
+    log.step = FIT_STEPS
+    log.loss = {name: float(value) for name, value in numbers.items()}
+    log.epochs = 1.0
+    validation = load_validation(
+        options, job.info, root=job.root, registry=job.registry
     )
     if validation is not None:
-        with ledger.validating(device=job.device):
-            value = validation(model)
-        ledger.validated(validation.metric, value)
-    ledger.state = "finished"
-    ledger.read_clocks(device=job.device)
-    state = {name: value.detach() for name, value in model.state_dict().items()}
-    save(job.folder.weights, job.checkpoint(ledger, rounded_weights(model)))
-    save(job.folder.checkpoint, job.checkpoint(ledger, state))
-    job.folder.write_record(job.record(model, ledger, steps=STEPS))
-    return ledger, STEPS
+        with log.time_validation(device=job.device):
+            value = validation.measure(model)
+        log.add_validation(validation.metric, value)
+    log.state = "finished"
+    log.read_clocks(device=job.device)
+
+    weights = {name: value.detach() for name, value in model.state_dict().items()}
+    save(job.folder.weights, job.checkpoint(log, round_weights(model)))
+    save(job.folder.checkpoint, job.checkpoint(log, weights))
+    job.folder.write_log(job.log_as_json(model, log, steps=FIT_STEPS))
+    return log, FIT_STEPS
+
+
+def _read_scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
+    """Yield the positions of each training scenario, shape [frame, particle, 2]."""
+    paths: list[Path] = []
+    for subset in job.recipe.training.windows:
+        files = scenario_paths(
+            job.info.split,
+            subset=subset,
+            size=job.info.size,
+            root=job.root,
+            registry=job.registry,
+        )
+        paths += files.values()
+    job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
+    for path in paths:
+        yield scenario_batch(path).position.transpose(0, 1).numpy()
+        job.meter.count(1, scenarios=1)

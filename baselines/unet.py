@@ -1,5 +1,7 @@
-"""Convolutions on the nodes of a grid: a U-Net, and what tells a few numbers about the
-whole of it.
+"""Convolutions on the nodes of a grid: a U-Net, and an encoder to a few numbers.
+
+The U-Net (Ronneberger et al. 2015) maps fields to fields. The context network maps the
+fields of the given frames to a few numbers that describe the whole scenario.
 """
 
 from __future__ import annotations
@@ -8,7 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
-COARSEST = 4  # nodes of the finest level to one of the coarsest, along each axis
+# nodes of the finest level to one node of the coarsest level, along each axis
+NODES_PER_COARSE_NODE = 4
 
 
 class Block(nn.Module):
@@ -19,27 +22,27 @@ class Block(nn.Module):
         self.first = nn.Conv2d(inputs, outputs, 3, padding=1)
         self.norm = nn.GroupNorm(4, outputs)
         self.second = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.shortcut = (
-            nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
-        )
+        self.shortcut: nn.Module = nn.Identity()
+        if inputs != outputs:
+            self.shortcut = nn.Conv2d(inputs, outputs, 1)
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the field after the block, shape [window, outputs, x node, y node]."""
-        changed: Tensor = self.second(gelu(self.norm(self.first(gelu(field)))))
-        past: Tensor = self.shortcut(field)
-        return changed + past
+        hidden = self.first(gelu(field))
+        residual: Tensor = self.second(gelu(self.norm(hidden)))
+        shortcut: Tensor = self.shortcut(field)
+        return residual + shortcut
 
 
 class UNet(nn.Module):
-    """Three levels of resolution (Ronneberger et al. 2015); the last layer starts at
-    zero.
-    """
+    """Three levels of resolution; the weights of the last layer start at zero."""
 
     def __init__(self, inputs: int, outputs: int, width: int) -> None:
         super().__init__()
         fine = width
         middle = 2 * width
         coarse = 4 * width
+
         self.begin = nn.Conv2d(inputs, fine, 3, padding=1)
         self.down_fine = Block(fine, fine)
         self.down_middle = Block(middle, middle)
@@ -55,23 +58,28 @@ class UNet(nn.Module):
             nn.init.zeros_(parameter)
 
     def forward(self, field: Tensor) -> Tensor:
-        """Return the output in float32, shape [window, outputs, x node, y node]; sides
-        are multiples of 4.
+        """Return the output in float32, shape [window, outputs, x node, y node].
+
+        The number of nodes along each axis is a multiple of 4.
         """
         fine = self.down_fine(self.begin(field))
         middle = self.down_middle(self.halve_fine(fine))
-        coarse = self.double_coarse(self.bottom(self.halve_middle(middle)))
-        middle = self.double_middle(self.up_middle(torch.cat([coarse, middle], dim=1)))
-        fine = self.up_fine(torch.cat([middle, fine], dim=1))
-        # Three digits of bfloat16 are too few for what is added to velocities every
-        # frame.
+        coarse = self.bottom(self.halve_middle(middle))
+
+        doubled = self.double_coarse(coarse)
+        middle = self.up_middle(torch.cat([doubled, middle], dim=1))
+        doubled = self.double_middle(middle)
+        fine = self.up_fine(torch.cat([doubled, fine], dim=1))
+
+        # Every frame adds the output to velocities: the three digits of bfloat16 are
+        # too few for that.
         with torch.autocast(field.device.type, enabled=False):
             output: Tensor = self.end(gelu(fine.to(field.dtype)))
         return output
 
 
-class Context(nn.Module):
-    """A few numbers that the given frames tell about a scenario as a whole."""
+class ContextNetwork(nn.Module):
+    """Encode the fields of the given frames to a few numbers about the scenario."""
 
     def __init__(self, inputs: int, outputs: int, width: int) -> None:
         super().__init__()
@@ -89,5 +97,7 @@ class Context(nn.Module):
 
     def forward(self, field: Tensor) -> Tensor:
         """Return the numbers, shape [window, outputs]."""
-        numbers: Tensor = self.numbers(self.fields(field).mean(dim=(2, 3)))
+        encoded = self.fields(field)
+        box_mean = encoded.mean(dim=(2, 3))
+        numbers: Tensor = self.numbers(box_mean)
         return numbers.to(field.dtype)

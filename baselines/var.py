@@ -1,5 +1,4 @@
-"""Vector autoregression of whole frames (thesis section 4.8.3), by least squares in
-small memory.
+"""Vector autoregression of whole frames (thesis section 4.8.3), in small memory.
 
 Least squares by the Gram matrix, refined once, are nearly of full accuracy. For
 regressors X [row, regressor] and responses Y [row, response], with G = X'X + r I
@@ -8,14 +7,15 @@ regressors X [row, regressor] and responses Y [row, response], with G = X'X + r 
 
 the corrected semi-normal equations (Bjorck, Linear Algebra Appl. 88/89 (1987) 31): the
 residual is formed from X itself, so the loss of digits in squaring X is undone while
-cond(X)^2 is below 1e16. Rows pass through in blocks; four square matrices are all that
-is held. With fewer rows than regressors the solution of least norm comes from the Gram
-matrix of the rows, B = X' (X X')^-1 Y.
+cond(X)^2 is below 1e16. Rows are read in blocks; memory holds four square matrices.
+With fewer rows than regressors the solution of least norm comes from the Gram matrix of
+the rows, B = X' (X X')^-1 Y.
 
 Leading principal directions of many long rows come from randomised subspace iteration
-(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace somewhat larger
-than wanted is multiplied by X'X a few times, then rotated so that X'X is diagonal in it
-(Rayleigh and Ritz). Rows pass through in blocks; nothing as large as X'X is formed.
+(Halko, Martinsson, Tropp, SIAM Review 53 (2011) 217): a random subspace with some
+directions to spare is multiplied by X'X a few times, then rotated so that X'X is
+diagonal in it (Rayleigh and Ritz). Rows are read in blocks; nothing as large as X'X is
+formed.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from torch import Tensor
 from lagbench.errors import WorkFailedError
 
 from . import baseline
-from .baseline import Facts
+from .baseline import DatasetInfo
 from .frame_model import FrameModel, FrameWindow
 
-BLOCK = 1024  # most rows that are held at a time
+BLOCK = 1024  # rows in memory at a time, at most
 EPSILON = 1e-12  # least ridge: directions without any variance stay as they are
 
 Matrix = NDArray[np.float64]
@@ -48,10 +48,10 @@ Sequences = Sequence[NDArray[np.float32]]
 
 
 class LaggedRows:
-    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)`` of several
-    sequences, p the lags.
+    """Regressors ``(1, z(f-1), ..., z(f-p))`` and responses ``z(f)``, p the lags.
 
-    No row reaches from one sequence of states, shape [frame, feature], into the next.
+    The rows are those of several sequences of states, shape [frame, feature]. No row
+    reaches from one sequence into the next.
     """
 
     def __init__(self, sequences: Sequences, *, lags: int) -> None:
@@ -62,16 +62,20 @@ class LaggedRows:
     def __iter__(self) -> Iterator[tuple[Matrix, Matrix]]:
         """Yield regressors and responses, at most :data:`BLOCK` rows at a time."""
         for states in self.sequences:
-            features = states.shape[1]
             for first in range(self.lags, len(states), BLOCK):
                 last = min(first + BLOCK, len(states))
-                regressors = np.ones((last - first, 1 + self.lags * features))
-                for lag in range(1, self.lags + 1):
-                    column = 1 + (lag - 1) * features
-                    regressors[:, column : column + features] = states[
-                        first - lag : last - lag
-                    ]
-                yield regressors, states[first:last].astype(np.float64)
+                responses = states[first:last].astype(np.float64)
+                yield self._regressors(states, first, last), responses
+
+    def _regressors(self, states: NDArray[np.float32], first: int, last: int) -> Matrix:
+        """Return the regressors of frames first to last, shape [row, regressor]."""
+        features = states.shape[1]
+        regressors = np.ones((last - first, 1 + self.lags * features))
+        for lag in range(1, self.lags + 1):
+            column = 1 + (lag - 1) * features
+            lagged = states[first - lag : last - lag]
+            regressors[:, column : column + features] = lagged
+        return regressors
 
 
 class Fitted(FrameModel):
@@ -85,8 +89,9 @@ class Fitted(FrameModel):
 
     @abstractmethod
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Set the coefficients from positions, [frame, particle, 2] per scenario;
-        return what to log.
+        """Set the coefficients from positions; return numbers to log.
+
+        Each scenario has shape [frame, particle, 2].
         """
 
     def states(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -94,7 +99,8 @@ class Fitted(FrameModel):
 
         The first frame is left out: it has no velocity of its own.
         """
-        state = self.frame_state.of(torch.from_numpy(position).to(torch.float64))
+        exact_position = torch.from_numpy(position).to(torch.float64)
+        state = self.frame_state.standardise(exact_position)
         return state[1:].flatten(1).to(torch.float32).numpy()
 
 
@@ -119,8 +125,8 @@ class VAR(Fitted):
     options: Options
     coefficients: Tensor
 
-    def __init__(self, options: Options, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Options, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         shape = (1 + options.lags * self.features, self.features)
         self.register_buffer("coefficients", torch.zeros(shape, dtype=torch.float64))
 
@@ -130,26 +136,29 @@ class VAR(Fitted):
         return self.options.lags
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Fit the coefficients; return condition number, floor and rows of
-        :class:`LeastSquares`.
+        """Fit the coefficients.
+
+        Return condition number, floor and rows of :class:`LeastSquares`.
         """
-        rows = LaggedRows(
-            [self.states(position) for position in scenarios], lags=self.options.lags
-        )
-        found = solve(rows)
-        self.coefficients = torch.from_numpy(found.coefficients)
-        return {"condition": found.condition, "floor": found.floor, "rows": found.rows}
+        sequences = [self.states(position) for position in scenarios]
+        solution = solve(LaggedRows(sequences, lags=self.options.lags))
+        self.coefficients = torch.from_numpy(solution.coefficients)
+        return {
+            "condition": solution.condition,
+            "floor": solution.floor,
+            "rows": solution.rows,
+        }
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
-        given = window.state.flip(1)  # the latest frame first
-        predicted = self.coefficients[0] + given.flatten(1) @ self.coefficients[1:]
-        return predicted.view(given.shape[0], *given.shape[2:])
+        latest_first = window.state.flip(1)
+        intercept = self.coefficients[0]
+        predicted = intercept + latest_first.flatten(1) @ self.coefficients[1:]
+        return predicted.view(latest_first.shape[0], *latest_first.shape[2:])
 
 
 class StableVAR(Fitted):
-    """``z(f) = z(f-1) + b + A' V' (z(f-1) - m)``: ridge and truncation around
-    persistence.
+    """``z(f) = z(f-1) + b + A' V' (z(f-1) - m)``: persistence, truncation and ridge.
 
     V are the leading principal directions of the states of training, m their mean, b
     the mean change. With P = V'(Z - m) of all rows, D their changes less b, and n
@@ -183,8 +192,8 @@ class StableVAR(Fitted):
     directions: Tensor
     response: Tensor
 
-    def __init__(self, options: Options, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Options, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         rank = min(options.rank, self.features)
         self.register_buffer("mean", torch.zeros(self.features))
         self.register_buffer("drift", torch.zeros(self.features))
@@ -192,50 +201,61 @@ class StableVAR(Fitted):
         self.register_buffer("response", torch.zeros(rank, self.features))
 
     def fit(self, scenarios: Iterable[NDArray[np.float32]]) -> Mapping[str, float]:
-        """Fit mean, drift, directions and response; return the share of variance they
-        hold.
+        """Fit mean, drift, directions and response.
+
+        Return the share of variance in the directions, and the rows.
         """
-        rows = LaggedRows([self.states(position) for position in scenarios], lags=1)
+        sequences = [self.states(position) for position in scenarios]
+        rows = LaggedRows(sequences, lags=1)
         if not rows.rows:
             raise WorkFailedError(
                 "nothing to fit", expected="scenarios of 3 frames or more", got="none"
             )
+        mean, drift, variance = self._moments(rows)
+        rank = self.directions.shape[1]
+        directions, eigenvalues = principal_directions(
+            partial(_centred_states, rows, mean), self.features, rank=rank
+        )
+
+        response = np.zeros((rank, self.features))  # A
+        for x, y in rows:
+            state = x[:, 1:]
+            change = y - state - drift
+            response += ((state - mean) @ directions).T @ change
+        ridge = max(self.options.ridge, EPSILON) * rows.rows
+        response /= (eigenvalues + ridge)[:, None]
+
+        self.mean.copy_(torch.from_numpy(mean))
+        self.drift.copy_(torch.from_numpy(drift))
+        self.directions.copy_(torch.from_numpy(directions))
+        self.response.copy_(torch.from_numpy(response))
+        return {"variance": float(eigenvalues.sum() / variance), "rows": rows.rows}
+
+    def _moments(self, rows: LaggedRows) -> tuple[Matrix, Matrix, float]:
+        """Return mean state, mean change, and the summed variance of all rows."""
         mean = np.zeros(self.features)
         drift = np.zeros(self.features)
-        squares = 0.0
+        square_sum = 0.0
         for x, y in rows:
-            mean += x[:, 1:].sum(0) / rows.rows
-            drift += (y - x[:, 1:]).sum(0) / rows.rows
-            squares += float(np.square(x[:, 1:]).sum())
-        spread = squares - rows.rows * float(mean @ mean)
-        kept = self.directions.shape[1]
-        directions, eigenvalues = principal_directions(
-            lambda: (x[:, 1:] - mean for x, _ in rows), self.features, rank=kept
-        )
-        response = np.zeros((kept, self.features))
-        for x, y in rows:
-            response += ((x[:, 1:] - mean) @ directions).T @ (y - x[:, 1:] - drift)
-        response /= (eigenvalues + max(self.options.ridge, EPSILON) * rows.rows)[
-            :, None
-        ]
-        found = {
-            "mean": mean,
-            "drift": drift,
-            "directions": directions,
-            "response": response,
-        }
-        for name, value in found.items():
-            getattr(self, name).copy_(torch.from_numpy(value))
-        return {"variance": float(eigenvalues.sum() / spread), "rows": rows.rows}
+            state = x[:, 1:]
+            mean += state.sum(0) / rows.rows
+            drift += (y - state).sum(0) / rows.rows
+            square_sum += float(np.square(state).sum())
+        variance = square_sum - rows.rows * float(mean @ mean)
+        return mean, drift, variance
 
     def next_state(self, window: FrameWindow) -> Tensor:
         """Return the next standardised state [1], shape [window, particle, 4]."""
         state = window.state[:, -1]
-        change = (
-            self.drift
-            + (state.flatten(1) - self.mean) @ self.directions @ self.response
-        )
+        deviation = state.flatten(1) - self.mean
+        change = self.drift + deviation @ self.directions @ self.response
         return state + change.view(state.shape)
+
+
+def _centred_states(rows: LaggedRows, mean: Matrix) -> Iterator[Matrix]:
+    """Yield the states of the regressors less the mean, in blocks of rows."""
+    for x, _ in rows:
+        yield x[:, 1:] - mean
 
 
 TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
@@ -243,46 +263,68 @@ TOLERANCE = 1e-3  # relative accuracy of the condition number's two eigenvalues
 
 @dataclass(frozen=True, kw_only=True)
 class LeastSquares:
-    """The solution and how well it is determined."""
+    """The least-squares solution, and the condition of the problem."""
 
     coefficients: Matrix  # B, shape [regressor, response]
     # largest over smallest singular value of X; a lower bound where 'floor' > 0
     condition: float
-    # added to the Gram matrix since it was singular to rounding, as a share of its
-    # largest eigenvalue; 0 if it was not
+    # added to the diagonal of a Gram matrix that is singular to rounding, as a share of
+    # its largest eigenvalue; else 0
     floor: float
     rows: int  # rows that went in
 
 
 def solve(blocks: LaggedRows) -> LeastSquares:
-    """Return the least-squares solution of X B = Y, that of least norm if there are
-    many.
+    """Return the least-squares solution of X B = Y; of many, that of least norm.
+
+    Raises:
+        WorkFailedError: there are no rows, or values are not finite.
     """
-    shape = next(((x.shape[1], y.shape[1]) for x, y in blocks), None)
-    if shape is None:
+    first_block = next(iter(blocks), None)
+    if first_block is None:
         raise WorkFailedError(
             "nothing to fit", expected="scenarios longer than the lags", got="no rows"
         )
-    if blocks.rows >= shape[0]:  # the Gram matrix of the regressors, by blocks of rows
-        divided, condition, floor = _factor(
-            lambda: _gram((x for x, _ in blocks), shape[0])
-        )
-        found = divided(_products(blocks, shape))
-        # (Y - X B)' of a block
-        residual = partial(blas.dgemm, -1.0, found, trans_a=True, beta=1.0)
-        found += divided(
-            _products(((x, residual(x.T, c=y.T).T) for x, y in blocks), shape)
-        )
-    else:  # the Gram matrix of the rows, which all fit
-        x, y = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        divided, condition, floor = _factor(
-            lambda: _gram([np.ascontiguousarray(x.T)], len(x))
-        )
-        dual = divided(np.asfortranarray(y))
-        dual += divided(np.asfortranarray(y - x @ (x.T @ dual)))
-        found = x.T @ dual
+    x, y = first_block
+    if blocks.rows >= x.shape[1]:
+        return _solve_overdetermined(blocks, (x.shape[1], y.shape[1]))
+    return _solve_underdetermined(blocks)
+
+
+def _solve_overdetermined(blocks: LaggedRows, shape: tuple[int, int]) -> LeastSquares:
+    """Solve by the Gram matrix of the regressors, from blocks of rows."""
+
+    def gram() -> Matrix:
+        return _gram((x for x, _ in blocks), shape[0])
+
+    divide, condition, floor = _factor(gram)
+    solution = divide(_products(blocks, shape))
+
+    def residuals() -> Iterator[tuple[Matrix, Matrix]]:
+        for x, y in blocks:
+            transposed = blas.dgemm(-1.0, solution, x.T, trans_a=True, beta=1.0, c=y.T)
+            yield x, transposed.T
+
+    solution += divide(_products(residuals(), shape))
     return LeastSquares(
-        coefficients=found, condition=condition, floor=floor, rows=blocks.rows
+        coefficients=solution, condition=condition, floor=floor, rows=blocks.rows
+    )
+
+
+def _solve_underdetermined(blocks: LaggedRows) -> LeastSquares:
+    """Solve by the Gram matrix of the rows, which are few enough for memory."""
+    x_blocks, y_blocks = zip(*blocks, strict=True)
+    x = np.concatenate(x_blocks)
+    y = np.concatenate(y_blocks)
+
+    def gram() -> Matrix:
+        return _gram([np.ascontiguousarray(x.T)], len(x))
+
+    divide, condition, floor = _factor(gram)
+    dual = divide(np.asfortranarray(y))
+    dual += divide(np.asfortranarray(y - x @ (x.T @ dual)))
+    return LeastSquares(
+        coefficients=x.T @ dual, condition=condition, floor=floor, rows=blocks.rows
     )
 
 
@@ -309,16 +351,17 @@ def _products(
 def _factor(
     gram: Callable[[], Matrix],
 ) -> tuple[Callable[[Matrix], Matrix], float, float]:
-    """Return G^-1 times a matrix, in its place when that is Fortran-ordered, condition
-    number and floor.
+    """Return a function that multiplies by G^-1, the condition number and the floor.
 
-    By Cholesky's factor of G, with the floor under it if it is singular to rounding.
+    It divides by Cholesky's factor of G, in place where a matrix is Fortran-ordered.
+    Where G is singular to rounding, the floor is added to its diagonal.
     """
     matrix = gram()
     size = len(matrix)
     if not np.isfinite(matrix.diagonal()).all():
         raise WorkFailedError("values are not finite", where="rows to fit")
     largest = _largest_eigenvalue(lambda v: blas.dsymv(1.0, matrix, v), size)
+
     for floor in (0.0, size * np.finfo(np.float64).eps):
         if floor:
             matrix = gram()  # the first attempt has overwritten it
@@ -327,32 +370,31 @@ def _factor(
             upper, _ = cho_factor(matrix, overwrite_a=True, check_finite=False)
         except LinAlgError:
             continue
-        divided: Callable[..., Matrix] = partial(
+        divide: Callable[..., Matrix] = partial(
             cho_solve, (upper, False), check_finite=False
         )
-        condition = float(np.sqrt(largest * _largest_eigenvalue(divided, size)))
-        return partial(divided, overwrite_b=True), condition, floor
+        condition = float(np.sqrt(largest * _largest_eigenvalue(divide, size)))
+        return partial(divide, overwrite_b=True), condition, floor
     raise WorkFailedError("the Gram matrix has no Cholesky factor", where="rows to fit")
 
 
 def _largest_eigenvalue(product: Callable[[Matrix], Matrix], size: int) -> float:
-    """Return the largest eigenvalue of a symmetric matrix given by its product with a
-    vector.
+    """Return the largest eigenvalue of a symmetric matrix.
+
+    ``product`` returns the product of the matrix with a vector.
     """
     if size < 3:
-        return float(
-            np.linalg.eigvalsh(np.column_stack([product(e) for e in np.eye(size)]))[-1]
-        )
+        columns = [product(unit_vector) for unit_vector in np.eye(size)]
+        return float(np.linalg.eigvalsh(np.column_stack(columns))[-1])
     operator = LinearOperator((size, size), matvec=product, dtype=np.float64)
     start = np.random.default_rng(0).normal(size=size)
-    return float(
-        eigsh(
-            operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False
-        )[0]
+    eigenvalues = eigsh(
+        operator, 1, which="LA", tol=TOLERANCE, v0=start, return_eigenvectors=False
     )
+    return float(eigenvalues[0])
 
 
-# directions beyond those wanted, which the last wanted ones need to converge
+# directions to spare, without which the last directions would not converge
 OVERSAMPLING = 20
 # multiplications by X'X; ratios of neighbouring eigenvalues count to twice this power
 ITERATIONS = 8
@@ -361,21 +403,31 @@ ITERATIONS = 8
 def principal_directions(
     blocks: Callable[[], Iterable[Matrix]], features: int, *, rank: int
 ) -> tuple[Matrix, Matrix]:
-    """Return orthonormal directions of largest X'X, shape [feature, rank], and their
-    eigenvalues.
+    """Return orthonormal directions of largest X'X, and their eigenvalues.
 
-    The largest come first. ``blocks`` returns the rows of X in blocks, centred; it is
-    called ten times.
+    The directions have shape [feature, rank], the largest first.
+
+    Args:
+        blocks: function that returns the rows of X in blocks, centred; it is called
+            nine times.
+        features: features of a row.
+        rank: number of directions.
     """
     width = min(features, rank + OVERSAMPLING)
     basis = np.random.default_rng(0).normal(size=(features, width))
     for _ in range(ITERATIONS):
-        basis = np.linalg.qr(_squared(blocks(), basis))[0]
-    small = basis.T @ _squared(blocks(), basis)
-    values, rotation = np.linalg.eigh((small + small.T) / 2)
-    return basis @ rotation[:, ::-1][:, :rank], values[::-1][:rank].clip(0.0)
+        product = _multiply_by_square(blocks(), basis)
+        basis, _ = np.linalg.qr(product)
+
+    small = basis.T @ _multiply_by_square(blocks(), basis)
+    eigenvalues, rotation = np.linalg.eigh((small + small.T) / 2)
+    largest_first = rotation[:, ::-1][:, :rank]
+    return basis @ largest_first, eigenvalues[::-1][:rank].clip(0.0)
 
 
-def _squared(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
+def _multiply_by_square(blocks: Iterable[Matrix], basis: Matrix) -> Matrix:
     """Return X'X times a basis."""
-    return sum((x.T @ (x @ basis) for x in blocks), np.zeros_like(basis))
+    total = np.zeros_like(basis)
+    for x in blocks:
+        total = total + x.T @ (x @ basis)
+    return total

@@ -46,7 +46,7 @@ from lagbench.metrics import METRICS, Direction, Tally, TaskConfig, aggregate
 from lagbench.metrics.aggregate import round_statistics
 from lagbench.metrics.distributions import BINS
 from lagbench.metrics.table import ranking_metric
-from lagbench.references.table import COUNTING, REFERENCES
+from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.card import (
     FRAMES,
     PARTICLES,
@@ -233,7 +233,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
     naive_scores = {}
     for row, row_scores in scores.items():
-        if row in COUNTING:
+        if row in NAIVE:
             naive_scores[row] = row_scores[ranking]
     return ScoreCard(
         header=header,

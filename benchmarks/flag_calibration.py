@@ -96,7 +96,7 @@ class CalibrationScenario:
         """
         position, displacement = self.last_motion(first)
         grid = self.scenario.config.grid
-        full = self.scenario.full
+        full = self.scenario.full_weight
         velocity = fields(position, displacement, grid, full=full).velocity
         frames = []
         for _ in range(count):

@@ -3,8 +3,8 @@ Markdown.
 
     python benchmarks/floors.py [--data cavity/full ...] [--each]
 
-From the scores that the package ships (``python -m lagbench.scoring.measure_references`` measures
-them): for each data set and floor the ranking metric with its 95 % interval over test
+From the scores that the package ships (``python -m
+lagbench.scoring.measure_references`` measures them): for each data set and floor the ranking metric with its 95 % interval over test
 scenarios, the correlation of vorticity at frame 54 (tiny: the last), and the CPU time
 of a frame; the best floor is marked. Then, for the full boxes, the share of test
 scenarios in which the frozen field correlates below 0.8 at that frame, and its median
@@ -23,7 +23,7 @@ import numpy as np
 from lagbench.data.registry import Size, load
 from lagbench.metrics.table import ranking_metric
 from lagbench.references import ReferenceScores, shipped
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 from lagbench.scoring.skill import best_reference
 
 FALLEN = 0.8
@@ -86,7 +86,7 @@ def _print_references(size: Size, references: Mapping[str, ReferenceScores]) -> 
     best = best_reference(
         {
             name: references[name].scores[ranking]
-            for name in COUNTING.intersection(references)
+            for name in NAIVE.intersection(references)
         }
     )
     for name, reference in references.items():

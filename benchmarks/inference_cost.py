@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lagbench.baselines.baseline import Batch, Facts
+from lagbench.baselines.baseline import Batch, DatasetInfo
 from lagbench.baselines.catalogue import find
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.rollout import roll_out
@@ -37,8 +37,8 @@ FRAMES = 8
 REPEATS = 3
 
 
-def make_facts(q: int) -> Facts:
-    """Return the facts of a data set with q^2 times the particles.
+def make_dataset_info(q: int) -> DatasetInfo:
+    """Return the info of a data set with q^2 times the particles.
 
     They are those of the data set whose recipes are used; no file of it is read.
     """
@@ -48,7 +48,7 @@ def make_facts(q: int) -> Facts:
         for name, (x, y) in size.measured.statistics.items():
             statistics_by_name[name] = (float(x), float(y))
     task = size.task
-    return Facts(
+    return DatasetInfo(
         split=SPLIT,
         size=SIZE,
         version=size.version,
@@ -66,12 +66,12 @@ def make_facts(q: int) -> Facts:
     )
 
 
-def make_given_frames(facts: Facts) -> Batch:
+def make_given_frames(info: DatasetInfo) -> Batch:
     """Return the given frames of a box full of particles that swirl.
 
     There is one particle in each cell of a lattice.
     """
-    count = facts.particles
+    count = info.particles
     side = int(np.ceil(np.sqrt(count)))
     axis = np.arange(side)
     cells = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -79,13 +79,13 @@ def make_given_frames(facts: Facts) -> Batch:
     # positions in a box of side 1, shape [particle, 2]
     unit_position = (cells[:count] + rng.random((count, 2))) / side
     phase_x, phase_y = np.pi * unit_position.T
-    speed = facts.statistics["velocity_std"][0]
+    speed = info.statistics["velocity_std"][0]
     velocity_x = np.sin(phase_x) * np.cos(phase_y)
     velocity_y = -np.cos(phase_x) * np.sin(phase_y)
     velocity = 2.0 * speed * np.stack([velocity_x, velocity_y], axis=-1)
-    low, high = np.transpose(facts.bounds)
+    low, high = np.transpose(info.bounds)
     first = low + (high - low) * unit_position
-    frames = [first + step * velocity for step in range(facts.input_frames)]
+    frames = [first + step * velocity for step in range(info.input_frames)]
     return Batch(
         position=torch.tensor(np.stack(frames, axis=1), dtype=torch.float32),
         sample=torch.zeros(count, dtype=torch.int64),
@@ -98,14 +98,14 @@ def make_given_frames(facts: Facts) -> Batch:
 
 def measure_milliseconds(name: str, q: int) -> float:
     """Return the median processor time of a frame of a model."""
-    facts = make_facts(q)
+    info = make_dataset_info(q)
     entry = find(name)
     options = dict(recipe_for(entry, SPLIT, SIZE).model)
     if "cells" in options:
         options["cells"] *= q
     torch.manual_seed(0)
-    model = entry.model.build(options, facts)
-    given = make_given_frames(facts)
+    model = entry.model.build(options, info)
+    given = make_given_frames(info)
     roll_out(model, given, FRAMES)
     milliseconds = []
     for _ in range(REPEATS):

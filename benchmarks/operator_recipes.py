@@ -21,7 +21,7 @@ import torch
 
 from lagbench.baselines.baseline import Baseline
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.machine import multiplies_bfloat16
 from lagbench.baselines.recipe import Recipe, recipe_for
 from lagbench.torch import WindowDataset, collate
@@ -108,11 +108,11 @@ def main() -> int:
         "|\n|---|---|---|---|---|---|"
     )
     for split in options.split:
-        facts = facts_of(split, options.size, root=options.root)
+        info = read_dataset_info(split, options.size, root=options.root)
         for name in options.operator:
             recipe = recipe_for(find(name), split, options.size, variant=options.recipe)
             torch.manual_seed(0)
-            model = find(name).model.build(recipe.model, facts)
+            model = find(name).model.build(recipe.model, info)
             data = WindowDataset(
                 split,
                 size=options.size,

@@ -76,7 +76,7 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
         given=given,
         material=np.zeros(len(position), np.int8),
         particle_mass=1.0 / len(position),
-        area=1.0 if config.full_box else 0.12,
+        area=1.0 if config.is_full_box else 0.12,
     )
     true_snapshot = scenario.snapshot(position, position - velocity)
     predicted_snapshot = scenario.snapshot(

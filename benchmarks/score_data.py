@@ -1,6 +1,6 @@
 """A made-up data set of the size of cavity full, and a submission to it.
 
-Particles are carried by swirls that differ between scenarios, so that fields and errors
+Particles are carried by rotating_disc that differ between scenarios, so that fields and errors
 are of realistic shape; nothing is learned from the values.
 """
 
@@ -23,7 +23,7 @@ from lagbench.submission import PredictionsWriter
 __all__ = ["ScoreData", "make_score_data", "write_scenario"]
 
 SPEED = 0.0022
-"""Per-frame speed of the swirls, as in the cavity [length/frame]."""
+"""Per-frame speed of the rotating_disc, as in the cavity [length/frame]."""
 
 BOX = (0.0625, 0.875)
 """Lower corner and side of the box [length]."""
@@ -88,7 +88,7 @@ def make_score_data(
     registry = load(registry_path)
     path = folder / "predictions.nc"
     writer = PredictionsWriter(
-        path, split="cavity", size="full", method="swirls", registry=registry
+        path, split="cavity", size="full", method="rotating_disc", registry=registry
     )
     with writer:
         for scenario in scenarios:
@@ -101,7 +101,7 @@ def make_score_data(
 def _flow(
     scenario: int, frames: int, particles: int, *, error: float = 0.0
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield positions frame by frame; an error makes the swirls that much faster."""
+    """Yield positions frame by frame; an error makes the rotating_disc that much faster."""
     rng = np.random.Generator(np.random.PCG64(scenario))
     low, side = BOX
     high = low + side

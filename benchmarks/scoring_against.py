@@ -3,7 +3,7 @@
     python benchmarks/scoring_against.py --against 0e958a2
 
 checks the other commit out beside this one (0e958a2 is the last with version 1 of the
-data). Each tree makes a submission to cavity full of the same swirls by its own
+data). Each tree makes a submission to cavity full of the same rotating_disc by its own
 ``score_data.py`` and scores it in processes of its own, in turns; the first round,
 which may hash the truth, is not counted. Printed is the processor time per scenario of
 90 frames, imports aside (best of the rounds), what the validation's child takes of it,

@@ -9,7 +9,7 @@ from typing import Any
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
-from lagbench.references.table import COUNTING, REFERENCES
+from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
@@ -37,7 +37,7 @@ def summary_table(all_results: Sequence[SplitResults]) -> str:
     )
     rows = []
     for results in all_results:
-        solver = _first(results, [name for name in REFERENCES if name not in COUNTING])
+        solver = _first(results, [name for name in REFERENCES if name not in NAIVE])
         model = _first(results, results.models)
         rows.append(
             (
@@ -188,7 +188,7 @@ def _shown_metrics(results: SplitResults) -> list[Metric]:
 
 def _seeds_cell(method: Method) -> str:
     """Return the number of seeds, or the kind of a reference predictor."""
-    if method.name in COUNTING:
+    if method.name in NAIVE:
         return "naive baseline"
     if method.name in REFERENCES:
         return "classical solver"
@@ -315,11 +315,11 @@ def cost_table(results: SplitResults) -> str:
 
 def _changes(recipe: Mapping[str, Any]) -> str:
     """Return the changed options of a recipe; a dash without a recipe."""
-    from lagbench.baselines.job import changes_of  # loads torch
+    from lagbench.baselines.recipe_changes import describe_changes  # loads torch
 
     if not recipe:
         return "-"
-    return recipe.get("changed") or "; ".join(changes_of(recipe)) or "none"
+    return recipe.get("changed") or "; ".join(describe_changes(recipe)) or "none"
 
 
 def _frame_costs(method: Method) -> Iterator[str]:

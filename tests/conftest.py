@@ -66,7 +66,7 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
-OUTCOMES = scored._outcomes
+SCORE_SCENARIOS = scored.score_scenarios
 PAINT = painting.paint_pictures
 Names = tuple[str, ...]
 READERS = (
@@ -186,48 +186,50 @@ def references_once() -> Iterator[None]:
     """
     known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
-    def outcomes(
+    def score_once(
         task: ScoredTask,
         path: Path,
-        anatomy: FileInfo,
+        info: FileInfo,
+        *,
         metrics: Names,
         references: Names,
         workers: int | None,
         scheduler: str | None,
         meter: Meter,
     ) -> list[ScenarioScores]:
-        options = {"workers": workers, "scheduler": scheduler, "meter": meter}
-        if not references or scheduler is not None or (workers or 1) > 1:
-            return OUTCOMES(
-                task, path, anatomy, metrics=metrics, references=references, **options
-            )
-        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        key = (
-            metrics,
-            references,
-            repr((task.size, task.config)),
-            *map(file_sha256, files),
-        )
-        found = OUTCOMES(
+        score_rows = functools.partial(
+            SCORE_SCENARIOS,
             task,
             path,
-            anatomy,
+            info,
             metrics=metrics,
-            references=() if key in known else references,
-            **options,
+            workers=workers,
+            scheduler=scheduler,
+            meter=meter,
         )
-        if key not in known:
+        if not references or scheduler is not None or (workers or 1) > 1:
+            return score_rows(references=references)
+
+        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
+        hashes = [file_sha256(file) for file in files]
+        key = (metrics, references, repr((task.size, task.config)), *hashes)
+        if key in known:
+            outcomes = score_rows(references=())
+        else:
+            outcomes = score_rows(references=references)
             known[key] = {
-                one.scenario: {name: one.tallies[name] for name in references}
-                for one in found
+                outcome.scenario: {name: outcome.tallies[name] for name in references}
+                for outcome in outcomes
             }
-        return [
-            replace(one, tallies={**one.tallies, **known[key][one.scenario]})
-            for one in found
-        ]
+
+        completed = []
+        for outcome in outcomes:
+            tallies = {**outcome.tallies, **known[key][outcome.scenario]}
+            completed.append(replace(outcome, tallies=tallies))
+        return completed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagbench.scoring.score.score_scenarios", outcomes)
+        patch.setattr("lagbench.scoring.score.score_scenarios", score_once)
         yield
 
 
@@ -276,7 +278,7 @@ def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"lagbench.{module}.validate", validate)
     for module in READERS:
         monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
-    monkeypatch.setattr("lagbench.scoring.score._outcomes", OUTCOMES)
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", SCORE_SCENARIOS)
     monkeypatch.setattr(painting, "paint_pictures", PAINT)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from lagbench.baselines import catalogue
-from lagbench.baselines.baseline import Baseline, Batch, Facts
+from lagbench.baselines.baseline import Baseline, Batch, DatasetInfo
 from lagbench.baselines.baseline import Options as Base
 from lagbench.baselines.operators.gat import GAT, GATv2
 from lagbench.baselines.operators.gns import GNS
@@ -27,13 +27,13 @@ from lagbench.baselines.operators.pointnet import PointNet
 from lagbench.baselines.operators.supergat import SuperGAT, SuperGATDot
 from lagbench.baselines.operators.transformer import Transformer
 from lagbench.baselines.simulator import GraphNetwork
-from lagbench.baselines.simulator import State as Moving
+from lagbench.baselines.simulator import ParticleState as Moving
 from lagbench.data.registry import Registry
 
 Floats = NDArray[np.float32]
 State = tuple[Tensor, Tensor, int]
 
-FACTS = Facts(
+INFO = DatasetInfo(
     split="curl-noise",
     size="tiny",
     version="1.0.0",
@@ -77,8 +77,8 @@ class Drift(Baseline):
         fail_at: int = 0  # call of `forward` whose loss is NaN; 0 is none
         explode_at: int = 0  # frame of a rollout that is infinite; 0 is none
 
-    def __init__(self, options: Any, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Any, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         self.a = nn.Parameter(torch.full((1,), options.start))
         self.register_buffer("calls", torch.zeros((), dtype=torch.int64))
 
@@ -122,7 +122,7 @@ class Bursting(Drift):
     def advance(self, state: State) -> tuple[State, Tensor]:
         """Advance by one frame; a batch with such a window is infinite altogether."""
         (now, after, frame), position = super().advance(state)
-        first = now[:: self.facts.particles, 0]
+        first = now[:: self.info.particles, 0]
         if frame > 4 and bool((first < 0.5).any()):
             position = torch.full_like(after, float("inf"))
         return (now, position, frame), position
@@ -171,8 +171,8 @@ def trainer(
     return call
 
 
-def facts_of(scenarios: Sequence[Floats]) -> Facts:
-    """Return facts whose statistics are those of some scenarios of shape [frame,
+def info_of(scenarios: Sequence[Floats]) -> DatasetInfo:
+    """Return info whose statistics are those of some scenarios of shape [frame,
     particle, 2].
     """
     statistics = {}
@@ -187,7 +187,7 @@ def facts_of(scenarios: Sequence[Floats]) -> Facts:
             statistics[f"{name}_{kind}"] = float(x), float(y)
     particles = scenarios[0].shape[1]
     return replace(
-        FACTS,
+        INFO,
         split="fluid",
         particles=particles,
         input_frames=2,
@@ -319,7 +319,7 @@ SMALL: dict[str, object] = {
 }
 
 
-def facts(**changes: object) -> Facts:
+def info(**changes: object) -> DatasetInfo:
     """Return the figures of a box of 256 particles whose statistics have no mean."""
     statistics = {
         "position_mean": (0.5, 0.5),
@@ -335,7 +335,7 @@ def facts(**changes: object) -> Facts:
         "frame_interval": 0.5,
     }
     return replace(
-        FACTS,
+        INFO,
         **plain
         | {"bounds": ((0.0625, 0.9375),) * 2, "statistics": statistics}
         | changes,
@@ -379,7 +379,7 @@ def network(
     """Return a small GNS in float32; awake ones have a decoder that is not zero."""
     torch.manual_seed(0)
     model = GraphNetwork.with_operator(GNS).build(
-        SMALL | options, facts(**(changes or {}))
+        SMALL | options, info(**(changes or {}))
     )
     if awake:
         torch.nn.init.normal_(model.network.decoder[-1].weight, std=0.1)
@@ -409,7 +409,7 @@ def oracle(truth: torch.Tensor, target: str, **options: object) -> Any:
             return scale(exact[:, self.frame - 1].float()).to(state.position.dtype), {}
 
     means = {"velocity_mean": (1e-3, -2e-3), "acceleration_mean": (1e-5, 2e-5)}
-    shifted = facts(statistics=dict(facts().statistics) | means)
+    shifted = info(statistics=dict(info().statistics) | means)
     return Oracle.build(SMALL | {"target": target} | options, shifted)
 
 

@@ -21,7 +21,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
-from lagbench.baselines.catalogue import names
+from lagbench.baselines.catalogue import list_names
 from lagbench.baselines.checkpoint import load
 from lagbench.errors import DataError, WorkFailedError
 from lagbench.exchange.local_split import LocalSplit
@@ -72,7 +72,7 @@ def test_a_fault_of_a_package_is_told_as_one(
     assert f"{module}, line 6" in result.stderr
 
 
-@pytest.mark.parametrize("baseline", names())
+@pytest.mark.parametrize("baseline", list_names())
 def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) -> None:
     """Two commands lead from a baseline's name to predictions that are valid and say
     their cost.

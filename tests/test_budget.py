@@ -106,7 +106,7 @@ def test_the_mean_over_seeds() -> None:
         "device": "a",
     }
     two = {**one, "windows": 201, "cpu_hours": 0.26, "device": "b"}
-    found = EntryBudget.of("mini", [Budget(**one), Budget(**two)])
+    found = EntryBudget.mean_over_seeds("mini", [Budget(**one), Budget(**two)])
     means: dict[str, Any] = {
         "windows": 150,
         "epochs": 0.5,
@@ -114,6 +114,8 @@ def test_the_mean_over_seeds() -> None:
         "gpu_hours": 0.0,
     }
     assert found == EntryBudget(track="equal compute", **means)
-    mixed = EntryBudget.of("mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})])
+    mixed = EntryBudget.mean_over_seeds(
+        "mini", [Budget(**one), Budget(**{**two, "cpu_hours": 2.0})]
+    )
     assert mixed.track is None
-    assert EntryBudget.of("mini", [Budget(**one), None]) is None
+    assert EntryBudget.mean_over_seeds("mini", [Budget(**one), None]) is None

@@ -7,19 +7,24 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from simple_models import RADIUS, batch, facts, jittered, swirl
+from simple_models import RADIUS, batch, info, jittered, swirl
 
-from lagbench.baselines.augmentation import Symmetry, draw, image, noisy
+from lagbench.baselines.augmentation import (
+    Symmetry,
+    add_walk_noise,
+    draw_mirror_matrices,
+    mirror_batch,
+)
 from lagbench.baselines.graph import (
     NodeFeatures,
-    Scale,
+    Standardisation,
     edge_features,
     radius_graph,
     wall_distance,
 )
 from lagbench.errors import UsageError
 
-BOUNDS = facts().bounds
+BOUNDS = info().bounds
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -29,18 +34,19 @@ def generator(seed: int = 0) -> torch.Generator:
 
 def node_features(**options: bool) -> NodeFeatures:
     """Return the features of the test's box, the scales without noise."""
-    statistics = facts().statistics
+    statistics = info().statistics
     torch.manual_seed(0)
     kinds = ("velocity", "acceleration")
     scales = (
-        Scale(statistics[f"{kind}_mean"], statistics[f"{kind}_std"]) for kind in kinds
+        Standardisation(statistics[f"{kind}_mean"], statistics[f"{kind}_std"])
+        for kind in kinds
     )
     return NodeFeatures(BOUNDS, *scales, RADIUS, **options)
 
 
 def test_noise_widens_the_deviation_of_the_data() -> None:
     """Data of deviation 3 and 0 with noise of deviation 4 have deviation 5 and 4."""
-    scale = Scale((1.0, 2.0), (3.0, 0.0), noise=4.0)
+    scale = Standardisation((1.0, 2.0), (3.0, 0.0), noise=4.0)
     value = torch.tensor([[6.0, 6.0], [-4.0, 2.0]])
     assert torch.equal(scale(value), torch.tensor([[1.0, 1.0], [-1.0, 0.0]]))
     assert torch.equal(scale.inverse(scale(value)), value)
@@ -150,7 +156,7 @@ def test_noise_has_the_stated_deviation_at_the_last_velocity() -> None:
 
     That of x and y, and of neighbours in the row, is uncorrelated.
     """
-    walks = noisy(torch.zeros(40_000, 6, 2), 6, 0.3, generator())
+    walks = add_walk_noise(torch.zeros(40_000, 6, 2), 6, 0.3, generator())
     velocity = walks.diff(dim=1)
     covariance = (
         torch.einsum("pjc,pkc->jk", velocity, velocity) / velocity[:, 0].numel()
@@ -171,7 +177,7 @@ def test_the_target_makes_up_for_the_noise() -> None:
     velocity noise.
     """
     truth = batch(swirl(0, 8)).position.double()
-    disturbed = noisy(truth, 6, 1e-3, generator(1))
+    disturbed = add_walk_noise(truth, 6, 1e-3, generator(1))
     noise = disturbed - truth
     assert float(noise[:, 5].abs().mean()) > 1e-4
     torch.testing.assert_close(
@@ -190,7 +196,7 @@ def test_every_image_is_drawn_evenly(symmetry: str, images: int) -> None:
     """8000 draws hold each image of the group 8000 / images times, within five
     deviations.
     """
-    drawn = draw(Symmetry(symmetry), 8000, generator()).reshape(-1, 4)
+    drawn = draw_mirror_matrices(Symmetry(symmetry), 8000, generator()).reshape(-1, 4)
     different, counts = drawn.unique(dim=0, return_counts=True)
     assert len(different) == images
     assert different.abs().sum(dim=1).tolist() == [2.0] * images
@@ -210,8 +216,8 @@ def test_walls_move_with_the_particles_on_them() -> None:
         np.stack([middle, middle + rider.wall_velocity[0, 0].numpy()]), walls=True
     )
     seen = set()
-    for matrix in draw(Symmetry.SQUARE, 200, generator()).unique(dim=0):
-        turned = image(rider, matrix[None], BOUNDS)
+    for matrix in draw_mirror_matrices(Symmetry.SQUARE, 200, generator()).unique(dim=0):
+        turned = mirror_batch(rider, matrix[None], BOUNDS)
         place = (
             (turned.position[:, None, 0] - torch.from_numpy(middle).float())
             .norm(dim=2)
@@ -233,15 +239,15 @@ def test_images_are_per_window_and_leave_the_data_alone() -> None:
     windows = batch(swirl(0, 3), swirl(1, 3), walls=True)
     kept = windows.position.clone()
     matrix = torch.stack([torch.eye(2), torch.diag(torch.tensor([-1.0, 1.0]))])
-    turned = image(windows, matrix, BOUNDS)
+    turned = mirror_batch(windows, matrix, BOUNDS)
     assert torch.equal(windows.position, kept)
     torch.testing.assert_close(turned.position[:256], kept[:256])
     torch.testing.assert_close(turned.position[256:, :, 0], 1.0 - kept[256:, :, 0])
     torch.testing.assert_close(turned.position[256:, :, 1], kept[256:, :, 1])
-    matrix = draw(Symmetry.SQUARE, 2, generator(3))
-    plain = image(windows, matrix, BOUNDS)
+    matrix = draw_mirror_matrices(Symmetry.SQUARE, 2, generator(3))
+    plain = mirror_batch(windows, matrix, BOUNDS)
     with torch.autocast("cpu", torch.bfloat16):
-        mixed = image(windows, matrix, BOUNDS)
+        mixed = mirror_batch(windows, matrix, BOUNDS)
     assert torch.equal(mixed.position, plain.position)
     assert torch.equal(mixed.wall_velocity, plain.wall_velocity)
 
@@ -249,4 +255,6 @@ def test_images_are_per_window_and_leave_the_data_alone() -> None:
 def test_axes_change_places_only_in_a_square() -> None:
     """In an oblong box a quarter turn is refused, with the option that works."""
     with pytest.raises(UsageError, match="symmetry: mirror"):
-        image(batch(swirl(0, 3)), torch.eye(2).flip(0)[None], ((0.0, 1.0), (0.0, 0.5)))
+        mirror_batch(
+            batch(swirl(0, 3)), torch.eye(2).flip(0)[None], ((0.0, 1.0), (0.0, 0.5))
+        )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from simple_models import (
     batch_of,
     counted,
-    facts_of,
+    info_of,
     rolled,
     rotations,
     share_of_persistence,
@@ -34,7 +34,7 @@ from lagbench.errors import DataError, UsageError
 from studies.thesis.published import MLP_STUDIES, MLPStudy
 
 SCENARIOS = rotations(4)
-FACTS = facts_of(SCENARIOS)
+INFO = info_of(SCENARIOS)
 SMALL = {"widths": [16, 8]}
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def test_parameters_of_the_thesis(study: MLPStudy) -> None:
         find("mlp"), split, "full", variant=f"table-{study.table}-{ends[study.table]}"
     )
     with torch.device("meta"):  # no memory for the weights
-        model = MLP.build(recipe.model, replace(FACTS, particles=2500))
+        model = MLP.build(recipe.model, replace(INFO, particles=2500))
     assert sum(p.numel() for p in model.parameters()) == study.parameters
 
 
@@ -71,7 +71,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 
 def transcribed(model: MLP, before: Array, last: Array, activation: str) -> Array:
     """Return the next positions by the equations, shape [particle, 2]."""
-    known = {name: np.array(value) for name, value in FACTS.statistics.items()}
+    known = {name: np.array(value) for name, value in INFO.statistics.items()}
     place = (last - known["position_mean"]) / known["position_std"]
     speed = (last - before - known["velocity_mean"]) / known["velocity_std"]
     state = np.concatenate([place, speed], axis=1).ravel()
@@ -91,7 +91,7 @@ def test_a_step_is_the_equation(activation: str) -> None:
     """One step of a rollout equals layers, activations and standardisation written out
     in NumPy.
     """
-    model = MLP.build({**SMALL, "activation": activation}, FACTS)
+    model = MLP.build({**SMALL, "activation": activation}, INFO)
     expected = transcribed(
         model, SCENARIOS[0][0].astype(float), SCENARIOS[0][1].astype(float), activation
     )
@@ -103,13 +103,13 @@ def test_the_loss_is_equation_4_16() -> None:
     """Weighted terms add up to the mean square over particles and standardised
     attributes.
     """
-    model = MLP.build(SMALL, FACTS)
+    model = MLP.build(SMALL, INFO)
     window = SCENARIOS[1][5:8]
     terms = model(batch_of([window]))
     loss = sum(
         model.weights[name] * float(term.detach()) for name, term in terms.items()
     )
-    state = FrameState(FACTS).of(torch.from_numpy(window))
+    state = FrameState(INFO).standardise(torch.from_numpy(window))
     predicted = model.next_state(model.start(batch_of([window[:2]])))[0]
     assert loss == pytest.approx(
         float((predicted - state[2]).square().mean().detach()), rel=1e-5
@@ -122,7 +122,7 @@ def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
 
     Scenarios of another size raise an error that says how many particles it takes.
     """
-    model = MLP.build(SMALL, FACTS)
+    model = MLP.build(SMALL, INFO)
     both = rolled(model, batch_of([SCENARIOS[0][:2], SCENARIOS[1][:2]]), 5)
     alone = [rolled(model, batch_of([x[:2]]), 5) for x in SCENARIOS[:2]]
     torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=1e-5)
@@ -138,7 +138,7 @@ def test_a_change_of_nothing_is_persistence() -> None:
     """With ``target: change`` a network that puts out zeros keeps every particle where
     it is.
     """
-    model = MLP.build({**SMALL, "target": "change"}, FACTS)
+    model = MLP.build({**SMALL, "target": "change"}, INFO)
     for parameter in model.network[-1].parameters():
         torch.nn.init.zeros_(parameter)
     given = batch_of([SCENARIOS[0][:2]])
@@ -151,12 +151,12 @@ def test_noise_is_as_large_as_asked_and_only_in_training() -> None:
     """Inputs get normal noise of the recipe's deviation with a generator, and none
     without.
     """
-    model = MLP.build({**SMALL, "noise_std": 0.3}, FACTS)
+    model = MLP.build({**SMALL, "noise_std": 0.3}, INFO)
     state = torch.zeros(500, 1, 12, 4)
-    noise = model.disturbed(state, torch.Generator().manual_seed(1))
+    noise = model.add_noise(state, torch.Generator().manual_seed(1))
     assert float(noise.std()) == pytest.approx(0.3, rel=0.02)
-    assert torch.equal(noise, model.disturbed(state, torch.Generator().manual_seed(1)))
-    assert torch.equal(model.disturbed(state, None), state)
+    assert torch.equal(noise, model.add_noise(state, torch.Generator().manual_seed(1)))
+    assert torch.equal(model.add_noise(state, None), state)
 
 
 GATED: dict[str, Any] = {"latent": 8, "decoder": [6]}
@@ -165,7 +165,7 @@ BOTH = pytest.mark.parametrize("kind", [LSTM, LSTMWithMLP])
 
 def window_of() -> FrameWindow:
     """Return the states of the first scenario's first two frames."""
-    state = FrameState(FACTS).of(torch.from_numpy(SCENARIOS[0][:2]))
+    state = FrameState(INFO).standardise(torch.from_numpy(SCENARIOS[0][:2]))
     return FrameWindow(state[None], torch.zeros(1, 12, dtype=torch.int64))
 
 
@@ -176,7 +176,7 @@ def test_parameters_of_table_4_6(kind: type[LSTM], material: int) -> None:
     + 1250.
     """
     with torch.device("meta"):
-        model = kind.build({"material": bool(material)}, replace(FACTS, particles=2500))
+        model = kind.build({"material": bool(material)}, replace(INFO, particles=2500))
     layer = 4 * (1250 * 1250 + 1250 * 1250 + 2 * 1250)
     expected = counted((4 + material, 1250)) + 2 * layer + counted((1250, 1250, 10_000))
     expected += counted((1250, 1250)) if kind is LSTMWithMLP else 0
@@ -211,7 +211,7 @@ def test_a_step_is_the_equations(kind: type[LSTM]) -> None:
     """Encoder, pooling, gates, the MLP between, and decoder, written out, give the same
     state.
     """
-    model = kind.build(GATED, FACTS).eval()
+    model = kind.build(GATED, INFO).eval()
     window = window_of()
     elu = ACTIVATIONS["elu"]
     latent = elu(linear(model.encoder[0], window.state[0].numpy().astype(float))).mean(
@@ -242,7 +242,7 @@ def test_a_rollout_starts_from_two_frames() -> None:
     """Two given frames are enough: the first takes the second's velocity, as its own is
     unknown.
     """
-    model = LSTM.build(GATED, FACTS)
+    model = LSTM.build(GATED, INFO)
     short, long = (
         model.start(batch_of([SCENARIOS[0][:frames]])).state[0] for frames in (2, 6)
     )
@@ -256,10 +256,10 @@ def test_dropout_acts_in_training_only() -> None:
     nothing.
     """
     window = window_of()
-    model = LSTM.build(GATED, FACTS).train()
+    model = LSTM.build(GATED, INFO).train()
     assert not torch.equal(model.next_state(window), model.next_state(window))
     assert torch.equal(model.eval().next_state(window), model.next_state(window))
-    still = LSTM.build({**GATED, "dropout": [0.0, 0.0]}, FACTS).train()
+    still = LSTM.build({**GATED, "dropout": [0.0, 0.0]}, INFO).train()
     assert torch.equal(still.next_state(window), still.next_state(window))
 
 
@@ -267,7 +267,7 @@ def test_the_density_term_compares_maps() -> None:
     """It is the squared error of the scorer's particle weights over their mean
     square.
     """
-    model = LSTM.build({**GATED, "dropout": [0.0, 0.0]}, FACTS)
+    model = LSTM.build({**GATED, "dropout": [0.0, 0.0]}, INFO)
     window = SCENARIOS[1][4:8]
     state = model.start(batch_of([window[:3]]))
     predicted = model.frame_state.position(model.next_state(state))[0].detach().numpy()
@@ -293,7 +293,7 @@ def test_the_material_is_a_fifth_input(
     window = [SCENARIOS[0][:2]]
     kinds = ([0] * 12, [0, 1, 2, 3] * 3)
     for given in (False, True):
-        model = kind.build({**options, "material": given}, FACTS)
+        model = kind.build({**options, "material": given}, INFO)
         first, second = (rolled(model, batch_of(window, kind), 1) for kind in kinds)
         assert torch.equal(first, second) is not given
 
@@ -310,7 +310,7 @@ def test_it_learns_a_rotation(
     """
     torch.manual_seed(0)
     recurrent = {"latent": 32, "decoder": [32], "dropout": [0.0, 0.0]}
-    model = kind.build({"widths": [64, 64]} if kind is MLP else recurrent, FACTS)
+    model = kind.build({"widths": [64, 64]} if kind is MLP else recurrent, INFO)
     train(model, rotations(24), steps=steps)
     assert share_of_persistence(model, rotations(30)[-1], frames=20) < share
 
@@ -332,8 +332,8 @@ def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) ->
         return
     recipe = recipe_for(find(name), split, size)
     with torch.device("meta"):  # no memory for the weights
-        facts = replace(FACTS, particles=load().size(split, size).particles)
-        model = find(name).model.build(recipe.model, facts)
+        info = replace(INFO, particles=load().size(split, size).particles)
+        model = find(name).model.build(recipe.model, info)
     numbers = sum(value.numel() for value in model.state_dict().values())
     if name in NETWORKS:
         assert recipe.model["material"] is (split == "multimaterial")

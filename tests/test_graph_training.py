@@ -9,12 +9,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from simple_models import SMALL, batch, facts, jittered, network, oracle, rolled, swirl
+from simple_models import SMALL, batch, info, jittered, network, oracle, rolled, swirl
 from torch import Tensor
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.operators.supergat import SuperGAT
 from lagbench.baselines.recipe import recipe_for
 from lagbench.baselines.simulator import (
@@ -23,7 +23,7 @@ from lagbench.baselines.simulator import (
     GraphNetwork,
     LossNorm,
     Motion,
-    State,
+    ParticleState,
     loss_terms,
 )
 from lagbench.data import grid as scoring
@@ -278,9 +278,9 @@ def test_rollout_losses_pass_gradients_through_all_steps() -> None:
     state = model.start(window.part(slice(6)))
     total = 0.0
     for frame in (6, 7, 8):
-        held = {f.name: getattr(state, f.name) for f in fields(State)}
+        held = {f.name: getattr(state, f.name) for f in fields(ParticleState)}
         state, _ = model.step(
-            State(
+            ParticleState(
                 **{
                     name: value if value is None else value.detach()
                     for name, value in held.items()
@@ -341,11 +341,11 @@ def test_the_operators_own_loss_has_its_weight() -> None:
     """
     linked = GraphNetwork.with_operator(SuperGAT)
     window = batch(swirl(0, 7))
-    model = linked.build(SMALL, facts())
+    model = linked.build(SMALL, info())
     assert set(model(window, torch.Generator().manual_seed(0))) == {*TERMS, "link"}
     assert model.weights["link"] == 1.0
     heavy = linked.build(
-        SMALL | {"link_weight": 0.5, "loss": {"vorticity": 0.0}}, facts()
+        SMALL | {"link_weight": 0.5, "loss": {"vorticity": 0.0}}, info()
     )
     assert (heavy.weights["link"], heavy.weights["vorticity"]) == (0.5, 0.0)
     assert "link" not in network().weights
@@ -360,7 +360,9 @@ def test_terms_that_count_start_alive(
     """
     recipe = recipe_for(find(name), "curl-noise", "tiny")
     torch.manual_seed(0)
-    made = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    made = read_dataset_info(
+        "curl-noise", "tiny", root=generated.root, registry=unmeasured
+    )
     model = find(name).model.build(recipe.model, made)
     data = WindowDataset(
         "curl-noise",
@@ -392,7 +394,7 @@ def test_every_operator_learns_a_swirl(name: str) -> None:
     after frame.
     """
     torch.manual_seed(0)
-    model = find(name).model.build(SMALL, facts())
+    model = find(name).model.build(SMALL, info())
     optimizer = torch.optim.Adam(model.parameters(), 3e-3)
     for step in range(40):
         optimizer.zero_grad()

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
-from simple_models import batch, facts, jittered, rolled, swirl
+from simple_models import batch, info, jittered, rolled, swirl
 from torch import Tensor, nn
 
-from lagbench.baselines.augmentation import Symmetry, image, images
+from lagbench.baselines.augmentation import Symmetry, mirror_batch, mirror_matrices
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.catalogue import find
-from lagbench.baselines.checkpoint import rounded_weights
+from lagbench.baselines.checkpoint import round_weights
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.start import Start
+from lagbench.baselines.start import TrainingStart
 from lagbench.data.registry import load
 from lagbench.errors import DataError, UsageError
 
@@ -43,7 +43,7 @@ def surrogate(
 ) -> Any:
     """Return a small model; `awake` is the deviation of its last layer's weights."""
     torch.manual_seed(0)
-    model = NeuralMPM.build(SMALL | options, facts(**(changes or {})))
+    model = NeuralMPM.build(SMALL | options, info(**(changes or {})))
     if awake:
         nn.init.normal_(model.network.end.weight, std=awake)
     return model
@@ -100,7 +100,7 @@ def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     model = surrogate(awake=30.0, conserve=conserve)
     given = batch(swirl(0, 3), swirl(1, 3))
     found = rolled(model, given, 12)
-    low, high = torch.tensor(facts().bounds).T
+    low, high = torch.tensor(info().bounds).T
     assert bool(((found >= low) & (found <= high)).all())
     assert bool(((found == low) | (found == high)).any())  # some were stopped
     _, frames = model.call(model.start(given))
@@ -235,7 +235,7 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(
     """Strain, walls that move and context included, the rollout of an image is the
     image of the rollout.
     """
-    matrix = images(Symmetry.SQUARE)[number]
+    matrix = mirror_matrices(Symmetry.SQUARE)[number]
     options = {
         "strain": True,
         "wall_velocity": True,
@@ -253,7 +253,7 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(
             nn.init.constant_(model.projection.limit, -2.0)  # all is too dense
         here, there = (
             rolled(model, one, 4)
-            for one in (given, image(given, matrix[None], facts().bounds))
+            for one in (given, mirror_batch(given, matrix[None], info().bounds))
         )
         return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())
 
@@ -395,8 +395,8 @@ def test_images_roll_out_as_images() -> None:
     model = surrogate(materials=[0], smoothing=0.2)
     model.network = Drag(-0.5 * model.speed / model.change, 2)
     given = liquid(swirl(0, 3, (0.2, 0.2)))
-    for matrix in images(Symmetry.SQUARE):
-        there = rolled(model, image(given, matrix[None], facts().bounds), 5)
+    for matrix in mirror_matrices(Symmetry.SQUARE):
+        there = rolled(model, mirror_batch(given, matrix[None], info().bounds), 5)
         here = (rolled(model, given, 5) - 0.5) @ matrix.T + 0.5
         torch.testing.assert_close(there, here, rtol=0, atol=1e-5)
 
@@ -488,7 +488,7 @@ def test_recipes_fit_every_split(split: str, size: str) -> None:
     described = load().size(split, size)
     recipe = recipe_for(find("neuralmpm"), split, size)
     model = NeuralMPM.build(
-        recipe.model, facts(moving_walls=split == "cavity", bounds=described.bounds)
+        recipe.model, info(moving_walls=split == "cavity", bounds=described.bounds)
     )
     gravity = described.parameters.get("gravity")
     assert recipe.model["wall_velocity"] is (split == "cavity")
@@ -531,19 +531,19 @@ def test_of_other_grids_those_go_on_that_stand_first_in_both(
     with torch.no_grad():
         for weight in before.parameters():
             weight.add_(0.01)
-    held = rounded_weights(before)
+    held = round_weights(before)
     own = {name: value.clone() for name, value in new.state_dict().items()}
     options = before.options.model_dump(
         mode="json", exclude=set(before.options.in_training)
     )
-    start = Start(
+    start = TrainingStart(
         path=Path("earlier.pt"),
-        facts=before.facts,
+        info=before.info,
         weights=held,
         options=options,
         record={},
     )
-    start.fill(new)
+    start.load_into(new)
     found = new.state_dict()
     assert found.keys() == own.keys()
     for name, value in found.items():

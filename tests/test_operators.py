@@ -21,7 +21,7 @@ from lagbench.baselines.operators.supergat import (
     START,
     SuperGAT,
     SuperGATDot,
-    unlinked_pairs,
+    draw_unlinked_pairs,
 )
 from lagbench.baselines.operators.transformer import Transformer
 
@@ -266,14 +266,14 @@ def test_unlinked_pairs() -> None:
     gives the same.
     """
     inputs = small()
-    pairs = unlinked_pairs(
+    pairs = draw_unlinked_pairs(
         inputs.edge_index, 9, 20_000, torch.Generator().manual_seed(5)
     )
     drawn = set(map(tuple, pairs.t().tolist()))
     linked = set(map(tuple, inputs.edge_index.t().tolist()))
     every = {(j, i) for j in range(9) for i in range(9) if i != j}
     assert drawn == every - linked  # 72 - 24 = 48 pairs in 20,000 draws of 81
-    again = unlinked_pairs(
+    again = draw_unlinked_pairs(
         inputs.edge_index, 9, 20_000, torch.Generator().manual_seed(5)
     )
     assert torch.equal(pairs, again)
@@ -291,7 +291,7 @@ def test_link_loss() -> None:
         inputs.edge,
         generator=torch.Generator().manual_seed(2),
     )
-    pairs = unlinked_pairs(
+    pairs = draw_unlinked_pairs(
         inputs.edge_index, 9, 12, torch.Generator().manual_seed(2)
     ).numpy()
     z = inputs.node.double().numpy() / SCALE @ weights(layer)["conv.lin.weight"].T

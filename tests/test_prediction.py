@@ -18,17 +18,16 @@ import netCDF4
 import numpy as np
 import pytest
 import torch
-from simple_models import FACTS, Bursting, Drift, State, install
+from simple_models import INFO, Bursting, Drift, State, install
 from torch import Tensor
 
 from lagbench.baselines import predict as prediction
-from lagbench.baselines.baseline import Batch, Facts
-from lagbench.baselines.catalogue import every_entry, find
+from lagbench.baselines.baseline import Batch, DatasetInfo
+from lagbench.baselines.catalogue import find, load_all
 from lagbench.baselines.checkpoint import Checkpoint, load, save
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.graph import radius_graph
-from lagbench.baselines.job import MOST_RECORD, OVER
-from lagbench.baselines.machine import threads_used
+from lagbench.baselines.machine import use_threads
 from lagbench.baselines.neuralmpm import NeuralMPM
 from lagbench.baselines.predict import (
     PredictionResult,
@@ -37,7 +36,9 @@ from lagbench.baselines.predict import (
     predict,
 )
 from lagbench.baselines.recipe import recipe_for
-from lagbench.baselines.rollout import as_published, roll_out, single
+from lagbench.baselines.rollout import roll_out, round_parameters, select_window
+from lagbench.baselines.run_folder import LARGEST_LOG
+from lagbench.baselines.training_log import OVER
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UnreadableFileError, UsageError, WorkFailedError
 from lagbench.make.generate import GenerationResult
@@ -52,16 +53,16 @@ UNFINISHED = {"state": "running", "step": 9, "steps": 70, "recipe": RECIPE}
 
 
 class Scaled(Drift):
-    """A Drift that may be run at any size, and keeps the facts that it was last
+    """A Drift that may be run at any size, and keeps the info that it was last
     told.
     """
 
     any_size = True
-    told: Facts
+    told: DatasetInfo
 
-    def __init__(self, options: Any, facts: Facts) -> None:
-        super().__init__(options, facts)
-        Scaled.told = facts
+    def __init__(self, options: Any, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        Scaled.told = info
 
 
 class Several(Drift):
@@ -72,8 +73,8 @@ class Several(Drift):
 
         count: int = 1
 
-    def __init__(self, options: Any, facts: Facts) -> None:
-        super().__init__(options, facts)
+    def __init__(self, options: Any, info: DatasetInfo) -> None:
+        super().__init__(options, info)
         self.a = torch.nn.Parameter(torch.full((options.count,), options.start))
 
 
@@ -91,13 +92,13 @@ def run(
         baseline: str = "drift", start: float = 1.0, **options: Any
     ) -> PredictionResult:
         root = options.pop("root", generated.root)
-        here = facts_of("curl-noise", "tiny", root=root, registry=unmeasured)
-        facts = options.pop("facts", here)
-        model = Drift.build({"start": start, **options.pop("model", {})}, facts)
+        here = read_dataset_info("curl-noise", "tiny", root=root, registry=unmeasured)
+        info = options.pop("info", here)
+        model = Drift.build({"start": start, **options.pop("model", {})}, info)
         stored = Checkpoint(
             baseline=baseline,
             options=model.options.model_dump(),
-            facts=facts,
+            info=info,
             weights=model.state_dict(),
             training={"step": 9, "recipe": RECIPE, **options.pop("training", {})},
         )
@@ -200,13 +201,15 @@ def test_the_search_that_is_timed_is_the_models(
     """Where matter has collapsed, only the neighbours that the model hears are
     searched.
     """
-    facts = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    info = read_dataset_info(
+        "curl-noise", "tiny", root=generated.root, registry=unmeasured
+    )
     options = {"latent": 4, "layers": 1, "neighbours": 3}
-    model = find("gns").model.build(options, facts)
+    model = find("gns").model.build(options, info)
     stored = Checkpoint(
         baseline="gns",
         options=options,
-        facts=facts,
+        info=info,
         weights=model.state_dict(),
         training={"recipe": RECIPE},
     )
@@ -266,13 +269,13 @@ def windows(firsts: list[float]) -> Batch:
 
 def test_a_diverging_scenario_leaves_others_alone() -> None:
     """Beside one that diverges, a scenario is predicted as it is alone."""
-    model = Bursting.build({"start": 1.0}, FACTS)
+    model = Bursting.build({"start": 1.0}, INFO)
     batch = windows([0.9, 0.1])
     good, bad = roll_out(model, batch, 8)
     assert (good.scenario, good.diverged_at) == (10, None)
     # Frames 4 and 5 are given, 6 to 8 finite.
     assert (bad.scenario, bad.diverged_at) == (11, 9)
-    alone = roll_out(model, single(batch, 0), 8)[0]
+    alone = roll_out(model, select_window(batch, 0), 8)[0]
     assert torch.equal(good.position, alone.position)
     assert good.position.shape == bad.position.shape == (8, 3, 2)
 
@@ -301,7 +304,7 @@ def test_a_rollout_is_frozen_before_it_is_too_far(
         return state, position + torch.tensor([float(state[2] - 1), 0.0])
 
     monkeypatch.setattr(Wrong, "answer", staticmethod(fleeing))
-    found = roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.9]), 30)[0]
+    found = roll_out(Wrong.build({"start": 0.0}, INFO), windows([0.9]), 30)[0]
     assert found.diverged_at is not None
     assert 8.0 < float(found.position.max()) < 10.6
     assert torch.isfinite(found.position).all()
@@ -325,7 +328,7 @@ def test_what_is_no_frame_is_not_broadcast(
     """
     monkeypatch.setattr(Wrong, "answer", staticmethod(answer))
     with torch.no_grad(), pytest.raises(UsageError) as caught:
-        roll_out(Wrong.build({"start": 0.0}, FACTS), windows([0.2, 0.9]), 3)
+        roll_out(Wrong.build({"start": 0.0}, INFO), windows([0.2, 0.9]), 3)
     assert caught.value.where == "Wrong.advance"
 
 
@@ -333,12 +336,12 @@ def test_rollouts_keep_mode_and_weights() -> None:
     """In training it is in training afterwards; rounded to bfloat16 for a while it has
     all its bits again.
     """
-    drift = Drift.build({}, FACTS).train()
+    drift = Drift.build({}, INFO).train()
     roll_out(drift, windows([0.9]), 1)
     assert drift.training
     model = torch.nn.Linear(8, 8)
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    with as_published(model):
+    with round_parameters(model):
         assert torch.equal(model.weight, before["weight"].bfloat16().float())
         assert not torch.equal(model.weight, before["weight"])
     assert all(
@@ -379,7 +382,9 @@ def test_another_size_than_that_of_the_training(
     """Four times as many particles are half as far apart; figures there, statistics of
     the training.
     """
-    here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+    here = read_dataset_info(
+        "curl-noise", "tiny", root=generated.root, registry=unmeasured
+    )
     ones = dict.fromkeys(here.statistics, (1.0, 1.0))
     trained = replace(
         here,
@@ -393,7 +398,7 @@ def test_another_size_than_that_of_the_training(
     valid = {"metric": "vorticity_nrmse", "best": 0.2, "validations": [[9, 0.2]]}
     budget = {"cpu_hours": 0.1, "steps": 9, **valid}
     result = run(
-        "scaled", start=0.5, facts=trained, size="tiny", training={"budget": budget}
+        "scaled", start=0.5, info=trained, size="tiny", training={"budget": budget}
     )
     assert (result.size, result.trained_size) == ("tiny", "mini")
     assert Scaled.told == replace(here, radius=1.0, statistics=ones)
@@ -410,12 +415,12 @@ def test_another_size_than_that_of_the_training(
         ("scaled", other, "tiny"),
         ("scaled", trained, "small"),
     )
-    for name, facts, size in wrong:
+    for name, info, size in wrong:
         with pytest.raises(UsageError):
-            run(name, size=size, facts=facts)
+            run(name, size=size, info=info)
     with pytest.raises(DataError):
-        run("scaled", size="tiny", facts=replace(trained, version="0.9.0"))
-    run("scaled", facts=replace(here, radius=0.5))
+        run("scaled", size="tiny", info=replace(trained, version="0.9.0"))
+    run("scaled", info=replace(here, radius=0.5))
     assert (
         Scaled.told.radius == 0.5
     )  # hashes do not hold it: at its own size that of the training counts
@@ -454,13 +459,13 @@ def test_no_image_falls_sideways(
     """
     root = tiny_split("fluid").root
     model = NeuralMPM.build(
-        {"symmetry": "mirror"}, facts_of("fluid", "tiny", root=root)
+        {"symmetry": "mirror"}, read_dataset_info("fluid", "tiny", root=root)
     )
     options = model.options.model_dump(mode="json")
     stored = Checkpoint(
         baseline="neuralmpm",
         options=options,
-        facts=model.facts,
+        info=model.info,
         weights=model.state_dict(),
         training={},
     )
@@ -484,25 +489,23 @@ def test_models_of_any_size_have_the_same_weights_at_each() -> None:
         for name in ("position", "velocity", "acceleration")
         for of in ("mean", "std")
     ]
-    small = replace(FACTS, statistics=dict.fromkeys(kinds, (0.5, 0.5)))
+    small = replace(INFO, statistics=dict.fromkeys(kinds, (0.5, 0.5)))
     large = replace(small, size="full", particles=12, radius=0.05)
     models = {
-        name: entry.model
-        for name, entry in every_entry().items()
-        if entry.model.any_size
+        name: entry.model for name, entry in load_all().items() if entry.model.any_size
     }
     assert (
         {"neuralmpm", "gns", "supergat"}
         <= set(models)
-        <= set(every_entry()) - {"mlp", "lstm", "var"}
+        <= set(load_all()) - {"mlp", "lstm", "var"}
     )
     for model in models.values():
         shapes = [
             {
                 name: value.shape
-                for name, value in model.build({}, facts).state_dict().items()
+                for name, value in model.build({}, info).state_dict().items()
             }
-            for facts in (small, large)
+            for info in (small, large)
         ]
         assert shapes[0] == shapes[1], model.method
 
@@ -583,7 +586,7 @@ def test_weights_of_an_unfinished_training(
         b"[" * 100_000,
         json.dumps({**UNFINISHED, "step": "9", "steps": {}}).encode(),
         b'{"state": "running", "step": 9, "steps": 70, "recipe": {"name": "another"}}',
-        json.dumps(UNFINISHED).encode() + b" " * MOST_RECORD,
+        json.dumps(UNFINISHED).encode() + b" " * LARGEST_LOG,
         "a pipe, which nobody writes to",
     ],
 )
@@ -628,6 +631,6 @@ def test_threads_are_those_asked_for(
     """
     monkeypatch.setenv("OMP_NUM_THREADS", environment)
     before = torch.get_num_threads()
-    with threads_used(count, processes=processes):
+    with use_threads(count, processes=processes):
         assert torch.get_num_threads() == expected
     assert torch.get_num_threads() == before

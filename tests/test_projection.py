@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from simple_models import facts, jittered
+from simple_models import info, jittered
 from torch import Tensor
 
 from lagbench.baselines.particle_grid import ParticleGrid
-from lagbench.baselines.projection import HEAVY, Density, Projection, Shape
+from lagbench.baselines.projection import (
+    LEARNING_SCALE,
+    DensityProjection,
+    Projection,
+    ShapeMatching,
+)
 
-BOUNDS = facts().bounds
+BOUNDS = info().bounds
 
 
 def body(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
@@ -22,16 +27,20 @@ def body(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
     return torch.from_numpy(jittered(seed, low=low, high=high)).double()
 
 
-def shape(position: Tensor, cells: int = 8) -> Shape:
+def shape(position: Tensor, cells: int = 8) -> ShapeMatching:
     """Return the clusters of one body in double precision."""
     grid = ParticleGrid(BOUNDS, cells).double()
-    return Shape.of(grid, position, torch.zeros(len(position), dtype=torch.int64), 1)
+    return ShapeMatching.build(
+        grid, position, torch.zeros(len(position), dtype=torch.int64), 1
+    )
 
 
-def crowd(position: Tensor) -> Density:
+def crowd(position: Tensor) -> DensityProjection:
     """Return the densities of one window in double precision."""
     grid = ParticleGrid(BOUNDS, 8).double()
-    return Density.of(grid, position, torch.zeros(len(position), dtype=torch.int64), 1)
+    return DensityProjection.build(
+        grid, position, torch.zeros(len(position), dtype=torch.int64), 1
+    )
 
 
 def turn(position: Tensor, angle: float) -> Tensor:
@@ -46,7 +55,7 @@ def test_rigid_motion_is_left_as_it_is(angle: float) -> None:
     """However far a body turns and flies, it has its shape."""
     first = body(0)
     moved = turn(first, angle) + torch.tensor([0.1, -0.2])
-    torch.testing.assert_close(shape(first).matched(moved), moved, rtol=0, atol=1e-9)
+    torch.testing.assert_close(shape(first).match(moved), moved, rtol=0, atol=1e-9)
 
 
 def test_clusters_turn_as_scipy_says() -> None:
@@ -55,7 +64,7 @@ def test_clusters_turn_as_scipy_says() -> None:
     first = body(0, low=0.4, high=0.6)[:40]
     now = turn(first, 0.7) + torch.from_numpy(rng.normal(0.0, 0.01, (40, 2)))
     found = shape(first, cells=6)
-    weight = np.zeros((found.nodes, 40))
+    weight = np.zeros((found.node_count, 40))
     for particle, (nodes, shares) in enumerate(
         zip(found.stencil.node.view(-1, 9), found.stencil.weight, strict=True)
     ):
@@ -68,7 +77,7 @@ def test_clusters_turn_as_scipy_says() -> None:
         angle = best.as_rotvec()[2]  # in the plane: no other axis
         flat = Rotation.from_rotvec([0.0, 0.0, angle])
         expected += each[:, None] * (there + flat.apply(x - here))[:, :2]
-    np.testing.assert_allclose(found.matched(now).numpy(), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.match(now).numpy(), expected, rtol=0, atol=1e-9)
 
 
 def test_shape_matching_keeps_both_momenta_and_restores_the_shape() -> None:
@@ -79,7 +88,7 @@ def test_shape_matching_keeps_both_momenta_and_restores_the_shape() -> None:
     first = body(0)
     found = shape(body(0))
     now = turn(first, 0.3) + torch.from_numpy(rng.normal(0.0, 0.02, first.shape))
-    there = found.matched(now)
+    there = found.match(now)
     pushed = there - now
     torch.testing.assert_close(
         pushed.sum(dim=0), torch.zeros(2).double(), rtol=0, atol=1e-9
@@ -96,7 +105,7 @@ def test_a_lone_particle_has_finite_gradients() -> None:
     """It has no direction and stays where it is."""
     first = torch.tensor([[0.51, 0.52]], dtype=torch.float64)
     now = torch.tensor([[0.3, 0.4]], dtype=torch.float64, requires_grad=True)
-    there = shape(first).matched(now)
+    there = shape(first).match(now)
     there.sum().backward()
     torch.testing.assert_close(there, now)
     assert bool(now.grad.isfinite().all())
@@ -116,11 +125,11 @@ def test_a_full_box_is_evenly_dense(cells: int, sides: tuple[float, float]) -> N
     lattice = torch.cartesian_prod(*axes)
     one = torch.zeros(150**2, dtype=torch.int64)
     grid = ParticleGrid(bounds, cells).double()
-    found = Density.of(grid, lattice, one, 1)
-    rho, mass = found.relative(grid.stencil(lattice, one))
+    found = DensityProjection.build(grid, lattice, one, 1)
+    rho, mass = found.relative_density(grid.stencil(lattice, one))
     torch.testing.assert_close(rho, torch.ones_like(rho), rtol=4e-3, atol=0)
     assert float(mass.sum()) == pytest.approx(150**2)
-    assert float(found.most) == pytest.approx(
+    assert float(found.greatest) == pytest.approx(
         (150 * grid.spacing) ** 2 / (sides[0] * sides[1]), rel=4e-3
     )
 
@@ -133,16 +142,18 @@ def test_what_is_pressed_together_comes_apart(shift: tuple[float, float]) -> Non
     first = torch.cat([body(0, 0.3, 0.45), body(1, 0.3, 0.45) - torch.tensor(shift)])
     found = crowd(first)
     limit = torch.ones(len(first)).double()
-    assert torch.equal(found.eased(first, torch.tensor(1.0), limit), first)
+    assert torch.equal(found.correct(first, torch.tensor(1.0), limit), first)
     now = first.clone()
     now[256:] += torch.tensor(shift)
     there = now
     most = []
     for _ in range(12):
         most.append(
-            float(found.relative(found.grid.stencil(there, found.sample))[0].max())
+            float(
+                found.relative_density(found.grid.stencil(there, found.sample))[0].max()
+            )
         )
-        there = found.eased(there, torch.tensor(1.0), limit)
+        there = found.correct(there, torch.tensor(1.0), limit)
     torch.testing.assert_close(there.mean(dim=0), now.mean(dim=0), rtol=0, atol=1e-9)
     assert most[0] > 1.6
     assert most[-1] < 1.15
@@ -154,17 +165,19 @@ def test_a_heap_is_not_thrown_apart() -> None:
     """
     found = crowd(body(0))
     heap = 0.5 + 0.2 * (body(1) - 0.5)
-    moved = found.eased(heap, torch.tensor(1.0), torch.ones(256).double()) - heap
+    moved = found.correct(heap, torch.tensor(1.0), torch.ones(256).double()) - heap
     assert 1.0 < float(moved.norm(dim=1).max()) / found.grid.spacing < 2.5
 
 
 def test_nothing_spins_by_rounding() -> None:
     """In single precision a body at rest stays there for hundreds of frames."""
     first = body(0).float()
-    found = Shape.of(ParticleGrid(BOUNDS, 15), first, torch.zeros(256).long(), 1)
+    found = ShapeMatching.build(
+        ParticleGrid(BOUNDS, 15), first, torch.zeros(256).long(), 1
+    )
     there = first
     for _ in range(300):
-        there = found.matched(there)
+        there = found.match(there)
     assert float((there - first).abs().max()) < 5e-5
 
 
@@ -179,13 +192,13 @@ def test_shares_and_limits_are_those_of_their_material() -> None:
     model = Projection(BOUNDS, shape=(8,), density=())
     shares = torch.tensor([0.25, 0.75])
     with torch.no_grad():
-        model.held.copy_(shares.logit() / HEAVY)
+        model.held.copy_(shares.logit() / LEARNING_SCALE)
     found = model(model.start(first, material, sample, 1), now)
     for kind, share in ((1, 0.25), (3, 0.75)):
         own = material == kind
-        there = Shape.of(ParticleGrid(BOUNDS, 8), first[own], sample[own], 1).matched(
-            now[own]
-        )
+        there = ShapeMatching.build(
+            ParticleGrid(BOUNDS, 8), first[own], sample[own], 1
+        ).match(now[own])
         torch.testing.assert_close(
             found[own], now[own] + share * (there - now[own]), rtol=0, atol=1e-6
         )
@@ -195,10 +208,10 @@ def test_shares_and_limits_are_those_of_their_material() -> None:
         model.limit[1] = 1.0
     drawn = model.start(first, material, sample, 1)
     limit = torch.where(material == 1, 1.2, 1.0)
-    expected = drawn.densities[0].eased(pressed, torch.tensor(1.0), limit)
+    expected = drawn.densities[0].correct(pressed, torch.tensor(1.0), limit)
     torch.testing.assert_close(model(drawn, pressed), expected, rtol=0, atol=1e-7)
     assert not torch.allclose(
-        expected, drawn.densities[0].eased(pressed, torch.tensor(1.0), 0 * limit + 1)
+        expected, drawn.densities[0].correct(pressed, torch.tensor(1.0), 0 * limit + 1)
     )
 
 

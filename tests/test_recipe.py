@@ -13,18 +13,18 @@ from typing import Any, Literal
 import pytest
 import torch
 from pydantic import ValidationError
-from simple_models import Drift, batch, facts, install, rolled, swirl
+from simple_models import Drift, batch, info, install, rolled, swirl
 
 from lagbench.baselines.baseline import Baseline, Settings
-from lagbench.baselines.catalogue import Entry, every_entry, find, names
-from lagbench.baselines.job import settings_of
+from lagbench.baselines.catalogue import CatalogueEntry, find, list_names, load_all
 from lagbench.baselines.recipe import (
     Schedule,
     TrainingOptions,
-    changed_options,
+    change_options,
     recipe_for,
     recipe_names,
 )
+from lagbench.baselines.recipe_changes import list_settings
 from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 
@@ -41,16 +41,16 @@ recipes:
 
 
 @pytest.fixture
-def entry(tmp_path: Path) -> Entry:
+def entry(tmp_path: Path) -> CatalogueEntry:
     """A baseline with recipes of its own."""
     path = tmp_path / "drift.yaml"
     path.write_text(TEXT)
-    return Entry(name="drift", model=Drift, recipes=path)
+    return CatalogueEntry(name="drift", model=Drift, recipes=path)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", list_names())
 def test_every_recipe_is_right(name: str) -> None:
-    """Every recipe of every baseline names a split and size of ours, and its options
+    """Every recipe of every baseline list_names a split and size of ours, and its options
     are accepted.
     """
     entry = find(name)
@@ -112,7 +112,7 @@ def test_options_of_the_training(name: str) -> None:
     """
     baseline = find(name)
     torch.manual_seed(0)
-    plain = baseline.model.build({}, facts())
+    plain = baseline.model.build({}, info())
     for part in plain.parameters():  # an untrained NeuralMPM changes nothing
         torch.nn.init.normal_(part, std=0.05)
     changes = {option: OTHER[option] for option in baseline.model.Options.in_training}
@@ -121,7 +121,7 @@ def test_options_of_the_training(name: str) -> None:
         for key, value in changes.items()
         if (name, key) != ("supergat", "noise_std")
     }
-    other = baseline.model.build(unseen, facts())
+    other = baseline.model.build(unseen, info())
     other.load_state_dict(plain.state_dict())
     given = batch(swirl(0, plain.history))
     given = replace(given, material=torch.zeros_like(given.material))
@@ -130,8 +130,8 @@ def test_options_of_the_training(name: str) -> None:
     for option in changes:
         setting = f"model.{option}={json.dumps(OTHER[option])}"
         with pytest.raises(UsageError):
-            changed_options(baseline, stored, [setting])
-    assert changed_options(baseline, stored, []) == stored
+            change_options(baseline, stored, [setting])
+    assert change_options(baseline, stored, []) == stored
 
 
 @pytest.mark.parametrize(
@@ -153,11 +153,11 @@ def test_weights_keep_their_meaning(name: str, option: str, value: str) -> None:
     setting = f"model.{option}={value}"
     stored = baseline.model.Options().model_dump(mode="json")
     with pytest.raises(UsageError):
-        changed_options(baseline, stored, [setting])
-    assert changed_options(baseline, {**stored, option: value}, [setting])
+        change_options(baseline, stored, [setting])
+    assert change_options(baseline, {**stored, option: value}, [setting])
 
 
-def test_layers(entry: Entry, tmp_path: Path) -> None:
+def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
     """Settings win over the recipe, and the recipe over the defaults of the file, which
     may be one's own.
 
@@ -219,7 +219,7 @@ def test_committed_trainings_lack_no_option() -> None:
     for path, recipe in {
         recipe["baseline"]: (p, recipe) for p, recipe in held.items() if recipe
     }.values():
-        settings = settings_of(recipe)
+        settings = list_settings(recipe)
         now = recipe_for(
             find(recipe["baseline"]), *path.parts[-3:-1], settings=settings
         ).as_json()
@@ -259,7 +259,7 @@ def test_settings_lead_back_to_the_recipe(name: str, given: tuple[str, ...]) -> 
         entry, "cavity", "mini", settings=[*given, "training.log_every=3"], seed=5
     )
     record = json.loads(json.dumps(recipe.as_json()))
-    told = settings_of(record)
+    told = list_settings(record)
     assert {one.partition("=")[0] for one in given} <= {
         one.partition("=")[0] for one in told
     }
@@ -270,7 +270,7 @@ def test_settings_lead_back_to_the_recipe(name: str, given: tuple[str, ...]) -> 
         == recipe
     )
     assert (
-        settings_of(
+        list_settings(
             recipe_for(
                 entry, "cavity", "mini", settings=["training.log_every=3"]
             ).as_json()
@@ -288,7 +288,7 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
     good = recipe_for(
         find("gns"), "cavity", "mini", settings=["training.steps=7"]
     ).as_json()
-    assert settings_of(good) == ("training.steps=7",)
+    assert list_settings(good) == ("training.steps=7",)
     for change in (
         *({"name": f"cavity/mini-{path}"} for path in (own, tmp_path / "absent.yaml")),
         *(
@@ -299,8 +299,8 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
         ),
         {"training": [1]},
     ):
-        assert settings_of({**good, **change}) == (), change
-    assert settings_of({**good, "model": None}) == ("training.steps=7",)
+        assert list_settings({**good, **change}) == (), change
+    assert list_settings({**good, "model": None}) == ("training.steps=7",)
     for odd in (
         "x" * 1000,
         "a\n\x1b[31m\ud800",
@@ -309,7 +309,7 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
         [[0] * 1000],
         {"steps": {"a": "b"}},
     ):
-        (told,) = settings_of(
+        (told,) = list_settings(
             {**good, "training": {**good["training"], "steps": odd, "unknown": 1}}
         ) or ("",)
         assert (len(told) < 250, told.isprintable(), told.isascii()) == (
@@ -317,10 +317,10 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
             True,
             True,
         )
-    assert settings_of(None) == settings_of([good]) == ()
+    assert list_settings(None) == list_settings([good]) == ()
 
 
-def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
+def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
     """A later layer that counts epochs drops the steps below it; in one layer both are
     refused.
     """
@@ -355,14 +355,16 @@ def test_steps_and_epochs_replace_each_other(entry: Entry) -> None:
         ("model.start=true", "model.start"),
     ],
 )
-def test_mistakes_in_settings(entry: Entry, setting: str, message: str) -> None:
-    """A wrong setting is a usage error that names key and remedy."""
+def test_mistakes_in_settings(
+    entry: CatalogueEntry, setting: str, message: str
+) -> None:
+    """A wrong setting is a usage error that list_names key and remedy."""
     with pytest.raises(UsageError, match=message):
         recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
-def test_no_such_recipe(entry: Entry) -> None:
-    """A split or variant without a recipe is a usage error that names the nearest."""
+def test_no_such_recipe(entry: CatalogueEntry) -> None:
+    """A split or variant without a recipe is a usage error that list_names the nearest."""
     bare = replace(entry, recipes=None)
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
     for asked, split, size, variant, words in (
@@ -408,7 +410,7 @@ def test_no_such_recipe(entry: Entry) -> None:
     ],
 )
 def test_mistakes_in_files(
-    entry: Entry, tmp_path: Path, text: str, message: str
+    entry: CatalogueEntry, tmp_path: Path, text: str, message: str
 ) -> None:
     """A file that is none of recipes is unreadable, and the message says where."""
     path = tmp_path / "wrong.yaml"
@@ -428,13 +430,17 @@ def test_schedules_equal_torch() -> None:
     decay = Schedule(kind="exponential", factor=0.1, every=20)
     for step in range(50):
         assert math.isclose(
-            ours.at(step, steps=50), optimizer.param_groups[0]["lr"], rel_tol=1e-9
+            ours.factor_at(step, steps=50),
+            optimizer.param_groups[0]["lr"],
+            rel_tol=1e-9,
         )
-        assert math.isclose(decay.at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12)
+        assert math.isclose(
+            decay.factor_at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12
+        )
         optimizer.step()
         cosine.step()
     # it rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1
-    assert [Schedule().at(step, steps=10, warmup=3) for step in range(5)] == [
+    assert [Schedule().factor_at(step, steps=10, warmup=3) for step in range(5)] == [
         0.25,
         0.5,
         0.75,
@@ -503,11 +509,11 @@ def test_other_packages_add_baselines(
 
 def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """What lacks methods or is no baseline cannot be loaded and only warns beside
-    others, as odd names do.
+    others, as odd list_names do.
     """
     install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
     with pytest.warns(UserWarning, match="adds no baseline") as told:
-        found = every_entry()
+        found = load_all()
     words = " ".join(str(warning.message) for warning in told)
     assert all(
         f"'{name}'" in words and name not in found
@@ -528,5 +534,5 @@ def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> 
 def test_the_page_of_the_baselines_is_complete() -> None:
     """docs/baselines.md names every baseline and every option of a training."""
     page = (Path(__file__).parents[1] / "docs/baselines.md").read_text()
-    for word in (*names(), *TrainingOptions.model_fields):
+    for word in (*list_names(), *TrainingOptions.model_fields):
         assert f"`{word}`" in page, word

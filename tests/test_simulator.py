@@ -12,7 +12,7 @@ from simple_models import (
     RADIUS,
     SMALL,
     batch,
-    facts,
+    info,
     jittered,
     network,
     oracle,
@@ -20,9 +20,9 @@ from simple_models import (
     swirl,
 )
 
-from lagbench.baselines.augmentation import image
+from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.operators.gns import GNS
-from lagbench.baselines.simulator import GraphNetwork, State
+from lagbench.baselines.simulator import GraphNetwork, ParticleState
 from lagbench.errors import UsageError
 
 
@@ -114,7 +114,7 @@ def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     given.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
     matrix[:, axis, axis] = -1.0
-    turned = image(given, matrix, facts().bounds)
+    turned = mirror_batch(given, matrix, info().bounds)
     model = network(awake=True, target=target, wall_velocity=True)
     here, there, plain = (
         rolled(m, w, 3)
@@ -169,10 +169,10 @@ def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
     given = batch(swirl(0, 7))
     model = network()
     following = model.start(given.part(slice(1, 7)))
-    moved = model.start(given.part(slice(6))).moved(
+    moved = model.start(given.part(slice(6))).move(
         following.position, following.velocity[:, -1]
     )
-    for field in fields(State):
+    for field in fields(ParticleState):
         one = getattr(moved, field.name)
         other = getattr(following, field.name)
         assert one is other is None or torch.equal(one, other)
@@ -202,7 +202,7 @@ def test_walls_move_per_frame() -> None:
     seen = []
     for _ in range(3):
         seen.append(float(state.wall_velocity[0, 0, 0, 0]))
-        state = state.moved(state.position, state.velocity[:, -1])
+        state = state.move(state.position, state.velocity[:, -1])
     assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 
@@ -234,7 +234,7 @@ def test_no_rollout_leaves_the_box(target: str) -> None:
     model = network(awake=True, target=target)
     torch.nn.init.normal_(model.network.decoder[-1].bias, std=50.0)
     found = rolled(model, batch(swirl(0, 6)), 30)
-    low, high = torch.tensor(facts().bounds).T
+    low, high = torch.tensor(info().bounds).T
     assert bool(((found >= low) & (found <= high)).all())
     assert bool(((found == low) | (found == high)).any())  # some did try
 
@@ -246,7 +246,7 @@ class Watched(GraphNetwork):
     method = "watched"
 
     def predict(
-        self, state: State, *_: object
+        self, state: ParticleState, *_: object
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Keep the state."""
         self.seen = [*getattr(self, "seen", []), state]
@@ -256,7 +256,7 @@ class Watched(GraphNetwork):
 def test_noise_stays_in_the_box() -> None:
     """Particles that rest at a wall are disturbed to its inner side only."""
     resting = np.repeat([[[0.9375, 0.3 + 0.05 * i] for i in range(8)]], 7, axis=0)
-    model = Watched.build(SMALL | {"noise_std": 1e-3}, facts())
+    model = Watched.build(SMALL | {"noise_std": 1e-3}, info())
     model(batch(resting), torch.Generator().manual_seed(0))
     x = model.seen[0].position[:, 0]
     assert float(x.min()) < float(x.max()) == 0.9375
@@ -295,7 +295,7 @@ def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
         found.append(state.position)
     assert torch.equal(found[0], found[1])
     changed = (found[0] - found[2]).abs().amax(dim=1) > 0
-    low, high = torch.tensor(facts().bounds).T
+    low, high = torch.tensor(info().bounds).T
     place = window.position[:, 5]
     near = torch.minimum(place - low, high - place).amin(dim=1)
     assert bool(changed[near < 0.9 * RADIUS].all())
@@ -309,7 +309,7 @@ def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
     but all of them.
     """
     window = batch(*(swirl(seed, 7) for seed in range(24)))
-    model = Watched.build(SMALL | {"forgetful": 1.0}, facts())
+    model = Watched.build(SMALL | {"forgetful": 1.0}, info())
     model(window, torch.Generator().manual_seed(0))
     starts = [
         model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)

@@ -16,9 +16,9 @@ import pytest
 import torch
 from simple_models import Drift, trainer
 
-from lagbench.baselines.baseline import Facts
+from lagbench.baselines.baseline import DatasetInfo
 from lagbench.baselines.checkpoint import Checkpoint, load, save
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import predict, provenance_of
 from lagbench.baselines.train import TrainingResult
 from lagbench.data.checksums import file_sha256
@@ -56,9 +56,9 @@ class AnySize(Drift):
         unit: float = 1.0
         share: float = 1.0
 
-    def __init__(self, options: Any, facts: Facts) -> None:
-        super().__init__(options, facts)
-        self.speed = facts.statistics["velocity_std"][0]
+    def __init__(self, options: Any, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        self.speed = info.statistics["velocity_std"][0]
 
     def advance(self, state: Any) -> Any:
         """Drift by a share of what is usual."""
@@ -83,22 +83,24 @@ def run(
 def stored(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path
 ) -> Callable[..., Path]:
-    """Store weights of a made-up training; ``facts`` change those of the data."""
+    """Store weights of a made-up training; ``info`` change those of the data."""
 
     def call(
         baseline: str = "any",
         *,
-        facts: Changes = None,
+        info: Changes = None,
         model: Changes = None,
         weights: Changes = None,
         **more: Any,
     ) -> Path:
-        here = facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+        here = read_dataset_info(
+            "curl-noise", "tiny", root=generated.root, registry=unmeasured
+        )
         built = AnySize.build({"start": 0.5, **(model or {})}, here)
         checkpoint = Checkpoint(
             baseline=baseline,
             options=built.options.model_dump(),
-            facts=replace(here, **(facts or {})),
+            info=replace(here, **(info or {})),
             weights=weights or built.state_dict(),
             training={"step": 9, "recipe": {"name": "curl-noise/mini-made-up"}, **more},
         )
@@ -128,7 +130,7 @@ def test_it_goes_on_where_the_weights_are(
         "statistics": units,
         "radius": 0.5,
     }
-    start = stored(facts=other if size == "mini" else None, model={"share": 0.5})
+    start = stored(info=other if size == "mini" else None, model={"share": 0.5})
     result = run("any", *STILL, start=start)  # the recipe's share is another
     options: dict[str, Any] = {
         "root": generated.root,
@@ -268,7 +270,7 @@ def test_facts_are_those_of_the_data(run: Run, stored: Callable[..., Path]) -> N
         "score_placement": "odd",
         "bounds": ((0.4, 0.6), (0.4, 0.6)),
     }
-    odd = run("any", "steps=2", start=stored(facts=told), to="odd")
+    odd = run("any", "steps=2", start=stored(info=told), to="odd")
     assert odd.best_value == plain.best_value
 
 
@@ -299,16 +301,16 @@ def test_it_can_be_interrupted(run: Run, stored: Callable[..., Path]) -> None:
     ("baseline", "start", "kind"),
     [
         ("drift", {}, UsageError),  # of another baseline
-        ("any", {"facts": {"split": "fluid"}}, UsageError),
-        ("any", {"facts": {"dataset_sha256": "0" * 64}}, DataError),
-        ("any", {"facts": {"size": "mini", "version": "0.9.0"}}, DataError),
-        ("any", {"facts": {"size": "mini", "frame_interval": 9.0}}, UsageError),
+        ("any", {"info": {"split": "fluid"}}, UsageError),
+        ("any", {"info": {"dataset_sha256": "0" * 64}}, DataError),
+        ("any", {"info": {"size": "mini", "version": "0.9.0"}}, DataError),
+        ("any", {"info": {"size": "mini", "frame_interval": 9.0}}, UsageError),
         (
             "drift",
-            {"baseline": "drift", "facts": {"size": "mini"}},
+            {"baseline": "drift", "info": {"size": "mini"}},
             UsageError,
         ),  # for one size only
-        ("any", {"facts": {"statistics": {}}}, UnreadableFileError),
+        ("any", {"info": {"statistics": {}}}, UnreadableFileError),
         *(
             (
                 "any",

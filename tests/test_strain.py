@@ -9,21 +9,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from simple_models import batch, facts, jittered
+from simple_models import batch, info, jittered
 from torch import Tensor
 
-from lagbench.baselines.augmentation import image
+from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.particle_grid import ParticleGrid
-from lagbench.baselines.strain import UNIT, Rest, first_frame
+from lagbench.baselines.strain import UNIT, RestShape, first_frame
 from lagbench.errors import UsageError
 
-BOUNDS = facts().bounds
+BOUNDS = info().bounds
 
 
-def rest(position: Tensor, *, bodies: int = 1) -> Rest:
+def rest(position: Tensor, *, bodies: int = 1) -> RestShape:
     """Return the first frame of bodies whose particles take turns."""
     layer = torch.arange(len(position)) % bodies
-    return Rest.of(ParticleGrid(BOUNDS, 12, multiple=4), position, layer, bodies)
+    return RestShape.build(
+        ParticleGrid(BOUNDS, 12, multiple=4), position, layer, bodies
+    )
 
 
 def cloud(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
@@ -73,7 +75,7 @@ def test_an_image_is_strained_as_an_image() -> None:
     """A mirror image in x has the same xx and yy, and the opposite xy."""
     frames = torch.stack([cloud(0), cloud(0) @ torch.tensor([[1.05, 0.1], [0.0, 0.9]])])
     given = replace(batch(frames.numpy()), origin=frames[0])
-    mirrored = image(given, torch.tensor([[[-1.0, 0.0], [0.0, 1.0]]]), BOUNDS)
+    mirrored = mirror_batch(given, torch.tensor([[[-1.0, 0.0], [0.0, 1.0]]]), BOUNDS)
     here, there = (
         rest(first_frame(one)).strain(one.position[:, 1]) for one in (given, mirrored)
     )

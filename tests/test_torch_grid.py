@@ -40,7 +40,7 @@ def fields(
     x: Tensor, u: Tensor, grid: Grid, *, full: float, counted: Any = None, **where: Any
 ) -> Any:
     """Return the fields of particles."""
-    return torch_grid.fields(
+    return torch_grid.tensor_fields(
         torch_grid.transfer(x, u, grid, **where), grid, full, counted
     )
 
@@ -283,7 +283,7 @@ def test_stresses_push_as_the_slopes_of_the_splines_say() -> None:
     stress = torch.randn(200, 3, 3, generator=rng)
     stencil = grid.stencil(place, layer)
     mass = grid.spread(stencil, torch.ones_like(place[:, :1]), 2)
-    found = grid.pushed(stencil, place, stress, mass)
+    found = grid.accelerate(stencil, place, stress, mass)
     moved = place.clone().requires_grad_()
     weight = grid.stencil(moved, layer).weight
     each = [

@@ -21,13 +21,13 @@ import pytest
 import torch
 from file_size_limit import largest_file
 from scipy.special import comb
-from simple_models import FACTS, Drift, trainer
+from simple_models import INFO, Drift, trainer
 
 from lagbench.baselines.baseline import Batch
 from lagbench.baselines.checkpoint import load, save
-from lagbench.baselines.job import RunFolder
-from lagbench.baselines.module import TrainingModule
+from lagbench.baselines.optimisation import Optimisation
 from lagbench.baselines.recipe import TrainingOptions
+from lagbench.baselines.run_folder import RunFolder
 from lagbench.baselines.train import StepBatches, TrainingResult, train
 from lagbench.data.registry import Registry
 from lagbench.errors import DataError, UsageError, WorkFailedError
@@ -286,13 +286,12 @@ def test_folders_are_guarded(run: Run) -> None:
 
 def test_learning_rate_follows_the_processes() -> None:
     """Thesis section 5.7.3: the rate is multiplied by the number of processes."""
-    model = Drift.build({}, FACTS)
+    model = Drift.build({}, INFO)
     options = TrainingOptions(steps=5, learning_rate=0.01)
     one, three = (
-        TrainingModule(
+        Optimisation(
             model,
             options,
-            loader=lambda *_: NotImplemented,
             steps=5,
             processes=processes,
         )

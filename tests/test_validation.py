@@ -16,7 +16,7 @@ import torch
 from simple_models import Drift, trainer
 
 from lagbench.baselines.checkpoint import load, restore
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.baselines.predict import predict
 from lagbench.baselines.recipe import TrainingOptions
 from lagbench.baselines.rollout import Validation
@@ -126,7 +126,7 @@ def test_how_often() -> None:
         (6300, 1, 720, 1),
         (10, 1, 720, 1),
     ):
-        count = options.validations(steps, trained=trained, rolled=rolled)
+        count = options.count_validations(steps, trained=trained, rolled=rolled)
         at = [
             s
             for s in range(1, steps + 1)
@@ -191,7 +191,10 @@ def test_fewer_frames_for_tests(
     )
     short = replace(task, config=replace(task.config, horizon=4))
     model = Drift.build(
-        {}, facts_of("curl-noise", "tiny", root=generated.root, registry=unmeasured)
+        {},
+        read_dataset_info(
+            "curl-noise", "tiny", root=generated.root, registry=unmeasured
+        ),
     )
     model.load_state_dict(dict(load(result.checkpoint).weights))
     whole = dict.fromkeys(task.scenarios, 20)

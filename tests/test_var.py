@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from simple_models import batch_of, facts_of, rolled, rotations, share_of_persistence
+from simple_models import batch_of, info_of, rolled, rotations, share_of_persistence
 from statsmodels.tsa.api import VAR as StatsmodelsVAR
 
 from lagbench.baselines.var import (
@@ -161,7 +161,7 @@ def test_the_model_fits_what_statsmodels_fits() -> None:
     states.
     """
     scenario = wandering(1, frames=200)[0]
-    model = VAR.build({}, facts_of([scenario]))
+    model = VAR.build({}, info_of([scenario]))
     report = model.fit(iter([scenario]))
     expected = (
         StatsmodelsVAR(model.states(scenario).astype(float)).fit(1, trend="c").params
@@ -181,7 +181,7 @@ def test_a_linear_motion_is_forecast() -> None:
     scenarios = list(
         (0.5 + rng.uniform(0.05, 0.3, shape) * np.cos(angle)).astype(np.float32)
     )
-    model = VAR.build({}, facts_of(scenarios))
+    model = VAR.build({}, info_of(scenarios))
     model.fit(scenarios[:19])
     assert share_of_persistence(model, scenarios[19], frames=30) < 1e-6
 
@@ -191,7 +191,7 @@ def test_lags_count_from_the_latest_frame() -> None:
     before.
     """
     scenario = wandering(1)[0]
-    model = VAR.build({"lags": 2}, facts_of([scenario]))
+    model = VAR.build({"lags": 2}, info_of([scenario]))
     model.coefficients.copy_(
         torch.from_numpy(np.random.default_rng(0).normal(0, 0.1, (49, 24)))
     )
@@ -208,12 +208,12 @@ def test_lags_count_from_the_latest_frame() -> None:
 def test_one_step_of_training_and_of_a_rollout_agree() -> None:
     """The loss terms of a window are the errors of the rollout's first step."""
     scenarios = wandering(3)
-    model = VAR.build({}, facts_of(scenarios))
+    model = VAR.build({}, info_of(scenarios))
     model.fit(scenarios)
     window = scenarios[0][10:13]
     step = rolled(model, batch_of([window[:2]]), 1)[:, 0]
     error = (step - torch.from_numpy(window[2])) / torch.tensor(
-        model.facts.statistics["position_std"]
+        model.info.statistics["position_std"]
     )
     found = float(model(batch_of([window]))["position"])
     assert found == pytest.approx(float(error.square().mean()), rel=1e-3)
@@ -224,9 +224,9 @@ def test_without_ridge_and_truncation_stable_is_plain() -> None:
     states.
     """
     scenarios = wandering(4)
-    facts = facts_of(scenarios)
-    plain = VAR.build({}, facts)
-    stable = StableVAR.build({"rank": 1000, "ridge": 0}, facts)
+    info = info_of(scenarios)
+    plain = VAR.build({}, info)
+    stable = StableVAR.build({"rank": 1000, "ridge": 0}, info)
     plain.fit(scenarios)
     report = stable.fit(scenarios)
     assert report["variance"] == pytest.approx(1.0)
@@ -243,12 +243,12 @@ def test_a_heavy_ridge_leaves_persistence() -> None:
     velocity.
     """
     scenarios = rotations(24)
-    light = StableVAR.build({"rank": 6, "ridge": 1e-3}, facts_of(scenarios))
+    light = StableVAR.build({"rank": 6, "ridge": 1e-3}, info_of(scenarios))
     light.fit(scenarios)
     assert (
         share_of_persistence(light, rotations(30)[-1], frames=20) < 0.1
     )  # from a new angle
-    model = StableVAR.build({"ridge": 1e9}, facts_of(scenarios))
+    model = StableVAR.build({"ridge": 1e9}, info_of(scenarios))
     model.fit(scenarios)
     given = batch_of([scenarios[0][:2]])
     step = rolled(model, given, 1)[:, 0] - given.position[:, -1]
@@ -261,11 +261,11 @@ def test_stable_holds_where_plain_diverges() -> None:
     stable does not.
     """
     scenarios = wandering(2, frames=60, particles=25)
-    facts = facts_of(scenarios)
+    info = info_of(scenarios)
     far = []
     for model in (
-        VAR.build({}, facts),
-        StableVAR.build({"rank": 8, "ridge": 1.0}, facts),
+        VAR.build({}, info),
+        StableVAR.build({"rank": 8, "ridge": 1.0}, info),
     ):
         model.fit(scenarios)
         far.append(

@@ -1,6 +1,6 @@
 """GAT and GATv2: attention from a node, its neighbour and their edge.
 
-GAT adds up what each of them says; in GATv2 the ranking of neighbours depends on the
+GAT adds one score of each of them; in GATv2 the ranking of neighbours depends on the
 node.
 """
 

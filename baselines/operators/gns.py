@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .operator import Losses, Operator, summed
+from .operator import Losses, Operator, sum_edges
 
 
 class GNS(Operator):
@@ -14,9 +14,9 @@ class GNS(Operator):
     .. math:: a_i = \sum_j m_{ij}
 
     With the network's node MLP:
-    :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. It gathers the
-    same with the option ``sum_messages: false``, which changes other operators' node
-    inputs.
+    :math:`x_i' = \mathrm{MLP}([x_i \Vert \textstyle\sum_j m_{ij}])`. The option
+    ``sum_messages: false``, which changes other operators' node inputs, changes nothing
+    here.
     """
 
     method = "GNS"
@@ -30,5 +30,5 @@ class GNS(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
-        return summed(edge_index, edge, len(node)), {}
+        """Return the aggregate of each node."""
+        return sum_edges(edge_index, edge, len(node)), {}

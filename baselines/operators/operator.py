@@ -1,4 +1,4 @@
-"""The contract of an operator: how a particle gathers what its neighbours tell it."""
+"""The contract of an operator: how a node aggregates the messages of its edges."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-__all__ = ["Losses", "Operator", "summed"]
+__all__ = ["Losses", "Operator", "sum_edges"]
 
 Losses = Mapping[str, Tensor]  # losses of an operator's own by name, each a scalar
 
@@ -17,13 +17,15 @@ Losses = Mapping[str, Tensor]  # losses of an operator's own by name, each a sca
 class Operator(nn.Module):
     """An aggregation; node MLP, LayerNorm and residual follow it in the network.
 
-    Class attributes: method: what the board calls a graph network with this operator.
-        weights: weight of each of its own losses in training. reads_nodes: whether it
-        looks at the nodes; else they are not put beside the sums for it.
+    Class attributes:
+        method: name of a graph network with this operator on the board.
+        weights: weight of each of its own losses in training.
+        reads_nodes: whether it reads the nodes; else the network does not sum the
+            messages for it.
 
     Args:
         inputs: width of a node's input.
-        latent: width of an edge and of what is gathered.
+        latent: width of an edge and of the aggregate.
         hidden: width of hidden layers, if it has any.
     """
 
@@ -46,7 +48,7 @@ class Operator(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers, and losses of its own if any.
+        """Return the aggregate of each node, and losses of the operator if any.
 
         Args:
             node: latent of each particle, by default beside the sum of the updates of
@@ -56,7 +58,7 @@ class Operator(nn.Module):
             generator: source of random numbers; None asks for the same draw every time.
 
         Returns:
-            What is gathered, shape [particle, latent]; losses by name.
+            Aggregates, shape [particle, latent], and losses by name.
         """
 
 
@@ -77,10 +79,12 @@ class Convolution(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
+        """Return the aggregate of each node."""
         return self.conv(node, edge_index, edge), {}
 
 
-def summed(edge_index: Tensor, edge: Tensor, nodes: int) -> Tensor:
-    """Return the sum of the edges that each node receives, shape [node, latent]."""
-    return edge.new_zeros(nodes, edge.shape[1]).index_add_(0, edge_index[1], edge)
+def sum_edges(edge_index: Tensor, edge: Tensor, nodes: int) -> Tensor:
+    """Return the sum of the edges to each node, shape [node, latent]."""
+    _, receiver = edge_index
+    sums = edge.new_zeros(nodes, edge.shape[1])
+    return sums.index_add_(0, receiver, edge)

@@ -35,10 +35,13 @@ class PointNet(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers."""
+        """Return the aggregate of each node."""
         sender, receiver = edge_index
-        of_node = self.of_node(node)
-        said = self.local(of_node.index_select(0, sender) + self.of_edge(edge))
-        itself = self.local(of_node.clone())
-        index = receiver[:, None].expand_as(said)
-        return itself.scatter_reduce(0, index, said, "amax"), {}
+        hidden_node = self.of_node(node)
+        hidden_edge = hidden_node.index_select(0, sender) + self.of_edge(edge)
+        message = self.local(hidden_edge)
+        # The layer works in place, and the loop of a node starts from the same values.
+        loop_message = self.local(hidden_node.clone())
+
+        index = receiver[:, None].expand_as(message)
+        return loop_message.scatter_reduce(0, index, message, "amax"), {}

@@ -11,36 +11,37 @@ from torch_geometric.nn import SuperGATConv
 from .operator import Losses, Operator
 
 START = 4.0
-"""Links and attention see inputs over this times the root of the latent width, values
-are multiplied by it.
+"""Scale of the inputs, as a multiple of the root of the latent width.
 
-Logits of links then start near 1, not near 1000, where the sigmoid is flat, the link
-loss drowns the others and one neighbour has all the attention.
+Links and attention see inputs over this scale, and the aggregate is multiplied by it.
+Logits of links then start near 1. Unscaled they start near 1000, where the sigmoid is
+flat, the link loss drowns the others and one neighbour has all the attention.
 """
 
 
 # Compilers know neither generators nor results of unknown size.
 @torch.compiler.disable  # type: ignore[untyped-decorator]
-def unlinked_pairs(
+def draw_unlinked_pairs(
     edge_index: Tensor, nodes: int, count: int, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Draw pairs of nodes and return those that are no edge and no loop, shape [2,
-    pair], at most `count`.
+    """Draw pairs of nodes and return those that are neither edges nor loops.
 
-    None as generator draws the same pairs every time.
+    The shape is [2, pair], with at most `count` pairs. Without a generator the same
+    pairs are drawn every time.
     """
     if generator is None:
-        source = torch.Generator().manual_seed(0)
-    else:
-        source = generator
-    pairs = torch.randint(nodes, (2, count), generator=source, device=source.device).to(
-        edge_index.device
+        generator = torch.Generator().manual_seed(0)
+    drawn = torch.randint(
+        nodes, (2, count), generator=generator, device=generator.device
     )
+    pairs = drawn.to(edge_index.device)
     sender, receiver = pairs
-    linked = torch.isin(
-        receiver * nodes + sender, edge_index[1] * nodes + edge_index[0]
-    )
-    return pairs[:, ~linked & (sender != receiver)]
+    edge_sender, edge_receiver = edge_index
+    pair_number = receiver * nodes + sender
+    edge_number = edge_receiver * nodes + edge_sender
+    is_edge = torch.isin(pair_number, edge_number)
+    is_loop = sender == receiver
+    return pairs[:, ~is_edge & ~is_loop]
 
 
 class SuperGAT(Operator):
@@ -55,8 +56,7 @@ class SuperGAT(Operator):
 
     Source: Eqs. 5.26 to 5.28. The cross entropy of Eq. 5.28 over edges, loops and drawn
     unlinked pairs is a term of the loss, weight 1; with the option ``link_weight`` 0 it
-    is not learnt from. k is 1 in the thesis; here it makes the start sound
-    (:data:`START`).
+    is not learnt from. In the thesis k is 1; here it is the scale of :data:`START`.
     """
 
     method = "GNS + SuperGATConv"
@@ -78,18 +78,20 @@ class SuperGAT(Operator):
         *,
         generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers, and the link loss in training."""
-        node = node / self.scale
+        """Return the aggregate of each node, and the link loss in training."""
+        scaled_node = node / self.scale
         if not self.training:
-            return self.scale * self.conv(node, edge_index), {}
-        count = int(self.negatives * edge_index.shape[1])
-        # Given pairs: PyG would draw its own from Python's global source.
-        pairs = unlinked_pairs(edge_index, len(node), count, generator)
-        gathered = self.scale * self.conv(node, edge_index, pairs)
-        loss = self.conv.get_attention_loss()
+            return self.scale * self.conv(scaled_node, edge_index), {}
+
+        pair_count = int(self.negatives * edge_index.shape[1])
+        # PyG would draw pairs of its own from Python's global source.
+        pairs = draw_unlinked_pairs(edge_index, len(node), pair_count, generator)
+        aggregate = self.scale * self.conv(scaled_node, edge_index, pairs)
+        link_loss = self.conv.get_attention_loss()
         # They would hold the whole graph of gradients.
-        self.conv.att_x = self.conv.att_y = None
-        return gathered, {"link": loss}
+        self.conv.att_x = None
+        self.conv.att_y = None
+        return aggregate, {"link": link_loss}
 
 
 class SuperGATDot(SuperGAT):

@@ -32,7 +32,7 @@ from lagbench.metrics.significance import (
 )
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
-from lagbench.references.table import COUNTING, REFERENCES
+from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.card import Preview
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
@@ -354,7 +354,7 @@ def _skill_of(
     ranking = method.ranking
     baselines = {}
     for reference in references:
-        if reference.name in COUNTING and ranking in reference.scores:
+        if reference.name in NAIVE and ranking in reference.scores:
             baselines[reference.name] = reference.scores[ranking]
     found = compute_skill(method.scores[ranking].seeds, baselines)
     if found is None:

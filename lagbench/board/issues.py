@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from lagbench.errors import LagbenchError
-from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES
 from lagbench.submission.issues import Severity, ValidationIssue
 
 RESCORE = (
@@ -96,7 +95,7 @@ CHECKS: Mapping[str, BoardCheck] = {
     "oversize": BoardCheck(
         "a score file of more than 1 MB",
         "a score file is too long",
-        f"at most {MAX_SCORE_BYTES} bytes",
+        "at most 1,000,000 bytes",
     ),
     "score_file": BoardCheck(
         "a score file that was edited, cannot be read, or belongs to something else",

@@ -22,7 +22,8 @@ from lagbench.submission.predictions import open_predictions
 from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
-from .draft import PredictionsFile, draft_entry
+from .describe import draft_entry
+from .draft import PredictionsFile
 from .entry import OUTSIDE, Meta
 from .fields import MOST_SEEDS
 from .folder import Folder

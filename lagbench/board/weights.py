@@ -72,21 +72,21 @@ def inspect_weights(path: Path) -> WeightsFile:
         UsageError: torch is not installed.
     """
     check_installed("torch", extra="baselines")
-    from lagbench.baselines.checkpoint import load, rounded_parameters
+    from lagbench.baselines.checkpoint import count_rounded_parameters, load
     from lagbench.baselines.predict import provenance_of
 
     checkpoint = load(path)
-    facts = checkpoint.facts
+    info = checkpoint.info
     recipe = checkpoint.training.get("recipe", {})
     return WeightsFile(
         path=path,
         sha256=file_sha256(path),
         is_state=checkpoint.optimizer is not None,
         baseline=checkpoint.baseline,
-        data_set=(facts.split, facts.size, facts.dataset_sha256),
+        data_set=(info.split, info.size, info.dataset_sha256),
         seed=recipe.get("training", {}).get("seed", 0),
         provenance=provenance_of(checkpoint),
-        parameters=rounded_parameters(checkpoint) or None,
+        parameters=count_rounded_parameters(checkpoint) or None,
     )
 
 

@@ -120,7 +120,7 @@ def model_left_out(registry: Registry) -> str | None:
     if MODEL_SPLIT not in demo_splits(registry):
         return f"the registry has no {MODEL_SPLIT} {DEMO_SIZE}"
     try:
-        for module in ("torch", "torch_geometric", "pytorch_lightning"):
+        for module in ("torch", "torch_geometric", "lightning_fabric"):
             check_installed(module, extra="baselines")
     except UsageError as error:
         return f"{error.what}; {error.fix}"

@@ -106,7 +106,7 @@ def train(
             fix=fix,
         )
     split = chosen(name, split)
-    for module in ("torch", "torch_geometric", "pytorch_lightning"):
+    for module in ("torch", "torch_geometric", "lightning_fabric"):
         check_installed(module, extra=EXTRA)
     from lagbench.data.local import locate
 
@@ -303,7 +303,7 @@ def predict(
             threads=threads,
             batch=batch,
             method=method,
-            solver=time_solver if solver else None,
+            time_solver=time_solver if solver else None,
             progress=draw,
         )
     told = _predicted(result, timed, replaced, f" --root {root}" if root else "")

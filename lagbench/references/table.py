@@ -40,8 +40,6 @@ NAIVE = frozenset(
 )
 """Names of the naive predictors: skill is measured against the best of them."""
 
-COUNTING = NAIVE
-
 CLASSICAL = frozenset(REFERENCES) - NAIVE
 """Names of the classical solvers, which ``against_classical`` is measured against."""
 

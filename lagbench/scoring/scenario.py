@@ -122,7 +122,7 @@ class ScenarioJob:
     task: ScoredTask  # the test subset
     scenario: int  # id of the scenario
     predictions: Path  # a predictions.nc that has been validated
-    anatomy: FileInfo  # content of its headers
+    info: FileInfo  # content of its headers
     metrics: tuple[str, ...]  # names of the metrics
     references: tuple[str, ...] = ()  # names of the references to measure beside it
     has_preview: bool = False  # whether to take the preview
@@ -150,7 +150,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     try:
         with (
             job.task.opened(number) as truth,
-            open_predictions(job.predictions, info=job.anatomy) as predictions,
+            open_predictions(job.predictions, info=job.info) as predictions,
         ):
             scenario = truth.scenario
             frames = _predicted_frames(predictions, number)

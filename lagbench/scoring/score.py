@@ -16,7 +16,7 @@ from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
 from lagbench.references.shipped import shipped
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -112,7 +112,7 @@ def score(
         check_writable(folder, option="--output")
     with open_predictions(path) as opened:
         header = opened.header
-        anatomy = opened.info
+        info = opened.info
         sha256 = result.sha256 or opened.content_sha256()
     if write:
         _check_overwriting(folder / JSON_NAME, header)
@@ -129,7 +129,7 @@ def score(
     outcomes = score_scenarios(
         task,
         path,
-        anatomy,
+        info,
         metrics=tuple(metric.name for metric in metrics),
         references=references,
         workers=workers,
@@ -151,7 +151,7 @@ def score(
     counting = {
         row: row_scores[ranking]
         for row, row_scores in scores.items()
-        if row in COUNTING and ranking in row_scores
+        if row in NAIVE and ranking in row_scores
     }
     card = ScoreCard(
         header=header,
@@ -254,7 +254,7 @@ def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
 def score_scenarios(
     task: ScoredTask,
     path: Path,
-    anatomy: FileInfo,
+    info: FileInfo,
     *,
     metrics: tuple[str, ...],
     references: tuple[str, ...],
@@ -267,7 +267,7 @@ def score_scenarios(
     Args:
         task: the test subset.
         path: a predictions.nc that has been validated.
-        anatomy: content of its headers.
+        info: content of its headers.
         metrics: names of the metrics.
         references: names of the references to measure beside it.
         workers: worker processes; None: one per core where the work is worth it.
@@ -281,7 +281,7 @@ def score_scenarios(
             task=task,
             scenario=scenario,
             predictions=path,
-            anatomy=anatomy,
+            info=info,
             metrics=metrics,
             references=references,
             has_preview=scenario == scenarios[0],

@@ -22,7 +22,7 @@ from lagbench.atomic import atomic_path
 from lagbench.errors import WorkFailedError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
-from lagbench.references.table import COUNTING
+from lagbench.references.table import NAIVE
 
 from .card import FORMAT, IDENTITY, SUBMISSION, Preview, ScoreCard
 from .published_scores import require_printable, unreadable_scores
@@ -291,7 +291,7 @@ def _read_reference(file: Any) -> tuple[str | None, NDArray[np.float64]]:  # noq
     name = file.getncattr("best_floor")
     values = np.asarray(file["best_floor_value"][:], np.float64)
     has_right_shape = values.shape == (len(file["scenario"]),)
-    if name not in COUNTING or not has_right_shape or np.isinf(values).any():
+    if name not in NAIVE or not has_right_shape or np.isinf(values).any():
         raise ValueError("not the scores of a reference")
     return name, values
 

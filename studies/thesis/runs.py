@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lagbench.atomic import write_atomically
-from lagbench.baselines.job import OVER
+from lagbench.baselines.training_log import OVER
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.scoring.card import JSON_NAME
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
@@ -216,7 +216,7 @@ def check_training(
     record = read_json(folder / RECORD_NAME)
     if not record:
         return
-    from lagbench.baselines.job import first_difference  # loads torch
+    from lagbench.baselines.recipe_changes import first_difference  # loads torch
 
     recipe = _recipe(plan, split, model=model, seed=seed).as_json()
     if record.get("recipe") != recipe:

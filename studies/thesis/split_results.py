@@ -28,7 +28,7 @@ from lagbench.metrics.aggregate import Score, mean_over_seeds
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
 from lagbench.references.shipped import shipped, shipped_path
-from lagbench.references.table import COUNTING, REFERENCES
+from lagbench.references.table import NAIVE, REFERENCES
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
 from lagbench.scoring.skill import best_reference
 
@@ -371,7 +371,7 @@ class SplitResults:
         """
         scores = {}
         for name, method in self.methods.items():
-            if name in COUNTING and self.ranking in method.scores:
+            if name in NAIVE and self.ranking in method.scores:
                 scores[name] = method.scores[self.ranking]
         return best_reference(scores)
 

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 from file_size_limit import largest_file
 from made_up import BoardBench, copied, nearer, noisy, still
-from simple_models import FACTS, Drift
+from simple_models import INFO, Drift
 
-from lagbench.baselines.checkpoint import Checkpoint, load, rounded_weights, save
+from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
 from lagbench.board import submit as submitting
 from lagbench.board import weights as kept
 from lagbench.board.check import check_board
@@ -79,17 +79,17 @@ def trained(
     own.predict(between, "drift", **labels).rename(folder / "predictions.nc")
     with open_predictions(folder / "predictions.nc") as opened:
         header = opened.header
-    facts = replace(
-        FACTS,
+    info = replace(
+        INFO,
         split=header.split,
         size=header.size,
         dataset_sha256=header.dataset_sha256,
     )
     recipe = {"name": "cavity/tiny", "training": {"seed": seed}}
-    held = rounded_weights(Drift.build({}, facts))
+    held = round_weights(Drift.build({}, info))
     told = {"step": 6, "recipe": recipe}
     weights = Checkpoint(
-        baseline="drift", options={}, facts=facts, weights=held, training=told
+        baseline="drift", options={}, info=info, weights=held, training=told
     )
     save(folder / "weights.pt", weights)
     (folder / "training.json").write_text(json.dumps({"step": 6}))

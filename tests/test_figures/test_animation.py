@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from PIL import ImageSequence
 from PIL.GifImagePlugin import GifImageFile
-from swirls import OMEGA, write_swirl
+from rotating_disc import OMEGA, write_swirl
 
 from lagbench.errors import DataError, UsageError, WorkFailedError
 from lagbench.figures import animate as animation

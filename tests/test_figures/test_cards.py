@@ -17,7 +17,7 @@ import yaml
 from conftest import PAINT
 from hypothesis import given
 from hypothesis import strategies as st
-from swirls import write_swirl
+from rotating_disc import write_swirl
 
 from lagbench.data import registry
 from lagbench.data.layout import dataset_folder
@@ -42,7 +42,7 @@ print(json.dumps(rows))
 def make(
     root: Path, split: str = "cavity", *, scenarios: tuple[int, ...] = (0, 1, 2, 3, 4)
 ) -> tuple[Size, Manifest]:
-    """Write swirls and their manifest."""
+    """Write rotating_disc and their manifest."""
     size = registry.load().size(split, "tiny")
     entries = []
     for scenario in scenarios:

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
-from swirls import OMEGA, TOP_TO_THE_RIGHT, write_swirl
+from rotating_disc import OMEGA, TOP_TO_THE_RIGHT, write_swirl
 
 from lagbench import errors
 from lagbench.errors import DataError, UsageError, WorkFailedError

@@ -43,7 +43,7 @@ from lagbench.figures.report.maps import crop_to_walls
 from lagbench.figures.report.report import write_report
 from lagbench.figures.report.subject import Subject, limit_of
 from lagbench.figures.report.summary import describe_stability
-from lagbench.metrics import METRICS, Setting, Tally, aggregate
+from lagbench.metrics import METRICS, Tally, TaskConfig, aggregate
 from lagbench.scoring.card import ScoreCard
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission.truth import Truth
@@ -389,7 +389,7 @@ def test_pages_of_others_stay(home: Path, tmp_path: Path) -> None:
 def subject_on(split: str, size_name: str) -> Subject:
     """Return a subject without entries: enough to ask which frames are shown."""
     size = load().size(split, size_name)
-    setting = Setting(
+    config = TaskConfig(
         grid=Grid(size.task.score_grid.cells),
         attribute_std=(1.0,) * 4,
         input_frames=size.task.input_frames,
@@ -397,7 +397,7 @@ def subject_on(split: str, size_name: str) -> Subject:
         frames_of_interest=size.task.frames_of_interest,
         radius=size.task.radius,
     )
-    task = ScoredTask(truth=Truth(size, Path()), setting=setting, density=1.0)
+    task = ScoredTask(truth=Truth(size, Path()), config=config, density=1.0)
     return Subject(task=task, title=split, entries=())
 
 

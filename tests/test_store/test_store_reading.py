@@ -17,7 +17,7 @@ from object_stores import Store, files, holding, machine
 from typer.testing import Result
 
 import lagbench
-from lagbench.baselines.facts import facts_of
+from lagbench.baselines.dataset_info import read_dataset_info
 from lagbench.data.layout import as_url, url_of
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Registry
@@ -131,10 +131,12 @@ def test_scores_are_those_of_the_folder(
 def test_baselines_and_exports_read_from_a_store(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """Facts, training files and the bytes of an export, which needs all subsets, are
+    """DatasetInfo, training files and the bytes of an export, which needs all subsets, are
     those of the folder.
     """
-    assert facts_of(SPLIT, SIZE, root=url) == facts_of(SPLIT, SIZE, root=generated.root)
+    assert read_dataset_info(SPLIT, SIZE, root=url) == read_dataset_info(
+        SPLIT, SIZE, root=generated.root
+    )
     assert here(url) == ["manifest.json", "train/0000.nc"]
     found = copy.scenario_files(
         tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid")

@@ -32,7 +32,7 @@ VALUES = arrays(
 )
 
 
-def swirls(scale: float, noise: float = 0.0) -> FramePair:
+def rotating_disc(scale: float, noise: float = 0.0) -> FramePair:
     """Return a pair in which the prediction turns ``scale`` times as fast, with
     noise.
     """
@@ -49,7 +49,7 @@ def test_a_scaled_flow_has_closed_errors() -> None:
     A prediction at rest has r = -omega: slope -1, no correlation. One that also turns
     by Omega has residual 2 Omega wherever no wall is near.
     """
-    pair = swirls(1.2)
+    pair = rotating_disc(1.2)
     omega = pair.true_vorticity
     laws = ("mse", "mae", "pearson", "residual_slope", "residual_mean")
     found = measured(pair, *(f"vorticity_{law}" for law in laws))
@@ -61,7 +61,10 @@ def test_a_scaled_flow_has_closed_errors() -> None:
         0.2 * np.mean(omega),
     ]
     assert found == pytest.approx(expected)
-    for still in (swirls(0.0), flying(1e-3, 0.0)):  # at rest, or all by one vector
+    for still in (
+        rotating_disc(0.0),
+        flying(1e-3, 0.0),
+    ):  # at rest, or all by one vector
         found = measured(still, "vorticity_residual_slope", "vorticity_pearson")
         assert found == pytest.approx([-1.0, math.nan], nan_ok=True)
     x = lattice(30)
@@ -76,7 +79,7 @@ def test_taylor_green_vorticity_follows_its_closed_form() -> None:
     """Omega = 2 pi U sin(pi x) sin(pi y), damped as spline and central difference damp
     a wave.
     """
-    omega = swirls(1.0).truth.fields.vorticity[2:-2, 2:-2]
+    omega = rotating_disc(1.0).truth.fields.vorticity[2:-2, 2:-2]
     wave = np.sin(np.pi * (np.arange(10) + 0.5) / 10)[2:-2]
     # with k h = pi / 10: the quadratic spline keeps (sin(kh/2) / (kh/2))^3 along each
     # axis, which is 0.98772, the difference sin(kh) / (kh) = 0.98363; in all 0.9596
@@ -90,7 +93,7 @@ def test_correlation_slope_and_residuals_are_scipys_and_numpys() -> None:
     Of 1 2 3 and 1 3 2: covariance 1, both sums of squares 2, so r = 1/2. Mean, std,
     greatest size and percentiles are those of r = predicted - true (Eq. 5.22).
     """
-    pair = swirls(0.7, noise=0.003)
+    pair = rotating_disc(0.7, noise=0.003)
     x = pair.true_vorticity
     y = pair.predicted_vorticity
     r, tilt = measured(pair, "vorticity_pearson", "vorticity_residual_slope")
@@ -204,7 +207,7 @@ def test_divergences_are_scipys_entropy() -> None:
     P = (1/4, 3/4), Q = (1/2, 1/2): ln(1/2)/4 + 3 ln(3/2)/4 = 0.130812. There are 64
     bins over the truth's range, the outer ones open, half a count added to each.
     """
-    pair = swirls(1.3, noise=0.002)
+    pair = rotating_disc(1.3, noise=0.002)
     p, q = (np.abs(w) + 1e-10 for w in (pair.true_vorticity, pair.predicted_vorticity))
     assert measured(pair, "vorticity_kl") == pytest.approx(
         [scipy.stats.entropy(p, q)], rel=1e-9
@@ -257,8 +260,8 @@ def test_wasserstein_grows_where_the_histogram_saturates() -> None:
 
     How much rotation there is does not change in a mirror, where it is does.
     """
-    near = swirls(10.0)
-    far = swirls(100.0)
+    near = rotating_disc(10.0)
+    far = rotating_disc(100.0)
     names = ("vorticity_kl_hist", "vorticity_w1")
     (kl_near, w_near), (kl_far, w_far) = (
         measured(pair, *names) for pair in (near, far)
@@ -304,7 +307,10 @@ def test_nrmse_is_the_ratio_of_sums_over_frames() -> None:
     ]
     for scale in (0.0, 1.0, 1.5, -1.0):
         cases.append(
-            (*np.array(measured(swirls(scale), *names))[:, None], abs(scale - 1.0))
+            (
+                *np.array(measured(rotating_disc(scale), *names))[:, None],
+                abs(scale - 1.0),
+            )
         )
     for mse, square, error in cases:
         assert metric.over_frames(metric.series(mse, square)) == pytest.approx(
@@ -329,7 +335,7 @@ def test_the_spectrum_forgives_place_and_punishes_smoothing() -> None:
     counts six.
     """
     for scale, decades in {1.0: 0.0, 10.0: 2.0, 0.1: 2.0, 0.0: 6.0}.items():
-        pair = replace(swirls(scale), frame=3)
+        pair = replace(rotating_disc(scale), frame=3)
         assert measured(pair, "spectrum_error") == pytest.approx([decades], abs=1e-9)
     rng = np.random.default_rng(4)
     x = lattice(40)

@@ -1,0 +1,94 @@
+"""The public figures of a generated data set; every checkpoint holds them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lagbench.data.layout import dataset_folder
+from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import Manifest, read_manifest
+from lagbench.data.registry import Registry, Size
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import DataError
+from lagbench.store.copy import update_working_copy
+
+from .baseline import DatasetInfo
+
+
+def read_dataset_info(
+    split: str,
+    size: str | None = None,
+    *,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> DatasetInfo:
+    """Return the public figures of a generated data set.
+
+    Raises:
+        DataError: the data set is not there, or not complete.
+    """
+    tier, root_folder, _ = locate(split, size, root=root, registry=registry)
+    folder = dataset_folder(root_folder, tier.split, tier.name, tier.major)
+    hint = suggest_repair(tier, root=root_folder)
+
+    update_working_copy(tier, root_folder)
+    manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
+    if manifest is None:
+        raise DataError("the data set is not generated", where=str(folder), fix=hint)
+    dataset_sha256 = _find_hash(manifest, tier)
+    if dataset_sha256 is None:
+        raise DataError("the data set is not complete", where=str(folder), fix=hint)
+    if not manifest.files:
+        raise DataError("the data set is empty", where=str(folder), fix=hint)
+    statistics = _find_statistics(manifest, tier)
+    if not statistics:
+        raise DataError(
+            "the subset train is not complete, its statistics are unknown",
+            where=str(folder),
+            fix=hint,
+        )
+
+    first_file = manifest.files[0]
+    update_working_copy(tier, root_folder, [first_file.scenario])
+    with read_scenario(folder / first_file.path) as file:
+        moving_walls = "wall_velocity" in file.variables
+
+    task = tier.task
+    return DatasetInfo(
+        split=tier.split,
+        size=tier.name,
+        version=tier.version,
+        dataset_sha256=dataset_sha256,
+        particles=tier.particles,
+        bounds=tier.bounds,
+        radius=task.radius,
+        input_frames=task.input_frames,
+        horizon=task.horizon,
+        score_cells=task.score_grid.cells,
+        score_placement=task.score_grid.placement,
+        frame_interval=tier.frame_interval,
+        moving_walls=moving_walls,
+        statistics=statistics,
+    )
+
+
+def _find_hash(manifest: Manifest, size: Size) -> str | None:
+    """Return the hash of the data at hand, else that of datasets.yaml."""
+    if manifest.dataset_sha256:
+        return manifest.dataset_sha256
+    if size.measured is not None:
+        return size.measured.dataset_sha256
+    return None
+
+
+def _find_statistics(manifest: Manifest, size: Size) -> dict[str, tuple[float, float]]:
+    """Return the statistics of the data at hand, else those of datasets.yaml.
+
+    Without train there are none at hand.
+    """
+    statistics = manifest.statistics
+    if not statistics and size.measured is not None:
+        statistics = size.measured.statistics
+    if not statistics:
+        return {}
+    return {name: (float(x), float(y)) for name, (x, y) in statistics.items()}

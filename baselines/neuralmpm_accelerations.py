@@ -1,0 +1,151 @@
+"""The output of NeuralMPM's U-Net: accelerations of the particles in the coming frames.
+
+Two decoders have the same methods. :class:`FieldAccelerations` reads the output as
+accelerations of each material at the nodes. :class:`StressAccelerations` reads it as
+stresses of each material, and accelerations beside walls, so that momentum is conserved
+away from walls, whatever the weights:
+
+    a(f+k) = g + G2P(w(f+k) - P2G(s(f+k) grad b) / P2G(1))
+
+with stresses s, which fade where matter is thin, and accelerations w beside walls. The
+model adds the fall g. One grid moves all materials, as in the material-point method.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from .augmentation import strain_matrix
+from .neuralmpm_fields import GridState
+from .neuralmpm_options import NeuralMPMOptions
+from .particle_grid import ParticleGrid, Stencil
+
+# cells from a wall to nodes that it cannot push; particles feel it half a cell further
+WALL_REACH = 2.5
+STRESS_UNIT = 4.0  # stress by an output of 1, in deviations of accelerations times cell
+# weight inside a body whose particles lie 1.6 to a radius; with less, matter is thin
+FULL_WEIGHT = 2.5
+
+
+class Accelerations(ABC):
+    """Decodes the U-Net's output.
+
+    Args:
+        grid: the U-Net's grid.
+        options: options of the model.
+        unit: weight of particles a radius apart [1].
+    """
+
+    def __init__(
+        self, grid: ParticleGrid, options: NeuralMPMOptions, *, unit: float
+    ) -> None:
+        self.grid = grid
+        self.unit = unit
+        self.frames = options.bundle
+        self.material_count = len(options.materials)
+
+    @property
+    @abstractmethod
+    def channels(self) -> int:
+        """Channels of the output."""
+
+    @abstractmethod
+    def mirror(self, matrix: Tensor) -> list[Tensor]:
+        """Return the blocks by which a mirror image changes the output at a node."""
+
+    @abstractmethod
+    def decode(
+        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+    ) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return the grid's velocity and the accelerations at the particles.
+
+        The velocity, and the acceleration in each coming frame, have shape [particle,
+        2].
+
+        Args:
+            state: input of the call.
+            stencil: nodes around the particles in their layers.
+            output: output of the U-Net [length/frame^2], shape [window, channel, x
+                node, y node].
+            grid_velocity: last velocity on the grid [length/frame], shape [layer, 2, x
+                node, y node].
+        """
+
+
+class FieldAccelerations(Accelerations):
+    """Accelerations of each material at the nodes, gathered at its particles."""
+
+    @property
+    def channels(self) -> int:
+        """Two components of each material in each frame."""
+        return 2 * self.material_count * self.frames
+
+    def mirror(self, matrix: Tensor) -> list[Tensor]:
+        """Return the image of each acceleration."""
+        return [matrix] * (self.material_count * self.frames)
+
+    def decode(
+        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+    ) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return the grid's velocity and the accelerations at the particles."""
+        accelerations = output.reshape(-1, 2 * self.frames, *self.grid.shape)
+        # One transfer serves the velocity and all frames.
+        field = torch.cat([grid_velocity, accelerations], dim=1)
+        gathered = self.grid.gather(stencil, field).view(len(stencil.weight), -1, 2)
+        velocity, *particle_accelerations = gathered.unbind(dim=1)
+        return velocity, particle_accelerations
+
+
+class StressAccelerations(Accelerations):
+    """Accelerations by stresses inside matter and by pushes beside walls."""
+
+    @property
+    def channels(self) -> int:
+        """Three stresses of each material and two accelerations in each frame."""
+        return (3 * self.material_count + 2) * self.frames
+
+    def mirror(self, matrix: Tensor) -> list[Tensor]:
+        """Return the images of the stresses, then those of the accelerations."""
+        stresses = [strain_matrix(matrix)] * (self.material_count * self.frames)
+        return stresses + [matrix] * self.frames
+
+    def decode(
+        self, state: GridState, stencil: Stencil, output: Tensor, grid_velocity: Tensor
+    ) -> tuple[Tensor, Sequence[Tensor]]:
+        """Return the grid's velocity and the accelerations at the particles."""
+        velocity = self.grid.gather(stencil, grid_velocity)
+        stress_channels = 3 * self.material_count * self.frames
+        stress, wall_push = output.tensor_split([stress_channels], dim=1)
+        stress = stress.reshape(-1, 3 * self.frames, *self.grid.shape)
+        node_stress = STRESS_UNIT * stress  # (xx, xy, yy) [length cell/frame^2]
+
+        # All materials of a window move on one layer.
+        shared = self.grid.stencil(state.position, state.sample)
+        one = torch.ones_like(state.position[:, :1])
+        mass = self.grid.spread(shared, one, len(output))
+        particle_stress = self.grid.gather(stencil, node_stress)
+        particle_stress = particle_stress * self._load(shared, mass)
+        particle_stress = particle_stress.view(-1, self.frames, 3)
+
+        inner = self.grid.accelerate(shared, state.position, particle_stress, mass)
+        node_acceleration = inner + self._wall_nearness() * wall_push
+        acceleration = self.grid.gather(shared, node_acceleration)
+        by_frame = acceleration.view(-1, self.frames, 2)
+        return velocity, by_frame.unbind(dim=1)
+
+    def _load(self, shared: Stencil, mass: Tensor) -> Tensor:
+        """Return the share of its stress that a particle bears; a surface bears less.
+
+        The shape is [particle, 1].
+        """
+        filled = self.grid.gather(shared, mass / self.unit) / FULL_WEIGHT
+        return filled.clamp(max=1.0).square()
+
+    def _wall_nearness(self) -> Tensor:
+        """Return 1 at walls, falling to 0 at their reach, shape [x node, y node]."""
+        distance = self.grid.wall_distance(WALL_REACH * self.grid.spacing)
+        return (1.0 - distance.amin(dim=0)).clamp(0.0, 1.0)

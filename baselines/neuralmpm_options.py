@@ -1,0 +1,94 @@
+"""The options of NeuralMPM, and the checks that concern several of them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from lagbench.errors import UsageError
+
+from .augmentation import Symmetry
+from .baseline import DatasetInfo, Options, check_moving_walls
+from .graph import MATERIALS
+
+GridCells = Annotated[int, Field(ge=2, le=256)]
+Grids = Annotated[tuple[GridCells, ...], Field(max_length=8)]
+
+
+class NeuralMPMOptions(Options):
+    """Options of the grid surrogate."""
+
+    in_training = frozenset({"calls", "pushforward", "recovery", "noise_std"})
+    # the weights of projections are of these grids, in this order
+    of_weights = frozenset({"shape", "density"})
+
+    # cells of the network's grid across the box; even, so that walls lie between two
+    # nodes on all sides
+    cells: int = Field(default=18, ge=4, le=256, multiple_of=2)
+    width: int = Field(default=32, ge=4, multiple_of=4)  # channels of the finest level
+    velocities: int = Field(default=5, ge=1)  # last velocities that the U-Net sees
+    bundle: int = Field(default=4, ge=1)  # frames that one call predicts
+    # calls that training unrolls; gradients pass through all
+    calls: int = Field(default=2, ge=1)
+    # largest number of calls before those, without gradients: training then sees states
+    # of rollouts
+    pushforward: int = Field(default=0, ge=0)
+    # each frame the gap to the true path is to close by 1/recovery of it: a third is
+    # left after so many frames; None asks for true velocities alone
+    recovery: float | None = Field(default=None, gt=1.0, allow_inf_nan=False)
+    # share s of the grid's velocity per frame
+    smoothing: float = Field(default=0.2, ge=0.0, le=1.0)
+    # on the last velocity [length/frame]
+    noise_std: float = Field(default=1e-4, ge=0.0, allow_inf_nan=False)
+    # numbers of the context network, which encodes the given frames once: the U-Net
+    # can learn a viscosity from them
+    context: int = Field(default=0, ge=0)
+    # materials that have density and velocity of their own
+    materials: tuple[int, ...] = (0,)
+    # whether the velocity of the walls in the coming frames is a channel
+    wall_velocity: bool = False
+    # whether particles are damped towards the velocity of all materials together, as if
+    # one grid carried them all
+    mixture: bool = False
+    # whether the U-Net predicts stresses, and accelerations beside walls only: momentum
+    # is conserved everywhere else
+    conserve: bool = False
+    # whether the U-Net sees the strain of solids since the scenario's first frame
+    strain: bool = False
+    # cells across the box of the grids of shape matching, in turn
+    shape: Grids = ()
+    # cells across the box of the grids of density projection, in turn
+    density: Grids = ()
+    # training windows are replaced by random ones of these mirror images
+    symmetry: Symmetry = Symmetry.NONE
+    # whether calls of rollouts, not of training, are mirror-averaged, at as many times
+    # the cost as there are mirror images
+    average: bool = False
+
+
+def check_options(options: NeuralMPMOptions, info: DatasetInfo) -> None:
+    """Refuse options that do not fit each other or the data set.
+
+    Raises:
+        UsageError: a material is unknown or named twice, there are no mirror images to
+            average over, or no wall moves.
+    """
+    check_moving_walls(options.wall_velocity, info)
+    materials = set(options.materials)
+    is_repeated = len(materials) < len(options.materials)
+    if not materials or is_repeated or not materials <= set(range(MATERIALS)):
+        raise UsageError(
+            "materials are named once each",
+            where="model.materials",
+            expected=f"some of {list(range(MATERIALS))}",
+            got=list(options.materials),
+        )
+    if options.average and options.symmetry is Symmetry.NONE:
+        raise UsageError(
+            "there are no mirror images to average over",
+            where="model.average",
+            expected=f"model.symmetry {Symmetry.MIRROR} or {Symmetry.SQUARE}",
+            got=str(options.symmetry),
+            fix="set model.symmetry=mirror too, or leave model.average out",
+        )

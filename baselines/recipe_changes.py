@@ -1,0 +1,137 @@
+"""The changes of a recipe by a training, from the log or the weights of the training.
+
+Both may come from a stranger. Options that are unknown here are passed over.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import yaml
+
+from lagbench.errors import LagbenchError
+
+from .catalogue import find
+from .recipe import ANY, LATER_OPTIONS, Recipe, recipe_for, recipe_names
+
+# options that do not change the learned weights' meaning, or are told elsewhere
+UNLISTED = ("seed", "compile", "log_every", "checkpoint_every")
+LONGEST_VALUE = 200  # letters of a value; longer ones become dots
+
+
+def list_settings(recipe: object) -> tuple[str, ...]:
+    """Return the changes of a shipped recipe, in the form of ``--set``.
+
+    ``recipe`` is the recipe of a log. Where it names no shipped recipe, there are none.
+    """
+    if not isinstance(recipe, Mapping):
+        return ()
+    shipped = _find_shipped_recipe(recipe)
+    if shipped is None:
+        return ()
+    shipped_options = {
+        "model": shipped.model,
+        "training": shipped.training.model_dump(mode="json"),
+    }
+    settings = []
+    for key, value in _find_changes(shipped_options, recipe, LATER_OPTIONS):
+        settings.append(f"{key}={_format_yaml(value)}")
+    return tuple(sorted(settings))
+
+
+def _find_shipped_recipe(recipe: Mapping[str, Any]) -> Recipe | None:
+    """Return the shipped recipe that a log names; None where there is none."""
+    split, _, size_name = str(recipe.get("name")).partition("/")
+    size, _, variant = size_name.partition("-")
+    names = {f"{split}/{size_name}", f"{ANY}/{size_name}"}
+    try:
+        entry = find(str(recipe.get("baseline")))
+        if names.isdisjoint(recipe_names(entry)):
+            return None
+        return recipe_for(entry, split, size, variant=variant or None)
+    except LagbenchError:
+        return None
+
+
+def describe_changes(recipe: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the changes of a recipe, and the weights of its start if it has any."""
+    changes = list_settings(recipe)
+    start = describe_start(recipe.get("start"))
+    if start:
+        return (*changes, f"started from {start}")
+    return changes
+
+
+def describe_start(start: Mapping[str, Any] | None) -> str:
+    """Return recipe and hash of the weights of a start; nothing for random ones."""
+    if start:
+        return f"{start['recipe']}, weights {start['sha256'][:12]}"
+    return ""
+
+
+def first_difference(
+    expected: Mapping[str, Any], logged: object, path: str = ""
+) -> str:
+    """Return the first key whose value differs, with both values."""
+    if not isinstance(logged, Mapping):
+        logged = {}
+    for key in sorted({*expected, *logged}):
+        expected_value = expected.get(key)
+        logged_value = logged.get(key)
+        if expected_value == logged_value:
+            continue
+        if isinstance(expected_value, Mapping) and isinstance(logged_value, Mapping):
+            return first_difference(expected_value, logged_value, f"{path}{key}.")
+        return (
+            f"{path}{key} = {expected_value!r}, as asked for; the folder has "
+            f"{logged_value!r}"
+        )
+    return "the same recipe"
+
+
+def _find_changes(
+    shipped: Mapping[str, Any],
+    logged: object,
+    defaults: Mapping[str, Any],
+    path: str = "",
+) -> Iterator[tuple[str, Any]]:
+    """Yield paths such as model.loss.vorticity and the values of a log that differ.
+
+    ``defaults`` are the values of options that the log lacks.
+    """
+    if not isinstance(logged, Mapping):
+        return
+    for key, shipped_value in shipped.items():
+        value = logged.get(key, defaults.get(key, shipped_value))
+        if isinstance(shipped_value, Mapping):
+            inner_defaults = defaults.get(key, {})
+            yield from _find_changes(
+                shipped_value, value, inner_defaults, f"{path}{key}."
+            )
+        elif key not in UNLISTED and value != shipped_value:
+            yield f"{path}{key}", value
+
+
+def _format_yaml(value: object) -> str:
+    """Return a value as a line of YAML; quote a text that YAML would read otherwise."""
+    if not isinstance(value, str) or not value.isascii() or not value.isprintable():
+        text = json.dumps(value)
+    elif _is_plain_yaml(value):
+        text = value
+    else:
+        text = json.dumps(value)
+    if len(text) > LONGEST_VALUE:
+        return "..."
+    return text
+
+
+def _is_plain_yaml(text: str) -> bool:
+    """Return whether YAML reads a text without quotes as that text."""
+    if len(text) > LONGEST_VALUE:
+        return True
+    try:
+        return bool(yaml.safe_load(text) == text)
+    except (yaml.YAMLError, ValueError):  # ValueError: it looks like a date and is none
+        return False

@@ -1,0 +1,256 @@
+"""Describe a submission: draft its entry, and refuse what does not fit the files."""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lagbench.errors import ErrorCollector, UsageError
+from lagbench.references.table import REFERENCES as KNOWN_REFERENCES
+from lagbench.submission.format import Header
+
+from .draft import Draft, PredictionsFile, find_entries_to_differ_from, fit
+from .entry import About, Entry, EntryBudget, Meta, Prediction, mean_cost
+from .entry_file import examine, read_rivals
+from .fields import LONGEST_TEXT, latest_date
+from .folder import Folder, Place, entry_path
+from .identity import confusable_key
+from .seeds import require_extendable, require_new, seeds_of
+from .verified import read_verified
+from .weights import require_weights
+
+LONGEST_LABEL = 100  # letters of the label of predictions that become a name
+
+DESCRIBED_KEYS = tuple(
+    name for name in About.model_fields if name not in ("budget", "date")
+)
+"""Keys of the description of a method that stay when seeds are added."""
+
+
+def draft_entry(
+    files: Sequence[PredictionsFile],
+    meta: Meta,
+    *,
+    folder: Folder,
+    weights: Sequence[str | Path],
+    replace: bool,
+    add: bool,
+) -> Draft:
+    """Return the draft of an entry; refuse together all that does not fit the files."""
+    headers = [file.header for file in files]
+    rivals: dict[Path, Entry] = {}
+    extended = None
+
+    errors = ErrorCollector()
+    with errors:
+        seeds = seeds_of(headers)
+    with errors:
+        urls = _urls_of(meta, len(files))
+    with errors:
+        place = _place_of(headers[0], meta)
+        rivals = read_rivals(folder, place)
+        if add:
+            extended = require_extendable(folder, place, headers, meta)
+        elif not replace:
+            _require_free(folder, place)
+        _require_distinct_name(_name_of(headers[0], meta, extended), rivals)
+        read_verified(folder)  # publishing may have to write it
+    with errors:
+        about = _describe(headers, meta, extended)
+    with errors:
+        weight_paths = require_weights(weights, headers, rivals)
+    errors.raise_errors()
+
+    hashes = [file.sha256 for file in files]
+    paths = [file.path for file in files]
+    owners = _owners_of_predictions(find_entries_to_differ_from(rivals, extended))
+    require_new(hashes, paths, owners)
+    predictions = []
+    for file, seed, url in zip(files, seeds, urls, strict=True):
+        predictions.append(_describe_predictions(folder, file, seed=seed, url=url))
+    return Draft(
+        place=place,
+        about=about,
+        predictions=predictions,
+        weight_paths=weight_paths,
+        rivals=rivals,
+        extended=extended,
+    )
+
+
+def _urls_of(meta: Meta, count: int) -> Sequence[str | None]:
+    if not meta.urls:
+        return (None,) * count
+    if len(meta.urls) != count:
+        raise UsageError(
+            "addresses do not match the files",
+            where="--url",
+            got=len(meta.urls),
+            fix=f"give {count}, one per file in their order, or none",
+        )
+    return meta.urls
+
+
+def _place_of(header: Header, meta: Meta) -> Place:
+    """Return split, size and method; the label of predictions may name the method."""
+    method = meta.method or header.method
+    _, issues = examine(Meta, {"method": method})
+    if issues:
+        suggestion = re.sub("[^a-z0-9]+", "-", method.lower()).strip("-")
+        raise UsageError(
+            "the label of the predictions cannot name an entry",
+            expected="small letters, digits and single hyphens",
+            got=ascii(method),
+            fix=f"name it: --method {suggestion or 'my-model'}",
+        )
+    if method in KNOWN_REFERENCES:
+        raise UsageError(
+            f"{method!r} is the name of a reference predictor",
+            where="--method",
+            fix="name your method otherwise; reference predictors are added by "
+            "themselves",
+        )
+    return header.split, header.size, method
+
+
+def _require_free(folder: Folder, place: Place) -> None:
+    path = folder.path / entry_path(place)
+    if path.exists():
+        raise UsageError(
+            "there is such an entry already",
+            where=str(path),
+            fix="a further seed: --add; instead of it: --replace; else another "
+            "--method, and name: in meta.yaml",
+        )
+
+
+def _name_of(header: Header, meta: Meta, extended: Entry | None) -> str:
+    if meta.name:
+        return meta.name
+    if extended is not None:
+        return extended.name
+    return header.method[:LONGEST_LABEL]
+
+
+def _require_distinct_name(name: str, rivals: Mapping[Path, Entry]) -> None:
+    owners = {}
+    for reference in KNOWN_REFERENCES:
+        owners[reference] = f"the reference predictor {reference}"
+    for path, entry in rivals.items():
+        owners[entry.name] = str(path)
+
+    key = confusable_key(name)
+    for other_name, owner in owners.items():
+        if confusable_key(other_name) == key:
+            raise UsageError(
+                "the name looks like another's",
+                where=owner,
+                got=ascii(name),
+                fix="choose another, or say what differs, in meta.yaml: "
+                "`name: GNS, six terms`",
+            )
+
+
+def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> About:
+    """Return the description of the method.
+
+    Keys come from ``meta``, else from the entry that gets more seeds, else from the
+    predictions.
+    """
+    if extended is not None:
+        meta = _fill_from_entry(meta, extended)
+    header = headers[0]
+    keys: dict[str, Any] = {name: getattr(meta, name) for name in About.model_fields}
+    keys["name"] = meta.name or header.method[:LONGEST_LABEL]
+    keys["date"] = _date_of(meta)
+    keys["training"] = meta.training or (header.training or "")[:LONGEST_TEXT]
+    if meta.parameters is None:
+        keys["parameters"] = header.parameters
+    keys["cost"] = _cost_of(headers, meta, extended)
+    keys["budget"] = _budget_of(headers, meta, extended)
+    return fit(About, keys)
+
+
+def _fill_from_entry(meta: Meta, entry: Entry) -> Meta:
+    keys = {name: getattr(entry, name) for name in DESCRIBED_KEYS}
+    for name in meta.model_fields_set:
+        keys[name] = getattr(meta, name)
+    return meta.model_copy(update=keys)
+
+
+def _date_of(meta: Meta) -> datetime.date:
+    date = meta.date or datetime.datetime.now(datetime.UTC).date()
+    latest = latest_date()
+    if date > latest:
+        raise UsageError(
+            "a day to come", where="date", expected=f"at most {latest}", got=date
+        )
+    return date
+
+
+def _cost_of(
+    headers: Sequence[Header], meta: Meta, extended: Entry | None
+) -> object | None:
+    solver_seconds = meta.solver_seconds_per_frame
+    if extended is None:
+        return meta.cost or mean_cost(headers, solver_seconds)
+    if meta.cost is not None and solver_seconds is not None:
+        return meta.cost.model_copy(update={"solver_seconds_per_frame": solver_seconds})
+    return meta.cost
+
+
+def _budget_of(
+    headers: Sequence[Header], meta: Meta, extended: Entry | None
+) -> EntryBudget | None:
+    if meta.budget is not None and meta.budget.track is not None:
+        raise UsageError(
+            "a track is not stated",
+            where="budget.track",
+            fix="leave it out: it follows from the budget that `lagbench predict` "
+            "writes into predictions.nc",
+        )
+    budgets = []
+    if extended is not None:
+        budgets += [prediction.budget for prediction in extended.predictions]
+    budgets += [header.budget for header in headers]
+    mean_budget = EntryBudget.mean_over_seeds(headers[0].size, budgets)
+    if mean_budget is not None:
+        return mean_budget
+    if meta.budget is not None:
+        return meta.budget
+    if extended is not None and extended.budget is not None:
+        # a track follows from the budgets of all seeds, which are not known
+        return extended.budget.model_copy(update={"track": None})
+    return None
+
+
+def _owners_of_predictions(entries: Mapping[Path, Entry]) -> dict[str, str]:
+    owners = {}
+    for path, entry in entries.items():
+        for prediction in entry.predictions:
+            owners[prediction.sha256] = str(path)
+    return owners
+
+
+def _describe_predictions(
+    folder: Folder, file: PredictionsFile, *, seed: int | None, url: str | None
+) -> Prediction:
+    path = file.path.resolve()
+    board = folder.path.resolve()
+    inner_path = None
+    if path.is_relative_to(board):
+        inner_path = path.relative_to(board).as_posix()
+    keys = {
+        "seed": seed,
+        "sha256": file.sha256,
+        "url": url,
+        "path": inner_path,
+        "bytes": file.path.stat().st_size,
+        "budget": file.header.budget,
+        "provenance": file.header.provenance,
+    }
+    fix = "name the file otherwise, or move it"
+    return fit(Prediction, keys, where=file.path, fix=fix)
