@@ -331,7 +331,7 @@ def test_scoring_takes_what_is_shipped(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With shipped scores nothing but the submission is measured, and the card is equal.
+    """With shipped scores the submission alone is measured, and the card is equal.
 
     Without them only the references that count are measured.
     """
