@@ -98,7 +98,7 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     assert not (root / "leaderboard").exists()
     made = made_in(root, run)
     assert made["model"] is None
-    assert made["model_left_out"] in line
+    assert made["model_left_out"] in result.stdout
     assert list(made["splits"]) == [SPLIT]
     assert made["splits"][SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
     assert Path(made["splits"][SPLIT]["picture"]).is_file()
