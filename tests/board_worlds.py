@@ -199,8 +199,8 @@ class _World:
         """Return a floor."""
         return ReferenceRow(
             name=name,
-            definition=f"What {name} says.",
             kind=Kind.NAIVE,
+            definition=f"What {name} says.",
             **self.scores(name, 6.0, name == REFERENCES[0]),
         )
 

@@ -53,7 +53,9 @@ def entry(tmp_path: Path) -> CatalogueEntry:
 
 @pytest.mark.parametrize("name", list_names())
 def test_every_recipe_is_right(name: str) -> None:
-    """Every recipe names a split and size of ours, and its options are accepted."""
+    """Every recipe of every baseline names a split and size of ours, and its options
+    are accepted.
+    """
     entry = find(name)
     registry = load()
     found = recipe_names(entry)
@@ -359,13 +361,13 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
 def test_mistakes_in_settings(
     entry: CatalogueEntry, setting: str, message: str
 ) -> None:
-    """A wrong setting is a usage error that list_names key and remedy."""
+    """A wrong setting is a usage error that names key and remedy."""
     with pytest.raises(UsageError, match=message):
         recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
 def test_no_such_recipe(entry: CatalogueEntry) -> None:
-    """A split or variant without a recipe is a usage error with the nearest name."""
+    """A split or variant without a recipe is a usage error that names the nearest."""
     bare = replace(entry, recipes=None)
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
     for asked, split, size, variant, words in (
@@ -510,7 +512,7 @@ def test_other_packages_add_baselines(
 
 def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """What lacks methods or is no baseline cannot be loaded and only warns beside
-    others, as odd list_names do.
+    others, as odd names do.
     """
     install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
     with pytest.warns(UserWarning, match="adds no baseline") as told:

@@ -53,8 +53,7 @@ def validated_on_test(
         with task.opened(scenario) as opened:
             frames[scenario] = len(opened.scenario.moving_frames)
     torch.set_num_threads(1)
-    validation = Validation(task=task, frames=frames)
-    return validation.measure(restore(load(weights)))
+    return Validation(task=task, frames=frames).measure(restore(load(weights)))
 
 
 def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
@@ -203,5 +202,4 @@ def test_fewer_frames_for_tests(
         Validation(task=short, frames=dict.fromkeys(task.scenarios, 4)).measure(model)
         == result.best_value
     )
-    whole_rmse = Validation(task=task, frames=whole).measure(model)
-    assert whole_rmse != result.best_value
+    assert Validation(task=task, frames=whole).measure(model) != result.best_value

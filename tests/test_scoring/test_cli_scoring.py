@@ -256,14 +256,9 @@ def statistic(pair):
 
 METRICS = (
     Metric(
-        name="my_enstrophy",
-        family="mine",
-        unit="1",
-        direction=Direction.LOWER,
-        perfect=0.0,
-        source="here",
-        summary="fails",
-        statistic=statistic,
+        name="my_enstrophy", family="mine", unit="1",
+        direction=Direction.LOWER, perfect=0.0,
+        source="here", summary="fails", statistic=statistic,
     ),
 )
 """

@@ -144,8 +144,7 @@ def test_the_child_is_limited_and_started_anew(
     program = (
         "import os\n"
         "def read(path):\n"
-        "    if 'flipping' in path:\n"
-        "        os.kill(os.getpid(), 11)\n"
+        "    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
     )
     use_child(monkeypatch, own.folder.parent, program)
     stopped = find_unreadable([good, bad, good])
