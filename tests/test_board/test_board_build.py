@@ -331,7 +331,7 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
     for reference in board.tabs[0].references:
         row = rows[reference.name]
         assert row[0] == "-"
-        assert row[-1] == "reference"
+        assert row[-1] == f"{reference.kind} reference"
     damped = rows["damped"]
     assert damped[0] == str(row_of(board, "damped").rank)
     assert " ± " in damped[3]

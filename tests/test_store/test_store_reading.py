@@ -131,8 +131,9 @@ def test_scores_are_those_of_the_folder(
 def test_baselines_and_exports_read_from_a_store(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """DatasetInfo, training files and the bytes of an export, which needs all subsets, are
-    those of the folder.
+    """Dataset info, training files and the bytes of an export are those of the folder.
+
+    An export needs all subsets.
     """
     assert read_dataset_info(SPLIT, SIZE, root=url) == read_dataset_info(
         SPLIT, SIZE, root=generated.root

@@ -28,7 +28,7 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics import METRICS
 from lagbench.scoring import flags
 
-CLONE = Path(__file__).parent.parent
+CLONE = Path(__file__).parents[2]
 README = (CLONE / "README.md").read_text()
 NOTEBOOK = CLONE / "docs" / "notebooks" / "quickstart.ipynb"
 PAGES = [CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md"))]
@@ -121,18 +121,12 @@ def test_every_command_of_the_pages_exists() -> None:
             assert given <= known | {"--help"}, f"{page.name}: {line}"
 
 
-def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
-    """At most 150 lines, its program 40; every file that a page of ours links is
-    there.
-    """
-    assert len(README.splitlines()) <= 150
-    (program,) = blocks(README, "python")
-    assert len(program.splitlines()) <= 40
+def test_the_links_of_the_pages_lead_somewhere() -> None:
+    """Every file that a page of ours links is there."""
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
-            assert "://" in target or (page.parent / target).exists(), (
-                f"{page.name}: {target}"
-            )
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def test_what_is_stored_is_small() -> None:

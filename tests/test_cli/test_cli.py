@@ -237,7 +237,7 @@ def test_a_tag_names_the_version() -> None:
     """A release's tag is v and the version of pyproject.toml, which CITATION.cff and
     README have too.
     """
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     version = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
     assert yaml.safe_load((root / "CITATION.cff").read_text())["version"] == version
     assert f"version = {{{version}}}" in (root / "README.md").read_text()
@@ -270,7 +270,7 @@ def test_bibtex_is_what_citation_cff_says(
         return dict(re.findall(r"^  (\w+) = \{(.*)\},$", text, re.MULTILINE))
 
     monkeypatch.delenv("LAGBENCH_REGISTRY")
-    cff = yaml.safe_load((Path(__file__).parent.parent / "CITATION.cff").read_text())
+    cff = yaml.safe_load((Path(__file__).parents[2] / "CITATION.cff").read_text())
     expected = {
         "author": "{The lagbench authors}",
         "title": cff["title"],
@@ -530,7 +530,7 @@ def test_letters_that_a_stream_lacks() -> None:
     """They are escaped, as the sign for what cannot be told apart: what was computed is
     told all the same.
     """
-    board = Path(__file__).parent.parent / "leaderboard"
+    board = Path(__file__).parents[2] / "leaderboard"
     words = [
         "leaderboard",
         "show",

@@ -94,12 +94,11 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
     assert "1 data sets, verified and drawn, in" in result.stdout
-    line = "no model, no leaderboard: torch is not installed; pip install 'lagbench[baselines]'"
-    assert line in result.stdout.splitlines()
+    assert "pip install 'lagbench[baselines]'" in result.stdout
     assert not (root / "leaderboard").exists()
     made = made_in(root, run)
     assert made["model"] is None
-    assert made["model_left_out"] in line
+    assert made["model_left_out"] in result.stdout
     assert list(made["splits"]) == [SPLIT]
     assert made["splits"][SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
     assert Path(made["splits"][SPLIT]["picture"]).is_file()
