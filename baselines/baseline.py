@@ -34,6 +34,7 @@ __all__ = [
     "Options",
     "Settings",
     "check_moving_walls",
+    "count_parameters",
     "last_velocities",
     "rescale",
 ]
@@ -186,6 +187,18 @@ class Baseline(nn.Module):
     @abstractmethod
     def advance(self, state: Any) -> tuple[Any, Tensor]:  # noqa: ANN401
         """Return the next state and positions [length], shape [particle, 2]."""
+
+
+def count_parameters(model: Baseline) -> int:
+    """Return how many numbers of a model are trained.
+
+    These are its parameters, or the coefficients of a closed form.
+    """
+    if getattr(model, "closed_form", False):
+        tensors = [t for t in model.state_dict().values() if t.is_floating_point()]
+    else:
+        tensors = [p for p in model.parameters() if p.requires_grad]
+    return sum(tensor.numel() for tensor in tensors)
 
 
 def last_velocities(position: Tensor, count: int) -> Tensor:

@@ -251,6 +251,7 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         ranking=ranking,
         tallies=tallies,
         scores=scores,
+        against_classical=None,
         skill=compute_skill([scores[SUBMISSION][ranking]], naive_scores),
         flags=(),
         warnings=(),

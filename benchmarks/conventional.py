@@ -28,13 +28,13 @@ import numpy as np
 import taichi as ti
 
 from lagbench.data import WALLS
-from lagbench.generators.acceptance.experiment import (
+from lagbench.generators.split import ClosedBoxParameters, InitialState
+from validation.experiment import (
     Case,
     initial_state,
     plan,
     solver_parameters,
 )
-from lagbench.generators.split import ClosedBoxParameters, InitialState
 
 
 @ti.data_oriented

@@ -33,6 +33,7 @@ from lagbench.board.model import (
 )
 from lagbench.data.registry import load
 from lagbench.metrics import METRICS
+from lagbench.references.predictor import Kind
 from lagbench.scoring.score_file_checks import reported_frames
 from lagbench.submission.task_checks import frames_to_predict
 
@@ -198,6 +199,7 @@ class _World:
         """Return a floor."""
         return ReferenceRow(
             name=name,
+            kind=Kind.NAIVE,
             definition=f"What {name} says.",
             **self.scores(name, 6.0, name == REFERENCES[0]),
         )
@@ -249,6 +251,8 @@ class _World:
             if place % 3 == 0
             else None,
             skill=known if skill else None,
+            against_classical=None,
+            solver=None,
             seed_means=(4e-3 * bad,) * (3 if place % 2 == 0 else 1),
             pictures=drawn,
             residuals=tuple(

@@ -53,7 +53,7 @@ def validated_on_test(
         with task.opened(scenario) as opened:
             frames[scenario] = len(opened.scenario.moving_frames)
     torch.set_num_threads(1)
-    return Validation(task=task, frames=frames)(restore(load(weights)))
+    return Validation(task=task, frames=frames).measure(restore(load(weights)))
 
 
 def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
@@ -199,7 +199,7 @@ def test_fewer_frames_for_tests(
     model.load_state_dict(dict(load(result.checkpoint).weights))
     whole = dict.fromkeys(task.scenarios, 20)
     assert (
-        Validation(task=short, frames=dict.fromkeys(task.scenarios, 4))(model)
+        Validation(task=short, frames=dict.fromkeys(task.scenarios, 4)).measure(model)
         == result.best_value
     )
-    assert Validation(task=task, frames=whole)(model) != result.best_value
+    assert Validation(task=task, frames=whole).measure(model) != result.best_value

@@ -32,14 +32,20 @@ from lagbench.metrics.significance import (
 )
 from lagbench.metrics.table import METRICS
 from lagbench.references.shipped import ReferenceScores, solver_seconds
-from lagbench.references.table import NAIVE, REFERENCES
+from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.card import Preview
 from lagbench.scoring.score_file_checks import (
     ScoreFile,
     read_score_file,
     reported_frames,
 )
-from lagbench.scoring.skill import compute_skill
+from lagbench.scoring.skill import (
+    AgainstClassical,
+    Skill,
+    compute_against_classical,
+    compute_skill,
+    seconds_where_measured,
+)
 from lagbench.submission.task_checks import frames_to_predict
 
 from .entry import Entry, EntryCost, Status, Verification
@@ -321,6 +327,7 @@ def _make_row(
             combined.score, interval=combined.interval, std=combined.std, size=size
         )
 
+    against = _against_classical(method, size, references)
     rank = None
     is_tied = False
     p = math.nan
@@ -336,6 +343,8 @@ def _make_row(
         p=p,
         verified=verified,
         skill=_skill_of(method, references),
+        against_classical=_value_of_ratio(against),
+        solver=None if against is None else against.reference,
         values=values,
         seed_means=method.scores[method.ranking].means,
         curves=_make_curves(scores, method.ranking),
@@ -356,13 +365,48 @@ def _skill_of(
     for reference in references:
         if reference.name in NAIVE and ranking in reference.scores:
             baselines[reference.name] = reference.scores[ranking]
-    found = compute_skill(method.scores[ranking].seeds, baselines)
-    if found is None:
+    return _value_of_ratio(compute_skill(method.scores[ranking].seeds, baselines))
+
+
+def _against_classical(
+    method: ScoredMethod, size: Size, references: Sequence[ReferenceScores]
+) -> AgainstClassical | None:
+    """Return the score over that of the best classical solver that costs no more.
+
+    None where the entry does not state what a frame costs the model and our solver.
+    """
+    cost = method.entry.cost
+    if not method.is_current or cost is None:
         return None
-    low, high = found.interval
+    seconds = seconds_where_measured(
+        seconds_per_frame=cost.seconds_per_frame,
+        solver_seconds=cost.solver_seconds_per_frame,
+        solver_seconds_here=solver_seconds(size),
+    )
+    if seconds is None:
+        return None
+    solvers = {}
+    costs = {}
+    for reference in references:
+        if reference.name in CLASSICAL and method.ranking in reference.scores:
+            solvers[reference.name] = reference.scores[method.ranking]
+            costs[reference.name] = reference.seconds_per_frame
+    return compute_against_classical(
+        method.scores[method.ranking].seeds,
+        solvers,
+        seconds=costs,
+        seconds_per_frame=seconds,
+    )
+
+
+def _value_of_ratio(ratio: Skill | AgainstClassical | None) -> Value | None:
+    """Return a skill, or a score over that of a solver, as a value of the board."""
+    if ratio is None:
+        return None
+    low, high = ratio.interval
     return Value(
-        mean=found.value,
-        std=found.std,
+        mean=ratio.value,
+        std=ratio.std,
         low=low,
         high=high,
         per_scenario=(),
@@ -401,7 +445,7 @@ def _make_reference(
         values=values,
         curves=_make_curves(reference.scores, ranking),
         energy=energy,
-        counts=description.counts,
+        kind=description.kind,
         cost=cost,
     )
 

@@ -175,6 +175,18 @@ def _describe_budget(row: TableRow) -> str:
     return ""
 
 
+def _read_kind(row: TableRow) -> str:
+    if isinstance(row, ReferenceRow):
+        return str(row.kind)
+    return str(row.entry.kind)
+
+
+def _read_solver(row: TableRow) -> str | None:
+    if isinstance(row, ReferenceRow):
+        return None
+    return row.solver
+
+
 def _count_seeds(row: TableRow) -> int | None:
     if isinstance(row, ReferenceRow):
         return None
@@ -198,7 +210,31 @@ SKILL = Column(
     "nothing learned, 1 perfect.",
 )
 
+AGAINST_CLASSICAL = Column(
+    key="against_classical",
+    label="÷ classical",
+    direction=Direction.LOWER,
+    meaning="Score over that of the best classical solver that costs no more per frame:"
+    " below 1 learning pays. Empty where the entry states no cost, or every classical"
+    " solver costs more.",
+)
+
 ENTRY_COLUMNS = (
+    Column(
+        key="kind",
+        label="kind",
+        form="text",
+        meaning="Naive: learns nothing and knows no equation. Classical: integrates the"
+        " equations. Learned: fitted to train. Hybrid: a solver with a learned part.",
+        read=_read_kind,
+    ),
+    Column(
+        key="solver",
+        label="classical solver",
+        form="text",
+        meaning="The best classical solver that costs no more per frame.",
+        read=_read_solver,
+    ),
     Column(
         key="speed_up",
         label="speed\u2011up",
@@ -323,6 +359,8 @@ def columns_of(tab: Tab, metrics: Mapping[str, Metric]) -> dict[str, Column]:
     columns = {}
     if any(row.skill for row in tab.rows):
         columns[SKILL.key] = SKILL
+    if any(row.against_classical for row in tab.rows):
+        columns[AGAINST_CLASSICAL.key] = AGAINST_CLASSICAL
     for name in dict.fromkeys((*tab.columns, *metrics)):
         if any(name in row.values for row in tab.lines):
             columns[name] = _metric_column(metrics[name])
@@ -349,7 +387,14 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     """Return the keys of each preset that has something to show, main first, all
     last.
     """
-    main = ("skill", *tab.columns[:MAIN_METRICS], "speed_up", "budget", "checked")
+    main = (
+        "against_classical",
+        *tab.columns[:MAIN_METRICS],
+        "kind",
+        "speed_up",
+        "budget",
+        "checked",
+    )
     keys_by_name = {"main": main, **PRESETS, "all": tuple(columns)}
     presets = {}
     for name, keys in keys_by_name.items():
@@ -394,8 +439,11 @@ def loss_of(row: TableRow, column: Column) -> float:
 
 def metric_value(row: TableRow, key: str) -> Value | None:
     """Return the value of a metric, or the skill; None where a row has none."""
-    if key == SKILL.key and isinstance(row, BoardRow):
-        return row.skill
+    if isinstance(row, BoardRow):
+        if key == SKILL.key:
+            return row.skill
+        if key == AGAINST_CLASSICAL.key:
+            return row.against_classical
     return row.values.get(key)
 
 

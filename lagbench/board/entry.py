@@ -15,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lagbench.data.checksums import round_digits
+from lagbench.references.predictor import Kind
 from lagbench.submission.budget import Budget, Track, track_of
 from lagbench.submission.format import Header
 from lagbench.submission.provenance import TrainingProvenance
@@ -252,6 +253,11 @@ class About(Strict):
     weights: Link | None = None
     date: Date | None = None
     notes: Long = ""
+    kind: Annotated[Kind, Field(strict=False)] = Field(
+        default=Kind.LEARNED,
+        description="learned, or hybrid: a solver with a learned part; "
+        "classical where nothing is learned",
+    )
     training: Long = Field(default="", description="what it was trained on, in words")
     budget: EntryBudget | None = None
     parameters: int | None = Field(
@@ -294,6 +300,7 @@ class Entry(About):
         "status",
         "superseded_by",
         "reason",
+        "kind",
         "training",
         "budget",
         "parameters",

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
 from lagbench.metrics.metric import Metric
+from lagbench.references.predictor import Kind
 
 from .entry import Entry, EntryCost, EntryFlag, Status, Verification
 
@@ -81,7 +82,7 @@ class ReferenceRow:
     values: Mapping[str, Value]
     curves: Mapping[str, Curve]
     energy: Curve | None
-    counts: bool = True  # whether skill may be measured from it
+    kind: Kind  # naive or classical
     # cost of a frame, and that of the solver, on the machine that measured
     cost: EntryCost | None = None
 
@@ -99,6 +100,10 @@ class BoardRow:
     verified: Verification | None  # the maintainers scored these predictions again
     # 1 - score / score of the best naive baseline, where the score files say it
     skill: Value | None
+    # score / score of the best classical solver that costs no more per frame; None
+    # where no cost is stated, or every classical solver costs more
+    against_classical: Value | None
+    solver: str | None  # name of that classical solver
     values: Mapping[str, Value]
     seed_means: tuple[float, ...]  # mean of the ranking metric of each seed
     curves: Mapping[str, Curve]

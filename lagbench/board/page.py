@@ -446,17 +446,10 @@ def _leader_tiles(
     value = float(value_of(leader, ranking))
     yield _tile(f"leader by {ranking.quantity}", text(value), name)
 
-    if metrics[tab.ranking].direction is not Direction.LOWER:
-        return
-    baselines = []
-    for reference in tab.references:
-        baseline_value = float(value_of(reference, ranking))
-        if reference.counts and baseline_value > 0.0:
-            baselines.append((baseline_value, reference.name))
-    if baselines:
-        baseline_value, baseline = min(baselines)
-        ratio = f"{text(value / baseline_value, 2)}×"
-        yield _tile("leader beside the best naive baseline", ratio, baseline)
+    if leader.against_classical is not None and leader.solver is not None:
+        ratio = f"{text(leader.against_classical.mean, 2)}×"
+        label = "error of the leader beside the best classical solver of its cost"
+        yield _tile(label, ratio, leader.solver)
 
 
 def _speed_tiles(tab: Tab) -> Iterator[Markup]:

@@ -74,6 +74,8 @@ def tables(
 
 def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
     names = [tab.ranking, *metrics]
+    if any(row.against_classical for row in tab.rows):
+        names.insert(0, "against_classical")
     if any(row.skill for row in tab.rows):
         names.insert(0, "skill")
     if wide:
@@ -101,7 +103,9 @@ def _plain_tab(tab: Tab) -> dict[str, Any]:
     for reference in tab.references:
         values = reference.values
         metrics = {name: _plain_value(value) for name, value in values.items()}
-        references.append({"id": reference.name, "metrics": metrics})
+        references.append(
+            {"id": reference.name, "kind": str(reference.kind), "metrics": metrics}
+        )
     return {
         "split": tab.size.split,
         "size": tab.size.name,
@@ -123,6 +127,9 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
     skill = None
     if row.skill is not None:
         skill = _plain_value(row.skill)
+    against_classical = None
+    if row.against_classical is not None:
+        against_classical = _plain_value(row.against_classical)
     return {
         "id": row.id,
         "rank": row.rank,
@@ -137,7 +144,10 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "flags": [flag.name for flag in row.flags],
         "cost": cost,
         "budget": budget,
+        "kind": str(entry.kind),
         "skill": skill,
+        "against_classical": against_classical,
+        "classical_solver": row.solver,
         "metrics": {name: _plain_value(value) for name, value in row.values.items()},
     }
 
@@ -155,7 +165,7 @@ def _format_row(row: TableRow, names: Sequence[str]) -> tuple[str, ...]:
     values = [_format_value(metric_value(row, name)) for name in names]
     if isinstance(row, ReferenceRow):
         times = _format_times(row.cost)
-        return (NOTHING, row.name, *values, *times, "reference")
+        return (NOTHING, row.name, *values, *times, f"{row.kind} reference")
     return (
         _format_rank(row),
         row.id,

@@ -44,7 +44,7 @@ def covered_nodes(cloud: Cloud, grid: Grid) -> int:
 def fitting_cells(
     clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int
 ) -> int | None:
-    """Return the number of cells suggest_name to ``near`` at which each cloud fits the grid.
+    """Return the number of cells nearest to ``near`` at which each cloud fits.
 
     A cloud fits a grid of which it covers enough nodes. Of two numbers as near the
     smaller is taken; None where no grid fits. ``clouds`` is called for each grid that

@@ -26,7 +26,7 @@ from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
-from .skill import Skill
+from .skill import AgainstClassical, Skill
 
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
@@ -85,6 +85,8 @@ class ScoreCard:
     # as scored: it does not follow a replaced `scores`; None where no reference that
     # counts has a score
     skill: Skill | None
+    # None where the predictions state no cost, or every classical solver costs more
+    against_classical: AgainstClassical | None
     flags: tuple[Flag, ...]  # hints for the reader of a score
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
@@ -142,6 +144,7 @@ class ScoreCard:
         }
         content["ranking_metric"] = self.ranking
         content["skill"] = _skill_as_json(self.skill)
+        content["against_classical"] = _classical_as_json(self.against_classical)
         content["metrics"] = {
             score.metric.name: _metric_as_json(score.metric)
             for score in self.submission.values()
@@ -240,6 +243,16 @@ def _skill_as_json(skill: Skill | None) -> dict[str, Any] | None:
         "floor": skill.reference,
         "value": digits(skill.value),
         "interval": _interval_as_json(skill.interval),
+    }
+
+
+def _classical_as_json(against: AgainstClassical | None) -> dict[str, Any] | None:
+    if against is None:
+        return None
+    return {
+        "solver": against.reference,
+        "value": digits(against.value),
+        "interval": _interval_as_json(against.interval),
     }
 
 

@@ -9,14 +9,14 @@ import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.local import load_rooted_registry, resolve_root
-from lagbench.data.registry import Registry
+from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
-from lagbench.references.shipped import shipped
-from lagbench.references.table import NAIVE
+from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
+from lagbench.references.table import CLASSICAL, NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -32,7 +32,12 @@ from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME, write_statistics
-from .skill import compute_skill
+from .skill import (
+    AgainstClassical,
+    compute_against_classical,
+    compute_skill,
+    seconds_where_measured,
+)
 from .task import ScoredTask, load_scored_task
 
 PREDICTIONS = "predictions.nc"
@@ -161,6 +166,9 @@ def score(
         tallies=tallies,
         scores=scores,
         skill=compute_skill([scores[SUBMISSION][ranking]], counting),
+        against_classical=_compare_with_solvers(
+            header, size, scores[SUBMISSION][ranking], shipped_references
+        ),
         flags=_judge(task, outcomes, scores),
         warnings=(*result.warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
         preview=next(one.preview for one in outcomes if one.preview is not None),
@@ -168,6 +176,35 @@ def score(
     if write:
         return _write(card, folder)
     return card
+
+
+def _compare_with_solvers(
+    header: Header,
+    size: Size,
+    submission: Score,
+    references: Mapping[str, ReferenceScores],
+) -> AgainstClassical | None:
+    """Return the submission's score over that of the best classical solver of its cost.
+
+    None where the predictions do not state what a frame costs the model and our solver.
+    """
+    seconds = seconds_where_measured(
+        seconds_per_frame=header.seconds_per_frame,
+        solver_seconds=header.solver_seconds_per_frame,
+        solver_seconds_here=solver_seconds(size),
+    )
+    if seconds is None:
+        return None
+    solvers = {}
+    costs = {}
+    for name in CLASSICAL.intersection(references):
+        reference = references[name]
+        if submission.metric.name in reference.scores:
+            solvers[name] = reference.scores[submission.metric.name]
+            costs[name] = reference.seconds_per_frame
+    return compute_against_classical(
+        [submission], solvers, seconds=costs, seconds_per_frame=seconds
+    )
 
 
 def scores_folder(predictions: Path) -> Path:

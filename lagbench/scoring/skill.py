@@ -1,10 +1,16 @@
-"""Skill: improvement of a method over the best reference predictor.
+"""Skill and `against_classical`: a method beside predictors that need no training.
 
-``1 - score / score of the best reference``, over the ranking metric. The best reference
-has the least mean over its own scenarios, among those that count (see
-:mod:`lagbench.references`); the ratio is over the scenarios that both have. 1 is
+``skill = 1 - score / score of the best naive predictor``, over the ranking metric. 1 is
 perfect, 0 means that nothing was learned, below 0 the method is worse than not
 learning.
+
+``against_classical = score / score of the best classical solver that costs no more per
+frame``. Below 1 learning pays: at this cost no solver here is as accurate. It keeps the
+rule of McGreivy and Hakim (Nature Machine Intelligence 6 (2024) 1256): compare at equal
+cost or at equal accuracy, and with an efficient solver.
+
+The best predictor has the least mean over its own scenarios (see
+:mod:`lagbench.references`); the ratio is over the scenarios that both have.
 """
 
 from __future__ import annotations
@@ -22,10 +28,10 @@ from lagbench.metrics.metric import Direction
 
 @dataclass(frozen=True, kw_only=True)
 class Skill:
-    """Improvement of a submission over the best reference predictor."""
+    """Improvement of a submission over the best naive predictor."""
 
     metric: str  # name of the ranking metric
-    reference: str  # name of the best reference predictor
+    reference: str  # name of the best naive predictor
     value: float  # 1 - score / score of that reference
     # 95 %: scenarios, those of the reference with them, and seeds are resampled; NaN of
     # few scenarios
@@ -40,6 +46,24 @@ class Skill:
         return f"{self.value:.3f} [{low:.3f}, {high:.3f}] over {self.reference}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class AgainstClassical:
+    """Score of a submission over that of the best classical solver of its cost."""
+
+    metric: str  # name of the ranking metric
+    reference: str  # name of the classical solver
+    value: float  # score / score of that solver; below 1 learning pays
+    interval: tuple[float, float]  # 95 %, as that of a skill
+    std: float = math.nan  # sample standard deviation over seeds; NaN for one
+
+    def __str__(self) -> str:
+        """Return value, interval (where there is one) and solver, as in a table."""
+        low, high = self.interval
+        if math.isnan(low):
+            return f"{self.value:.2f} of {self.reference}"
+        return f"{self.value:.2f} [{low:.2f}, {high:.2f}] of {self.reference}"
+
+
 def best_reference(references: Mapping[str, Score]) -> str | None:
     """Return the name of the reference with the least mean, None if none is above 0."""
     means = {name: score.mean for name, score in references.items()}
@@ -52,28 +76,114 @@ def best_reference(references: Mapping[str, Score]) -> str | None:
 def compute_skill(
     seeds: Sequence[Score], references: Mapping[str, Score]
 ) -> Skill | None:
-    """Return the skill of a method over references in the same metric.
+    """Return the skill of a method over naive predictors in the same metric.
 
-    The interval is that of the ratio of means r = A / B, by the linear part of its
-    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
-    score of seed s and b_i that of the reference in scenario i, it is 1 - r exp(e). So
-    it never passes 1, and is one point where the ratio is the same everywhere. Two
-    seeds say little: its lower end may lie far down.
+    The interval never passes 1 (see :func:`_compute_ratio`).
 
     Args:
         seeds: score of each seed, over the same scenarios.
-        references: scores of the reference predictors that count, by name.
+        references: scores of the naive predictors, by name.
 
     Returns:
-        None without a reference that counts, without a scenario that both have, and for
-        a metric of which less is not better.
+        None without a naive predictor, without a scenario that both have, and for a
+        metric of which less is not better.
     """
     name = best_reference(references)
-    metric = seeds[0].metric
-    if name is None or metric.direction is not Direction.LOWER:
+    if name is None:
         return None
+    ratio = _compute_ratio(seeds, references[name])
+    if ratio is None:
+        return None
+    low, high = ratio.interval
+    return Skill(
+        metric=seeds[0].metric.name,
+        reference=name,
+        value=1.0 - ratio.value,
+        interval=(1.0 - high, 1.0 - low),
+        std=ratio.std,
+    )
 
-    base = _values_in(references[name], seeds[0].scenarios)  # shape [scenario]
+
+def compute_against_classical(
+    seeds: Sequence[Score],
+    solvers: Mapping[str, Score],
+    *,
+    seconds: Mapping[str, float],
+    seconds_per_frame: float,
+) -> AgainstClassical | None:
+    """Return a method's score over that of the best classical solver of its cost.
+
+    Args:
+        seeds: score of each seed, over the same scenarios.
+        solvers: scores of the classical solvers, by name, in the same metric.
+        seconds: processor time that a frame costs each solver [s].
+        seconds_per_frame: the same of the method, on the same machine [s].
+
+    Returns:
+        None where every solver costs more, without a scenario that both have, and for
+        a metric of which less is not better.
+    """
+    affordable = {}
+    for name, score in solvers.items():
+        if seconds[name] <= seconds_per_frame:
+            affordable[name] = score
+    name_of_best = best_reference(affordable)
+    if name_of_best is None:
+        return None
+    ratio = _compute_ratio(seeds, affordable[name_of_best])
+    if ratio is None:
+        return None
+    return AgainstClassical(
+        metric=seeds[0].metric.name,
+        reference=name_of_best,
+        value=ratio.value,
+        interval=ratio.interval,
+        std=ratio.std,
+    )
+
+
+def seconds_where_measured(
+    *,
+    seconds_per_frame: float | None,
+    solver_seconds: float | None,
+    solver_seconds_here: float | None,
+) -> float | None:
+    """Return what a frame would cost a method where the references were timed [s].
+
+    The solver that made the data is timed on both machines: the method's time is scaled
+    by the ratio of the two. None where one of the times is not known.
+
+    Args:
+        seconds_per_frame: time of the method on its machine [s].
+        solver_seconds: time of our solver on that machine [s].
+        solver_seconds_here: time of our solver where the references were timed [s].
+    """
+    if not seconds_per_frame or not solver_seconds or not solver_seconds_here:
+        return None
+    return seconds_per_frame * solver_seconds_here / solver_seconds
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScoreRatio:
+    """Score of a method over that of a reference."""
+
+    value: float  # ratio of the means [1]
+    interval: tuple[float, float]  # 95 % [1]; NaN of few scenarios
+    std: float  # sample standard deviation over seeds [1]; NaN for one
+
+
+def _compute_ratio(seeds: Sequence[Score], reference: Score) -> ScoreRatio | None:
+    """Return the ratio of two scores over the scenarios that both have.
+
+    The interval is that of the ratio of means r = A / B, by the linear part of its
+    logarithm: with e the two-way bootstrap of (a_si - r b_i) / (r B), where a_si is the
+    score of seed s and b_i that of the reference in scenario i, it is r exp(e). So it
+    stays above 0, and is one point where the ratio is the same everywhere. Two seeds
+    say little: its upper end may lie far up.
+    """
+    if seeds[0].metric.direction is not Direction.LOWER:
+        return None
+    base = _values_in(reference, seeds[0].scenarios)  # shape [scenario]
     method = np.stack([score.values for score in seeds])  # shape [seed, scenario]
     has_both = ~np.isnan(base) & ~np.isnan(method).all(axis=0)
     base = base[has_both]
@@ -88,11 +198,9 @@ def compute_skill(
     else:
         relative = method  # zeros, and certain
     low, high = bootstrap_interval(relative / scale)
-    return Skill(
-        metric=metric.name,
-        reference=name,
-        value=1.0 - ratio,
-        interval=(1.0 - ratio * math.exp(high), 1.0 - ratio * math.exp(low)),
+    return ScoreRatio(
+        value=ratio,
+        interval=(ratio * math.exp(low), ratio * math.exp(high)),
         std=_std_over_seeds(method, scale),
     )
 

@@ -81,6 +81,10 @@ def _over_horizon(
         best = card.skill.reference
     zeros = ["0" if row == best else "" for row in references]
     rows = [("skill ↑", skill_cell, *zeros)]
+    if card.against_classical is not None:
+        against = card.against_classical
+        cell = _with_interval(against.value, against.interval)
+        rows.append((f"against {against.reference} ↓", cell, *[""] * len(references)))
 
     for name in names:
         score = card.submission[name]

@@ -184,7 +184,7 @@ def test_references_are_judged_like_entries(board: Board) -> None:
     assert view.lines[0].row is reference
     assert view.lines[0].cells[tab.ranking].classes == ("best", "heat0")
     page = render(replace(board, tabs=(changed,)))
-    (first_line,) = re.findall(r"<tbody>(<tr class=\"floor\"[^>]*>)", page)
+    (first_line,) = re.findall(r"<tbody>(<tr class=\"reference\"[^>]*>)", page)
     assert f'data-reference="{reference.name}"' in first_line
 
 

@@ -316,14 +316,6 @@ def test_mistakes_are_named_on_load(
             ("parameter jacobian_relaxation", ">= 0 and <= 1", "2"),
         ),
         (tiny(wall=16), ("parameter wall", "an integer, >= 0 and <= 14", "16")),
-        (
-            always("area_min", value="big"),
-            ("size tiny", "generators.fluid can use", "area_min = 'big'"),
-        ),
-        (
-            renamed("fluid", "area_max", "aera_max"),
-            ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
-        ),
     ],
 )
 def test_a_solver_that_cannot_be_fed_is_refused_before_work(
@@ -346,6 +338,33 @@ def test_a_solver_that_cannot_be_fed_is_refused_before_work(
     assert [
         p for p in root.rglob("*") if p.is_file() and not p.name.startswith(".lock")
     ] == []
+    refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        (
+            always("area_min", value="big"),
+            ("size tiny", "generators.fluid can use", "area_min = 'big'"),
+        ),
+        (
+            renamed("fluid", "area_max", "aera_max"),
+            ("size tiny", "did you mean 'aera_max'?", "'area_max'"),
+        ),
+    ],
+)
+def test_a_scenario_that_cannot_be_drawn_is_refused_by_its_worker(
+    change: Change, parts: tuple[str, ...], tmp_path: Path
+) -> None:
+    """Planning draws nothing, so a dry run passes; no file is left."""
+    path = edited(tmp_path, change)
+    root = tmp_path / "data"
+    options = {"root": root, "registry": load(path), "workers": 1}
+    generate("fluid", "tiny", dry_run=True, **options)
+    refused(path, parts, lambda: generate("fluid", "tiny", **options))
+    assert not list(root.rglob("*.nc"))
+    assert not list(root.rglob("manifest.json"))
     refused(path, parts, lambda: verify("fluid", "tiny", regenerate=1, **options))
 
 

@@ -256,7 +256,8 @@ def statistic(pair):
 
 METRICS = (
     Metric(
-        name="my_enstrophy", family="mine", unit="1", direction=Direction.LOWER, perfect=0.0,
+        name="my_enstrophy", family="mine", unit="1",
+        direction=Direction.LOWER, perfect=0.0,
         source="here", summary="fails", statistic=statistic,
     ),
 )

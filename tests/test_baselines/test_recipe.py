@@ -36,7 +36,10 @@ recipes:
   cavity/tiny: {training: {steps: 7}}
   cavity/tiny-long: {model: {start: 2.0}, training: {steps: 70, schedule: {every: 10}}}
   "*/mini": {training: {learning_rate: 1.0e-2}}
-  fluid/full: {model: {start: 1.0}, training: {steps: 8}, baselines: {gns: {training: {steps: 9}}}}
+  fluid/full:
+    model: {start: 1.0}
+    training: {steps: 8}
+    baselines: {gns: {training: {steps: 9}}}
 """
 
 
@@ -50,7 +53,7 @@ def entry(tmp_path: Path) -> CatalogueEntry:
 
 @pytest.mark.parametrize("name", list_names())
 def test_every_recipe_is_right(name: str) -> None:
-    """Every recipe of every baseline list_names a split and size of ours, and its options
+    """Every recipe of every baseline names a split and size of ours, and its options
     are accepted.
     """
     entry = find(name)
@@ -211,7 +214,7 @@ def test_committed_trainings_lack_no_option() -> None:
     """What the records of committed weights do not say is what is done without it, so
     that they can go on.
     """
-    paths = Path(__file__).parents[1].glob("leaderboard/weights/*/*/*.json")
+    paths = Path(__file__).parents[2].glob("leaderboard/weights/*/*/*.json")
     held = {
         path: json.loads(path.read_text(encoding="utf-8")).get("recipe")
         for path in sorted(paths)
@@ -358,13 +361,13 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
 def test_mistakes_in_settings(
     entry: CatalogueEntry, setting: str, message: str
 ) -> None:
-    """A wrong setting is a usage error that list_names key and remedy."""
+    """A wrong setting is a usage error that names key and remedy."""
     with pytest.raises(UsageError, match=message):
         recipe_for(entry, "cavity", "tiny", settings=[setting])
 
 
 def test_no_such_recipe(entry: CatalogueEntry) -> None:
-    """A split or variant without a recipe is a usage error that list_names the nearest."""
+    """A split or variant without a recipe is a usage error that names the nearest."""
     bare = replace(entry, recipes=None)
     assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
     for asked, split, size, variant, words in (
@@ -509,7 +512,7 @@ def test_other_packages_add_baselines(
 
 def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """What lacks methods or is no baseline cannot be loaded and only warns beside
-    others, as odd list_names do.
+    others, as odd names do.
     """
     install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
     with pytest.warns(UserWarning, match="adds no baseline") as told:
@@ -533,6 +536,6 @@ def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_page_of_the_baselines_is_complete() -> None:
     """docs/baselines.md names every baseline and every option of a training."""
-    page = (Path(__file__).parents[1] / "docs/baselines.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/baselines.md").read_text()
     for word in (*list_names(), *TrainingOptions.model_fields):
         assert f"`{word}`" in page, word

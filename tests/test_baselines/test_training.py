@@ -322,7 +322,8 @@ def test_the_mean_of_the_weights_is_published(
         means = [
             float(mean) for mean in pd.Series(seen).ewm(alpha=0.9, adjust=False).mean()
         ]
-    else:  # that keep n / (n + 9): binomial weights C(k + 8, 8), which sum to C(n + 9, 9)
+    else:
+        # Means keep n / (n + 9): binomial weights C(k + 8, 8), of sum C(n + 9, 9).
         weighted = [seen[0], *(comb(k + 8, 8) * x for k, x in enumerate(seen, start=1))]
         means = [
             float(sum(weighted[: n + 1]) / comb(n + 9, 9))

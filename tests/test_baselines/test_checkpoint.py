@@ -386,7 +386,7 @@ def test_weights_of_the_board_can_be_run() -> None:
     from.
     """
     files = sorted(
-        (Path(__file__).parent.parent / "leaderboard" / "weights").rglob("*.pt")
+        (Path(__file__).parents[2] / "leaderboard" / "weights").rglob("*.pt")
     )
     assert len(files) > 60
     for file in files:
