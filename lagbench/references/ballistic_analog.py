@@ -129,8 +129,8 @@ def frames_of_flight(given: Given) -> int:
     """Return how many frames on the bodies still fly freely, at most the horizon."""
     radius = given.size.task.radius
     body = label_bodies(given.last, radius)
-    low = np.asarray(given.box.low) + 1e-9
-    high = np.asarray(given.box.high) - 1e-9
+    low = given.box.lower_walls + 1e-9
+    high = given.box.upper_walls - 1e-9
     for frames_on in range(1, len(given.predicted_frames)):
         position = ballistic_positions(given, frames_on)
         on_wall = ((position <= low) | (position >= high)).any(axis=1)
@@ -202,7 +202,8 @@ def _analogs_of(
         previous = given.last
     elif flown > 1:
         previous = ballistic_positions(given, flown - 1)
-    feature = describe_state(position, position - previous, given.material)
+    velocity = given.box.displacement(previous, position)  # [length/frame]
+    feature = describe_state(position, velocity, given.material)
     states = library.nearest(feature, count=choice.analogs, without=without)
     followed = []
     for number, state in enumerate(states):
@@ -217,7 +218,7 @@ def _analogs_of(
         )
         stop = frame + 1 + len(given.predicted_frames)
         paths = mirror.positions(motion.position[frame:stop, partner])
-        offset = position[members] - paths[0]
+        offset = given.box.displacement(paths[0], position[members])
         followed.append(FollowedAnalog(members, paths, offset))
     return followed
 
