@@ -189,7 +189,8 @@ def cost_figure(tab: Tab) -> Markup:
         "Further left is cheaper, further down more accurate; the line joins the "
         "methods that no other beats in both. The full grey line joins the classical "
         "solvers: an entry below it is more accurate than every solver of its cost. "
-        "The upright line is the time of the solver itself. Costs of entries are self-reported, brought to the machine of "
+        "The upright line is the time of the solver itself. Costs of entries are "
+        "self-reported, brought to the machine of "
         "the solver by their speed-up."
     )
     if any(point.kind == "classical" for point in points):
