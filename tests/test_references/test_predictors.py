@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from score_bench import ScoreBench, straight
 
-from lagbench.data.box import Box
+from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.layout import major_of
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
@@ -227,9 +227,10 @@ def test_decay_of_an_exponential() -> None:
     """
     step = scattered(20, -0.01, 0.01)
     shrinking = np.cumsum([step * 0.9**k for k in range(6)], axis=0)
-    assert decay(shrinking) == pytest.approx(0.9)
-    assert decay(np.cumsum([step * 1.1**k for k in range(6)], axis=0)) == 1.0
-    assert decay(np.repeat(step[None], 6, axis=0)) == 1.0
+    assert decay(shrinking, UNIT_SQUARE) == pytest.approx(0.9)
+    growing = np.cumsum([step * 1.1**k for k in range(6)], axis=0)
+    assert decay(growing, UNIT_SQUARE) == 1.0
+    assert decay(np.repeat(step[None], 6, axis=0), UNIT_SQUARE) == 1.0
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.02])
