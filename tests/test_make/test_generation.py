@@ -15,7 +15,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from conftest import PAINT, SIZE, SPLIT
+from conftest import PAINT_PICTURES, SIZE, SPLIT
 from independent_hash import content_hash, dumps
 
 from lagbench.data import WALLS
@@ -547,7 +547,7 @@ def test_a_registry_of_ones_own_is_all_that_counts(
     """A split that only the given registry knows is generated, drawn and described with
     its own title.
     """
-    monkeypatch.setattr(painting, "paint_pictures", PAINT)
+    monkeypatch.setattr(painting, "paint_pictures", PAINT_PICTURES)
     described = unmeasured.split(SPLIT).model_copy(update={"title": "Noise of our own"})
     own = Registry({"own-noise": described}, {})
     result = generate(
