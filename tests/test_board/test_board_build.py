@@ -211,7 +211,8 @@ def test_residual_histograms(card: ScoreCard) -> None:
         half_bin = greatest / (RESIDUAL_BINS - 1)
         end = greatest + half_bin
         counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
-        assert (histogram.low, histogram.high) == (-greatest, greatest)
+        assert histogram.low == -greatest
+        assert histogram.high == greatest
         assert histogram.shares == pytest.approx(counts / residual.size)
 
 

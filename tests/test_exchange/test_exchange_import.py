@@ -164,7 +164,8 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
         output=tmp_path / "b",
         kinds={1: "drop"},
     )
-    assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
+    assert named.particles == (36, 36)
+    assert dropped.particles == (30, 30)
     np.testing.assert_array_equal(
         positions(dropped.folder)[0], straight_runs(3)[0][:, :30]
     )
@@ -219,7 +220,9 @@ def test_what_the_user_says_goes_before_the_metadata(
     done = run(*arguments, *options)
     assert done.exit_code == 0, done.output
     size = locate(str(tmp_path / "own")).size
-    assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
+    assert size.task.radius == 0.1
+    assert size.task.input_frames == 2
+    assert size.task.horizon == 4
     assert size.task.score_grid.placement == "cell_centres"
     assert size.value("spacing") == 0.05
 
