@@ -166,7 +166,7 @@ class Bonds:
         points = position
         period = None
         if box.is_periodic:
-            points = box.wrap(position) - box.low
+            points = np.asarray(box.wrap(position) - box.low)
             period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
         tree = cKDTree(points, boxsize=period)
         neighbours = tree.query_pairs(radius, output_type="ndarray")

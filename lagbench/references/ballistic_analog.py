@@ -83,9 +83,15 @@ def _chosen() -> Mapping[str, Mapping[str, int]]:
 
 
 def choice_for(size: Size) -> Choice:
-    """Return what was chosen for a data set; the default for those of a user."""
-    key = f"{size.split}-{size.name}-v{size.major}"
-    return Choice(**_chosen().get(key, {}))
+    """Return what was chosen for a data set, or for size mini of its split.
+
+    Data sets of a user have the default.
+    """
+    for name in (size.name, "mini"):
+        chosen = _chosen().get(f"{size.split}-{name}-v{size.major}")
+        if chosen is not None:
+            return Choice(**chosen)
+    return Choice()
 
 
 def label_bodies(position: Floats, radius: float) -> NDArray[np.intp]:

@@ -28,8 +28,8 @@ from lagbench.metrics.table import ranking_metric
 from lagbench.submission.task_checks import frames_to_predict
 from lagbench.work.machine import run_in_child
 
-from .card import FRAMES, PARTICLES, SUBMISSION, Preview
-from .published_scores import PublishedScores, unreadable_scores
+from .card import FRAMES, PARTICLES, SUBMISSION, Preview, unreadable_scores
+from .published_scores import PublishedScores
 from .score_file import FILM_RANGE, SubmissionStatistics, read_statistics
 
 MAX_SCORE_BYTES = 1_000_000  # longest score file [bytes]

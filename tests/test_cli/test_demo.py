@@ -94,12 +94,11 @@ def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_re
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
     assert "1 data sets, verified and drawn, in" in result.stdout
-    line = "no model, no leaderboard: torch is not installed; pip install 'lagbench[baselines]'"
-    assert line in result.stdout.splitlines()
+    assert "pip install 'lagbench[baselines]'" in result.stdout
     assert not (root / "leaderboard").exists()
     made = made_in(root, run)
     assert made["model"] is None
-    assert made["model_left_out"] in line
+    assert made["model_left_out"] in result.stdout
     assert list(made["splits"]) == [SPLIT]
     assert made["splits"][SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
     assert Path(made["splits"][SPLIT]["picture"]).is_file()
@@ -134,7 +133,8 @@ def test_the_demo_ends_with_a_leaderboard_of_its_own(
     }
     assert second["card"]["predictions_sha256"] == first["card"]["predictions_sha256"]
     assert second["card"]["rows"] == first["card"]["rows"]
-    assert (second["page"]["rows"], second["page"]["tabs"]) == (1, 1)
+    assert second["page"]["rows"] == 1
+    assert second["page"]["tabs"] == 1
     ranked = second["card"]["rows"]["submission"][second["card"]["ranking_metric"]]
     assert second["entry"]["mean"] == pytest.approx(ranked["mean"], rel=1e-5)
 
@@ -151,7 +151,9 @@ def test_what_another_version_left_is_trained_anew(
     assert demo.demo_model(root=root).training.state == "finished"
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.width=4"))
     again = demo.demo_model(root=root).training
-    assert (again.state, again.step, again.steps) == ("finished", 3, 3)
+    assert again.state == "finished"
+    assert again.step == 3
+    assert again.steps == 3
     assert torch.load(again.weights, weights_only=True)
 
 
@@ -187,5 +189,6 @@ def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
     assert (
         model["card"]["skill"]["value"] > 0.2
     )  # better than anything that costs no learning
-    assert (model["page"]["rows"], model["page"]["tabs"]) == (1, 1)
+    assert model["page"]["rows"] == 1
+    assert model["page"]["tabs"] == 1
     assert Path(model["page"]["page"]).stat().st_size == model["page"]["bytes"]
