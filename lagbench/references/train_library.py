@@ -73,7 +73,7 @@ class Mirror:
 
 def mirrors_of(size: Size) -> tuple[Mirror, ...]:
     """Return the mirror images under which a split is the same; the first is itself."""
-    box = Box.from_bounds(size.bounds)
+    box = size.box
     symmetric_axes = range(box.dimension) if fills_box(size) else range(1)
     mirrors = []
     for count in range(len(symmetric_axes) + 1):
@@ -215,7 +215,7 @@ def _build_library(
         for number, mirror in enumerate(mirrors_of(size)):
             image = mirror.positions(motion.position.astype(np.float64))
             for frame in range(1, last, STATE_STRIDE):
-                velocity = image[frame] - image[frame - 1]
+                velocity = size.box.displacement(image[frame - 1], image[frame])
                 state = describe_state(image[frame], velocity, motion.material)
                 scenarios.append(scenario)
                 numbers.append(number)

@@ -56,11 +56,9 @@ def test_round_trip(tmp_path: Path) -> None:
     stored = example(optimizer=optimizer.state_dict())
     save(tmp_path / "a.pt", stored)
     found = load(tmp_path / "a.pt")
-    assert (found.baseline, found.options, found.info) == (
-        stored.baseline,
-        stored.options,
-        INFO,
-    )
+    assert found.baseline == stored.baseline
+    assert found.options == stored.options
+    assert found.info == INFO
     assert found.training == stored.training
     assert torch.equal(found.weights["a"], stored.weights["a"])
     # Adam's first moment after one step: (1 - 0.9) x gradient.

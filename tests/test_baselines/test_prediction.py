@@ -158,7 +158,9 @@ def test_the_file_is_valid_and_says_what_made_it(
     report = examine(result.path, root=generated.root, registry=unmeasured)
     assert report.valid, report.findings
     found = said(result.path)
-    assert (found["method"], found["seed"], found["parameters"]) == ("my drift", 3, 1)
+    assert found["method"] == "my drift"
+    assert found["seed"] == 3
+    assert found["parameters"] == 1
     assert "curl-noise/tiny, step 9" in found["training"]
     assert "1 thread" in found["device"]
     assert found["seconds_per_frame"] == result.seconds_per_frame > 0
@@ -169,7 +171,8 @@ def test_the_file_is_valid_and_says_what_made_it(
 def test_batches_do_not_matter(run: Predict) -> None:
     """Scenarios predicted side by side are those predicted one by one."""
     alone, together = (run(name=f"{batch}.nc", batch=batch) for batch in (1, 2))
-    assert (alone.batch, together.batch) == (1, 2)
+    assert alone.batch == 1
+    assert together.batch == 2
     assert np.array_equal(written(alone.path), written(together.path))
 
 
@@ -272,9 +275,11 @@ def test_a_diverging_scenario_leaves_others_alone() -> None:
     model = Bursting.build({"start": 1.0}, INFO)
     batch = windows([0.9, 0.1])
     good, bad = roll_out(model, batch, 8)
-    assert (good.scenario, good.diverged_at) == (10, None)
+    assert good.scenario == 10
+    assert good.diverged_at is None
     # Frames 4 and 5 are given, 6 to 8 finite.
-    assert (bad.scenario, bad.diverged_at) == (11, 9)
+    assert bad.scenario == 11
+    assert bad.diverged_at == 9
     alone = roll_out(model, select_window(batch, 0), 8)[0]
     assert torch.equal(good.position, alone.position)
     assert good.position.shape == bad.position.shape == (8, 3, 2)
@@ -400,7 +405,8 @@ def test_another_size_than_that_of_the_training(
     result = run(
         "scaled", start=0.5, info=trained, size="tiny", training={"budget": budget}
     )
-    assert (result.size, result.trained_size) == ("tiny", "mini")
+    assert result.size == "tiny"
+    assert result.trained_size == "mini"
     assert Scaled.told == replace(here, radius=1.0, statistics=ones)
     assert np.array_equal(
         written(result.path), written(run(start=0.5, name="own.nc").path)

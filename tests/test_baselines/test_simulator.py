@@ -156,7 +156,8 @@ def test_two_frames_are_enough_to_start_from() -> None:
     with pytest.raises(UsageError, match="2 or more"):
         model.start(given.part(slice(1)))
     model = network(awake=True, velocities=1)  # sees two frames and starts from two
-    assert (model.history, model.features.count) == (2, 22)
+    assert model.history == 2
+    assert model.features.count == 22
     assert torch.equal(
         rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2)
     )

@@ -140,7 +140,8 @@ def test_converges_to_least_squares(run: Run, generated: GenerationResult) -> No
     assert float(load(result.checkpoint).weights["a"]) == pytest.approx(
         above / below, abs=2e-3
     )
-    assert (result.state, result.parameters) == ("finished", 1)
+    assert result.state == "finished"
+    assert result.parameters == 1
 
 
 @pytest.mark.parametrize("baseline", ["supergat", "neuralmpm", "drift"])
@@ -162,12 +163,16 @@ def test_resumed_equals_uninterrupted(run: Run, baseline: str, tmp_path: Path) -
         with pytest.raises(KeyboardInterrupt):
             run(baseline, *settings, to="parts", progress=interrupt_at(step))
         stopped = json.loads((tmp_path / "parts/training.json").read_text())
-        assert (stopped["state"], stopped["step"]) == ("interrupted", step)
+        assert stopped["state"] == "interrupted"
+        assert stopped["step"] == step
     parts = run(baseline, *settings, to="parts")
-    assert (parts.state, parts.first_step, parts.step) == ("finished", 5, 7)
+    assert parts.state == "finished"
+    assert parts.first_step == 5
+    assert parts.step == 7
     assert same(whole.checkpoint, parts.checkpoint)
     assert same(whole.weights, parts.weights)
-    assert (whole.best_value, whole.best_step) == (parts.best_value, parts.best_step)
+    assert whole.best_value == parts.best_value
+    assert whole.best_step == parts.best_step
 
 
 @pytest.mark.parametrize(("baseline", "steps"), [("drift", 3), ("var", 1)])
@@ -179,16 +184,18 @@ def test_a_finished_training_is_not_repeated(
     """
     settings = () if baseline == "var" else (f"steps={steps}",)
     first = run(baseline, *settings)
-    assert (first.state, first.step, first.steps) == ("finished", steps, steps)
+    assert first.state == "finished"
+    assert first.step == steps
+    assert first.steps == steps
     assert first.weights.exists()
     before = first.checkpoint.read_bytes()
     stamp = first.checkpoint.stat().st_mtime_ns
     again = run(baseline, *settings)
-    assert (again.state, again.first_step, again.step) == ("finished", steps, steps)
-    assert (first.checkpoint.read_bytes(), first.checkpoint.stat().st_mtime_ns) == (
-        before,
-        stamp,
-    )
+    assert again.state == "finished"
+    assert again.first_step == steps
+    assert again.step == steps
+    assert first.checkpoint.read_bytes() == before
+    assert first.checkpoint.stat().st_mtime_ns == stamp
 
 
 def test_seeds(run: Run) -> None:
@@ -242,18 +249,14 @@ def test_a_training_that_stopped_early_is_over(run: Run) -> None:
     files = (first.checkpoint, first.weights, first.folder / "training.json")
     before = [file.read_bytes() for file in files]
     values = [entry["vorticity_nrmse"] for entry in json.loads(before[2])["validation"]]
-    assert (first.state, first.step) == (
-        "stopped early",
-        int(np.argmin(values)) + 1 + 3,
-    )
+    assert first.state == "stopped early"
+    assert first.step == int(np.argmin(values)) + 1 + 3
     assert first.step < 50
     assert load(first.weights).training["step"] == first.best_step
     again = run("drift", *settings)
-    assert (again.state, again.step, again.best_step) == (
-        first.state,
-        first.step,
-        first.best_step,
-    )
+    assert again.state == first.state
+    assert again.step == first.step
+    assert again.best_step == first.best_step
     assert [file.read_bytes() for file in files] == before
 
 

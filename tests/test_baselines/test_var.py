@@ -73,7 +73,8 @@ def test_coefficients_are_those_of_statsmodels(lags: int, spread: float) -> None
     assert condition <= 1e6
     assert relative(found.coefficients, expected) <= 1e-6
     assert found.condition == pytest.approx(condition, rel=2e-3)
-    assert (found.floor, found.rows) == (0.0, 300 - lags)
+    assert found.floor == 0.0
+    assert found.rows == 300 - lags
 
 
 @pytest.mark.parametrize(
@@ -321,7 +322,8 @@ def test_the_protocol_of_the_thesis_runs(
     assert var_protocol.main() == 0
     found = json.loads(capsys.readouterr().out)
     assert found["features"] == 4 * 506
-    assert (found["frames"], found["forecast_frames"]) == (91, 19)
+    assert found["frames"] == 91
+    assert found["forecast_frames"] == 19
     assert found["fit_mse"] < 1e-9  # fewer frames than features: every one is met
     ours = {
         **found,

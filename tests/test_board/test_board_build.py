@@ -211,7 +211,8 @@ def test_residual_histograms(card: ScoreCard) -> None:
         half_bin = greatest / (RESIDUAL_BINS - 1)
         end = greatest + half_bin
         counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
-        assert (histogram.low, histogram.high) == (-greatest, greatest)
+        assert histogram.low == -greatest
+        assert histogram.high == greatest
         assert histogram.shares == pytest.approx(counts / residual.size)
 
 
@@ -331,7 +332,7 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
     for reference in board.tabs[0].references:
         row = rows[reference.name]
         assert row[0] == "-"
-        assert row[-1] == "reference"
+        assert row[-1] == f"{reference.kind} reference"
     damped = rows["damped"]
     assert damped[0] == str(row_of(board, "damped").rank)
     assert " ± " in damped[3]

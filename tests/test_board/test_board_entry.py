@@ -384,12 +384,10 @@ def test_options_win_over_the_file(tmp_path: Path) -> None:
     path = tmp_path / "meta.yaml"
     path.write_text("name: From file\nauthors: [A, B]\ndate: 2026-01-31\nmethod: a\n")
     meta = read_meta(path, {"method": "b", "authors": None, "urls": [], "notes": ""})
-    assert (meta.method, meta.name, meta.authors, meta.urls) == (
-        "b",
-        "From file",
-        ("A", "B"),
-        (),
-    )
+    assert meta.method == "b"
+    assert meta.name == "From file"
+    assert meta.authors == ("A", "B")
+    assert meta.urls == ()
     path.write_text("- a list\n")
     with pytest.raises(UsageError, match="does not describe"):
         read_meta(path, {})

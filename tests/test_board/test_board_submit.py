@@ -74,8 +74,11 @@ def test_the_entry_says_all_that_is_known(own: BoardBench, predictions: Path) ->
     }
     result = own.submit(predictions, **said)
     entry = read_entry(own.entry("my-model"))
-    assert (entry.name, entry.code, entry.date) == ("My model", "https://a.org/x", DAY)
-    assert (entry.parameters, entry.training) == (9, "train")
+    assert entry.name == "My model"
+    assert entry.code == "https://a.org/x"
+    assert entry.date == DAY
+    assert entry.parameters == 9
+    assert entry.training == "train"
     assert entry.cost is not None
     cost = {
         "seconds_per_frame": 0.25,
@@ -398,7 +401,8 @@ def test_no_board_is_begun_by_mistake(
         (board / name).write_text("mine")
     with pytest.raises(UsageError) as error:
         submitting.submit([predictions], meta, **where)
-    assert (error.value.where, error.value.got) == (str(board), "'index.html'")
+    assert error.value.where == str(board)
+    assert error.value.got == "'index.html'"
     assert sorted(path.name for path in board.iterdir()) == [
         ".git",
         "README.md",

@@ -405,11 +405,9 @@ def test_reading_parts(written: tuple[Path, str]) -> None:
             np.concatenate(list(file.blocks("position"))), truth
         )
         assert file.read("particle_mass") == 1e-4 / 8
-        assert (file.header.frames, file.header.particles, file.header.key) == (
-            4,
-            8,
-            KEY,
-        )
+        assert file.header.frames == 4
+        assert file.header.particles == 8
+        assert file.header.key == KEY
         with pytest.raises(DataError, match="variable 'density'"):
             file.read("density")
 

@@ -114,7 +114,8 @@ def test_all_ways_to_name_it(
     ]
     for split, root in [*by_path, ("own", own.parent), ("own", "."), ("own", None)]:
         found = locate_split(split, root=root)
-        assert (found.name, found.root.resolve()) == ("own", own.parent.resolve())
+        assert found.name == "own"
+        assert found.root.resolve() == own.parent.resolve()
     monkeypatch.chdir(own.parent.parent)
     monkeypatch.setenv("LAGBENCH_ROOT", str(own.parent))
     assert locate_split("own").root == own.parent
@@ -129,10 +130,8 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
     (tmp_path / "cavity").mkdir()
     (tmp_path / "cavity" / "split.yaml").write_text("format: 1")
     found = locate("cavity", "tiny", root=tmp_path)
-    assert (found.size.generator, found.root) == (
-        "lagbench.generators.cavity",
-        tmp_path,
-    )
+    assert found.size.generator == "lagbench.generators.cavity"
+    assert found.root == tmp_path
     with pytest.raises(UsageError, match="taken by another split"):
         locate(str(tmp_path / "cavity"), "tiny")
 
@@ -161,7 +160,8 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     ):
         with pytest.raises(UsageError) as several:
             opened("cavity", root=tmp_path)
-        assert (several.value.where, several.value.fix) == ("--size", "--size full")
+        assert several.value.where == "--size"
+        assert several.value.fix == "--size full"
     assert locate_new("cavity", root=tmp_path).size.name == "mini"
     # Where a split has no mini, its only size is the default.
     assert (

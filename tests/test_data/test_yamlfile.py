@@ -79,7 +79,8 @@ def test_numbers_are_those_of_yaml_1_2(
     point.
     """
     found = read_yaml(_write(tmp_path, f"a: {text}\n"))["a"]
-    assert (found, type(found)) == (value, type(value))
+    assert found == value
+    assert type(found) is type(value)
 
 
 @pytest.mark.parametrize(

@@ -294,7 +294,8 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
         for f, p in shapes
     ]
     made = adopted(tmp_path, ragged, test=2)
-    assert (made.horizon, made.particles) == (12, (25, 40))
+    assert made.horizon == 12
+    assert made.particles == (25, 40)
     with lagbench.open_split(str(made.folder), subset="train") as data:
         assert data["frame_count"].values.tolist() == [12, 20]
         assert data["particle_count"].values.tolist() == [40, 30]
@@ -325,11 +326,9 @@ def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
         rescale=True,
     )
     size = locate(str(made.folder)).size
-    assert (size.task.radius, size.bounds[0], size.value("source_scale")) == (
-        0.075,
-        (0.0, 0.75),
-        4.0,
-    )
+    assert size.task.radius == 0.075
+    assert size.bounds[0] == (0.0, 0.75)
+    assert size.value("source_scale") == 4.0
     np.testing.assert_array_equal(stored(made, 0, "position") * 4, wide[0])
 
 
@@ -363,7 +362,8 @@ def test_a_fitted_box_lies_in_the_unit_box(
 ) -> None:
     """Scale and corner are the least that bring a box into the unit box."""
     transform = BoxTransform.fit(bounds)
-    assert (transform.scale, transform.corner) == (scale, corner)
+    assert transform.scale == scale
+    assert transform.corner == corner
     box = np.array(transform.transform_box(bounds))
     assert box.min() >= 0.0
     assert box.max() <= 1.0
@@ -717,11 +717,9 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
     done = run(*words)
     assert done.exit_code == 0, done.output
     size, _, splits = locate(str(tmp_path / "mine"))
-    assert (size.task.radius, size.task.horizon, size.task.frames_of_interest) == (
-        0.1,
-        3,
-        (8,),
-    )
+    assert size.task.radius == 0.1
+    assert size.task.horizon == 3
+    assert size.task.frames_of_interest == (8,)
     assert size.bounds == ((0.0, 1.0), (0.25, 1.0))
     assert size.value("density") == 2.0
     assert splits.split("mine").licence == "CC0-1.0"

@@ -34,8 +34,9 @@ def positions(folder: Path, subset: str = "train") -> np.ndarray:
 def test_an_export_comes_back(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, form: str
 ) -> None:
-    """Every subset has the stored bits again, and the task is the one that was
-    exported.
+    """Every subset has the stored bits again, and the task is the exported one.
+
+    Only the effective viscosity, which was fitted to our data, is not in those formats.
     """
     name, _, walls = form.partition(" ")
     options: dict[str, Any] = {
@@ -64,7 +65,9 @@ def test_an_export_comes_back(
             mass = data["particle_mass"].values[0]
     here = locate(str(made.folder)).size
     there = unmeasured.size("curl-noise", "tiny")
-    assert (here.task, here.bounds) == (there.task, there.bounds)
+    expected_task = there.task.model_copy(update={"effective_viscosity": None})
+    assert here.task == expected_task
+    assert here.bounds == there.bounds
     assert here.frame_interval == there.frame_interval
     with lagbench.open_split(str(made.folder)) as data:
         assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
@@ -161,7 +164,8 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
         output=tmp_path / "b",
         kinds={1: "drop"},
     )
-    assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
+    assert named.particles == (36, 36)
+    assert dropped.particles == (30, 30)
     np.testing.assert_array_equal(
         positions(dropped.folder)[0], straight_runs(3)[0][:, :30]
     )
@@ -216,7 +220,9 @@ def test_what_the_user_says_goes_before_the_metadata(
     done = run(*arguments, *options)
     assert done.exit_code == 0, done.output
     size = locate(str(tmp_path / "own")).size
-    assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
+    assert size.task.radius == 0.1
+    assert size.task.input_frames == 2
+    assert size.task.horizon == 4
     assert size.task.score_grid.placement == "cell_centres"
     assert size.value("spacing") == 0.05
 

@@ -129,7 +129,8 @@ def test_what_no_part_holds_is_simulated(
     linked.symlink_to(os.path.relpath(parts[1] / "blob", linked.parent))
     for dry in (True, False):
         result = gather(parts[1], scenarios="1,3,4", dry_run=dry)
-        assert (result.simulated, result.kept) == ((1,), (3, 4))
+        assert result.simulated == (1,)
+        assert result.kept == (3, 4)
     assert not (whole / FOLDER / "test" / "0004.nc").is_symlink()
     again = gather(*parts)
     assert again.simulated == ()

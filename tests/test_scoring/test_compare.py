@@ -256,7 +256,8 @@ def test_files_of_a_leaderboard(
     assert compare("moving.nc", "constant-velocity").seeds == (2, 1)
     (folder / "moving_old.nc").write_bytes(b"not a seed")
     result = compare(folder / "moving.nc", "constant-velocity")
-    assert (result.first, result.seeds) == ("moving", (2, 1))
+    assert result.first == "moving"
+    assert result.seeds == (2, 1)
     single = compare(scored["still"] / "scores.nc", "constant-velocity").as_json()[
         "metrics"
     ]
@@ -318,7 +319,8 @@ def test_floors_stand_in_the_scores(scored: dict[str, Path]) -> None:
     by_name = compare(scored["still"], "constant-velocity").as_json()
     by_file = compare(scored["still"], scored["straight"]).as_json()
     assert by_name["metrics"] == by_file["metrics"]
-    assert (by_name["second"], by_file["second"]) == ("constant-velocity", "straight")
+    assert by_name["second"] == "constant-velocity"
+    assert by_file["second"] == "straight"
     with pytest.raises(UsageError, match="vorticity_rmse"):
         compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
     with pytest.raises(UsageError, match="'constant-velocity'"):
@@ -340,7 +342,8 @@ def test_equal_names_are_told_apart(tmp_path: Path) -> None:
         tmp_path / "b", [2, 3, 4, 5, 6, 8], method="toy", predictions_sha256="b"
     )
     result = compare(a, b)
-    assert (result.first, result.second) == ("toy (1)", "toy (2)")
+    assert result.first == "toy (1)"
+    assert result.second == "toy (2)"
     assert result.namesakes
     assert "toy (1) is better" in result.verdict
     assert list(comparison_tables(result))[1].columns[1:] == ("toy (1)", "toy (2)")
@@ -349,11 +352,9 @@ def test_equal_names_are_told_apart(tmp_path: Path) -> None:
         tmp_path, [1] * 6, method="floor", rows={**rows, "floor": rows["submission"]}
     )
     result = compare(borrowed, "floor")
-    assert (result.first, result.second, result.namesakes) == (
-        "floor (1)",
-        "floor",
-        False,
-    )
+    assert result.first == "floor (1)"
+    assert result.second == "floor"
+    assert not result.namesakes
 
 
 def row_of(

@@ -207,7 +207,8 @@ def test_both_files_read_back(card: ScoreCard) -> None:
         assert score.undefined == card.submission[name].undefined, name
     for scenario, tally in card.tallies[SUBMISSION].items():
         again = stored.tallies[scenario]
-        assert (again.names, again.frames) == (tally.names, tally.frames)
+        assert again.names == tally.names
+        assert again.frames == tally.frames
         for field in ("total", "weight", "undefined"):
             np.testing.assert_array_equal(getattr(again, field), getattr(tally, field))
     published = read_scores(card.files[0])

@@ -378,8 +378,6 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert REFERENCES[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert (again.reference, again.value) == (
-        standing.skill.reference,
-        standing.skill.value,
-    )
+    assert again.reference == standing.skill.reference
+    assert again.value == standing.skill.value
     assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")

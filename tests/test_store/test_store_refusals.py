@@ -120,5 +120,6 @@ def test_the_command_line_says_it_too(s3: str) -> None:
         done = CliRunner().invoke(
             app, ["generate", SPLIT, "--size", SIZE, "--root", name]
         )
-        assert (done.exit_code, type(done.exception)) == (code, SystemExit)
+        assert done.exit_code == code
+        assert type(done.exception) is SystemExit
         assert "fix: " in done.stderr or "expected: " in done.stderr

@@ -214,8 +214,11 @@ def test_what_is_published_comes_along(
     scenarios share them.
     """
     box = lagbench.windows("cavity", size="tiny", root=root, registry=registry)
-    assert (box.history, box.future, box.length) == (6, 1, 7)
-    assert (box.gravity, box.viscosity) == (0.0, None)
+    assert box.history == 6
+    assert box.future == 1
+    assert box.length == 7
+    assert box.gravity == 0.0
+    assert box.viscosity is None
     for i in unmeasured.size("fluid", "tiny").subsets["valid"]:
         frames = unmeasured.size("fluid", "tiny").frame_count(i)
         write_scenario(
@@ -227,7 +230,9 @@ def test_what_is_published_comes_along(
     splash = lagbench.windows(
         "fluid", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
     )
-    assert (splash.history, splash.gravity, splash.viscosity) == (2, 2.5, 1e-3)
+    assert splash.history == 2
+    assert splash.gravity == 2.5
+    assert splash.viscosity == 1e-3
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
@@ -240,7 +245,8 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
     windows = [data[2], data[34 + 20 + 1]]
     batch = collate(windows)
     assert batch.sample.tolist() == 8 * [0] + 11 * [1]
-    assert (batch.scenario.tolist(), batch.frame.tolist()) == ([0, 2], [2, 1])
+    assert batch.scenario.tolist() == [0, 2]
+    assert batch.frame.tolist() == [2, 1]
     assert torch.equal(batch.position[8:], windows[1].position)
     assert batch.material.shape == (19,)
     assert batch.wall_velocity is not None
@@ -372,7 +378,8 @@ def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
     data = train()
     for index in (np.array(-1), torch.tensor(-1)):
         window = data[index]  # type: ignore[index]
-        assert (window.scenario, window.frame) == (data[-1].scenario, data[-1].frame)
+        assert window.scenario == data[-1].scenario
+        assert window.frame == data[-1].frame
         assert type(window.frame) is int
         assert int(index) == -1
 
@@ -472,7 +479,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     data = train()
     first = data[0]
     sent = pickle.loads(pickle.dumps(data))
-    assert (sent.store.cached_bytes, len(sent.store._open_scenarios)) == (0, 0)
+    assert sent.store.cached_bytes == 0
+    assert len(sent.store._open_scenarios) == 0
     assert torch.equal(sent[0].position, first.position)
     batches = [
         list(

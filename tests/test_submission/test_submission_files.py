@@ -94,11 +94,9 @@ def test_the_template_is_the_last_given_frame_repeated(
     """
     made: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
     result = template("cavity", "tiny", output=bench.folder / "t.nc", **made)
-    assert (result.scenarios, result.frames, result.particles) == (
-        TESTS,
-        (GIVEN, FRAMES - 1),
-        PARTICLES,
-    )
+    assert result.scenarios == TESTS
+    assert result.frames == (GIVEN, FRAMES - 1)
+    assert result.particles == PARTICLES
     assert bench.validate(result.path).exit_code == 0
     with open_predictions(result.path) as predictions:
         assert predictions.header.method == "persistence"
@@ -323,11 +321,9 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         )
     with open_predictions(path) as predictions:
         header = predictions.header
-        assert (header.seconds_per_frame, header.seed, header.device) == (
-            0.5,
-            2,
-            "one core",
-        )
+        assert header.seconds_per_frame == 0.5
+        assert header.seed == 2
+        assert header.device == "one core"
 
 
 def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
@@ -374,13 +370,15 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
                 predictions.frames(*place)
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
-    assert (header.split, header.size, header.method) == ("cavity", "tiny", "truth")
-    assert (header.scenarios, header.frames, header.particles) == (
-        TESTS,
-        tuple(ALL),
-        PARTICLES,
-    )
-    assert (header.seconds_per_frame, header.seed, header.device) == (0.25, 7, None)
+    assert header.split == "cavity"
+    assert header.size == "tiny"
+    assert header.method == "truth"
+    assert header.scenarios == TESTS
+    assert header.frames == tuple(ALL)
+    assert header.particles == PARTICLES
+    assert header.seconds_per_frame == 0.25
+    assert header.seed == 7
+    assert header.device is None
 
 
 def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:
