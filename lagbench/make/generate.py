@@ -582,7 +582,8 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         keeper.fetch(train_ids)
         setup.meter.begin("statistics", total=len(train_ids), scenarios=len(train_ids))
         paths = {f"scenario {i}": setup.path(i) for i in train_ids}
-        moments = setup.read_files(file_moments, paths, paths.values())
+        read_moments = partial(file_moments, box=setup.size.box)
+        moments = setup.read_files(read_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     keeper.keep(manifest)
 
