@@ -150,8 +150,9 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     """
     kinds = np.array([0] * 30 + [1] * 6 + [-1] * 4)
     source = write_h5(tmp_path / "in", straight_runs(3), kinds)
-    with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert caught.value.where.endswith("in/train.h5, group '00000'")
     named = import_split(
         source,
         format="lagrangebench-h5",
@@ -181,10 +182,9 @@ def test_periodic_boxes(tmp_path: Path) -> None:
     import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
     runs[1][5:, 0, 0] += np.float32(0.42 if runs[1][5, 0, 0] < 0.5 else -0.42)
     source = write_h5(tmp_path / "in", runs, **periodic)
-    with pytest.raises(
-        DataError, match=r"periodic boundary\n  where: .*valid.h5.*frame 5"
-    ):
+    with pytest.raises(DataError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
+    assert caught.value.where.endswith("in/valid.h5, group '00000', frame 5")
 
 
 def test_what_the_user_says_goes_before_the_metadata(
@@ -231,6 +231,6 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
     """Where the files are those of the other format, the message names it."""
     for subset in SUBSETS:
         (tmp_path / f"{subset}.h5").touch()
-    with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
     assert "--format lagrangebench-h5" in str(caught.value)
