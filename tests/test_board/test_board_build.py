@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import PLACE, BoardBench, copied, master, noisy
+from board_bench import PLACE, BoardBench, copied, master, noisy
 from numpy.typing import NDArray
 
 from lagbench.board.build import (

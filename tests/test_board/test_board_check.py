@@ -15,7 +15,16 @@ from typing import Any
 import netCDF4
 import pytest
 import yaml
-from made_up import PLACE, SCORES, BoardBench, copied, master, reform, scale, set_mean
+from board_bench import (
+    PLACE,
+    SCORES,
+    BoardBench,
+    copied,
+    master,
+    reform,
+    scale,
+    set_mean,
+)
 
 from lagbench.board import folder_checks
 from lagbench.board.build import build

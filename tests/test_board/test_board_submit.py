@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_up import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
+from board_bench import DAY, BoardBench, copied, damped, motion, nearer, noisy, still
 
 from lagbench import __version__
 from lagbench.board import publish

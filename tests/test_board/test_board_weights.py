@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
-from made_up import BoardBench, copied, nearer, noisy, still
 from simple_models import INFO, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from bad_submissions import FAULTS
-from faulty import positions, rows, store
+from fault_registry import positions, rows, store
 from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
 from submission_data import (

@@ -17,7 +17,7 @@ import pytest
 import torch
 import xarray as xr
 from bad_submissions import FAULTS
-from faulty import DIMS, positions, rows, store
+from fault_registry import DIMS, positions, rows, store
 from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
