@@ -13,8 +13,10 @@ import functools
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .frame import Floats, FramePair, average
 from .metric import (
@@ -164,7 +166,7 @@ def energy_spectrum(velocity: Floats, periodic: Sequence[bool] | None = None) ->
     half_waves = 1 if all(periodic) else 2  # of a whole wave
     longest = max(node_counts)
 
-    modes = velocity
+    modes: NDArray[Any] = velocity
     wave_numbers = []  # of each axis, shape [mode]
     limits = []  # the first wave number that an axis does not resolve
     for axis, count in enumerate(node_counts):

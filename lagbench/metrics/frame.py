@@ -163,10 +163,12 @@ class Bonds:
         # splits without bodies save a fifth of a second
         from scipy.spatial import cKDTree
 
-        tree = cKDTree(position)
+        points = position
+        period = None
         if box.is_periodic:
+            points = np.asarray(box.wrap(position) - box.low)
             period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
-            tree = cKDTree(box.wrap(position) - box.low, boxsize=period)
+        tree = cKDTree(points, boxsize=period)
         neighbours = tree.query_pairs(radius, output_type="ndarray")
         pairs = np.asarray(neighbours, np.intp).reshape(-1, 2)
         first_length = np.sqrt(_squared_lengths(position, pairs, box))

@@ -144,7 +144,8 @@ class Truth:
 
     def _hint_for_damage(self) -> str:
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        return f"{self._hint()}; {verify} --root {quote_root(self.root)} says what is wrong"
+        place = quote_root(self.root)
+        return f"{self._hint()}; {verify} --root {place} says what is wrong"
 
     def open(self, scenario: int) -> ScenarioFile:
         """Open a scenario, and check that it is the one that the registry means.
