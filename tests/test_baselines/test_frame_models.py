@@ -130,8 +130,9 @@ def test_windows_do_not_mix_and_are_of_as_many_particles() -> None:
         rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4)
     )
     assert torch.equal(long, short)
-    with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
+    with pytest.raises(DataError) as caught:
         model.start(batch_of([SCENARIOS[0][:2, :11]]))
+    assert caught.value.where == "batch"
 
 
 def test_a_change_of_nothing_is_persistence() -> None:
@@ -327,8 +328,9 @@ def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) ->
     MB.
     """
     if name == "var" and size == "full" and split in ("cavity", "curl-noise"):
-        with pytest.raises(UsageError, match="no recipe"):
+        with pytest.raises(UsageError) as caught:
             recipe_for(find(name), split, size)
+        assert caught.value.where == "--split, --size, --recipe"
         return
     recipe = recipe_for(find(name), split, size)
     with torch.device("meta"):  # no memory for the weights

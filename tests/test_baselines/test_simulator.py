@@ -153,7 +153,7 @@ def test_two_frames_are_enough_to_start_from() -> None:
     six = model.start(given.part(slice(2, 8)))
     assert torch.equal(long.velocity, six.velocity)
     assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
-    with pytest.raises(UsageError, match="2 or more"):
+    with pytest.raises(UsageError):
         model.start(given.part(slice(1)))
     model = network(awake=True, velocities=1)  # sees two frames and starts from two
     assert model.history == 2

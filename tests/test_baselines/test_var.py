@@ -133,12 +133,13 @@ def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
 
 def test_nothing_to_fit_is_an_error() -> None:
     """Scenarios as short as the lags, and values that are not finite, are refused."""
-    with pytest.raises(WorkFailedError, match="nothing to fit"):
+    with pytest.raises(WorkFailedError):
         solve(LaggedRows([series(2, 3)], lags=2))
     broken = series(30, 3)
     broken[4, 1] = np.nan
-    with pytest.raises(WorkFailedError, match="not finite"):
+    with pytest.raises(WorkFailedError) as caught:
         solve(LaggedRows([broken], lags=1))
+    assert caught.value.where == "rows to fit"
 
 
 def wandering(scenarios: int, *, frames: int = 60, particles: int = 6) -> list[Floats]:
