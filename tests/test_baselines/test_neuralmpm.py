@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from simple_models import batch, info, jittered, rolled, swirl
 from torch import Tensor, nn
@@ -30,8 +31,9 @@ SMALL: dict[str, object] = {
     "velocities": 2,
     "bundle": 2,
     "calls": 2,
+    "noise_std": 0.0,
+    "materials": [0, 1, 2, 3],
 }
-SMALL |= {"noise_std": 0.0, "materials": [0, 1, 2, 3]}
 PROJECTED: dict[str, object] = {"shape": [4, 8], "density": [8]}
 
 
@@ -43,197 +45,239 @@ def surrogate(
 ) -> Any:
     """Return a small model; `awake` is the deviation of its last layer's weights."""
     torch.manual_seed(0)
-    model = NeuralMPM.build(SMALL | options, info(**(changes or {})))
+    dataset_info = info(**(changes or {}))
+    model = NeuralMPM.build(SMALL | options, dataset_info)
     if awake:
         nn.init.normal_(model.network.end.weight, std=awake)
     return model
 
 
-def liquid(*windows: np.ndarray[Any, np.dtype[np.float64]]) -> Batch:
+def liquid(*windows: NDArray[np.float64]) -> Batch:
     """Return windows side by side, all of one material."""
-    given = batch(*windows)
-    given.material.zero_()
-    return given
+    window = batch(*windows)
+    window.material.zero_()
+    return window
+
+
+def move_straight(
+    position: NDArray[np.float64], velocity: NDArray[np.float64], frames: int = 3
+) -> NDArray[np.float64]:
+    """Return frames of particles at constant velocity, shape [frame, particle, 2]."""
+    time = np.arange(frames)[:, None, None]
+    return position + time * velocity
 
 
 def drift(
     speed: tuple[float, float], frames: int, seed: int = 0
-) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Return a cloud in the middle of the box that moves as one, shape [frame,
-    particle, 2].
-    """
-    return jittered(seed, low=0.35, high=0.65) + np.arange(frames)[
-        :, None, None
-    ] * np.array(speed)
+) -> NDArray[np.float64]:
+    """Return a cloud that moves as one, shape [frame, particle, 2]."""
+    cloud = jittered(seed, low=0.35, high=0.65)
+    return move_straight(cloud, np.array(speed), frames)
+
+
+def make_too_dense(model: Any) -> None:
+    """Set the density limit so low that the projection corrects everything."""
+    nn.init.constant_(model.projection.limit, -2.0)
 
 
 def test_untrained_models_keep_every_velocity() -> None:
-    """Without smoothing particles move on straight, and with it a uniform flow keeps
-    its kinetic energy.
-    """
-    velocity = np.random.default_rng(0).normal(0.0, 2e-3, (256, 2))
-    window = jittered(0, low=0.3, high=0.7) + np.arange(3)[:, None, None] * velocity
-    found = rolled(surrogate(smoothing=0.0), batch(window), 20).diff(dim=1)
-    expected = (
-        torch.from_numpy(window[1] - window[0])[:, None].expand(-1, 19, -1).float()
-    )
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    moved = rolled(surrogate(smoothing=0.2), batch(drift((4e-3, -2e-3), 3)), 40)
-    energy = moved.diff(dim=1).double().square().sum(dim=2).mean(dim=0)
+    """Without smoothing particles move on straight."""
+    rng = np.random.default_rng(0)
+    velocity = rng.normal(0.0, 2e-3, (256, 2))
+    window = move_straight(jittered(0, low=0.3, high=0.7), velocity)
+    model = surrogate(smoothing=0.0)
+
+    predicted = rolled(model, batch(window), 20).diff(dim=1)
+    last_velocity = torch.from_numpy(window[1] - window[0]).float()
+    expected = last_velocity[:, None].expand(-1, 19, -1)
+    torch.testing.assert_close(predicted, expected, rtol=0, atol=1e-6)
+
+
+def test_smoothing_keeps_the_energy_of_a_uniform_flow() -> None:
+    window = batch(drift((4e-3, -2e-3), 3))
+    path = rolled(surrogate(smoothing=0.2), window, 40)
+    velocity = path.diff(dim=1).double()
+    energy = velocity.square().sum(dim=2).mean(dim=0)
     np.testing.assert_allclose(energy.numpy(), 2e-5, rtol=2e-3)
 
 
 def test_smoothing_damps_what_the_grid_does_not_see() -> None:
-    """A share s of the sub-grid velocity goes with every frame; momentum stays."""
-    velocity = np.random.default_rng(0).normal(0.0, 1e-3, (256, 2))
-    window = jittered(0, low=0.3, high=0.7) + np.arange(3)[:, None, None] * velocity
-    found = rolled(surrogate(smoothing=0.3), liquid(window), 4).diff(dim=1).double()
-    spread = found.std(dim=0).mean(dim=1)
-    assert bool((spread[1:] < 0.85 * spread[:-1]).all())
+    """A share of the sub-grid velocity goes with every frame."""
+    rng = np.random.default_rng(0)
+    velocity = rng.normal(0.0, 1e-3, (256, 2))
+    window = move_straight(jittered(0, low=0.3, high=0.7), velocity)
+    model = surrogate(smoothing=0.3)
+
+    predicted = rolled(model, liquid(window), 4).diff(dim=1).double()
+    deviation = predicted.std(dim=0).mean(dim=1)
+    assert bool((deviation[1:] < 0.85 * deviation[:-1]).all())
 
 
 @pytest.mark.parametrize("conserve", [False, True])
 def test_particles_stay_inside_the_walls(conserve: bool) -> None:
-    """Whatever the network says, positions stay in the box and velocities true to
-    them.
-    """
+    """Velocities are the differences of the positions, also where a wall stops."""
     model = surrogate(awake=30.0, conserve=conserve)
-    given = batch(swirl(0, 3), swirl(1, 3))
-    found = rolled(model, given, 12)
+    window = batch(swirl(0, 3), swirl(1, 3))
+    path = rolled(model, window, 12)
     low, high = torch.tensor(info().bounds).T
-    assert bool(((found >= low) & (found <= high)).all())
-    assert bool(((found == low) | (found == high)).any())  # some were stopped
-    _, frames = model.call(model.start(given))
+    is_inside = (path >= low) & (path <= high)
+    is_stopped = (path == low) | (path == high)
+    assert bool(is_inside.all())
+    assert bool(is_stopped.any())
+
+    _, frames = model.call(model.start(window))
+    first_position, _ = frames[0]
+    second_position, second_velocity = frames[1]
     torch.testing.assert_close(
-        frames[1][0] - frames[0][0], frames[1][1], rtol=0, atol=2e-7
+        second_position - first_position, second_velocity, rtol=0, atol=2e-7
     )
 
 
 @pytest.mark.parametrize("conserve", [False, True])
 def test_windows_side_by_side_do_not_see_each_other(conserve: bool) -> None:
-    """Two windows in one batch roll out as they do alone, walls and context
-    included.
-    """
+    """Two windows in one batch roll out as they do alone, with walls and context."""
     model = surrogate(awake=0.1, context=3, wall_velocity=True, conserve=conserve)
-    windows = [batch(swirl(seed, 3), walls=True) for seed in (0, 1)]
-    both = rolled(model, batch(swirl(0, 3), swirl(1, 3), walls=True), 5)
-    torch.testing.assert_close(
-        both, torch.cat([rolled(model, w, 5) for w in windows]), rtol=0, atol=1e-6
-    )
+    windows = [swirl(0, 3), swirl(1, 3)]
+
+    together = rolled(model, batch(*windows, walls=True), 5)
+    alone = [rolled(model, batch(window, walls=True), 5) for window in windows]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=0, atol=1e-6)
 
 
 def test_training_unrolls_the_rollout() -> None:
-    """The loss over two calls is the mean error of the rollout's velocities, over the
-    deviation.
+    """The loss over two calls is the mean error of the rollout's velocities.
 
-    With a generator after none or one call without gradients: of the rollout's next
-    frames.
+    It is measured in deviations of the acceleration. With a generator none or one call
+    without gradients comes before, and the loss is that of the rollout's next frames.
     """
     window = batch(swirl(0, 9))
     model = surrogate(awake=0.1, pushforward=1)
-    path = torch.cat(
-        [window.position[:, 2:3], rolled(model, window.part(slice(3)), 6)], dim=1
-    )
-    error = (path.diff(dim=1) - window.position[:, 2:].diff(dim=1)).square() / (
-        (2e-4**2 + 1e-4**2) / 2
-    )
-    expected = [float(error[:, start : start + 4].mean()) for start in (0, 2)]
+    predicted = rolled(model, window.part(slice(3)), 6)
+    path = torch.cat([window.position[:, 2:3], predicted], dim=1)
+    truth = window.position[:, 2:]
+
+    acceleration_variance = (2e-4**2 + 1e-4**2) / 2
+    difference = path.diff(dim=1) - truth.diff(dim=1)
+    error = difference.square() / acceleration_variance
+    first_frames = float(error[:, 0:4].mean())
+    next_frames = float(error[:, 2:6].mean())
+
+    losses = set()
     with torch.no_grad():
-        assert float(model(window)["velocity"]) == pytest.approx(expected[0], rel=1e-3)
-        found = {
-            float(model(window, torch.Generator().manual_seed(seed))["velocity"])
-            for seed in range(12)
-        }
-    assert sorted(found) == pytest.approx(sorted(expected), rel=1e-3)
+        loss = float(model(window)["velocity"])
+        for seed in range(12):
+            generator = torch.Generator().manual_seed(seed)
+            losses.add(float(model(window, generator)["velocity"]))
+    assert loss == pytest.approx(first_frames, rel=1e-3)
+    expected = sorted([first_frames, next_frames])
+    assert sorted(losses) == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("after", [2.2e-3, 6e-3])
-def test_the_way_back_is_asked_for(after: float) -> None:
-    """An untrained model goes on as before, the truth faster: how far it is behind
-    counts, to a bound.
+@pytest.mark.parametrize("speed", [2.2e-3, 6e-3])
+def test_recovery_asks_for_the_way_back(speed: float) -> None:
+    """The loss counts how far the model is behind the truth, up to a bound.
+
+    The untrained model goes on as before, the truth goes on at `speed` per frame.
     """
-    given = 2e-3
-    frames = np.arange(1.0, 5.0)
-    travelled = np.concatenate([given * np.arange(3.0), 2 * given + after * frames])
-    window = batch(
-        jittered(0, low=0.3, high=0.6) + travelled[:, None, None] * np.array([1.0, 0.0])
-    )
+    initial_speed = 2e-3
+    initial_path = initial_speed * np.arange(3.0)
+    later_path = 2 * initial_speed + speed * np.arange(1.0, 5.0)
+    distance = np.concatenate([initial_path, later_path])
+    along_x = distance[:, None, None] * np.array([1.0, 0.0])
+    window = batch(jittered(0, low=0.3, high=0.6) + along_x)
     model = surrogate(smoothing=0.0, recovery=4.0)
-    behind = (after - given) * np.arange(4.0)
-    wanted = after + np.minimum(behind / 4.0, 3.0 * model.change)
-    # nothing moves along y
-    expected = ((wanted - given) ** 2 / 2).mean() / model.change**2
+
+    lag = (speed - initial_speed) * np.arange(4.0)
+    target = speed + np.minimum(lag / 4.0, 3.0 * model.change)
+    # Nothing moves along y, so the mean over both axes is half of that along x.
+    mean_square = (target - initial_speed) ** 2 / 2
+    expected = mean_square.mean() / model.change**2
     with torch.no_grad():
-        assert float(model(window)["velocity"]) == pytest.approx(expected, rel=1e-2)
+        loss = float(model(window)["velocity"])
+    assert loss == pytest.approx(expected, rel=1e-2)
 
 
 @pytest.mark.parametrize("projected", [{}, PROJECTED])
 def test_momentum_is_conserved_away_from_walls(projected: dict[str, object]) -> None:
-    """Whatever stresses are said: two materials push each other apart, and their mean
-    goes on and falls.
-    """
+    """Two materials push each other apart, and their mean goes on and falls."""
     model = surrogate(awake=0.3, conserve=True, smoothing=0.3, strain=True, **projected)
     nn.init.constant_(model.fall, -0.05)
     if model.projection is not None:
-        nn.init.constant_(model.projection.limit, -2.0)  # all is too dense
-    window = drift((2e-3, -1e-3), 3)
-    given = batch(window)
-    given.material[::2] = 3
-    found = rolled(model, given, 4).diff(dim=1).double()
+        make_too_dense(model)
+    window = batch(drift((2e-3, -1e-3), 3))
+    window.material[::2] = 3
+
+    velocity = rolled(model, window, 4).diff(dim=1).double()
     fall = -0.05 * 10.0 * model.change
-    mean = found.mean(dim=0).numpy()
-    np.testing.assert_allclose(
-        mean, [(2e-3, -1e-3 + fall * k) for k in (2, 3, 4)], rtol=0, atol=2e-7
+    expected = np.array(
+        [
+            (2e-3, -1e-3 + fall * 2),
+            (2e-3, -1e-3 + fall * 3),
+            (2e-3, -1e-3 + fall * 4),
+        ]
     )
-    apart = found[::2].mean(dim=0) - found[1::2].mean(dim=0)
-    assert float(apart.abs().max()) > 1e-5
+    mean = velocity.mean(dim=0).numpy()
+    np.testing.assert_allclose(mean, expected, rtol=0, atol=2e-7)
+
+    even_mean = velocity[::2].mean(dim=0)
+    odd_mean = velocity[1::2].mean(dim=0)
+    assert float((even_mean - odd_mean).abs().max()) > 1e-5
+
+
+def burst_speed(spacing: float) -> float:
+    """Return the greatest speed in a lattice under a pressure, after one frame."""
+    model = surrogate(conserve=True, materials=[0], bundle=1, smoothing=0.0)
+    nn.init.constant_(model.network.end.bias[:3:2], 1.0)
+    axis = np.arange(0.3 + spacing / 2, 0.7, spacing)
+    lattice = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(1, -1, 2)
+    window = liquid(np.repeat(lattice, 3, axis=0))
+    with torch.no_grad():
+        _, frames = model.call(model.start(window))
+    ((_, velocity),) = frames
+    return float(velocity.norm(dim=1).max())
 
 
 def test_thin_matter_bears_less() -> None:
-    """Under one pressure a lattice bursts at its rim; with a quarter of the particles
-    far less.
-    """
-
-    def bursting(spacing: float) -> float:
-        model = surrogate(conserve=True, materials=[0], bundle=1, smoothing=0.0)
-        nn.init.constant_(model.network.end.bias[:3:2], 1.0)
-        axis = np.arange(0.3 + spacing / 2, 0.7, spacing)
-        given = liquid(
-            np.repeat(
-                np.stack(np.meshgrid(axis, axis), axis=-1).reshape(1, -1, 2), 3, axis=0
-            )
-        )
-        with torch.no_grad():
-            _, ((_, velocity),) = model.call(model.start(given))
-        return float(velocity.norm(dim=1).max())
-
-    dense, full, thin, thinner = (
-        bursting(spacing) for spacing in (0.0125, 0.025, 0.05, 0.1)
-    )
-    assert full == pytest.approx(dense, rel=0.2)
+    """Under one pressure a lattice bursts at its rim, a thinner lattice far less."""
+    full = burst_speed(0.025)
+    assert full == pytest.approx(burst_speed(0.0125), rel=0.2)
+    thin = burst_speed(0.05)
     assert thin < full / 5
-    assert thinner < thin / 10
-
-
-def test_walls_push_where_they_are() -> None:
-    """Beside a wall momentum changes; a body in the middle is not reached."""
-    model = surrogate(conserve=True, materials=[0])
-    nn.init.constant_(model.network.end.bias[-4:], 1.0)
-    for low, pushed in ((0.05, True), (0.4, False)):
-        given = liquid(np.repeat(jittered(0, low=low, high=low + 0.2)[None], 3, axis=0))
-        moved = rolled(model, given, 2)[:, -1] - given.position[:, -1]
-        assert bool(moved.abs().max() > 1e-5) is pushed
+    assert burst_speed(0.1) < thin / 10
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"conserve": True}, {"conserve": True} | PROJECTED]
+    ("low", "is_pushed"),
+    [
+        (0.05, True),
+        (0.4, False),
+    ],
+)
+def test_walls_push_only_beside_them(low: float, is_pushed: bool) -> None:
+    """Beside a wall momentum changes; the wall does not reach a body in the middle."""
+    model = surrogate(conserve=True, materials=[0])
+    nn.init.constant_(model.network.end.bias[-4:], 1.0)
+    body = jittered(0, low=low, high=low + 0.2)
+    window = liquid(np.repeat(body[None], 3, axis=0))
+    displacement = rolled(model, window, 2)[:, -1] - window.position[:, -1]
+    assert bool(displacement.abs().max() > 1e-5) is is_pushed
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"conserve": True},
+        {"conserve": True} | PROJECTED,
+    ],
 )
 @pytest.mark.parametrize("number", range(8))
-def test_the_mean_over_images_has_the_symmetry_of_the_box(
+def test_the_mirror_average_has_the_symmetry_of_the_box(
     number: int, changes: dict[str, object]
 ) -> None:
-    """Strain, walls that move and context included, the rollout of an image is the
-    image of the rollout.
+    """The rollout of a mirror image is the mirror image of the rollout.
+
+    That includes strain, moving walls and context.
     """
     matrix = mirror_matrices(Symmetry.SQUARE)[number]
     options = {
@@ -242,122 +286,142 @@ def test_the_mean_over_images_has_the_symmetry_of_the_box(
         "context": 3,
         "symmetry": "square",
     } | changes
-    given = batch(swirl(0, 3), walls=True)
-    sheared = torch.tensor([[0.9, 0.15], [0.0, 1.05]])
-    given = replace(given, origin=(given.position[:, 0] - 0.5) @ sheared + 0.5)
+    window = batch(swirl(0, 3), walls=True)
+    shear = torch.tensor([[0.9, 0.15], [0.0, 1.05]])
+    origin = (window.position[:, 0] - 0.5) @ shear + 0.5
+    window = replace(window, origin=origin)
+    image = mirror_batch(window, matrix[None], info().bounds)
 
-    def apart(*, average: bool) -> float:
+    def greatest_difference(*, average: bool) -> float:
         model = surrogate(**options, awake=0.1, average=average)
         nn.init.normal_(model.context.numbers[-1].weight, std=3.0)
         if model.projection is not None:
-            nn.init.constant_(model.projection.limit, -2.0)  # all is too dense
-        here, there = (
-            rolled(model, one, 4)
-            for one in (given, mirror_batch(given, matrix[None], info().bounds))
-        )
-        return float((there - ((here - 0.5) @ matrix.T + 0.5)).abs().max())
+            make_too_dense(model)
+        path = rolled(model, window, 4)
+        image_path = rolled(model, image, 4)
+        expected = (path - 0.5) @ matrix.T + 0.5
+        return float((image_path - expected).abs().max())
 
-    assert apart(average=True) < 2e-6
-    assert (apart(average=False) > 1e-5) is (number > 0)  # the weights have no symmetry
+    assert greatest_difference(average=True) < 2e-6
+    # The weights have no symmetry; number 0 is the identity.
+    has_difference = greatest_difference(average=False) > 1e-5
+    assert has_difference is (number > 0)
 
 
-def test_the_mean_over_images_in_half_precision() -> None:
-    """Under autocast the rollout is near that in full precision; without images there
-    is no mean.
-    """
+def test_the_mirror_average_in_half_precision() -> None:
+    """Under autocast the rollout is near that in full precision."""
     model = surrogate(awake=0.1, symmetry="square", average=True)
-    given = batch(swirl(0, 3))
+    window = batch(swirl(0, 3))
     with torch.autocast("cpu", torch.bfloat16):
-        rounded = rolled(model, given, 4)
-    torch.testing.assert_close(rounded, rolled(model, given, 4), rtol=0, atol=1e-4)
-    with pytest.raises(UsageError, match="symmetry"):
+        rounded = rolled(model, window, 4)
+    torch.testing.assert_close(rounded, rolled(model, window, 4), rtol=0, atol=1e-4)
+
+
+def test_without_symmetry_there_is_no_mirror_average() -> None:
+    with pytest.raises(UsageError):
         surrogate(average=True)
 
 
 def test_materials_in_one_place_come_to_one_velocity() -> None:
-    """Two clouds that lie in each other and part are held together by a grid that they
-    share.
-    """
+    """A grid that two clouds share holds them together where they lie in each other."""
     rng = np.random.default_rng(0)
-    side = np.where(np.arange(256) % 2, 1.0, -1.0)[:, None] * np.array([1e-3, 0.0])
-    given = batch(rng.uniform(0.3, 0.7, (256, 2)) + np.arange(3)[:, None, None] * side)
-    given = replace(given, material=torch.arange(256) % 2)
+    is_odd = torch.arange(256) % 2
+    direction = np.where(is_odd.numpy(), 1.0, -1.0)[:, None]
+    velocity = direction * np.array([1e-3, 0.0])
+    cloud = rng.uniform(0.3, 0.7, (256, 2))
+    window = batch(move_straight(cloud, velocity))
+    window = replace(window, material=is_odd)
 
-    def gap(**options: object) -> float:
-        found = (
-            rolled(surrogate(smoothing=0.5, **options), given, 6).diff(dim=1).double()
-        )
-        assert float(found.mean(dim=0).abs().max()) < 2e-4
-        return float(found[1::2, -1, 0].mean() - found[::2, -1, 0].mean())
+    def velocity_difference(**options: object) -> float:
+        model = surrogate(smoothing=0.5, **options)
+        predicted = rolled(model, window, 6).diff(dim=1).double()
+        assert float(predicted.mean(dim=0).abs().max()) < 2e-4
+        odd_mean = predicted[1::2, -1, 0].mean()
+        even_mean = predicted[::2, -1, 0].mean()
+        return float(odd_mean - even_mean)
 
-    assert gap() == pytest.approx(2e-3, rel=0.02)
-    assert abs(gap(mixture=True)) < 0.3 * 2e-3
+    assert velocity_difference() == pytest.approx(2e-3, rel=0.02)
+    assert abs(velocity_difference(mixture=True)) < 0.3 * 2e-3
 
 
 def test_materials_matter() -> None:
-    """Who is jelly and who is snow matters; a material that was not named is refused.
+    window = batch(swirl(0, 3))
+    exchanged = replace(window, material=(window.material + 1) % 4)
+    model = surrogate(awake=0.1)
+    path = rolled(model, window, 2)
+    assert not torch.equal(path, rolled(model, exchanged, 2))
 
-    A strained first frame matters where a body is solid; liquid has no shape to come
-    back to.
-    """
-    given = batch(swirl(0, 3))
-    other = replace(given, material=(given.material + 1) % 4)
-    plain = surrogate(awake=0.1)
-    model = surrogate(awake=0.1, strain=True)
-    assert not torch.equal(rolled(plain, given, 2), rolled(plain, other, 2))
+
+def test_a_material_that_the_options_do_not_name_is_refused() -> None:
+    window = batch(swirl(0, 3))
     with pytest.raises(DataError):
-        surrogate(materials=[0, 2]).start(given)
-    origin = 0.9 * (given.position[:, 0] - 0.5) + 0.5
-    for material, differs in ((0, False), (1, True)):
-        alike = replace(given, material=torch.full_like(given.material, material))
-        strained = rolled(model, replace(alike, origin=origin), 2)
-        assert torch.equal(rolled(model, alike, 2), strained) is not differs
+        surrogate(materials=[0, 2]).start(window)
+
+
+@pytest.mark.parametrize(
+    ("material", "is_solid"),
+    [
+        (0, False),
+        (1, True),
+    ],
+)
+def test_a_strained_first_frame_matters_to_solids(
+    material: int, is_solid: bool
+) -> None:
+    """A liquid has no shape to come back to."""
+    window = batch(swirl(0, 3))
+    model = surrogate(awake=0.1, strain=True)
+    window = replace(window, material=torch.full_like(window.material, material))
+    origin = 0.9 * (window.position[:, 0] - 0.5) + 0.5
+    strained = replace(window, origin=origin)
+    is_same = torch.equal(rolled(model, window, 2), rolled(model, strained, 2))
+    assert is_same is not is_solid
 
 
 def test_bodies_come_back_to_the_shape_of_the_first_frame() -> None:
-    """Jelly that is pulled apart in later frames is drawn together again; without the
-    option it is not.
-    """
+    """Shape matching draws jelly together again that later frames pulled apart."""
     rng = np.random.default_rng(0)
-    window = jittered(0, low=0.4, high=0.6) + 0.02 * np.arange(3)[
-        :, None, None
-    ] * rng.normal(0, 1, (256, 2))
-    first = torch.from_numpy(jittered(0, low=0.4, high=0.6)).float()
-    given = batch(window)
-    given = replace(given, material=torch.ones(256).long(), frame=given.frame + 7)
+    body = jittered(0, low=0.4, high=0.6)
+    first = torch.from_numpy(body).float()
+    velocity = rng.normal(0, 1, (256, 2)) * 0.02
+    window = batch(move_straight(body, velocity))
+    jelly = torch.ones(256).long()
+    window = replace(window, material=jelly, frame=window.frame + 7)
 
-    def off(**options: object) -> float:
+    def shape_error(**options: object) -> float:
         model = surrogate(smoothing=0.0, **options)
-        told = replace(given, origin=first if model.origin else None)
-        return float(
-            (torch.pdist(rolled(model, told, 6)[:, -1]) - torch.pdist(first))
-            .abs()
-            .mean()
-        )
+        origin = None
+        if model.origin:
+            origin = first
+        path = rolled(model, replace(window, origin=origin), 6)
+        difference = torch.pdist(path[:, -1]) - torch.pdist(first)
+        return float(difference.abs().mean())
 
-    assert off(shape=[4, 8]) < 0.1 * off()
+    assert shape_error(shape=[4, 8]) < 0.1 * shape_error()
 
 
-def test_clouds_that_meet_are_not_pressed_into_each_other() -> None:
-    """Two that fly into each other end less dense where that is asked for."""
-    side = np.where(np.arange(512) < 256, 1.0, -1.0)[:, None] * np.array([8e-3, 0.0])
-    clouds = np.concatenate(
-        [jittered(0, low=0.25, high=0.45), jittered(1, low=0.55, high=0.75)]
-    )
-    clouds[:, 1] += np.where(np.arange(512) < 256, 0.15, -0.15)
-    given = batch(clouds + np.arange(3)[:, None, None] * side)
+def test_density_projection_keeps_clouds_that_meet_apart() -> None:
+    """Two clouds that fly into each other end less dense with the projection."""
+    is_left = np.arange(512) < 256
+    direction = np.where(is_left, 1.0, -1.0)[:, None]
+    velocity = direction * np.array([8e-3, 0.0])
+    left = jittered(0, low=0.25, high=0.45)
+    right = jittered(1, low=0.55, high=0.75)
+    clouds = np.concatenate([left, right])
+    clouds[:, 1] += np.where(is_left, 0.15, -0.15)
+    window = batch(move_straight(clouds, velocity))
 
-    def nearest(**options: object) -> float:
-        moved = rolled(surrogate(smoothing=0.0, **options), given, 16)[:, -1]
-        return float((torch.cdist(moved, moved) < 0.02).sum())
+    def count_close_pairs(**options: object) -> float:
+        model = surrogate(smoothing=0.0, **options)
+        position = rolled(model, window, 16)[:, -1]
+        is_close = torch.cdist(position, position) < 0.02
+        return float(is_close.sum())
 
-    assert nearest(density=[8, 16]) < 0.75 * nearest()
+    assert count_close_pairs(density=[8, 16]) < 0.75 * count_close_pairs()
 
 
 class Drag(nn.Module):
-    """Stands for the U-Net: every frame's acceleration is -rate times the velocity on
-    the grid.
-    """
+    """Stand for the U-Net: the acceleration is -rate times the velocity on the grid."""
 
     def __init__(self, rate: float, bundle: int) -> None:
         super().__init__()
@@ -365,64 +429,77 @@ class Drag(nn.Module):
         self.bundle = bundle
 
     def forward(self, field: Tensor) -> Tensor:
-        """Return the accelerations of one material."""
-        return -self.rate * field[:, 1:3].repeat(1, self.bundle, 1, 1)
+        """Return the accelerations of one material in all frames of a bundle."""
+        velocity = field[:, 1:3]
+        return -self.rate * velocity.repeat(1, self.bundle, 1, 1)
 
 
 def test_a_known_network_has_a_known_rollout() -> None:
-    """Drag takes the share r of the velocity before a bundle in each of its frames: a
-    closed form.
-    """
+    """Drag takes a share of the velocity before a bundle in each of its frames."""
     model = surrogate(materials=[0], smoothing=0.0)
     rate = 0.1
     model.network = Drag(rate * model.speed / model.change, 2)
-    given = liquid(drift((4e-3, -2e-3), 3))
-    found = rolled(model, given, 4).double().mean(dim=0) - given.position[
-        :, -1
-    ].double().mean(dim=0)
-    shares = np.array(
-        [1 - rate, 1 - 2 * rate, (1 - 2 * rate) * (1 - rate), (1 - 2 * rate) ** 2]
+    window = liquid(drift((4e-3, -2e-3), 3))
+
+    path = rolled(model, window, 4).double().mean(dim=0)
+    last = window.position[:, -1].double().mean(dim=0)
+    velocity_shares = np.array(
+        [
+            1 - rate,
+            1 - 2 * rate,
+            (1 - 2 * rate) * (1 - rate),
+            (1 - 2 * rate) ** 2,
+        ]
     )
-    np.testing.assert_allclose(
-        found.numpy(), shares.cumsum()[:, None] * [4e-3, -2e-3], rtol=1e-3
-    )
+    expected = velocity_shares.cumsum()[:, None] * np.array([4e-3, -2e-3])
+    np.testing.assert_allclose((path - last).numpy(), expected, rtol=1e-3)
 
 
 def test_images_roll_out_as_images() -> None:
-    """All eight images of the box, with a network that knows no direction: transfers
-    and walls know none.
+    """Transfers and walls know no direction: all eight mirror images of the box.
+
+    The network of this test knows none either.
     """
     model = surrogate(materials=[0], smoothing=0.2)
     model.network = Drag(-0.5 * model.speed / model.change, 2)
-    given = liquid(swirl(0, 3, (0.2, 0.2)))
+    window = liquid(swirl(0, 3, (0.2, 0.2)))
+    path = rolled(model, window, 5)
     for matrix in mirror_matrices(Symmetry.SQUARE):
-        there = rolled(model, mirror_batch(given, matrix[None], info().bounds), 5)
-        here = (rolled(model, given, 5) - 0.5) @ matrix.T + 0.5
-        torch.testing.assert_close(there, here, rtol=0, atol=1e-5)
+        image = mirror_batch(window, matrix[None], info().bounds)
+        expected = (path - 0.5) @ matrix.T + 0.5
+        image_path = rolled(model, image, 5)
+        torch.testing.assert_close(image_path, expected, rtol=0, atol=1e-5)
 
 
 def test_each_frame_is_driven_by_its_own_walls() -> None:
-    """The first bundle sees the walls of its two frames and none after them; the second
-    sees its own.
-    """
+    """A bundle sees the walls of its two frames and none after them."""
     model = surrogate(awake=0.1, wall_velocity=True)
     whole = batch(swirl(0, 9), walls=True)
 
-    def with_walls_at(frame: int) -> Tensor:
-        walls = torch.zeros_like(whole.wall_velocity)
-        walls[:, frame] = 0.05
-        return rolled(model, replace(whole, wall_velocity=walls).part(slice(3)), 4)
+    def roll_out_with_walls_at(frame: int) -> Tensor:
+        wall_velocity = torch.zeros_like(whole.wall_velocity)
+        wall_velocity[:, frame] = 0.05
+        window = replace(whole, wall_velocity=wall_velocity)
+        return rolled(model, window.part(slice(3)), 4)
 
-    still = with_walls_at(2)  # the last given frame is over
-    first, second, later = (with_walls_at(frame) for frame in (3, 6, 7))
-    assert not torch.equal(first[:, 0], still[:, 0])
-    assert torch.equal(second[:, :2], still[:, :2])
-    assert not torch.equal(second[:, 2], still[:, 2])
-    assert torch.equal(later, still)
-    # a batch that knows nothing of later frames is rolled out as if its last walls
-    # stayed
-    short = replace(whole.part(slice(3)), wall_velocity=whole.wall_velocity[:, :3])
-    assert torch.equal(rolled(model, whole.part(slice(3)), 6), rolled(model, short, 6))
+    # Frame 2 is the last frame of the window: its walls are over.
+    still = roll_out_with_walls_at(2)
+    in_first_bundle = roll_out_with_walls_at(3)
+    in_second_bundle = roll_out_with_walls_at(6)
+    after_both = roll_out_with_walls_at(7)
+    assert not torch.equal(in_first_bundle[:, 0], still[:, 0])
+    assert torch.equal(in_second_bundle[:, :2], still[:, :2])
+    assert not torch.equal(in_second_bundle[:, 2], still[:, 2])
+    assert torch.equal(after_both, still)
+
+
+def test_the_last_known_walls_stay() -> None:
+    """A batch without walls of later frames rolls out as if its last ones stayed."""
+    model = surrogate(awake=0.1, wall_velocity=True)
+    whole = batch(swirl(0, 9), walls=True)
+    window = whole.part(slice(3))
+    short = replace(window, wall_velocity=whole.wall_velocity[:, :3])
+    assert torch.equal(rolled(model, window, 6), rolled(model, short, 6))
 
 
 @pytest.mark.parametrize(
@@ -436,118 +513,134 @@ def test_each_frame_is_driven_by_its_own_walls() -> None:
 )
 def test_options_that_do_not_fit_are_refused(option: str, value: object) -> None:
     """Materials that do not exist, and walls of a split where none moves."""
-    with pytest.raises(UsageError) as told:
+    with pytest.raises(UsageError) as caught:
         surrogate(changes={"moving_walls": False}, **{option: value})
-    assert told.value.where == f"model.{option}"
+    assert caught.value.where == f"model.{option}"
 
 
 @pytest.mark.parametrize("cells", [18, 20, 22, 30, 38, 42])
-def test_walls_are_felt_alike_on_all_sides(cells: int) -> None:
-    """As many rows of nodes beside each wall; with an odd number walls lay on nodes:
-    refused.
-    """
-    held = surrogate(cells=cells).grid
-    beside = [int(side.count_nonzero()) for side in held.beside_walls()]
-    assert len(set(beside)) == 1
+def test_all_walls_have_as_many_nodes_beside_them(cells: int) -> None:
+    """With an odd number of cells walls would lie on nodes, so it is refused."""
+    grid = surrogate(cells=cells).grid
+    node_counts = {int(side.count_nonzero()) for side in grid.beside_walls()}
+    assert len(node_counts) == 1
     with pytest.raises(ValidationError):
         surrogate(cells=cells + 1)
 
 
 def test_learns_a_swirl() -> None:
-    """Particles turn ever slower: soon the rollout errs a third of what constant
-    velocity does.
+    """The rollout's error falls to a third of that of constant velocity.
+
+    The particles turn ever slower.
     """
     model = surrogate(materials=[0], width=16, symmetry="square", noise_std=1e-5)
     flows = [swirl(seed, 24, (0.06, 0.01)) for seed in range(4)]
+    test_flow = liquid(swirl(9, 24, (0.06, 0.01)))
     generator = torch.Generator().manual_seed(0)
     optimiser = torch.optim.Adam(model.parameters(), lr=3e-3)
     rng = np.random.default_rng(0)
+    length = model.history + model.future
 
-    def error() -> float:
-        whole = liquid(swirl(9, 24, (0.06, 0.01)))
-        found = rolled(model, whole.part(slice(3)), 20)
-        return float((found - whole.position[:, 3:23]).square().mean().sqrt())
+    def rollout_error() -> float:
+        path = rolled(model, test_flow.part(slice(3)), 20)
+        difference = path - test_flow.position[:, 3:23]
+        return float(difference.square().mean().sqrt())
 
-    before = error()
+    untrained_error = rollout_error()
     for _ in range(60):
-        length = model.history + model.future
         starts = rng.integers(24 - length + 1, size=4)
-        given = liquid(*(f[s : s + length] for f, s in zip(flows, starts, strict=True)))
+        windows = []
+        for flow, start in zip(flows, starts, strict=True):
+            windows.append(flow[start : start + length])
         optimiser.zero_grad()
-        model(given, generator)["velocity"].backward()
+        model(liquid(*windows), generator)["velocity"].backward()
         optimiser.step()
-    assert error() < before / 3
+    assert rollout_error() < untrained_error / 3
 
 
 @pytest.mark.parametrize("size", ["tiny", "mini", "full"])
 @pytest.mark.parametrize("split", ["cavity", "curl-noise", "fluid", "multimaterial"])
 def test_recipes_fit_every_split(split: str, size: str) -> None:
-    """Walls drive the cavity alone, gravity allows the mirror alone, materials are
-    those of the split.
+    """Walls drive the cavity alone, and gravity allows the mirror alone.
+
+    The materials are those of the split, and the weights take at most 4 MB.
     """
-    described = load().size(split, size)
+    dataset_size = load().size(split, size)
     recipe = recipe_for(find("neuralmpm"), split, size)
-    model = NeuralMPM.build(
-        recipe.model, info(moving_walls=split == "cavity", bounds=described.bounds)
-    )
-    gravity = described.parameters.get("gravity")
-    assert recipe.model["wall_velocity"] is (split == "cavity")
-    assert recipe.model["symmetry"] == (
-        "mirror" if gravity and gravity.value else "square"
-    )
-    assert len(recipe.model["materials"]) == (4 if split == "multimaterial" else 1)
-    assert (
-        2 * sum(p.numel() for p in model.parameters()) <= 4e6
-    )  # bytes of its weights in bfloat16
+    is_cavity = split == "cavity"
+    dataset_info = info(moving_walls=is_cavity, bounds=dataset_size.bounds)
+    model = NeuralMPM.build(recipe.model, dataset_info)
+
+    gravity = dataset_size.parameters.get("gravity")
+    symmetry = "square"
+    if gravity and gravity.value:
+        symmetry = "mirror"
+    material_count = 1
+    if split == "multimaterial":
+        material_count = 4
+    assert recipe.model["wall_velocity"] is is_cavity
+    assert recipe.model["symmetry"] == symmetry
+    assert len(recipe.model["materials"]) == material_count
+
+    parameter_count = sum(parameter.numel() for parameter in model.parameters())
+    assert 2 * parameter_count <= 4e6  # bytes of the weights in bfloat16
 
 
-def both(*cells: int) -> dict[str, object]:
-    """Return options with the same grids of both kinds."""
-    return {"shape": list(cells), "density": list(cells)}
+def both_grids(*cells: int) -> dict[str, object]:
+    """Return options with the same grids for shape matching and density projection."""
+    return {
+        "shape": list(cells),
+        "density": list(cells),
+    }
 
 
 @pytest.mark.parametrize(
-    ("earlier", "later", "same"),
+    ("earlier", "later", "shared_count"),
     [
-        *(({}, both(4, 8), 0), (both(4), both(4, 8), 1)),
-        *(({kind: [4]}, both(4, 8), 1) for kind in ("shape", "density")),
-        *(({kind: [4]}, {kind: [4, 8]}, 1) for kind in ("shape", "density")),
-        *(
-            (both(4), both(8), 0),
-            (both(4, 8), both(4, 16), 1),
-            (both(4, 8), both(4), 1),
-        ),
-        *((both(4, 8), both(8, 4), 0), (both(4, 8), {}, 0)),
+        ({}, both_grids(4, 8), 0),
+        (both_grids(4), both_grids(4, 8), 1),
+        ({"shape": [4]}, both_grids(4, 8), 1),
+        ({"density": [4]}, both_grids(4, 8), 1),
+        ({"shape": [4]}, {"shape": [4, 8]}, 1),
+        ({"density": [4]}, {"density": [4, 8]}, 1),
+        (both_grids(4), both_grids(8), 0),
+        (both_grids(4, 8), both_grids(4, 16), 1),
+        (both_grids(4, 8), both_grids(4), 1),
+        (both_grids(4, 8), both_grids(8, 4), 0),
+        (both_grids(4, 8), {}, 0),
     ],
 )
-def test_of_other_grids_those_go_on_that_stand_first_in_both(
-    earlier: dict[str, object], later: dict[str, object], same: int
+def test_grids_that_stand_first_in_both_models_keep_their_weights(
+    earlier: dict[str, object], later: dict[str, object], shared_count: int
 ) -> None:
-    """Their weights are kept; others start as in a new model, and those that are left
-    out are dropped.
-    """
+    """The other grids start as in a new model; grids left out are dropped."""
     before = surrogate(awake=0.1, **earlier)
-    new = surrogate(**later)
+    model = surrogate(**later)
     with torch.no_grad():
         for weight in before.parameters():
             weight.add_(0.01)
-    held = round_weights(before)
-    own = {name: value.clone() for name, value in new.state_dict().items()}
-    options = before.options.model_dump(
-        mode="json", exclude=set(before.options.in_training)
-    )
+    earlier_weights = round_weights(before)
+    new_weights = {}
+    for name, value in model.state_dict().items():
+        new_weights[name] = value.clone()
+
+    training_options = set(before.options.in_training)
     start = TrainingStart(
         path=Path("earlier.pt"),
         info=before.info,
-        weights=held,
-        options=options,
+        weights=earlier_weights,
+        options=before.options.model_dump(mode="json", exclude=training_options),
         record={},
     )
-    start.load_into(new)
-    found = new.state_dict()
-    assert found.keys() == own.keys()
-    for name, value in found.items():
-        expected = held.get(name, own[name]).to(value.dtype)
-        if name in held and name in {"projection.held", "projection.push"}:
-            expected = torch.cat([expected[:same], own[name][same:]])
+    start.load_into(model)
+
+    loaded = model.state_dict()
+    assert loaded.keys() == new_weights.keys()
+    for name, value in loaded.items():
+        new_value = new_weights[name]
+        expected = earlier_weights.get(name, new_value).to(value.dtype)
+        is_per_grid = name in {"projection.held", "projection.push"}
+        if is_per_grid and name in earlier_weights:
+            shared = expected[:shared_count]
+            expected = torch.cat([shared, new_value[shared_count:]])
         torch.testing.assert_close(value, expected, rtol=0, atol=0)
