@@ -134,18 +134,6 @@ def test_the_loss_is_equation_4_16() -> None:
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:
     model = MLP.build(SMALL, INFO)
-<<<<<<< HEAD
-    both = rolled(model, batch_of([SCENARIOS[0][:2], SCENARIOS[1][:2]]), 5)
-    alone = [rolled(model, batch_of([x[:2]]), 5) for x in SCENARIOS[:2]]
-    torch.testing.assert_close(both, torch.cat(alone), atol=1e-6, rtol=1e-5)
-    long, short = (
-        rolled(model, batch_of([SCENARIOS[0][first:6]]), 3) for first in (0, 4)
-    )
-    assert torch.equal(long, short)
-    with pytest.raises(DataError) as caught:
-        model.start(batch_of([SCENARIOS[0][:2, :11]]))
-    assert caught.value.where == "batch"
-=======
     windows = [SCENARIOS[0][:2], SCENARIOS[1][:2]]
     together = rolled(model, batch_of(windows), 5)
     alone = [rolled(model, batch_of([window]), 5) for window in windows]
@@ -165,7 +153,6 @@ def test_scenarios_of_another_size_are_refused() -> None:
     window = batch_of([SCENARIOS[0][:2, :11]])
     with pytest.raises(DataError, match="12 particles in each window\n  got: 11"):
         model.start(window)
->>>>>>> room/tests2
 
 
 def test_a_change_of_nothing_is_persistence() -> None:
@@ -391,24 +378,11 @@ def count_numbers(model: torch.nn.Module) -> int:
 
 @pytest.mark.parametrize("size", ["tiny", "mini", "full"])
 @pytest.mark.parametrize("split", SPLITS)
-<<<<<<< HEAD
-@pytest.mark.parametrize("name", [*NETWORKS, "var", "var-stable"])
-def test_models_have_recipes_where_they_fit(name: str, split: str, size: str) -> None:
-    """Plain VAR is not for full boxes; mini has at most 4 M numbers, a stable VAR 8
-    MB.
-    """
-    if name == "var" and size == "full" and split in ("cavity", "curl-noise"):
-        with pytest.raises(UsageError) as caught:
-            recipe_for(find(name), split, size)
-        assert caught.value.where == "--split, --size, --recipe"
-        return
-=======
 @pytest.mark.parametrize("name", NETWORKS)
 def test_networks_have_recipes_for_every_split(
     name: str, split: str, size: str
 ) -> None:
     """They have the thesis's form, and mini at most 4 M numbers."""
->>>>>>> room/tests2
     recipe = recipe_for(find(name), split, size)
     assert recipe.model["material"] is (split == "multimaterial")
     assert recipe.model["target"] == "state"

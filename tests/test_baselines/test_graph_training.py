@@ -426,14 +426,6 @@ def test_the_operators_own_loss_has_its_weight() -> None:
     terms = model(batch(swirl(0, 7)), seeded(0))
     assert set(terms) == {*TERMS, "link"}
     assert model.weights["link"] == 1.0
-<<<<<<< HEAD
-    heavy = linked.build(
-        SMALL | {"link_weight": 0.5, "loss": {"vorticity": 0.0}}, info()
-    )
-    assert heavy.weights["link"] == 0.5
-    assert heavy.weights["vorticity"] == 0.0
-=======
->>>>>>> room/tests2
     assert "link" not in network().weights
 
 

@@ -166,27 +166,6 @@ def test_two_frames_are_enough_to_start_from() -> None:
     """The first velocity repeats in place of those before the window."""
     window = batch(swirl(0, 8))
     model = network()
-<<<<<<< HEAD
-    short = model.start(given.part(slice(2)))
-    first = given.position[:, 1] - given.position[:, 0]
-    assert torch.equal(short.velocity, first[:, None].expand(-1, 5, -1))
-    assert torch.equal(short.position, given.position[:, 1])
-    middle = model.start(given.part(slice(4)))
-    assert torch.equal(middle.velocity[:, :3], first[:, None].expand(-1, 3, -1))
-    assert torch.equal(middle.velocity[:, 2:], given.position[:, :4].diff(dim=1))
-    long = model.start(given)
-    six = model.start(given.part(slice(2, 8)))
-    assert torch.equal(long.velocity, six.velocity)
-    assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
-    with pytest.raises(UsageError):
-        model.start(given.part(slice(1)))
-    model = network(awake=True, velocities=1)  # sees two frames and starts from two
-    assert model.history == 2
-    assert model.features.count == 22
-    assert torch.equal(
-        rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2)
-    )
-=======
     first_velocity = window.position[:, 1] - window.position[:, 0]
 
     from_two = model.start(window.part(slice(2)))
@@ -218,7 +197,6 @@ def test_a_model_of_one_velocity_sees_two_frames() -> None:
     assert model.features.count == 22
     from_two = rolled(model, window.part(slice(6, 8)), 2)
     assert torch.equal(rolled(model, window, 2), from_two)
->>>>>>> room/tests2
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:

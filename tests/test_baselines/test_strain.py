@@ -93,17 +93,6 @@ def test_an_image_is_strained_as_an_image() -> None:
     torch.testing.assert_close(image_strain, expected, rtol=0, atol=1e-3)
 
 
-<<<<<<< HEAD
-def test_the_first_frame_is_known_or_asked_for() -> None:
-    """Windows from the first frame hold it, others must bring it."""
-    given = batch(jittered(0)[None].repeat(3, axis=0))
-    assert torch.equal(first_frame(given), given.position[:, 0])
-    later = replace(given, frame=given.frame + 4)
-    with pytest.raises(UsageError) as caught:
-        first_frame(later)
-    assert caught.value.where == "batch.origin"
-    assert torch.equal(first_frame(replace(later, origin=cloud(1))), cloud(1))
-=======
 def test_windows_from_the_first_frame_have_it() -> None:
     window = batch(jittered(0)[None].repeat(3, axis=0))
     assert torch.equal(first_frame(window), window.position[:, 0])
@@ -116,4 +105,3 @@ def test_later_windows_must_bring_the_first_frame() -> None:
         first_frame(later)
     origin = square_body(1)
     assert torch.equal(first_frame(replace(later, origin=origin)), origin)
->>>>>>> room/tests2

@@ -85,17 +85,10 @@ def test_coefficients_are_those_of_statsmodels(lags: int, spread: float) -> None
     expected = StatsmodelsVAR(states.astype(float)).fit(lags, trend="c").params
     condition = np.linalg.cond(design_matrix(states, lags))
     assert condition <= 1e6
-<<<<<<< HEAD
-    assert relative(found.coefficients, expected) <= 1e-6
-    assert found.condition == pytest.approx(condition, rel=2e-3)
-    assert found.floor == 0.0
-    assert found.rows == 300 - lags
-=======
     assert relative_error(solution.coefficients, expected) <= 1e-6
     assert solution.condition == pytest.approx(condition, rel=2e-3)
     assert solution.floor == 0.0
     assert solution.rows == 300 - lags
->>>>>>> room/tests2
 
 
 @pytest.mark.parametrize(
@@ -153,17 +146,6 @@ def test_rows_stay_within_scenarios_and_blocks_add_up() -> None:
     assert relative_error(coefficients, least_squares(x, y)) < 1e-12
 
 
-<<<<<<< HEAD
-def test_nothing_to_fit_is_an_error() -> None:
-    """Scenarios as short as the lags, and values that are not finite, are refused."""
-    with pytest.raises(WorkFailedError):
-        solve(LaggedRows([series(2, 3)], lags=2))
-    broken = series(30, 3)
-    broken[4, 1] = np.nan
-    with pytest.raises(WorkFailedError) as caught:
-        solve(LaggedRows([broken], lags=1))
-    assert caught.value.where == "rows to fit"
-=======
 def test_scenarios_as_short_as_the_lags_are_refused() -> None:
     with pytest.raises(WorkFailedError, match="nothing to fit"):
         solve(LaggedRows([series(2, 3)], lags=2))
@@ -174,7 +156,6 @@ def test_values_that_are_not_finite_are_refused() -> None:
     states[4, 1] = np.nan
     with pytest.raises(WorkFailedError, match="not finite"):
         solve(LaggedRows([states], lags=1))
->>>>>>> room/tests2
 
 
 def noisy_orbits(
@@ -360,20 +341,6 @@ def test_the_protocol_of_the_thesis_runs(
     ]
     monkeypatch.setattr(sys, "argv", ["var_protocol", *arguments])
     assert var_protocol.main() == 0
-<<<<<<< HEAD
-    found = json.loads(capsys.readouterr().out)
-    assert found["features"] == 4 * 506
-    assert found["frames"] == 91
-    assert found["forecast_frames"] == 19
-    assert found["fit_mse"] < 1e-9  # fewer frames than features: every one is met
-    ours = {
-        **found,
-        "mse_at": {int(frame): value for frame, value in found["mse_at"].items()},
-    }
-    assert "| 3.5e+18 |" in var_protocol.result_markdown(
-        var_protocol.ProtocolResult(**ours)
-    )
-=======
     result = json.loads(capsys.readouterr().out)
     assert result["features"] == 4 * 506
     assert result["frames"] == 91
@@ -384,4 +351,3 @@ def test_the_protocol_of_the_thesis_runs(
     mse_at = {int(frame): value for frame, value in result["mse_at"].items()}
     protocol_result = var_protocol.ProtocolResult(**(result | {"mse_at": mse_at}))
     assert "| 3.5e+18 |" in var_protocol.result_markdown(protocol_result)
->>>>>>> room/tests2
