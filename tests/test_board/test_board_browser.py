@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from browser import (
     CHROMIUM,
     Browser,
@@ -29,6 +28,7 @@ from browser import (
     until,
 )
 from PIL import Image
+from sample_boards import make_board, with_entry
 
 from lagbench.board.columns import columns_of, format_value, presets_of, value_of
 from lagbench.board.model import Board, BoardRow, ReferenceRow, Tab
