@@ -19,6 +19,7 @@ from typer.testing import Result
 import lagbench
 from lagbench.data.checksums import dataset_hash, subset_hash
 from lagbench.data.local import locate
+from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import check_scenario, read_scenario
 from lagbench.errors import (
     DataError,
@@ -727,3 +728,60 @@ def test_a_file_describes_the_data_and_options_win(tmp_path: Path, run: Run) -> 
     assert size.value("density") == 2.0
     assert splits.split("mine").licence == "CC0-1.0"
     assert size.task.score_grid.placement == "nodes"
+
+
+def drifting_runs(count: int) -> list[NDArray[np.float32]]:
+    """Return trajectories through a periodic box of side 1, wrapped into it."""
+    rng = np.random.default_rng(7)
+    start = rng.random((count, 1, 60, 2))
+    time = np.arange(12)[None, :, None, None]
+    position = start + np.array([0.02, 0.001]) * time
+    return list(np.mod(position, 1.0).astype(np.float32))
+
+
+def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
+    tmp_path: Path, run: Callable[..., Result]
+) -> None:
+    paths = save_runs(tmp_path / "in", drifting_runs(3))
+    options = {"bounds": ((0.0, 1.0), (0.0, 1.0)), **BASIC}
+    with pytest.raises(DataError) as caught:
+        adopt(paths, output=tmp_path / "walls", **options)
+    assert caught.value.where is not None
+    assert "along x" in caught.value.where
+
+    made = adopt(paths, output=tmp_path / "mine", periodic=["x", "y"], **options)
+    size = locate(str(made.folder)).size
+    assert size.box.periodic == (True, True)
+    velocity = stored(made, 0, "velocity") * size.frame_interval  # [length/frame]
+    np.testing.assert_allclose(velocity[..., 0], 0.02, atol=1e-6)
+    manifest = read_manifest(tmp_path, "mine", "full", 1)
+    assert manifest is not None
+    assert manifest.statistics["velocity_mean"][0] == pytest.approx(0.02, rel=1e-4)
+
+    result = run(
+        "adopt",
+        tmp_path / "in",
+        "--output",
+        tmp_path / "told",
+        "--radius",
+        "0.2",
+        "--frame-interval",
+        "0.1",
+        "--bounds",
+        "0,1,0,1",
+        "--periodic",
+        "x,y",
+    )
+    assert result.exit_code == 0, result.output
+    assert locate(str(tmp_path / "told")).size.box == size.box
+
+
+def test_a_periodic_axis_needs_a_name_and_bounds(tmp_path: Path) -> None:
+    paths = save_runs(tmp_path / "in", drifting_runs(3))
+    for options in (
+        {"periodic": ["x"]},
+        {"periodic": ["q"], "bounds": ((0.0, 1.0), (0.0, 1.0))},
+    ):
+        with pytest.raises(UsageError) as caught:
+            adopt(paths, output=tmp_path / "mine", **options, **BASIC)
+        assert caught.value.where == "--periodic"
