@@ -133,7 +133,7 @@ def test_long_author_lines_clip_no_column(
         f"[...{table}.querySelectorAll('thead th:not([hidden])')].map(th => "
         f"th.textContent)"
     )
-    assert len(heads) == 2 + 1 + 5 + 3
+    assert len(heads) == 2 + 1 + 4 + 4
     assert heads[-2:] == ["budgetself\u2011reported", "scores"]
     titles = page.value(
         f"[...{table}.querySelectorAll('tr[data-entry] .sub')].map(e => e.title)"
