@@ -256,7 +256,8 @@ class NeuralMPM(Baseline):
     ) -> tuple[GridState, list[Frame]]:
         """Return the state after a bundle of frames, and those frames.
 
-        ``average`` is that of :meth:`start`.
+        With ``average=False``, as in training, nothing is mirror-averaged, whatever the
+        options say.
         """
         stencil = self.grid.stencil(state.position, state.layer)
         fields, grid_velocity = self.encoder.encode(state, stencil)

@@ -373,12 +373,15 @@ def test_mistakes(run: Predict, generated: GenerationResult, tmp_path: Path) -> 
     own.
     """
     made = run().path
-    with pytest.raises(DataError, match="lagbench generate"):
+    with pytest.raises(DataError) as caught:
         predict(tmp_path / "weights.pt", made, root=tmp_path / "nowhere")
-    with pytest.raises(UnreadableFileError, match=r"none\.pt"):
+    assert caught.value.where.endswith("nowhere/curl-noise/tiny/v2")
+    with pytest.raises(UnreadableFileError) as caught:
         predict(tmp_path / "none.pt", made, root=generated.root)
-    with pytest.raises(UsageError, match="no device 'tpu'"):
+    assert caught.value.where.endswith("none.pt")
+    with pytest.raises(UsageError) as caught:
         run(device="tpu")
+    assert caught.value.where == "--device"
 
 
 def test_another_size_than_that_of_the_training(
@@ -476,13 +479,14 @@ def test_no_image_falls_sideways(
         training={},
     )
     save(tmp_path / "weights.pt", stored)
-    with pytest.raises(UsageError, match="gravity"):
+    with pytest.raises(UsageError) as caught:
         predict(
             tmp_path / "weights.pt",
             tmp_path / "p.nc",
             root=root,
             settings=["model.symmetry=square"],
         )
+    assert caught.value.where == "model.symmetry"
     assert not (tmp_path / "p.nc").exists()
 
 
@@ -560,7 +564,7 @@ def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         Drift, "advance", Mock(side_effect=torch.OutOfMemoryError("no memory left"))
     )
-    with pytest.raises(WorkFailedError, match="lower --batch"):
+    with pytest.raises(WorkFailedError):
         run(name="none.nc")
 
 

@@ -223,8 +223,9 @@ def test_chance_of_the_caller_is_left_alone(run: Run) -> None:
 
 def test_a_loss_that_is_not_finite(run: Run, tmp_path: Path) -> None:
     """NaN stops with the step and the term; the checkpoint before it stays."""
-    with pytest.raises(WorkFailedError, match=r"step 6(.|\n)*swirl") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         run("drift", "model.fail_at=6", "steps=9", "checkpoint_every=4")
+    assert caught.value.where == "step 6"
     assert "motion" not in str(caught.value)
     kept = load(tmp_path / "run/checkpoint.pt")
     assert kept.training["step"] == 4
@@ -280,10 +281,12 @@ def test_what_a_model_cannot_use_is_refused(
 def test_folders_are_guarded(run: Run) -> None:
     """Another recipe in a folder is refused unless the user wants to train anew."""
     run("drift", "steps=2")
-    with pytest.raises(UsageError, match=r"training\.steps = 3"):
+    with pytest.raises(UsageError) as caught:
         run("drift", "steps=3")
-    with pytest.raises(UsageError, match="--resume"):
+    assert caught.value.where.endswith("/run")
+    with pytest.raises(UsageError) as caught:
         run("drift", "steps=2", resume=False)
+    assert caught.value.where.endswith("/run")
     assert run("drift", "steps=3", fresh=True).step == 3
 
 
@@ -400,8 +403,9 @@ def test_weights_without_a_checkpoint_are_not_replaced(run: Run) -> None:
     assert {file: file.read_bytes() for file in before} == before
     for content in (b"{", b"[]"):
         (first.folder / "training.json").write_bytes(content)
-        with pytest.raises(UsageError, match="no checkpoint to go on from"):
+        with pytest.raises(UsageError) as caught:
             run("drift", "steps=1")
+        assert caught.value.where.endswith("/run")
     assert run("drift", "steps=2", fresh=True).step == 2
     first.checkpoint.unlink()
     first.weights.unlink()
@@ -433,8 +437,9 @@ def test_gravity_has_no_square_of_images(split: str, tmp_path: Path) -> None:
     """Where gravity acts, only a mirror image is drawn; a box without it has all
     eight.
     """
-    with pytest.raises(UsageError, match=r"gravity in(.|\n)*model\.symmetry=mirror"):
+    with pytest.raises(UsageError) as caught:
         train("gns", split, "tiny", root=tmp_path, settings=("model.symmetry=square",))
+    assert caught.value.where == "model.symmetry"
     for other, images in ((split, "mirror"), ("cavity", "square")):
         with pytest.raises(
             DataError

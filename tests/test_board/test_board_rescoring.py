@@ -16,7 +16,7 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from made_up import (
+from board_bench import (
     PLACE,
     SCORES,
     BoardBench,

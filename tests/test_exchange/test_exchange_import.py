@@ -150,8 +150,9 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     """
     kinds = np.array([0] * 30 + [1] * 6 + [-1] * 4)
     source = write_h5(tmp_path / "in", straight_runs(3), kinds)
-    with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert caught.value.where.endswith("in/train.h5, group '00000'")
     named = import_split(
         source,
         format="lagrangebench-h5",
@@ -233,6 +234,6 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
     """Where the files are those of the other format, the message names it."""
     for subset in SUBSETS:
         (tmp_path / f"{subset}.h5").touch()
-    with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
     assert "--format lagrangebench-h5" in str(caught.value)

@@ -102,7 +102,7 @@ def test_a_subset_comes_and_nothing_else(
     store.remove(f"{FOLDER}/test/0003.nc")
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     assert not store.server or store.server.count("0004.nc") == 1
-    with pytest.raises(DataError, match="0-1"):
+    with pytest.raises(DataError):
         lagbench.open_split(
             SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing"
         )

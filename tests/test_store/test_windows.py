@@ -257,8 +257,9 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
         [window, train(history=3)[0]],
         [window, window._replace(wall_velocity=None)],
     ):
-        with pytest.raises(UsageError, match="side by side"):
+        with pytest.raises(UsageError) as caught:
             collate(windows)
+        assert caught.value.where == "collate"
 
 
 def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None:
@@ -420,8 +421,9 @@ def test_ranks_share_out_one_order(
         : WINDOWS // 3 * 3
     ]
     for rank, count in ((2, 2), (-1, 2), (0, WINDOWS + 1)):
-        with pytest.raises(UsageError, match="rank"):
+        with pytest.raises(UsageError) as caught:
             WindowSampler(data, seed=0, rank=rank, ranks=count)
+        assert caught.value.where == "WindowSampler"
     for name, value in {
         "is_initialized": True,
         "get_rank": 1,
@@ -514,10 +516,12 @@ def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
     assert scenario_batch(paths[4]).frames == 26
     assert scenario_batch(paths[4], slice(-2, None)).frame.tolist() == [24]
     for frames in (slice(50, 60), slice(0, 10, 2), slice(5, 5)):
-        with pytest.raises(UsageError, match="no consecutive frames"):
+        with pytest.raises(UsageError) as caught:
             scenario_batch(paths[4], frames)
-    with pytest.raises(UsageError, match="side by side"):
+        assert caught.value.where.endswith("cavity/tiny/v2/test/0004.nc")
+    with pytest.raises(UsageError) as caught:
         scenario_batch(sorted(root.rglob("*.nc")))
+    assert caught.value.where == "collate"
 
 
 @pytest.mark.parametrize(
@@ -577,10 +581,9 @@ def test_another_scenario_under_its_name_is_refused(
     measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
     store = store_windows.FrameStore(size, {2: folder / "0002.nc"})
-    with pytest.raises(
-        DataError, match=r"(?s)not that of the registry.*content hash 0{16}"
-    ):
+    with pytest.raises(DataError) as caught:
         store.frames(2, 0, 2)
+    assert caught.value.where.endswith("cavity/tiny/v2/train/0002.nc")
 
 
 def drifting(batch: Batch) -> torch.Tensor:
@@ -678,8 +681,9 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
     where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
     found = dict(predict(step, "cavity", history=history, device="cpu", **where))
     for wrong in (0, 7):  # none, or more than the task gives
-        with pytest.raises(UsageError, match="from 1 to 6"):
+        with pytest.raises(UsageError) as caught:
             next(predict(drifting, "cavity", history=wrong, **where))
+        assert caught.value.where == "predict"
     task = registry.size("cavity", "tiny").task
     assert list(found) == [4, 5]
     files = scenario_paths("cavity", **where)
