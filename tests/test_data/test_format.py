@@ -100,7 +100,7 @@ def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
 
 
 def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None:
-    """By lagbench, from xarray's variables, and by lines written after docs/format.md."""
+    """By lagbench, from xarray, and by code written after docs/format.md."""
     path, content = written
     assert rehash(path) == content
     assert check_scenario(path) == content
