@@ -16,13 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 
 from lagbench.atomic import write_atomically
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError
-from lagbench.submission.provenance import StartWeights, TrainingProvenance
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -39,13 +37,11 @@ from .machine import (
     hardware,
     use_threads,
 )
+from .provenance import training_provenance
 from .recipe import change_options
-from .recipe_changes import list_settings
 from .rollout import Rollout, roll_out, scenario_batch, scenario_paths
 from .run_folder import LARGEST_LOG, RunFolder
 from .start import warn_of_last_state
-
-START_DIGITS = 12  # digits of a SHA-256 that provenance names
 
 TIMED_SEARCHES = 5  # frames of a rollout on which the neighbour search is timed alone
 
@@ -418,40 +414,6 @@ def _restore_model(
         ) from error
 
 
-def provenance_of(checkpoint: Checkpoint) -> TrainingProvenance:
-    """Return the training behind weights.
-
-    Raises:
-        UnreadableFileError: the record of the training in the weights is damaged.
-    """
-    info = checkpoint.info
-    recipe = checkpoint.training.get("recipe", {})
-    start = recipe.get("start")
-    start_weights = None
-    try:
-        if start:
-            start_weights = StartWeights(
-                recipe=start["recipe"], weights=start["sha256"][:START_DIGITS]
-            )
-        return TrainingProvenance(
-            split=info.split,
-            size=info.size,
-            subsets=tuple(recipe.get("training", {}).get("windows", ("train",))),
-            recipe=str(recipe.get("name")),
-            step=checkpoint.training.get("step", 0),
-            overrides=list_settings(recipe),
-            start=start_weights,
-        )
-    except (ValidationError, TypeError, KeyError) as error:
-        raise UnreadableFileError(
-            "the weights record a damaged training",
-            where=f"{info.split} {info.size}",
-            expected="a recipe, subsets and a step, as `lagbench train` records them",
-            got=type(error).__name__,
-            fix="train the model with `lagbench train`",
-        ) from error
-
-
 def _training_attributes(
     checkpoint: Checkpoint, target: DatasetInfo, settings: Sequence[str]
 ) -> dict[str, Any]:
@@ -459,7 +421,7 @@ def _training_attributes(
 
     The validations of another size are left out: they compare with nothing here.
     """
-    provenance = provenance_of(checkpoint).model_copy(
+    provenance = training_provenance(checkpoint).model_copy(
         update={"prediction_overrides": tuple(settings)}
     )
     recipe = checkpoint.training.get("recipe", {})

@@ -4,13 +4,14 @@ Markdown.
     python benchmarks/floors.py [--data cavity/full ...] [--each]
 
 From the scores that the package ships (``python -m
-lagbench.scoring.measure_references`` measures them): for each data set and floor the ranking metric with its 95 % interval over test
-scenarios, the correlation of vorticity at frame 54 (tiny: the last), and the CPU time
-of a frame; the best floor is marked. Then, for the full boxes, the share of test
-scenarios in which the frozen field correlates below 0.8 at that frame, and its median
-relative error of the vorticity; for the free surfaces how long the truth moves. Exits
-with 1 where, at full or mini, that share is below 75 %, or the median error of the
-cavity below 0.8. ``frozen_field.py`` measures the same from the data.
+lagbench.scoring.measure_references`` measures them): for each data set and reference
+predictor the ranking metric with its 95 % interval over test scenarios, the correlation
+of vorticity at frame 54 (tiny: the last), and the CPU time of a frame; the best naive
+predictor is marked. Then, for the full boxes, the share of test scenarios in which the
+frozen field correlates below 0.8 at that frame, and its median relative error of the
+vorticity; for the free surfaces how long the truth moves. Exits with 1 where, at full
+or mini, that share is below 75 %, or the median error of the cavity below 0.8.
+``frozen_field.py`` measures the same from the data.
 """
 
 from __future__ import annotations

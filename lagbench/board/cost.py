@@ -44,7 +44,8 @@ STYLE = """
 .dot.naive circle{stroke:#667085}
 .dot.classical circle{fill:#667085;stroke:#667085}
 .classical-front{fill:none;stroke:#667085;stroke-width:1.5}
-.dot .reach,.dot.best .reach,.dot.classical .reach,.dot.naive .reach{fill:none;stroke:none}
+.dot .reach,.dot.best .reach,.dot.classical .reach,.dot.naive .reach{
+fill:none;stroke:none}
 .name{paint-order:stroke;stroke:#fff;stroke-width:4px}
 """
 """Colours of a picture on its own; on the page the style sheets have them."""
@@ -187,9 +188,9 @@ def cost_figure(tab: Tab) -> Markup:
     caption = (
         "Further left is cheaper, further down more accurate; the line joins the "
         "methods that no other beats in both. The full grey line joins the classical "
-        "solvers: an entry below it is more accurate than every solver of its cost. The "
-        "upright line is the time of the "
-        "solver itself. Costs of entries are self-reported, brought to the machine of "
+        "solvers: an entry below it is more accurate than every solver of its cost. "
+        "The upright line is the time of the solver itself. Costs of entries are "
+        "self-reported, brought to the machine of "
         "the solver by their speed-up."
     )
     if any(point.kind == "classical" for point in points):

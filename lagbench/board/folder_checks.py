@@ -26,8 +26,7 @@ from .fields import latest_date
 from .folder import VERIFIED, Folder, Place, entry_path
 from .identity import confusable_key, find_impossible_values, fingerprint_of
 from .issues import issue_from_error, make_issue
-from .ranking import combine, dataset_of, is_current, summarise
-from .rescoring import TOLERANCE
+from .ranking import TOLERANCE, combine, dataset_of, is_current, summarise
 from .verified import read_verified, verification_of
 from .weights import check_weights
 

@@ -24,12 +24,7 @@ from lagbench.submission.issues import ValidationIssue
 from .entry import Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
 from .issues import REFERENCES_ANEW, make_issue
-from .ranking import scored_file
-
-TOLERANCE = 1e-6
-"""Relative difference up to which two numbers are equal; NumPy versions may differ in
-the last bits.
-"""
+from .ranking import TOLERANCE, scored_file
 
 # step of packed film positions [length]
 FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS

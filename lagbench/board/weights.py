@@ -73,7 +73,7 @@ def inspect_weights(path: Path) -> WeightsFile:
     """
     check_installed("torch", extra="baselines")
     from lagbench.baselines.checkpoint import count_rounded_parameters, load
-    from lagbench.baselines.predict import provenance_of
+    from lagbench.baselines.provenance import training_provenance
 
     checkpoint = load(path)
     info = checkpoint.info
@@ -85,7 +85,7 @@ def inspect_weights(path: Path) -> WeightsFile:
         baseline=checkpoint.baseline,
         data_set=(info.split, info.size, info.dataset_sha256),
         seed=recipe.get("training", {}).get("seed", 0),
-        provenance=provenance_of(checkpoint),
+        provenance=training_provenance(checkpoint),
         parameters=count_rounded_parameters(checkpoint) or None,
     )
 

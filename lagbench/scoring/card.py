@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
+from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
-from lagbench.submission.format import Header
+from lagbench.submission.format import MAX_NAME, Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
@@ -277,3 +278,14 @@ def format_scores(card: ScoreCard) -> bytes:
     """Return the bytes of scores.json."""
     text = json.dumps(card.as_json(), indent=1, allow_nan=False, ensure_ascii=False)
     return f"{text}\n".encode()
+
+
+def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
+    """Return the error for a file that is no scores.json or scores.nc."""
+    return UnreadableFileError(
+        f"not a scores{path.suffix} of lagbench",
+        where=str(path),
+        expected="what `lagbench score` writes beside the predictions",
+        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
+        fix="score the predictions again: lagbench score predictions.nc",
+    )

@@ -12,32 +12,19 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from lagbench.errors import UnreadableFileError, check_regular
+from lagbench.errors import check_regular
 from lagbench.metrics.aggregate import LARGEST, Score
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available
-from lagbench.submission.format import MAX_NAME
+from lagbench.submission.format import require_name
 
-from .card import FORMAT, IDENTITY
+from .card import FORMAT, IDENTITY, unreadable_scores
 
 MAX_BYTES = 64 << 20
 """Longest scores.json that is read [bytes]; those of ours take less than 2 MB."""
 
 LARGEST_IN_FILE = float(f"{LARGEST:.9g}")
 """Largest value of a score, as rounded in the file."""
-
-
-def require_printable(text: str) -> str:
-    """Return a text that terminals may show as it is.
-
-    It obeys the rule for attributes of predictions.
-
-    Raises:
-        ValueError: it is empty, too long or not printable.
-    """
-    if not text.strip() or len(text) > MAX_NAME or not text.isprintable():
-        raise ValueError(f"not printable text of 1 to {MAX_NAME} characters")
-    return text
 
 
 def _require_known_format(number: int) -> int:
@@ -52,7 +39,7 @@ def _require_unique(ids: list[int]) -> list[int]:
     return ids
 
 
-Text = Annotated[str, AfterValidator(require_printable)]
+Text = Annotated[str, AfterValidator(require_name)]
 Count = Annotated[int, Field(ge=0, lt=2**31)]
 Value = Annotated[float, Field(ge=-LARGEST_IN_FILE, le=LARGEST_IN_FILE)]
 
@@ -111,17 +98,6 @@ def read_scores(path: Path) -> PublishedScores:
     except RecursionError as error:
         # its own trace is a thousand frames long and says no more
         raise unreadable_scores(path, error) from None
-
-
-def unreadable_scores(path: Path, error: Exception) -> UnreadableFileError:
-    """Return the error for a file that is no scores.json or scores.nc."""
-    return UnreadableFileError(
-        f"not a scores{path.suffix} of lagbench",
-        where=str(path),
-        expected="what `lagbench score` writes beside the predictions",
-        got=f"{type(error).__name__}: {str(error)[:MAX_NAME]}",
-        fix="score the predictions again: lagbench score predictions.nc",
-    )
 
 
 def parse_scores(content: Mapping[str, Any]) -> PublishedScores:

@@ -23,9 +23,16 @@ from lagbench.errors import WorkFailedError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
 from lagbench.references.table import NAIVE
+from lagbench.submission.format import require_name
 
-from .card import FORMAT, IDENTITY, SUBMISSION, Preview, ScoreCard
-from .published_scores import require_printable, unreadable_scores
+from .card import (
+    FORMAT,
+    IDENTITY,
+    SUBMISSION,
+    Preview,
+    ScoreCard,
+    unreadable_scores,
+)
 from .skill import Skill, compute_skill
 
 NETCDF_NAME = "scores.nc"
@@ -281,7 +288,7 @@ def _read_text(file: Any, name: str) -> str:  # noqa: ANN401
     text = file.getncattr(name)
     if not isinstance(text, str):
         raise ValueError(f"{name} is no text")
-    return require_printable(text)
+    return require_name(text)
 
 
 def _read_reference(file: Any) -> tuple[str | None, NDArray[np.float64]]:  # noqa: ANN401

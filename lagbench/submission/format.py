@@ -199,6 +199,17 @@ def is_name_valid(text: str) -> bool:
     return bool(text.strip()) and len(text) <= MAX_NAME and text.isprintable()
 
 
+def require_name(text: str) -> str:
+    """Return a text that can be a required attribute; terminals may show it as it is.
+
+    Raises:
+        ValueError: it is empty, too long or not printable.
+    """
+    if not is_name_valid(text):
+        raise ValueError(f"not {describe_kind('method')}")
+    return text
+
+
 def is_text_valid(name: str, text: str) -> bool:
     """Return whether a text can be an optional attribute.
 

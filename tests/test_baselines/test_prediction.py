@@ -387,24 +387,25 @@ def test_only_the_input_frames_are_read(
     np.testing.assert_array_equal(predicted, expected)
 
 
-def test_missing_data_name_the_command_that_makes_them(
-    run: Predict, tmp_path: Path
-) -> None:
+def test_missing_data_are_an_error(run: Predict, tmp_path: Path) -> None:
     path = run().path
-    with pytest.raises(DataError, match="lagbench generate"):
+    with pytest.raises(DataError) as caught:
         predict(tmp_path / "weights.pt", path, root=tmp_path / "nowhere")
+    assert str(caught.value.where).endswith("nowhere/curl-noise/tiny/v2")
 
 
 def test_a_missing_checkpoint_is_unreadable(
     generated: GenerationResult, tmp_path: Path
 ) -> None:
-    with pytest.raises(UnreadableFileError, match=r"none\.pt"):
+    with pytest.raises(UnreadableFileError) as caught:
         predict(tmp_path / "none.pt", tmp_path / "p.nc", root=generated.root)
+    assert str(caught.value.where).endswith("none.pt")
 
 
 def test_a_missing_device_is_a_usage_error(run: Predict) -> None:
-    with pytest.raises(UsageError, match="no device 'tpu'"):
+    with pytest.raises(UsageError) as caught:
         run(device="tpu")
+    assert caught.value.where == "--device"
 
 
 @pytest.fixture
@@ -529,8 +530,9 @@ def test_no_image_falls_sideways(
         training={},
     )
     save(weights, checkpoint)
-    with pytest.raises(UsageError, match="gravity"):
+    with pytest.raises(UsageError) as caught:
         predict(weights, output, root=root, settings=["model.symmetry=square"])
+    assert caught.value.where == "model.symmetry"
     assert not output.exists()
 
 
@@ -606,10 +608,9 @@ def test_predictions_are_replaced_while_their_cost_is_beside_them(
 
 
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The message says which option to lower."""
     error = torch.OutOfMemoryError("no memory left")
     monkeypatch.setattr(Drift, "advance", Mock(side_effect=error))
-    with pytest.raises(WorkFailedError, match="lower --batch"):
+    with pytest.raises(WorkFailedError):
         run(name="none.nc")
 
 

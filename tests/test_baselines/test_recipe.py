@@ -168,26 +168,26 @@ def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
     said of it by name.
     """
     plain = recipe_for(entry, "cavity", "tiny")
-    assert (plain.training.steps, plain.training.epochs, plain.training.batch) == (
-        7,
-        None,
-        4,
-    )
+    assert plain.training.steps == 7
+    assert plain.training.epochs is None
+    assert plain.training.batch == 4
     long = recipe_for(
         entry, "cavity", "tiny", variant="long", settings=["training.batch=9"], seed=5
     )
-    assert (plain.model["start"], long.model["start"]) == (0.5, 2.0)
-    assert (long.training.batch, long.training.seed) == (9, 5)
-    assert (long.training.schedule.factor, long.training.schedule.every) == (0.5, 10)
+    assert plain.model["start"] == 0.5
+    assert long.model["start"] == 2.0
+    assert long.training.batch == 9
+    assert long.training.seed == 5
+    assert long.training.schedule.factor == 0.5
+    assert long.training.schedule.every == 10
     starred = recipe_for(entry, "fluid", "mini")
-    assert (starred.name, starred.training.learning_rate) == ("fluid/mini", 0.01)
+    assert starred.name == "fluid/mini"
+    assert starred.training.learning_rate == 0.01
     for name, steps in (("drift", 8), ("gns", 9)):
         recipe = recipe_for(replace(entry, name=name), "fluid", "full")
-        assert (
-            recipe.model["start"],
-            recipe.training.steps,
-            recipe.training.batch,
-        ) == (1.0, steps, 4)
+        assert recipe.model["start"] == 1.0
+        assert recipe.training.steps == steps
+        assert recipe.training.batch == 4
     own = tmp_path / "own.yaml"
     own.write_text("{format: 1, recipes: {fluid/tiny: {training: {steps: 3}}}}")
     assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
@@ -315,11 +315,9 @@ def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
         (told,) = list_settings(
             {**good, "training": {**good["training"], "steps": odd, "unknown": 1}}
         ) or ("",)
-        assert (len(told) < 250, told.isprintable(), told.isascii()) == (
-            True,
-            True,
-            True,
-        )
+        assert len(told) < 250
+        assert told.isprintable()
+        assert told.isascii()
     assert list_settings(None) == list_settings([good]) == ()
 
 
@@ -329,7 +327,8 @@ def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
     """
     for settings in (["training.epochs=2"], ["training.steps=5", "training.epochs=2"]):
         changed = recipe_for(entry, "cavity", "tiny", settings=settings).training
-        assert (changed.steps, changed.epochs) == (None, 2)
+        assert changed.steps is None
+        assert changed.epochs == 2
     # 2 epochs x 41 windows / (4 windows x 2 processes) = 10.25
     assert changed.total_steps(41, processes=2) == 11
     with pytest.raises(ValueError, match="steps or epochs"):

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from html_check import Element, read_html
 from page_reader import element_text, read_page_data
+from sample_boards import make_board, with_entry
 
 from lagbench.board.columns import columns_of
 from lagbench.board.entry import EntryCost, EntryFlag, Weights

@@ -318,10 +318,11 @@ def test_a_compound_type_is_damage(written: tuple[Path, str]) -> None:
     assert_refused(path, "damaged", "variable 'odd'", check=rehash)
 
 
-def test_a_root_that_cannot_be_written_has_a_fix(tmp_path: Path) -> None:
+def test_a_root_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "cavity").write_text("in the way")
-    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--root") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         write_scenario(tmp_path, KEY)
+    assert str(caught.value.where).endswith("cavity/tiny/v2/test/0003.nc")
     assert caught.value.exit_code == 5
 
 
@@ -432,11 +433,9 @@ def test_blocks_stream_all_frames_in_order(written: tuple[Path, str]) -> None:
 
 def test_an_unknown_variable_is_an_error(written: tuple[Path, str]) -> None:
     path, _ = written
-    with (
-        read_scenario(path) as file,
-        pytest.raises(DataError, match="variable 'density'"),
-    ):
+    with read_scenario(path) as file, pytest.raises(DataError) as caught:
         file.read("density")
+    assert str(caught.value.where).endswith(f"{path.name}, variable 'density'")
 
 
 def write_with_parameters(
@@ -490,8 +489,9 @@ def test_too_many_frames_are_refused(tmp_path: Path) -> None:
     with open_writer(tmp_path / "c.nc") as file:
         file.append(FRAME, FRAME)
         file.append(FRAME, FRAME)
-        with pytest.raises(DataError, match="too many values"):
+        with pytest.raises(DataError) as caught:
             file.append(FRAME, FRAME)
+    assert caught.value.where == "variable 'position'"
 
 
 @pytest.mark.parametrize("name", ["seed", "content_sha256", "two words", ""])
@@ -499,13 +499,15 @@ def test_parameters_that_would_hide_an_attribute_are_refused(
     tmp_path: Path, name: str
 ) -> None:
     """So are names that are no names."""
-    with pytest.raises(DataError, match="cannot be"):
+    with pytest.raises(DataError) as caught:
         write_scenario(tmp_path, KEY, parameters={name: 1})
+    assert str(caught.value.where).endswith("0003.nc")
 
 
 @pytest.mark.parametrize("value", ["", [1], {"a": 1}, np.array([1, 2])])
 def test_parameters_that_netcdf_would_change_are_refused(
     tmp_path: Path, value: object
 ) -> None:
-    with pytest.raises(DataError, match="cannot be"):
+    with pytest.raises(DataError) as caught:
         write_scenario(tmp_path, KEY, parameters={"depth": value})
+    assert str(caught.value.where).endswith("0003.nc")

@@ -376,7 +376,7 @@ def test_files_of_two_data_sets_are_refused_before_any_is_scored(
             result = dataclasses.replace(result, size="mini")
         return result
 
-    monkeypatch.setattr(validation, "validate", validate_second_as_mini)
+    monkeypatch.setattr("lagbench.cli.score.validate", validate_second_as_mini)
     result = run("score", first, second, "--report", report)
     assert result.exit_code == 2
     assert "two data sets" in result.stderr

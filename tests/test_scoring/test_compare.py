@@ -341,7 +341,7 @@ def test_a_seed_is_not_compared_with_itself(
 
 
 def test_a_reference_goes_second(scored: dict[str, Path]) -> None:
-    with pytest.raises(UsageError, match="persistence"):
+    with pytest.raises(UsageError):
         compare("persistence", scored["still"])
 
 
@@ -370,12 +370,13 @@ def test_a_reference_is_as_good_as_its_submission(scored: dict[str, Path]) -> No
     assert by_file["second"] == "straight"
 
 
-def test_a_misspelt_metric_or_reference_gets_the_nearest_name(
+def test_a_misspelt_metric_or_reference_is_refused(
     scored: dict[str, Path],
 ) -> None:
-    with pytest.raises(UsageError, match="vorticity_rmse"):
+    with pytest.raises(UsageError) as caught:
         compare(scored["still"], scored["straight"], metrics=["vorticity_rsme"])
-    with pytest.raises(UsageError, match="'constant-velocity'"):
+    assert caught.value.where == "--metric"
+    with pytest.raises(UsageError):
         compare(scored["still"], "constant-velocty")
 
 
@@ -467,20 +468,21 @@ def test_a_folder_without_scores_is_unreadable(tmp_path: Path) -> None:
 def test_json_deeper_than_pythons_stack_is_unreadable(tmp_path: Path) -> None:
     path = tmp_path / "scores.json"
     path.write_text("[" * 100_000)
-    with pytest.raises(UnreadableFileError, match="RecursionError"):
+    with pytest.raises(UnreadableFileError) as caught:
         compare(path, path)
+    assert caught.value.where == str(path)
 
 
 def test_rows_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
     path = publish(tmp_path, [1.0], method="a", ranking_metric="vorticity_rmse")
-    with pytest.raises(UnreadableFileError, match="ranking"):
+    with pytest.raises(UnreadableFileError):
         compare(path, path)
 
 
 def test_references_without_the_ranking_metric_are_unreadable(tmp_path: Path) -> None:
     rows = rows_of([1] * 6) | {"persistence": {}}
     path = publish(tmp_path, [1.0] * 6, method="b", rows=rows)
-    with pytest.raises(UnreadableFileError, match="ranking"):
+    with pytest.raises(UnreadableFileError):
         compare(path, "persistence")
 
 
@@ -532,7 +534,7 @@ def test_wide_tables_come_in_blocks() -> None:
         rows.append(tuple(row))
     table = Table("wide", tuple(columns), tuple(rows))
 
-    blocks = list(output.blocks(table, 80))
+    blocks = list(output.split_table(table, 80))
     assert len(blocks) > 1
     block_columns: list[str] = []
     second_row: list[str] = []

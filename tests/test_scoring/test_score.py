@@ -272,20 +272,21 @@ def test_invalid_predictions_are_refused(
     with h5py.File(broken, "r+") as file:
         file["position"][0, 3, 5, 1] = np.nan
     results: list[Any] = []
-    with pytest.raises(ChecksFailedError, match="finite"):
+    with pytest.raises(ChecksFailedError) as caught:
         bench.score(broken, examined=results.append)
+    assert caught.value.where == "first in scenario 3, frame 9, particle 5, y"
     assert [finding.check for finding in results[0].errors] == ["finite"]
     assert list(tmp_path.iterdir()) == [broken]
 
 
-def test_a_root_without_the_data_set_names_the_command_that_makes_it(
+def test_a_root_without_the_data_set_is_an_error(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
     path = bench.submit(tmp_path / "predictions.nc", still)
     assert validate(path, root=bench.root, registry=bench.registry).valid
-    command = "lagbench generate --split curl-noise --size tiny"
-    with pytest.raises(DataError, match=command):
+    with pytest.raises(DataError) as caught:
         scoring.score(path, root=tmp_path / "root", registry=bench.registry)
+    assert str(caught.value.where).endswith("root/curl-noise/tiny/v2/test")
 
 
 def test_scenarios_without_statistics_of_train_are_not_enough(
@@ -298,23 +299,22 @@ def test_scenarios_without_statistics_of_train_are_not_enough(
         target = root / source.relative_to(bench.root)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(source, target)
-    with pytest.raises(DataError, match="recorded"):
+    with pytest.raises(DataError):
         scoring.score(path, root=root, registry=bench.registry)
 
 
-def test_a_misspelt_extra_gets_the_nearest_name(
-    bench: ScoreBench, predictions: Path
-) -> None:
-    with pytest.raises(UsageError, match="did you mean 'transport'"):
+def test_a_misspelt_extra_is_refused(bench: ScoreBench, predictions: Path) -> None:
+    with pytest.raises(UsageError) as caught:
         bench.evaluate(predictions, extras=("transprot",))
+    assert caught.value.where == "--extras"
 
 
-def test_optional_metrics_name_their_extra(
+def test_optional_metrics_need_their_extra(
     bench: ScoreBench, predictions: Path
 ) -> None:
-    """Sinkhorn without POT names the extra that installs it; with POT it is scored."""
+    """Sinkhorn without POT is refused; with POT it is scored."""
     if importlib.util.find_spec("ot") is None:
-        with pytest.raises(UsageError, match=r"lagbench\[transport\]"):
+        with pytest.raises(UsageError):
             bench.evaluate(predictions, extras=("transport",))
     else:
         card = bench.evaluate(predictions, extras=("transport",))

@@ -210,10 +210,10 @@ def test_load_manifest_reads_what_was_written(tmp_path: Path) -> None:
     assert load_manifest("cavity", size="tiny", root=tmp_path) == manifest
 
 
-def test_without_a_manifest_the_command_is_named(tmp_path: Path) -> None:
-    message = r"(?s)no manifest.*lagbench generate --split cavity --size tiny"
-    with pytest.raises(DataError, match=message):
+def test_a_missing_manifest_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
         load_manifest("cavity", size="tiny", root=tmp_path)
+    assert str(caught.value.where).endswith("cavity/tiny/v2")
 
 
 def test_all_splits_are_listed() -> None:
@@ -226,5 +226,5 @@ def test_public_names_load_on_first_use() -> None:
     assert set(lagbench.__all__) <= set(dir(lagbench))
     assert lagbench.open_split is open_split
     assert lagbench.__version__[0].isdigit()
-    with pytest.raises(AttributeError, match="opensplit"):
+    with pytest.raises(AttributeError):
         lagbench.opensplit  # noqa: B018

@@ -107,9 +107,11 @@ def test_a_second_look_fetches_nothing(store: Store, tiny: Registry) -> None:
         assert store.server.count("0004.nc") == 1
 
 
-def test_scenarios_that_the_store_lacks_are_named(store: Store, tiny: Registry) -> None:
+def test_scenarios_that_the_store_lacks_are_an_error(
+    store: Store, tiny: Registry
+) -> None:
     root = f"{store.url}/nothing"
-    with pytest.raises(DataError, match="0-1"):
+    with pytest.raises(DataError):
         lagbench.open_split(SPLIT, size=SIZE, subset="train", root=root)
 
 

@@ -276,8 +276,9 @@ def test_windows_that_do_not_fit_are_not_collated(train: Open) -> None:
         [window, shorter],
         [window, without_walls],
     ):
-        with pytest.raises(UsageError, match="side by side"):
+        with pytest.raises(UsageError) as caught:
             collate(windows)
+        assert caught.value.where == "collate"
 
 
 def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None:
@@ -455,8 +456,9 @@ def test_ranks_that_do_not_exist_are_refused(
     train: Open, rank: int, ranks: int
 ) -> None:
     """More ranks than windows are refused too."""
-    with pytest.raises(UsageError, match="rank"):
+    with pytest.raises(UsageError) as caught:
         WindowSampler(train(), seed=0, rank=rank, ranks=ranks)
+    assert caught.value.where == "WindowSampler"
 
 
 def test_a_sampler_asks_torch_for_its_rank(
@@ -575,13 +577,15 @@ def test_a_whole_scenario_has_all_frames_by_default(
 def test_frames_that_do_not_follow_each_other_are_refused(
     paths_of_test: dict[int, Path], frames: slice
 ) -> None:
-    with pytest.raises(UsageError, match="no consecutive frames"):
+    with pytest.raises(UsageError) as caught:
         scenario_batch(paths_of_test[4], frames)
+    assert caught.value.where == str(paths_of_test[4])
 
 
 def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
-    with pytest.raises(UsageError, match="side by side"):
+    with pytest.raises(UsageError) as caught:
         scenario_batch(sorted(root.rglob("*.nc")))
+    assert caught.value.where == "collate"
 
 
 @pytest.mark.parametrize(
@@ -666,9 +670,9 @@ def test_a_scenario_of_another_hash_is_refused(
     measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
     store = store_windows.FrameStore(size, {2: path})
-    words = r"(?s)not that of the registry.*content hash 0{16}"
-    with pytest.raises(DataError, match=words):
+    with pytest.raises(DataError) as caught:
         store.frames(2, 0, 2)
+    assert caught.value.where == str(path)
 
 
 def extrapolate(batch: Batch) -> torch.Tensor:
@@ -808,5 +812,6 @@ def test_predictions_start_from_the_input_frames_of_the_task(
     root: Path, registry: Registry, history: int
 ) -> None:
     location: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
-    with pytest.raises(UsageError, match="from 1 to 6"):
+    with pytest.raises(UsageError) as caught:
         next(predict(extrapolate, "cavity", history=history, **location))
+    assert caught.value.where == "predict"

@@ -28,7 +28,7 @@ from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics import METRICS
 from lagbench.scoring import flags
 
-CLONE = Path(__file__).parent.parent
+CLONE = Path(__file__).parents[2]
 README = (CLONE / "README.md").read_text()
 NOTEBOOK = CLONE / "docs" / "notebooks" / "quickstart.ipynb"
 PAGES = [CLONE / "README.md", *sorted((CLONE / "docs").glob("*.md"))]
@@ -115,24 +115,20 @@ def test_every_command_of_the_pages_exists() -> None:
             if hasattr(command, "commands"):
                 command = command.commands[words[2]]
             known = {
-                option for parameter in command.params for option in parameter.opts
+                option
+                for parameter in command.loaded.params
+                for option in parameter.opts
             }
             given = {word.partition("=")[0] for word in words if word.startswith("-")}
             assert given <= known | {"--help"}, f"{page.name}: {line}"
 
 
-def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
-    """At most 150 lines, its program 40; every file that a page of ours links is
-    there.
-    """
-    assert len(README.splitlines()) <= 150
-    (program,) = blocks(README, "python")
-    assert len(program.splitlines()) <= 40
+def test_the_links_of_the_pages_lead_somewhere() -> None:
+    """Every file that a page of ours links is there."""
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#\s]+)", page.read_text()):
-            assert "://" in target or (page.parent / target).exists(), (
-                f"{page.name}: {target}"
-            )
+            if "://" not in target:
+                assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
 def test_what_is_stored_is_small() -> None:
@@ -163,18 +159,16 @@ def test_every_metric_stands_in_the_table() -> None:
 def test_thresholds_of_the_flags() -> None:
     """The thresholds in the text are those of the code."""
     assert f"is below {flags.AUTOCORRELATION:g};" in TEXT
-    assert (flags.DROP, "less than half within one frame" in TEXT) == (0.5, True)
-    assert (flags.SHIFT_GAIN, "less than a quarter of the error" in TEXT) == (
-        0.25,
-        True,
-    )
-    assert (flags.GROWTH, "less than twice the first frame's" in TEXT) == (2.0, True)
+    assert flags.DROP == 0.5
+    assert "less than half within one frame" in TEXT
+    assert flags.SHIFT_GAIN == 0.25
+    assert "less than a quarter of the error" in TEXT
+    assert flags.GROWTH == 2.0
+    assert "less than twice the first frame's" in TEXT
     assert f"outside {flags.ENERGY[0]:g} to {flags.ENERGY[1]:g} times" in TEXT
     assert f"outside {flags.OCCUPANCY[0]:g} to {flags.OCCUPANCY[1]:g} times" in TEXT
-    assert (flags.TWIN_REGULAR, "past a tenth of that of persistence" in TEXT) == (
-        0.1,
-        True,
-    )
+    assert flags.TWIN_REGULAR == 0.1
+    assert "past a tenth of that of persistence" in TEXT
 
 
 def test_every_option_of_score_is_described() -> None:
@@ -187,7 +181,7 @@ def test_every_option_of_score_is_described() -> None:
     cells = "".join(
         line.split("|")[1] for line in table.splitlines() if line.startswith("| `")
     )
-    score = get_command(app).commands["score"]  # type: ignore[attr-defined]
+    score = get_command(app).commands["score"].loaded  # type: ignore[attr-defined]
     options = {name for p in score.params for name in p.opts if name.startswith("-")}
     assert set(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cells)) == options - {
         "--help"

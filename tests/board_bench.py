@@ -243,7 +243,10 @@ def runaway(truth: Floats, n: int, h: int) -> Floats:
     return guess
 
 
-HOSTILE = "<script>console.error(1)</script><img src=http://example.com/x onerror=console.error(2)>"
+HOSTILE = (
+    "<script>console.error(1)</script>"
+    "<img src=http://example.com/x onerror=console.error(2)>"
+)
 
 METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
 """The methods of :func:`page_of`."""

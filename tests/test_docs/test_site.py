@@ -15,7 +15,7 @@ import pytest
 
 import lagbench
 
-CLONE = Path(__file__).parent.parent
+CLONE = Path(__file__).parents[2]
 LOADED = {
     "script": "src",
     "img": "src",

@@ -24,9 +24,9 @@ LESS = """
 import os, signal, sys
 for name in ("resource", "fcntl", "pwd", "grp", "termios"):
     sys.modules[name] = None
-for module, names in ((os, ("sched_getaffinity", "fork", "killpg")), (signal, ("SIGXCPU",))):
-    for name in names:
-        delattr(module, name)
+for name in ("sched_getaffinity", "fork", "killpg"):
+    delattr(os, name)
+del signal.SIGXCPU
 opened = os.open
 def no_folders(path, *rest, **more):
     if os.path.isdir(path):
