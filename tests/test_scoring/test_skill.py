@@ -20,8 +20,8 @@ from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
 from lagbench.references.shipped import (
     shipped_path,
+    write_costs,
     write_shipped,
-    write_solver_seconds,
 )
 from lagbench.references.table import NAIVE
 from lagbench.scoring import references as references_of_scoring
@@ -290,7 +290,7 @@ def test_one_reference_measured_anew_leaves_the_others(
         "folder": tmp_path,
     }
     path = write_shipped(size, measured_references, **options)
-    write_solver_seconds(size, 0.5, tmp_path)
+    write_costs(size, {}, solver=0.5, folder=tmp_path)
     before = json.loads(path.read_text())
     analog = replace(
         measured_references["persistence"], name="analog", seconds_per_frame=9.0
