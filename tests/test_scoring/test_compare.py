@@ -163,9 +163,9 @@ def test_copies_are_no_seeds(tmp_path: Path) -> None:
     published(mixed, [1.0] * 6, method="b")
     for folder in (copies, mixed):
         for sides in ((folder, other), (other, folder)):
-            with pytest.raises(UsageError) as told:
+            with pytest.raises(UsageError) as caught:
                 compare(*sides)
-            assert str(folder) in str(told.value.where)
+            assert str(folder) in str(caught.value.where)
 
 
 def test_frames_without_a_value_are_told(tmp_path: Path) -> None:

@@ -131,10 +131,10 @@ def test_a_full_disk_is_said(card: ScoreCard, tmp_path: Path, size: int) -> None
     """Most bytes are written when the file is closed: what is refused then is told too,
     with the remedy.
     """
-    with largest_file(size), pytest.raises(WorkFailedError) as told:
+    with largest_file(size), pytest.raises(WorkFailedError) as caught:
         write_statistics(noisy(card), tmp_path / "scores.nc", option="--board")
-    assert told.value.where == str(tmp_path / "scores.nc")
-    assert "--board" in str(told.value.fix)
+    assert caught.value.where == str(tmp_path / "scores.nc")
+    assert "--board" in str(caught.value.fix)
     assert not list(tmp_path.iterdir())
 
 

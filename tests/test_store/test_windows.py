@@ -627,9 +627,9 @@ def test_a_rollout_feeds_on_itself(train: Open) -> None:
     expected = torch.stack([x2, x3], 1)
     given_positions = torch.stack([x0, x1], 1)
     given = replace(batch.part(slice(2)), position=given_positions)
-    found = roll_out(drifting, given, 2)
-    assert torch.equal(found, expected)
-    found.sum().backward()
+    actual = roll_out(drifting, given, 2)
+    assert torch.equal(actual, expected)
+    actual.sum().backward()
     assert x0.grad is not None
     assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
 
@@ -679,13 +679,13 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
         return drifting(batch)
 
     where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
-    found = dict(predict(step, "cavity", history=history, device="cpu", **where))
+    actual = dict(predict(step, "cavity", history=history, device="cpu", **where))
     for wrong in (0, 7):  # none, or more than the task gives
         with pytest.raises(UsageError) as caught:
             next(predict(drifting, "cavity", history=wrong, **where))
         assert caught.value.where == "predict"
     task = registry.size("cavity", "tiny").task
-    assert list(found) == [4, 5]
+    assert list(actual) == [4, 5]
     files = scenario_paths("cavity", **where)
     for row, (scenario, path) in enumerate(files.items()):
         whole = scenario_batch(path)
@@ -693,5 +693,5 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
         given = whole.part(slice(start, task.input_frames))
         assert same(seen[row * task.horizon], given)
         expected = roll_out(drifting, given, task.horizon).transpose(0, 1)
-        assert found[scenario].dtype == np.float32
-        np.testing.assert_array_equal(found[scenario], expected.numpy())
+        assert actual[scenario].dtype == np.float32
+        np.testing.assert_array_equal(actual[scenario], expected.numpy())
