@@ -346,7 +346,7 @@ def test_several_files_are_checked_before_any_is_scored(
         )
 
     with monkeypatch.context() as patch:
-        patch.setattr(validation, "validate", other)
+        patch.setattr("lagbench.cli.score.validate", other)
         result = run("score", *two, "--report", tmp_path / "rep")
     assert result.exit_code == 2
     assert "two data sets" in result.stderr

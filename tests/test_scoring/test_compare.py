@@ -468,7 +468,7 @@ def test_wide_tables_come_in_blocks() -> None:
     rows = tuple(
         (f"row {j}", *(f"{i}.{j} [0.25, 0.75]" for i in range(20))) for j in range(3)
     )
-    blocks = list(output.blocks(Table("wide", columns, rows), 80))
+    blocks = list(output.split_table(Table("wide", columns, rows), 80))
     assert len(blocks) > 1
     for block in blocks:
         widths = [
