@@ -67,61 +67,62 @@ def noisy(card: ScoreCard) -> ScoreCard:
 
 
 def scattered(card: ScoreCard) -> ScoreCard:
-    """Return a card as large as one of multimaterial full, with a scatter of a
-    hundredth in every frame.
+    """Return a card as large as one of multimaterial full.
 
-    As there, every scenario has two of the four materials, and transport is measured in
-    two frames.
+    Every frame scatters by a hundredth. As there, every scenario has two of the four
+    materials, and transport is measured in two frames.
     """
     rng = np.random.Generator(np.random.PCG64(1))
     names = card.tallies[SUBMISSION][3].names
     frames = tuple(range(2, 600))
     levels = 10.0 ** rng.uniform(-6, 0, (len(names), 1))
+    lacking_materials = [("jelly", "snow"), ("snow", "rope"), ("liquid", "rope")]
     tallies = {}
-    for i, lacking in enumerate(
-        [("jelly", "snow"), ("snow", "rope"), ("liquid", "rope")] * 2, 54
-    ):
-        there = np.array([not name.endswith(lacking) for name in names])[
-            :, None
-        ] & np.ones(598, bool)
-        there[names.index("sliced_w2"), 1:-1] = False
-        values = levels * (1 + 0.01 * rng.standard_normal(there.shape))
-        weight = there.astype(np.int64)
-        tallies[i] = round_statistics(
-            Tally(names, frames, np.where(there, values, 0.0), weight, 0 * weight)
+    for scenario, lacking in enumerate(lacking_materials * 2, 54):
+        is_measured = np.ones((len(names), len(frames)), bool)
+        for row, name in enumerate(names):
+            if name.endswith(lacking):
+                is_measured[row] = False
+        is_measured[names.index("sliced_w2"), 1:-1] = False
+        values = levels * (1 + 0.01 * rng.standard_normal(is_measured.shape))
+        weight = is_measured.astype(np.int64)
+        tally = Tally(
+            names, frames, np.where(is_measured, values, 0.0), weight, 0 * weight
         )
+        tallies[scenario] = round_statistics(tally)
+
     fields = rng.standard_normal((2, 2, 65, 65)).astype(np.float32)
     fields[:, :, :, 26:] = np.nan  # the material fills less than two fifths of the box
     steps = 1e-3 * rng.standard_normal((2, FRAMES, PARTICLES, 2))
-    film = (rng.random((1, 1, PARTICLES, 2)) + np.cumsum(steps, axis=1)).astype(
-        np.float32
-    )
+    start = rng.random((1, 1, PARTICLES, 2))
+    film = start + np.cumsum(steps, axis=1)
     large = noisy(card)
-    few = {
-        "histogram": large.preview.histogram[:, :2],
-        "histogram_range": large.preview.histogram_range[:2],
-    }
     preview = replace(
-        large.preview, map_frames=(60, 599), vorticity=fields, film=film, **few
+        large.preview,
+        map_frames=(60, 599),
+        vorticity=fields,
+        film=film.astype(np.float32),
+        histogram=large.preview.histogram[:, :2],
+        histogram_range=large.preview.histogram_range[:2],
     )
     return replace(large, tallies={SUBMISSION: tallies}, preview=preview)
 
 
 def test_full_submissions_take_300_kb(card: ScoreCard, tmp_path: Path) -> None:
-    """Six scenarios of 598 frames that scatter stay below 300 kB, and their scores
-    follow from the file.
+    """Six scenarios of 598 frames that scatter stay below it; scores follow the file.
 
-    Even incompressible statistics and pictures of six scenarios of 90 frames stay below
-    300 kB.
+    So do incompressible statistics and pictures of six scenarios of 90 frames.
     """
     path = tmp_path / "scores.nc"
-    made = scattered(card)
-    write_statistics(made, path)
+    large = scattered(card)
+    write_statistics(large, path)
     assert 200_000 < path.stat().st_size <= 300_000
-    again = read_statistics(path)
-    expected = aggregate(select(again.tallies[54].names), made.tallies[SUBMISSION])
-    for name, score in expected.items():
-        assert again.scores()[name].mean == score.mean or math.isnan(score.mean)
+    statistics = read_statistics(path)
+    metrics = select(statistics.tallies[54].names)
+    for name, score in aggregate(metrics, large.tallies[SUBMISSION]).items():
+        stored_mean = statistics.scores()[name].mean
+        assert stored_mean == score.mean or math.isnan(score.mean)
+
     write_statistics(noisy(card), path)
     assert 200_000 < path.stat().st_size <= 300_000
 
@@ -138,38 +139,41 @@ def test_a_full_disk_is_said(card: ScoreCard, tmp_path: Path, size: int) -> None
     assert not list(tmp_path.iterdir())
 
 
-def test_stored_statistics_are_rounded() -> None:
-    """To float32, beyond which they saturate; in long rollouts to eleven bits, twice as
-    well as once.
-
-    0 and 1 stay; what is undefined is counted.
-    """
+def test_stored_statistics_saturate_at_float32() -> None:
+    """An undefined value is counted."""
     largest = float(np.finfo(np.float32).max)
     values = {0: {"a": 1e300, "b": -1e300, "c": 0.1, "d": math.nan}}
     stored = round_statistics(Tally.of("abcd", (0,), values))
-    np.testing.assert_array_equal(
-        stored.total[:, 0], [largest, -largest, float(np.float32(0.1)), 0.0]
-    )
+    expected = [largest, -largest, float(np.float32(0.1)), 0.0]
+    np.testing.assert_array_equal(stored.total[:, 0], expected)
     assert stored.undefined[:, 0].tolist() == [0, 0, 0, 1]
+
+
+def test_statistics_of_long_rollouts_are_rounded_to_eleven_bits() -> None:
+    """Rounded twice they are the same; 0 and 1 stay."""
+    largest = float(np.finfo(np.float32).max)
     frames = range(101)
-    given = Tally.of(
-        "abcd",
-        frames,
-        {f: {"a": 1e-9 * math.pi**f, "b": 0.0, "c": 1.0, "d": -1e300} for f in frames},
-    )
-    stored = round_statistics(given)
-    np.testing.assert_allclose(stored.total[0, :80], given.total[0, :80], rtol=2.0**-11)
-    assert len(np.unique(np.frexp(stored.total[0, :80])[0] * 2**11 % 1)) == 1
+    values = {}
+    for frame in frames:
+        growing = 1e-9 * math.pi**frame
+        values[frame] = {"a": growing, "b": 0.0, "c": 1.0, "d": -1e300}
+    tally = Tally.of("abcd", frames, values)
+    stored = round_statistics(tally)
+    finite = stored.total[0, :80]
+    np.testing.assert_allclose(finite, tally.total[0, :80], rtol=2.0**-11)
+    mantissas, _ = np.frexp(finite)
+    remainders = mantissas * 2**11 % 1
+    assert len(np.unique(remainders)) == 1
     assert [set(row) for row in stored.total[1:]] == [{0.0}, {1.0}, {-largest}]
-    np.testing.assert_array_equal(round_statistics(stored).total[:3], stored.total[:3])
+    again = round_statistics(stored)
+    np.testing.assert_array_equal(again.total[:3], stored.total[:3])
 
 
 def test_preview_shows_the_truth_beside_the_prediction(
     bench: ScoreBench, card: ScoreCard
 ) -> None:
-    """Xarray unpacks the preview to within one level of the positions, fields and
-    shares it was made of.
-    """
+    """Xarray unpacks the preview to within one level of its content."""
+    level = 2.0 / 65534
     with xr.open_dataset(card.files[1], group="preview") as preview:
         n = bench.size.task.input_frames
         truth = bench.truth(int(preview.attrs["scenario"]))
@@ -177,54 +181,57 @@ def test_preview_shows_the_truth_beside_the_prediction(
         particles = preview["film_particle"].values
         assert len(frames) == bench.size.task.horizon
         assert len(particles) == PARTICLES
-        level = 2.0 / 65534
-        film = preview["film"].values
-        np.testing.assert_allclose(film[0], truth[frames][:, particles], atol=level)
-        guess = straight(truth, n, len(frames))[:, particles]
-        np.testing.assert_allclose(film[1], guess, atol=level)
-        omega = preview["vorticity"].values
-        assert np.isnan(omega[0]).any()
-        assert np.array_equal(np.isnan(omega[0]), np.isnan(omega[1]))
-        for i in range(len(preview["map_frame"])):
-            known = ~np.isnan(omega[0, i])
-            shares = histograms(omega[0, i][known], omega[1, i][known])
-            assert shares is not None
-            assert abs(preview["histogram"].values[:, i].sum(axis=1) - 1.0).max() < 0.01
+
+        true_film, predicted_film = preview["film"].values
+        expected_truth = truth[frames][:, particles]
+        np.testing.assert_allclose(true_film, expected_truth, atol=level)
+        prediction = straight(truth, n, len(frames))[:, particles]
+        np.testing.assert_allclose(predicted_film, prediction, atol=level)
+
+        true_maps, predicted_maps = preview["vorticity"].values
+        is_empty = np.isnan(true_maps)
+        assert is_empty.any()
+        assert np.array_equal(is_empty, np.isnan(predicted_maps))
+        for i, true_map in enumerate(true_maps):
+            defined = ~is_empty[i]
+            assert histograms(true_map[defined], predicted_maps[i][defined]) is not None
+            share_sums = preview["histogram"].values[:, i].sum(axis=1)
+            assert abs(share_sums - 1.0).max() < 0.01
 
 
-def test_both_files_read_back(card: ScoreCard) -> None:
-    """What compare needs comes back from scores.json; of scores.nc every bit of the
-    statistics and scores.
-    """
+def test_the_statistics_read_back_to_the_bit(card: ScoreCard) -> None:
+    """So do the scores that follow from them."""
     stored = read_statistics(card.files[1])
     assert stored.predictions_sha256 == card.predictions_sha256
     assert list(stored.scores()) == list(card.submission)
     for name, score in stored.scores().items():
-        np.testing.assert_array_equal(
-            score.values, card.submission[name].values, err_msg=name
-        )
-        np.testing.assert_equal(score.interval, card.submission[name].interval)
-        assert score.undefined == card.submission[name].undefined, name
+        expected = card.submission[name]
+        np.testing.assert_array_equal(score.values, expected.values, err_msg=name)
+        np.testing.assert_equal(score.interval, expected.interval)
+        assert score.undefined == expected.undefined, name
     for scenario, tally in card.tallies[SUBMISSION].items():
         again = stored.tallies[scenario]
         assert again.names == tally.names
         assert again.frames == tally.frames
-        for field in ("total", "weight", "undefined"):
-            np.testing.assert_array_equal(getattr(again, field), getattr(tally, field))
+        np.testing.assert_array_equal(again.total, tally.total)
+        np.testing.assert_array_equal(again.weight, tally.weight)
+        np.testing.assert_array_equal(again.undefined, tally.undefined)
+
+
+def test_scores_json_reads_back_with_its_digits(card: ScoreCard) -> None:
+    """It holds what compare needs."""
     published = read_scores(card.files[0])
     assert published.ranking == "vorticity_nrmse"
     assert published.identity["method"] == card.header.method
-    assert [digits(v) for v in (1.23456789012e-7, math.nan, math.inf)] == [
-        1.23456789e-7,
-        None,
-        None,
-    ]
+    assert digits(1.23456789012e-7) == 1.23456789e-7
+    assert digits(math.nan) is None
+    assert digits(math.inf) is None
     for row, scores in card.scores.items():
         for name, score in scores.items():
             again = published.scores[row][name]
-            assert [digits(v) for v in again.values.tolist()] == [
-                digits(v) for v in score.values.tolist()
-            ]
+            stored_digits = [digits(value) for value in again.values.tolist()]
+            expected_digits = [digits(value) for value in score.values.tolist()]
+            assert stored_digits == expected_digits
             assert again.undefined == score.undefined
 
 

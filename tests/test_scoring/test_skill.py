@@ -22,8 +22,8 @@ from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
 from lagbench.references.shipped import (
     shipped_path,
+    write_costs,
     write_shipped,
-    write_solver_seconds,
 )
 from lagbench.references.table import NAIVE
 from lagbench.scoring import references as references_of_scoring
@@ -240,7 +240,7 @@ def test_one_floor_measured_anew_leaves_the_others(
     size = recorded(bench.size)
     known = {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
     path = write_shipped(size, measured_references, **known)
-    write_solver_seconds(size, 0.5, tmp_path)
+    write_costs(size, {}, solver=0.5, folder=tmp_path)
     before = json.loads(path.read_text())
     other = replace(
         measured_references["persistence"], name="analog", seconds_per_frame=9.0
