@@ -95,7 +95,11 @@ def points_of(tab: Tab) -> list[CostPoint]:
                 error=reference.values[tab.ranking].mean,
             )
             points.append(point)
-    return [point for point in points if point.is_drawable]
+    drawable_points = []
+    for point in points:
+        if point.is_drawable:
+            drawable_points.append(point)
+    return drawable_points
 
 
 def _seconds_here(cost: EntryCost, solver_seconds_here: float | None) -> float:
@@ -134,8 +138,11 @@ def draw(
         ranking: name of the ranking metric.
         title: title of the figure.
     """
-    times = [point.seconds for point in points]
-    errors = [point.error for point in points]
+    times = []
+    errors = []
+    for point in points:
+        times.append(point.seconds)
+        errors.append(point.error)
     if solver:
         times.append(solver)
     plot = Plot(
@@ -151,7 +158,10 @@ def draw(
     front_times = [point.seconds for point in front]
     front_errors = [point.error for point in front]
     plot.line(front_times, front_errors, "front")
-    plot.spots([_spot_of(point, ranking, is_best=point in front) for point in points])
+    spots = []
+    for point in points:
+        spots.append(_spot_of(point, ranking, is_best=point in front))
+    plot.spots(spots)
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:
@@ -232,7 +242,9 @@ def picture(board: Board, size: Size) -> str:
         points = _shipped_points(size, ranking)
     else:
         ranking = tab.ranking
-        points = [replace(point, href=None) for point in points_of(tab)]
+        points = []
+        for point in points_of(tab):
+            points.append(replace(point, href=None))
     if not points:
         raise DataError(
             "nothing to draw: neither entries nor reference predictors with a cost",

@@ -1,11 +1,11 @@
-"""Scores of the floors, measured once per data set and shipped with the package.
+"""Scores of reference predictors, measured once per data set, shipped with the package.
 
 ``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value
-of every metric per scenario, and of what is told frame by frame the mean over
-scenarios: at the reported frames, and for the metrics in :data:`CURVES` at all frames
-(of long rollouts at a hundred, linear between). Numbers have five significant digits,
-means at frames four, curves three. Beside them stands what a frame costs the floors and
-the solver itself on the machine that measured.
+of every metric per scenario. For metrics with a value per frame it has the mean over
+scenarios too: at the reported frames, and for the metrics in :data:`CURVES` at all
+frames (of long rollouts at a hundred, linear between). Numbers have five significant
+digits, means at frames four, curves three. The file also has what a frame costs the
+reference predictors and the solver itself on the machine that measured.
 """
 
 from __future__ import annotations
@@ -34,29 +34,36 @@ FORMAT = 1
 """Number of the layout of these files; stored as ``lagbench_floors``."""
 
 CURVES = (
-    *("vorticity_nrmse", "cloud_distance"),
-    *("vorticity_mse", "vorticity_rmse", "vorticity_pearson", "attribute_mse"),
-    *(
-        "position_rmse",
-        "velocity_rmse",
-        "energy_ratio",
-        "energy_retention",
-        "density_rmse",
-    ),
-    *("divergence_rms", "shape_error", "connectivity"),
+    "vorticity_nrmse",
+    "cloud_distance",
+    "vorticity_mse",
+    "vorticity_rmse",
+    "vorticity_pearson",
+    "attribute_mse",
+    "position_rmse",
+    "velocity_rmse",
+    "energy_ratio",
+    "energy_retention",
+    "density_rmse",
+    "divergence_rms",
+    "shape_error",
+    "connectivity",
 )
 """Metrics of which reports and boards draw curves."""
+
+KNOTS = 100  # most frames of a curve
 
 DIGITS = 5
 FRAME_DIGITS = 4
 CURVE_DIGITS = 3
+COST_DIGITS = 3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceScores:
-    """What a floor scores on one split and size."""
+    """Scores of a reference predictor on one split and size."""
 
-    name: str  # name of the floor
+    name: str  # name of the reference predictor
     # scores by metric; per_frame has one row, the mean over scenarios, NaN where it is
     # not kept
     scores: Mapping[str, Score]
@@ -75,94 +82,99 @@ def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
 
 
 def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
-    """Return the file with the scores of the floors of a split and size."""
+    """Return the file with the shipped scores of a split and size."""
     return folder / f"{size.split}-{size.name}.json"
 
 
 def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, ReferenceScores] | None:
-    """Return what the floors of a split and size score, by name.
+    """Return the scores of the reference predictors of a split and size, by name.
 
     None where none were measured on the data set that the registry describes.
     """
-    held = _held(size, folder)
-    if held is None:
+    content = _read(size, folder)
+    if content is None:
         return None
-    first, last = held["frames"]
-    scenarios = tuple(held["scenarios"])
-    frames = range(first, last + 1)
-    known = available()
-    none = [0] * len(scenarios)
-    found = {}
-    for floor, said in held["floors"].items():
-        scores = {}
-        for name, values in said["values"].items():
-            if name not in known:
-                continue  # of a package that is not installed here
-            per_frame = np.full((1, len(frames)), np.nan)
-            if name in said["curves"]:
-                per_frame[0] = np.interp(
-                    frames, _knots(frames), _floats(said["curves"][name])
-                )
-            if name in said["at"]:
-                reported = [frames.index(frame) for frame in held["reported_frames"]]
-                per_frame[0, reported] = _floats(said["at"][name])
-            undefined = tuple(said["undefined"].get(name, none))
-            scores[name] = Score(
-                known[name],
-                scenarios,
-                tuple(frames),
-                per_frame,
-                _floats(values),
-                undefined,
-            )
-        found[floor] = ReferenceScores(
-            name=floor,
-            scores=scores,
-            seconds_per_frame=said["seconds_per_frame"],
-            correlation=_floats(said["correlation"]),
+
+    references = {}
+    for name, reference in content["floors"].items():
+        references[name] = ReferenceScores(
+            name=name,
+            scores=_scores_from_json(reference, content),
+            seconds_per_frame=reference["seconds_per_frame"],
+            correlation=_floats(reference["correlation"]),
         )
-    return found
+    return references
+
+
+def _scores_from_json(
+    reference: Mapping[str, Any], content: Mapping[str, Any]
+) -> dict[str, Score]:
+    """Return the scores of a reference predictor; content is that of the whole file."""
+    first, last = content["frames"]
+    frames = range(first, last + 1)
+    scenarios = tuple(content["scenarios"])
+    reported = [frames.index(frame) for frame in content["reported_frames"]]
+    always_defined = [0] * len(scenarios)
+
+    metrics = available()
+    scores = {}
+    for name, values in reference["values"].items():
+        if name not in metrics:
+            continue  # of a package that is not installed here
+        per_frame = np.full((1, len(frames)), np.nan)
+        if name in reference["curves"]:
+            curve = _floats(reference["curves"][name])
+            per_frame[0] = np.interp(frames, _knots(frames), curve)
+        if name in reference["at"]:
+            per_frame[0, reported] = _floats(reference["at"][name])
+        scores[name] = Score(
+            metrics[name],
+            scenarios,
+            tuple(frames),
+            per_frame,
+            _floats(values),
+            tuple(reference["undefined"].get(name, always_defined)),
+        )
+    return scores
 
 
 def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
-    """Return the processor time that a frame costs the solver itself, where the floors
-    were measured [s].
+    """Return the processor time of a frame of the solver itself [s].
+
+    It was measured on the machine that measured the reference predictors.
     """
-    held = _held(size, folder)
-    if held is None:
+    content = _read(size, folder)
+    if content is None:
         return None
-    return held.get("solver_seconds_per_frame")
+    return content.get("solver_seconds_per_frame")
 
 
-def _held(size: Size, folder: Path) -> dict[str, Any] | None:
+def _read(size: Size, folder: Path) -> dict[str, Any] | None:
+    """Return the content of the file of a data set; None without one that fits it."""
     path = shipped_path(size, folder)
     if size.measured is None or not path.is_file():
         return None
-    held: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    same = (
-        held["lagbench_floors"] == FORMAT
-        and held["dataset_sha256"] == size.measured.dataset_sha256
-    )
-    if same:
-        return held
+    content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    has_format = content["lagbench_floors"] == FORMAT
+    if has_format and content["dataset_sha256"] == size.measured.dataset_sha256:
+        return content
     return None
 
 
-def _measured(size: Size, folder: Path) -> dict[str, Any]:
-    held = _held(size, folder)
-    if held is None:
+def _require(size: Size, folder: Path) -> dict[str, Any]:
+    content = _read(size, folder)
+    if content is None:
         raise DataError(
-            "no floors were measured on this data set",
+            "no reference predictors were measured on this data set",
             where=str(shipped_path(size, folder)),
         )
-    return held
+    return content
 
 
 def _knots(frames: Sequence[int]) -> NDArray[np.intp]:
-    """Return the frames at which a curve is kept, first and last included."""
-    return np.rint(np.linspace(frames[0], frames[-1], min(len(frames), 100))).astype(
-        np.intp
-    )
+    """Return the frames at which the file has a curve, first and last included."""
+    count = min(len(frames), KNOTS)
+    return np.rint(np.linspace(frames[0], frames[-1], count)).astype(np.intp)
 
 
 def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
@@ -171,99 +183,106 @@ def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
 
 def write_shipped(
     size: Size,
-    floors: Mapping[str, ReferenceScores],
+    references: Mapping[str, ReferenceScores],
     *,
     dataset_sha256: str,
     reported: Sequence[int],
     folder: Path = FOLDER,
     partial: bool = False,
 ) -> Path:
-    """Write what the floors of a data set score, equal bytes for equal scores and
-    costs.
+    """Write the scores of a data set: equal bytes for equal scores and costs.
 
-    With ``partial`` the other floors stay as they are, and so do all costs, which
-    compare only within one run on one machine.
+    With ``partial`` the other reference predictors stay as they are, and so do all
+    costs, which compare only within one run on one machine.
     """
-    first = next(iter(next(iter(floors.values())).scores.values()))
-    said = {name: _said(floor, reported) for name, floor in floors.items()}
-    kept: dict[str, Any] = {}
+    entries = {}
+    for name, reference in references.items():
+        entries[name] = _reference_as_json(reference, reported)
+
+    costs: dict[str, Any] = {}
     if partial:
-        earlier = _measured(size, folder)
-        known = earlier["floors"]
-        for name in said.keys() & known.keys():
-            said[name]["seconds_per_frame"] = known[name]["seconds_per_frame"]
-        said = {**known, **said}
-        kept = {
-            name: cost
-            for name, cost in earlier.items()
-            if name == "solver_seconds_per_frame"
-        }
-    held = {
+        earlier = _require(size, folder)
+        earlier_entries = earlier["floors"]
+        for name in entries.keys() & earlier_entries.keys():
+            seconds = earlier_entries[name]["seconds_per_frame"]
+            entries[name]["seconds_per_frame"] = seconds
+        entries = {**earlier_entries, **entries}
+        if "solver_seconds_per_frame" in earlier:
+            seconds = earlier["solver_seconds_per_frame"]
+            costs["solver_seconds_per_frame"] = seconds
+
+    first_reference = next(iter(references.values()))
+    first_score = next(iter(first_reference.scores.values()))
+    content = {
         "lagbench_floors": FORMAT,
         "split": size.split,
         "size": size.name,
         "dataset_version": size.version,
         "dataset_sha256": dataset_sha256,
-        "scenarios": list(first.scenarios),
-        "frames": [first.frames[0], first.frames[-1]],
+        "scenarios": list(first_score.scenarios),
+        "frames": [first_score.frames[0], first_score.frames[-1]],
         "reported_frames": list(reported),
-        **kept,
-        "floors": said,
+        **costs,
+        "floors": entries,
     }
-    return _write(size, held, folder)
+    return _write(size, content, folder)
 
 
 def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
-    """Add what a frame costs the solver itself to the measured floors of a data set
-    [s].
-    """
-    held = _measured(size, folder)
-    floors = held.pop("floors")
-    return _write(
-        size,
-        held | {"solver_seconds_per_frame": _number(seconds, 3), "floors": floors},
-        folder,
-    )
+    """Add the processor time of a frame of the solver itself to a file [s]."""
+    content = _require(size, folder)
+    entries = content.pop("floors")
+    content["solver_seconds_per_frame"] = _number(seconds, COST_DIGITS)
+    content["floors"] = entries
+    return _write(size, content, folder)
 
 
-def _write(size: Size, held: Mapping[str, Any], folder: Path) -> Path:
+def _write(size: Size, content: Mapping[str, Any], folder: Path) -> Path:
     path = shipped_path(size, folder)
-    write_atomically(path, f"{_spelled(held)}\n".encode(), option="--folder")
+    write_atomically(path, f"{_format(content)}\n".encode(), option="--folder")
     return path
 
 
-def _said(floor: ReferenceScores, reported: Sequence[int]) -> dict[str, Any]:
-    scores = floor.scores
-    told = {name: score for name, score in scores.items() if score.metric.per_frame}
+def _reference_as_json(
+    reference: ReferenceScores, reported: Sequence[int]
+) -> dict[str, Any]:
+    values = {}
+    undefined = {}
+    at = {}
+    for name, score in reference.scores.items():
+        values[name] = _numbers(score.values, DIGITS)
+        if any(score.undefined):
+            undefined[name] = list(score.undefined)
+        if score.metric.per_frame:
+            at[name] = _means_at(score, reported, FRAME_DIGITS)
+
+    curves = {}
+    for name in CURVES:
+        score_of_curve = reference.scores.get(name)
+        if score_of_curve is not None and score_of_curve.metric.per_frame:
+            knots = _knots(score_of_curve.frames).tolist()
+            curves[name] = _means_at(score_of_curve, knots, CURVE_DIGITS)
     return {
-        "seconds_per_frame": _number(floor.seconds_per_frame, 3),
-        "correlation": [
-            _number(value, FRAME_DIGITS) for value in floor.correlation.tolist()
-        ],
-        "values": {
-            name: [_number(v, DIGITS) for v in s.values.tolist()]
-            for name, s in scores.items()
-        },
-        "undefined": {
-            name: list(s.undefined) for name, s in scores.items() if any(s.undefined)
-        },
-        "at": {
-            name: [_number(_mean(s.at(f)), FRAME_DIGITS) for f in reported]
-            for name, s in told.items()
-        },
-        "curves": {
-            name: [
-                _number(_mean(told[name].at(f)), CURVE_DIGITS)
-                for f in _knots(told[name].frames).tolist()
-            ]
-            for name in CURVES
-            if name in told
-        },
+        "seconds_per_frame": _number(reference.seconds_per_frame, COST_DIGITS),
+        "correlation": _numbers(reference.correlation, FRAME_DIGITS),
+        "values": values,
+        "undefined": undefined,
+        "at": at,
+        "curves": curves,
     }
 
 
-def _mean(values: NDArray[np.float64]) -> float:
-    return mean(values[np.isfinite(values)])
+def _means_at(score: Score, frames: Sequence[int], digits: int) -> list[float | None]:
+    """Return the means over the scenarios that have a value, at some frames."""
+    means = []
+    for frame in frames:
+        values = score.at(frame)
+        means.append(_number(mean(values[np.isfinite(values)]), digits))
+    return means
+
+
+def _numbers(values: NDArray[np.float64], digits: int) -> list[float | None]:
+    return [_number(value, digits) for value in values.tolist()]
 
 
 def _number(value: float, digits: int) -> float | None:
@@ -272,14 +291,16 @@ def _number(value: float, digits: int) -> float | None:
     return None
 
 
-def _spelled(value: object, depth: int = 0) -> str:
-    """Return JSON with an entry of a mapping in a line, so that a change shows where it
-    is.
+def _format(value: object, depth: int = 0) -> str:
+    """Return JSON with each entry of a mapping in its own line.
+
+    A comparison of two versions then shows which entry changed.
     """
     if not isinstance(value, dict) or not value:
         return json.dumps(value, allow_nan=False, separators=(",", ":"))
-    inner = (
-        f"{' ' * (depth + 1)}{json.dumps(k)}: {_spelled(v, depth + 1)}"
-        for k, v in value.items()
-    )
-    return "{\n" + ",\n".join(inner) + f"\n{' ' * depth}}}"
+    indent = " " * (depth + 1)
+    entries = []
+    for key, member in value.items():
+        entries.append(f"{indent}{json.dumps(key)}: {_format(member, depth + 1)}")
+    body = ",\n".join(entries)
+    return f"{{\n{body}\n{' ' * depth}}}"
