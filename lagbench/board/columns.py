@@ -405,7 +405,11 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
         if columns.keys().isdisjoint(keys):
             continue
         shown_keys = {"skill", tab.ranking, *keys}
-        presets[name] = tuple(key for key in columns if key in shown_keys)
+        shown_columns = []
+        for key in columns:
+            if key in shown_keys:
+                shown_columns.append(key)
+        presets[name] = tuple(shown_columns)
     return presets
 
 
@@ -434,7 +438,9 @@ def loss_of(row: TableRow, column: Column) -> float:
     value = value_of(row, column)
     metric = metric_value(row, column.key)
     if column.direction is Direction.TARGET and metric is not None:
-        losses = [column.loss(scenario_mean) for scenario_mean in metric.per_scenario]
+        losses = []
+        for scenario_mean in metric.per_scenario:
+            losses.append(column.loss(scenario_mean))
         return mean(np.array(losses))
     if isinstance(value, str):
         return math.nan

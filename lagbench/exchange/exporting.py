@@ -120,7 +120,9 @@ def export(
         )
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     target = Path(output)
-    file_of = {subset: target / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
+    file_of = {}
+    for subset in HASHED_SUBSETS:
+        file_of[subset] = target / f"{subset}{ENDINGS[form]}"
     _check_target(target, list(file_of.values()), force=force)
 
     frames_of = _frames_by_subset(entry, folder)
@@ -207,7 +209,10 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
             where=str(folder / FORCE),
             fix="name another folder: --output",
         )
-    existing = [path.name for path in (*files, folder / NAME) if path.exists()]
+    existing = []
+    for path in (*files, folder / NAME):
+        if path.exists():
+            existing.append(path.name)
     if existing and not force:
         raise UsageError(
             "files of that name are there",

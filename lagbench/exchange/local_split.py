@@ -462,7 +462,9 @@ class SplitBuilder:
         )
         write_manifest(self.root, manifest)
 
-        statistics = {key: list(row) for key, row in manifest.statistics.items()}
+        statistics = {}
+        for quantity, row in manifest.statistics.items():
+            statistics[quantity] = list(row)
         measured: dict[str, object] = {
             "dataset_sha256": manifest.dataset_sha256,
             "subset_sha256": manifest.subset_sha256,
@@ -560,7 +562,11 @@ class SplitBuilder:
         ]
 
     def _test_entries(self) -> list[FileEntry]:
-        return [entry for entry in self.entries if entry.subset == "test"]
+        test_entries = []
+        for entry in self.entries:
+            if entry.subset == "test":
+                test_entries.append(entry)
+        return test_entries
 
     def _particle_count(self) -> int:
         """Return the particles of a test scenario; the most of any if they differ."""

@@ -137,14 +137,21 @@ def find_materials(
     for name, number in NUMBERS[form].items():
         name_of[number] = name
     name_of.update(user_kinds)
-    code_of = {number: _material_code(name) for number, name in name_of.items()}
+    code_of = {}
+    for number, name in name_of.items():
+        code_of[number] = _material_code(name)
 
     stored_numbers = np.unique(numbers).tolist()
-    unknown_numbers = [number for number in stored_numbers if number not in code_of]
+    unknown_numbers = []
+    for number in stored_numbers:
+        if number not in code_of:
+            unknown_numbers.append(number)
     if unknown_numbers:
         meanings = MEANINGS[form]
         known = [f"{number} ({name})" for number, name in sorted(name_of.items())]
-        unknown = [f"{n} ({meanings.get(n, 'unknown')})" for n in unknown_numbers]
+        unknown = []
+        for n in unknown_numbers:
+            unknown.append(f"{n} ({meanings.get(n, 'unknown')})")
         first = unknown_numbers[0]
         raise UnreadableFileError(
             "particles of a kind that no material is known for",

@@ -390,7 +390,10 @@ def _scan_folder(
         if result.entry:
             hashed.append(result.entry)
             bad_ids.discard(result.scenario)
-    old_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
+    old_entries = []
+    for entry in old.files:
+        if entry.scenario not in bad_ids:
+            old_entries.append(entry)
     base = old.model_copy(update={"files": tuple(old_entries)})
 
     kept_ids = []
@@ -418,7 +421,9 @@ def _suspects(
     """Return the ids to inspect: those chosen, and those whose file came, went, or has
     another length than the manifest says; what the store holds is right.
     """
-    stated_lengths = {entry.scenario: entry.bytes for entry in old.files}
+    stated_lengths = {}
+    for entry in old.files:
+        stated_lengths[entry.scenario] = entry.bytes
     suspects = []
     for scenario in setup.size.scenarios:
         if scenario in stored:
@@ -581,9 +586,10 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         train_ids = setup.size.subsets["train"]
         keeper.fetch(train_ids)
         setup.meter.begin("statistics", total=len(train_ids), scenarios=len(train_ids))
-        paths = {f"scenario {i}": setup.path(i) for i in train_ids}
-        read_moments = partial(file_moments, box=setup.size.box)
-        moments = setup.read_files(read_moments, paths, paths.values())
+        paths = {}
+        for i in train_ids:
+            paths[f"scenario {i}"] = setup.path(i)
+        moments = setup.read_files(file_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     keeper.keep(manifest)
 

@@ -1,9 +1,9 @@
 """Measure the reference predictors of data sets and write the scores that are shipped.
 
 usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
-           [--root FOLDER] [--workers 2] [--floor analog ...] [--costs]
+           [--root FOLDER] [--workers 2] [--predictor analog ...] [--costs]
 
-All splits and sizes whose data are there are measured, or those named. With --floor
+All splits and sizes whose data are there are measured, or those named. With --predictor
 only these references are measured anew, from the start; the others, and all costs, stay
 as they are. Without it each measured scenario is saved under the root folder: an
 interrupted run continues where it stopped. Last a frame of each reference and of the
@@ -61,8 +61,8 @@ def measure_and_ship(
     """
     where = f"{size.split} {size.name}"
     if names is not None:
-        known = {reference.name for reference in references_of(size)}
-        if known.isdisjoint(names):
+        names_here = {reference.name for reference in references_of(size)}
+        if names_here.isdisjoint(names):
             raise UsageError(
                 "the data set has no such reference", where=where, got=names
             )
@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     part = parser.add_mutually_exclusive_group()
-    part.add_argument("--floor", nargs="+", choices=sorted(REFERENCES))
+    part.add_argument("--predictor", nargs="+", choices=sorted(REFERENCES))
     part.add_argument("--costs", action="store_true")
     options = parser.parse_args(arguments)
 
@@ -123,9 +123,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for size in measured_sizes(root, split=options.split, name=options.size):
             if not options.costs:
                 measure_and_ship(
-                    size, root, workers=options.workers, names=options.floor
+                    size, root, workers=options.workers, names=options.predictor
                 )
-            if not options.floor:
+            if not options.predictor:
                 time_all(size, root)
             path = shipped_path(size)
             length = path.stat().st_size
