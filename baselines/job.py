@@ -17,7 +17,7 @@ from lagbench.data.registry import Registry
 from lagbench.submission.budget import MOST_VALIDATIONS, Budget, track_of
 from lagbench.work.progress import Meter
 
-from .baseline import Baseline, DatasetInfo
+from .baseline import Baseline, DatasetInfo, count_parameters
 from .checkpoint import Checkpoint
 from .machine import hardware
 from .recipe import Recipe
@@ -164,15 +164,3 @@ def _select_validations(log: TrainingLog) -> tuple[tuple[int, float], ...]:
     stride = max(1, math.ceil(len(validations) / MOST_VALIDATIONS))
     latest_first = validations[::-1][::stride]
     return tuple(latest_first[::-1])
-
-
-def count_parameters(model: Baseline) -> int:
-    """Return how many numbers of a model are trained.
-
-    These are its parameters, or the coefficients of a closed form.
-    """
-    if getattr(model, "closed_form", False):
-        tensors = [t for t in model.state_dict().values() if t.is_floating_point()]
-    else:
-        tensors = [p for p in model.parameters() if p.requires_grad]
-    return sum(tensor.numel() for tensor in tensors)

@@ -26,11 +26,10 @@ from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline, DatasetInfo, rescale
+from .baseline import Baseline, DatasetInfo, count_parameters, rescale
 from .catalogue import find
 from .checkpoint import Checkpoint, check_data, load, restore
 from .graph import radius_graph
-from .job import count_parameters
 from .machine import (
     bound_memory,
     choose_device,

@@ -28,11 +28,11 @@ from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
 from .augmentation import check_symmetry
-from .baseline import Baseline
+from .baseline import Baseline, count_parameters
 from .catalogue import find
 from .checkpoint import load_weights, round_weights, save
 from .dataset_info import read_dataset_info
-from .job import TrainingJob, count_parameters
+from .job import TrainingJob
 from .machine import (
     bound_memory,
     check_compiler,

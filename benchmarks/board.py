@@ -38,7 +38,7 @@ from lagbench.board.entry import (
 from lagbench.board.entry_file import entry_bytes
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.ranking import combine, summarise, write_references
-from lagbench.cli.output import spell_bytes
+from lagbench.cli.output import format_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
@@ -107,7 +107,7 @@ def _measure(target: Path, entries: int) -> int:
     print(f"entries      {result.rows} on {result.tabs} tabs")
     print(f"score files  {len(files)}, at most {max(files)} bytes")
     print(
-        f"page         {spell_bytes(result.bytes)} ({result.bytes} bytes; limit "
+        f"page         {format_bytes(result.bytes)} ({result.bytes} bytes; limit "
         f"{MOST_BYTES})"
     )
     print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s")

@@ -1,7 +1,7 @@
 """A made-up data set of the size of cavity full, and a submission to it.
 
-Particles are carried by rotating discs that differ between scenarios, so that fields
-and errors are of realistic shape; nothing is learned from the values.
+Rotating discs that differ between scenarios carry the particles, so that fields and
+errors are of realistic shape; nothing is learned from the values.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ def make_score_data(
             subset="test",
         )
         positions = _flow(scenario, frames, size.particles)
+        # Positions take the place of velocities, whose values do not matter here.
         flow = ((position, position) for position in positions)
         mass = 1e-4 * BOX[1] ** 2 / size.particles
         hashes[scenario] = write_scenario(
@@ -101,7 +102,7 @@ def make_score_data(
 def _flow(
     scenario: int, frames: int, particles: int, *, error: float = 0.0
 ) -> Iterator[NDArray[np.float32]]:
-    """Yield positions frame by frame; an error makes the disc that much faster."""
+    """Yield positions frame by frame; an error makes the discs that much faster."""
     rng = np.random.Generator(np.random.PCG64(scenario))
     low, side = BOX
     high = low + side

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from lagbench.baselines.particle_grid import ParticleGrid
-from lagbench.baselines.projection import Density, Shape
+from lagbench.baselines.projection import DensityProjection, ShapeMatching
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size, load
 from lagbench.data.scenario import read_scenario
@@ -64,16 +64,16 @@ def measure(
                 truth[frame] = file.read("position", slice(frame, frame + 1))[0]
 
         single_material = torch.zeros_like(material)
-        shape = Shape.of(cluster_grid, first, material, len(MATERIALS))
-        density = Density.of(density_grid, first, single_material, 1)
+        shape = ShapeMatching.build(cluster_grid, first, material, len(MATERIALS))
+        density = DensityProjection.build(density_grid, first, single_material, 1)
         for frame, true_position in truth.items():
             numbers = true_position
             if read_frame is not None:
                 numbers = read_frame(scenario, frame)
             position = torch.from_numpy(numbers)
-            deviation = (shape.matched(position) - position).norm(dim=1)
+            deviation = (shape.match(position) - position).norm(dim=1)
             stencil = density_grid.stencil(position, single_material)
-            relative_density, _ = density.relative(stencil)
+            relative_density, _ = density.relative_density(stencil)
             for kind in sorted(set(material.tolist())):
                 is_kind = material == kind
                 mean_deviation = float(deviation[is_kind].mean())

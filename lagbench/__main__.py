@@ -7,15 +7,15 @@ import io
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
-from .cli import board, data, draw, exchange, scoring, training
-from .cli import demo as tour
+from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS
+from .cli.lazy_group import LazyGroup
 from .errors import (
     LagbenchError,
     WorkFailedError,
@@ -34,8 +34,10 @@ RESUMABLE_COMMANDS = {"demo", "generate", "download", "train"}
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
-class _Commands(TyperGroup):
-    """Turns whatever a command raises into a message on stderr and an exit code."""
+class _Program(LazyGroup):
+    """All commands; what they raise becomes a message on stderr and an exit code."""
+
+    entries = COMMANDS
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
         for stream in (sys.stdout, sys.stderr):
@@ -160,7 +162,7 @@ def _short_warnings() -> Iterator[None]:
 
 
 app = typer.Typer(
-    cls=_Commands,
+    cls=_Program,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -171,8 +173,6 @@ app = typer.Typer(
 
 def _print_version(is_requested: bool) -> None:
     if is_requested:
-        from importlib.metadata import version
-
         typer.echo(version("lagbench"))
         raise typer.Exit
 
@@ -192,41 +192,19 @@ def _lagbench(
     """Bit-reproducible particle data sets for neural surrogates of simulators."""
 
 
-COMMANDS: tuple[tuple[Callable[..., None], str], ...] = (
-    (tour.demo, "demo --root demo"),
-    (data.list_splits, "list --json"),
-    (data.info, "info cavity --size mini"),
-    (data.generate, "generate --split cavity --size tiny --workers 2"),
-    (data.verify, "verify --split cavity --size tiny --regenerate 2"),
-    (exchange.download, "download --split cavity --size mini --from https://host/data"),
-    (exchange.export, "export cavity --size mini --format gns-npz -o cavity-gns"),
-    (exchange.import_split, "import WaterDrop --format gns-npz -o drop"),
-    (exchange.adopt, "adopt runs/*.npz -o own --radius 0.03 --frame-interval 0.1"),
-    (scoring.template, "template cavity --size tiny -o predictions.nc"),
-    (scoring.validate, "validate predictions.nc"),
-    (scoring.score, "score predictions.nc"),
-    (scoring.compare, "compare ours/scores.json theirs/scores.json"),
-    (training.train, "train --baseline gns --split cavity --size tiny"),
-    (training.predict, "predict runs/cavity/tiny/gns-0/weights.pt"),
-    (training.bench, "bench solver --split cavity --size tiny"),
-    (board.submit, "submit predictions.nc --from meta.yaml"),
-    (draw.plot, "plot cavity --size tiny --scenario 3 --frame 15 -o flow.png"),
-    (draw.animate, "animate fluid --size tiny --scenario 3 -o splash.gif"),
-    (data.cite, "cite cavity"),
-    (data.doctor, "doctor"),
-    (data.clean, "clean --split cavity --size tiny --dry-run"),
+class _LeaderboardGroup(LazyGroup):
+    entries = LEADERBOARD_COMMANDS
+
+
+leaderboard = typer.Typer(
+    cls=_LeaderboardGroup,
+    no_args_is_help=True,
+    help="Draw, check and show the leaderboard.",
 )
-"""Every command, in the order in which a user meets them, and the example in its help.
-
-The example begins with the name of the command.
-"""
-
-for function, example in COMMANDS:
-    command_name = example.split()[0]
-    register = app.command(command_name, epilog=f"Example: lagbench {example}")
-    register(function)
 app.add_typer(
-    board.leaderboard, name="leaderboard", epilog="Example: lagbench leaderboard show"
+    leaderboard,
+    name="leaderboard",
+    epilog="Example: lagbench leaderboard show",
 )
 
 if __name__ == "__main__":

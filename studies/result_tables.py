@@ -9,7 +9,7 @@ from typing import Any
 from lagbench.figures.tables import markdown
 from lagbench.metrics.metric import Direction, Metric
 from lagbench.metrics.table import CHOSEN
-from lagbench.references.table import NAIVE, REFERENCES
+from lagbench.references.table import CLASSICAL, NAIVE
 from lagbench.scoring.tables import ARROWS
 
 from .thesis.cases import key_frame, scenario_of
@@ -26,30 +26,97 @@ from .thesis.split_results import (
 
 
 def summary_table(all_results: Sequence[SplitResults]) -> str:
-    """Return the best reference predictors and the best model of each data set."""
+    """Return the best predictor of each kind, data set by data set."""
     heads = (
         "data set",
-        "ranking metric",
-        "best naive baseline",
-        "classical solver",
-        "best model",
-        "skill of the model",
+        "metric",
+        "best naive",
+        "best classical",
+        "best learned",
+        "skill",
+        "against_classical",
     )
     rows = []
     for results in all_results:
-        solver = _first(results, [name for name in REFERENCES if name not in NAIVE])
         model = _first(results, results.models)
+        solver = _first(results, sorted(CLASSICAL))
+        skill = None
+        if model is not None:
+            skill = results.skill(model)
         rows.append(
             (
                 results.where,
                 results.ranking,
                 _name_and_score(results, results.best_naive),
-                _name_and_score(results, solver),
-                _name_and_score(results, model),
-                number(None if model is None else results.skill(model)),
+                _name_score_and_cost(results, solver),
+                _name_score_and_cost(results, model),
+                number(skill),
+                _format_against(results, model),
             )
         )
     return markdown(heads, rows)
+
+
+def verdict_on_learning(all_results: Sequence[SplitResults]) -> str:
+    """Return in one sentence each where learned models beat a solver of their cost."""
+    pays = []
+    open_sets = []
+    does_not_pay = []
+    for results in all_results:
+        model = _first(results, results.models)
+        against = None if model is None else results.against_classical(model)
+        if against is None:
+            continue
+        low, high = against.interval
+        if high < 1.0:
+            pays.append(results.where)
+        elif low > 1.0:
+            does_not_pay.append(results.where)
+        else:
+            open_sets.append(results.where)
+    sentences = []
+    if pays:
+        sentences.append(
+            f"Learning pays on {_join(pays)}: the best learned model is more accurate"
+            " than every classical solver here that costs no more per frame."
+        )
+    if open_sets:
+        sentences.append(f"On {_join(open_sets)} the interval contains 1: it is open.")
+    if does_not_pay:
+        sentences.append(
+            f"Learning does not pay on {_join(does_not_pay)}: a classical solver that"
+            " costs no more is more accurate than the best learned model."
+        )
+    return " ".join(sentences)
+
+
+def _join(names: Sequence[str]) -> str:
+    if len(names) == 1:
+        return names[0]
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _format_against(results: SplitResults, model: str | None) -> str:
+    if model is None:
+        return "-"
+    against = results.against_classical(model)
+    if against is None:
+        return "-"
+    low, high = against.interval
+    return (
+        f"{number(against.value)} ({number(low)} to {number(high)}),"
+        f" {label(against.reference)}"
+    )
+
+
+def _name_score_and_cost(results: SplitResults, name: str | None) -> str:
+    text = _name_and_score(results, name)
+    if name is None:
+        return text
+    seconds = results.seconds_per_frame(name)
+    if seconds is None:
+        return text
+    return f"{text} ({number(1000.0 * seconds)} ms)"
 
 
 def _first(
@@ -190,7 +257,7 @@ def _seeds_cell(method: Method) -> str:
     """Return the number of seeds, or the kind of a reference predictor."""
     if method.name in NAIVE:
         return "naive baseline"
-    if method.name in REFERENCES:
+    if method.name in CLASSICAL:
         return "classical solver"
     return str(len(method.trainings))
 

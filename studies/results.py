@@ -26,6 +26,7 @@ from .result_tables import (
     order_agreement,
     summary_table,
     training_table,
+    verdict_on_learning,
     vorticity_table,
 )
 from .thesis.cases import key_frame
@@ -54,6 +55,13 @@ claims of the thesis hold on our data, and what the trainings cost. The first ta
 the best model of each data set. After it come the claims, the trainings, and one
 chapter per data set with all models beside the numbers of the thesis (D. Dharma, PhD
 thesis, University of Leeds, 2025)."""
+
+SUMMARY_NOTE = """\
+Scores: less is better. In brackets stands what a frame costs on one core; the times of
+the learned models are brought to that machine by the time of our solver on both.
+`skill` is 1 - score / score of the best naive baseline. `against_classical` is score /
+score of the best classical solver that costs no more per frame, with its 95 % interval:
+below 1 learning pays."""
 
 HOW_TO_READ = """\
 ## How to read this page
@@ -133,7 +141,7 @@ def render(sources: Sources, sizes: Sequence[str] = SIZES) -> str:
 
     parts = [INTRODUCTION]
     if learned:
-        parts.append(summary_table(learned))
+        parts += [summary_table(learned), SUMMARY_NOTE, verdict_on_learning(learned)]
     parts.append(HOW_TO_READ)
     parts += _claims(learned)
     for results in scored:

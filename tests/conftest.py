@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import Browser, browser
+from click import Command
+from click.testing import CliRunner, Result
 from exchange_readers import straight_runs
 from filelock import FileLock
 from hypothesis import settings
 from score_bench import ScoreBench, bench_of
 from typer.main import get_command
-from typer.testing import CliRunner, Result
 
 from lagbench.__main__ import app
 from lagbench.data.checksums import file_sha256
-from lagbench.data.layout import dataset_folder
 from lagbench.data.registry import Registry, Size, default_path, load
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
@@ -35,14 +35,8 @@ from lagbench.make import painting
 from lagbench.make.card_files import PICTURES
 from lagbench.make.generate import GenerationResult, generate
 from lagbench.metrics.aggregate import Tally
-from lagbench.scoring import score as scored
+from lagbench.scoring import score as scorer
 from lagbench.scoring.scenario import ScenarioScores
-from lagbench.scoring.score_file import SubmissionStatistics, read_statistics
-from lagbench.scoring.score_file_checks import (
-    MAX_SCORE_BYTES,
-    ScoreFile,
-    read_score_file,
-)
 from lagbench.scoring.task import ScoredTask
 from lagbench.submission import ValidationResult
 from lagbench.submission.format import FileInfo
@@ -51,11 +45,12 @@ from lagbench.work.pool import Pool
 from lagbench.work.progress import Meter
 from lagbench.work.run import ONE_THREAD
 
-# The same code gives the same verdict: what Hypothesis finds by chance is to be found
-# by whoever caused it. Seeded examples are the same ones every time, and the later ones
-# are variations of the first.
+# Hypothesis draws the same examples every time: a failure appears to whoever caused it,
+# not by chance to somebody else.
 settings.register_profile("seeded", derandomize=True, deadline=None, max_examples=40)
 settings.load_profile("seeded")
+
+Names = tuple[str, ...]
 
 # Each process would compile torch anew, in 7 s, and every run all that the tests
 # import, in 15 s.
@@ -66,76 +61,76 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     sys.dont_write_bytecode = False
 
-SCORE_SCENARIOS = scored.score_scenarios
-PAINT = painting.paint_pictures
-Names = tuple[str, ...]
-READERS = (
-    "build",
-    "folder_checks",
-    "identity",
-    "publish",
-    "ranking",
-    "rescoring",
-    "seeds",
-)
-
 SPLIT = "curl-noise"
 SIZE = "tiny"
 """The quickest data set to generate: five scenarios of 312 substeps."""
 
+# The parts that session fixtures exchange below, as they ship.
+SCORE_SCENARIOS = scorer.score_scenarios
+PAINT_PICTURES = painting.paint_pictures
+POOL_USERS = ("lagbench.make.generate.Pool", "lagbench.make.verify.Pool")
+VALIDATION_USERS = ("lagbench.scoring.score.validate", "lagbench.board.submit.validate")
+SCENARIO_SCORER = "lagbench.scoring.score.score_scenarios"
+PICTURE_PAINTER = "lagbench.make.painting.paint_pictures"
+
 
 def pytest_collection_finish() -> None:
-    """Leave what the imports made out of every search for garbage: some 700,000
-    objects.
+    """Leave what the imports made out of every search for garbage.
+
+    These are some 700,000 objects.
     """
     gc.collect()
     gc.freeze()
 
 
 def pytest_sessionfinish() -> None:
-    """Have Taichi keep what it compiled, which it does only where no solver is left as
-    the process ends.
+    """Have Taichi keep the kernels that it compiled.
+
+    It keeps them only where no solver is left as the process ends.
     """
-    if (taichi := sys.modules.get("taichi")) is not None:
-        with suppress(
-            Exception
-        ):  # a cache that cannot be written costs the next run a compilation
+    taichi = sys.modules.get("taichi")
+    if taichi is not None:
+        # A cache that cannot be written costs the next run a compilation.
+        with suppress(Exception):
             taichi.reset()
-    if (
-        sys.pycache_prefix is not None
-    ):  # of modules that lay in temporary folders, each time another
-        shutil.rmtree(sys.pycache_prefix + tempfile.gettempdir(), ignore_errors=True)
+    if sys.pycache_prefix is not None:
+        # The bytecode of modules in temporary folders is never read again.
+        temporary_modules = sys.pycache_prefix + tempfile.gettempdir()
+        shutil.rmtree(temporary_modules, ignore_errors=True)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def lasting_workers() -> Iterator[None]:
-    """Simulate in one worker that outlives a generation, unless it is left at work:
-    Taichi starts in seconds.
+    """Simulate in one worker that outlives a generation.
 
-    Generations that are killed or counted are started by their tests as processes of
-    their own.
+    For speed: Taichi takes seconds to start in every new worker. A pool that a failed
+    generation leaves at work is closed. Generations that are killed or counted are
+    started by their tests as processes of their own.
     """
-    held: dict[object, Pool] = {}
+    pools: dict[object, Pool] = {}
 
     @contextmanager
-    def lasting(_: int, __: Mapping[str, str] | None = None) -> Iterator[Pool]:
-        # A simulation is told all else that it reads, its folder and registry too.
-        inherited = sorted(
-            (k, v) for k, v in os.environ.items() if k.startswith(("PYTHON", "TI_"))
-        )
-        key = tuple(sys.path), tuple(inherited)
-        if key not in held:
-            held[key] = stack.enter_context(Pool(1, ONE_THREAD))
-        pool = held[key]
+    def lasting_pool(
+        _size: int, _environment: Mapping[str, str] | None = None
+    ) -> Iterator[Pool]:
+        # A worker inherits these; everything else comes with its work item.
+        inherited = []
+        for name, value in sorted(os.environ.items()):
+            if name.startswith(("PYTHON", "TI_")):
+                inherited.append((name, value))
+        key = (tuple(sys.path), tuple(inherited))
+        if key not in pools:
+            pools[key] = stack.enter_context(Pool(1, ONE_THREAD))
+        pool = pools[key]
         try:
             yield pool
         finally:
-            if pool._queue or any(worker.attempt for worker in pool._workers):
-                held.pop(key).close()
+            if not pool.is_idle:
+                pools.pop(key).close()
 
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
-        for module in ("generate", "verify"):
-            patch.setattr(f"lagbench.make.{module}.Pool", lasting)
+        for name in POOL_USERS:
+            patch.setattr(name, lasting_pool)
         yield
 
 
@@ -147,44 +142,60 @@ def running() -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def quick(home: Path) -> Iterator[None]:
-    """Keep out of the user's cache, and do without what takes long and has tests of its
-    own.
+def own_cache(home: Path) -> Iterator[None]:
+    """Keep out of the user's cache."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def validation_in_process() -> Iterator[None]:
+    """Validate predictions that are scored without a child process.
+
+    For speed: the child imports netCDF4 anew for every score. tests/test_submission
+    tests the child, and ``as_shipped`` brings it back.
     """
 
-    def validated(
+    def validate_here(
         path: str | Path, *, isolated: bool = True, **options: Any
     ) -> ValidationResult:
-        """Validate without the child that looks at predictions first."""
+        """Validate in this process."""
         assert isolated
         return validate(path, isolated=False, **options)
 
-    def draw(root: Path, size: Size, *_: object) -> None:
-        """Leave the pictures of cards blank: to draw them takes longer than to generate
-        tiny data.
-        """
+    with pytest.MonkeyPatch.context() as patch:
+        for name in VALIDATION_USERS:
+            patch.setattr(name, validate_here)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def blank_pictures() -> Iterator[None]:
+    """Leave the pictures of cards blank.
+
+    For speed: to paint them takes longer than to generate tiny data.
+    tests/test_figures/test_cards.py paints them.
+    """
+
+    def write_blank_pictures(root: Path, size: Size, *_: object) -> None:
         for name in PICTURES:
-            path = dataset_folder(root, size.split, size.name, size.major) / name
+            path = size.folder(root) / name
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(b"")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("LAGBENCH_CACHE", str(home / "cache"))
-        for module in ("scoring.score", "board.submit"):
-            patch.setattr(f"lagbench.{module}.validate", validated)
-        patch.setattr(painting, "paint_pictures", draw)
-        # Commands are built from their signatures once, not at every call, which may
-        # take less.
-        patch.setattr("typer.testing._get_command", functools.cache(get_command))
+        patch.setattr(PICTURE_PAINTER, write_blank_pictures)
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def references_once() -> Iterator[None]:
-    """Measure the floors of a data set once, unless by workers: they are most of what a
-    score costs.
+    """Measure the reference predictors of a data set once, unless by workers.
+
+    For speed: they take most of the time of a score.
     """
-    known: dict[Hashable, dict[int, dict[str, Tally]]] = {}
+    reference_tallies: dict[Hashable, dict[int, dict[str, Tally]]] = {}
 
     def score_once(
         task: ScoredTask,
@@ -210,85 +221,52 @@ def references_once() -> Iterator[None]:
         if not references or scheduler is not None or (workers or 1) > 1:
             return score_rows(references=references)
 
-        files = sorted(task.truth.path(task.scenarios[0]).parents[1].rglob("*.nc"))
-        hashes = [file_sha256(file) for file in files]
+        dataset = task.truth.path(task.scenarios[0]).parents[1]
+        hashes = [file_sha256(file) for file in sorted(dataset.rglob("*.nc"))]
         key = (metrics, references, repr((task.size, task.config)), *hashes)
-        if key in known:
+        if key in reference_tallies:
             outcomes = score_rows(references=())
         else:
             outcomes = score_rows(references=references)
-            known[key] = {
-                outcome.scenario: {name: outcome.tallies[name] for name in references}
-                for outcome in outcomes
-            }
+            reference_tallies[key] = {}
+            for outcome in outcomes:
+                tallies = {name: outcome.tallies[name] for name in references}
+                reference_tallies[key][outcome.scenario] = tallies
 
         completed = []
         for outcome in outcomes:
-            tallies = {**outcome.tallies, **known[key][outcome.scenario]}
+            tallies = {**outcome.tallies, **reference_tallies[key][outcome.scenario]}
             completed.append(replace(outcome, tallies=tallies))
         return completed
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lagbench.scoring.score.score_scenarios", score_once)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def stored_once() -> Iterator[None]:
-    """Read score files of equal bytes once: commands read all of a board's, several
-    times.
-    """
-    known: dict[Hashable, ScoreFile] = {}
-
-    @functools.cache
-    def statistics(_: str, path: Path) -> SubmissionStatistics:
-        stored = read_statistics(path)
-        # no test of tables adds metrics
-        object.__setattr__(stored, "scores", functools.cache(stored.scores))
-        return stored
-
-    def read(path: Path, size: Size | None = None) -> ScoreFile:
-        if (
-            path.is_symlink()
-            or not path.is_file()
-            or path.stat().st_size > MAX_SCORE_BYTES
-        ):
-            return read_score_file(path, size)
-        key = file_sha256(path), size and repr(size)
-        if key not in known:
-            known[key] = read_score_file(path, size)
-        return known[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module in READERS:
-            patch.setattr(f"lagbench.board.{module}.read_score_file", read)
-        reader = "studies.thesis.split_results.read_statistics"
-        patch.setattr(reader, lambda path: statistics(file_sha256(path), path))
+        patch.setattr(SCENARIO_SCORER, score_once)
         yield
 
 
 @pytest.fixture
 def as_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Take what is above back for one test: workers of its own, the child, floors,
-    files, pictures.
+    """Take the exchanges above back for one test.
+
+    It gets workers, the child process, reference predictors and pictures of its own.
     """
-    for module in ("make.generate", "make.verify"):
-        monkeypatch.setattr(f"lagbench.{module}.Pool", Pool)
-    for module in ("scoring.score", "board.submit"):
-        monkeypatch.setattr(f"lagbench.{module}.validate", validate)
-    for module in READERS:
-        monkeypatch.setattr(f"lagbench.board.{module}.read_score_file", read_score_file)
-    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", SCORE_SCENARIOS)
-    monkeypatch.setattr(painting, "paint_pictures", PAINT)
+    for name in POOL_USERS:
+        monkeypatch.setattr(name, Pool)
+    for name in VALIDATION_USERS:
+        monkeypatch.setattr(name, validate)
+    monkeypatch.setattr(SCENARIO_SCORER, SCORE_SCENARIOS)
+    monkeypatch.setattr(PICTURE_PAINTER, PAINT_PICTURES)
 
 
 @pytest.fixture(scope="session")
 def unmeasured_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of datasets.yaml without its measured block, so that tests hold before and
-    after a record.
+    """A copy of datasets.yaml without its measured block.
+
+    Tests that use it hold before and after hashes are recorded.
     """
     path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
-    path.write_text(default_path().read_text().split("\nmeasured:")[0] + "\n")
+    described, _, _ = default_path().read_text().partition("\nmeasured:")
+    path.write_text(f"{described}\n")
     return path
 
 
@@ -300,32 +278,37 @@ def unmeasured(unmeasured_path: Path) -> Registry:
 
 @pytest.fixture(scope="session")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder that all processes of a test run share; take a FileLock for what is
-    made there once.
+    """The folder that all processes of a test run share.
+
+    Take a FileLock for files that are made there once.
     """
-    own = tmp_path_factory.getbasetemp()
+    process_folder = tmp_path_factory.getbasetemp()
     # Under pytest-xdist each process has a folder of its own in one that all share.
-    return own.parent if "PYTEST_XDIST_WORKER" in os.environ else own
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        return process_folder.parent
+    return process_folder
 
 
 @pytest.fixture(scope="session")
 def tiny_split(home: Path) -> Callable[..., GenerationResult]:
-    """A function that generates the tiny data of a split once for all tests; do not
-    change the files.
+    """A function that generates the tiny data of a split once for all tests.
+
+    Do not change the files.
     """
 
-    def made(split: str, name: str = "tiny", **options: Any) -> GenerationResult:
+    def generate_once(
+        split: str, name: str = "tiny", **options: Any
+    ) -> GenerationResult:
         root = home / f"{name}-{split}"
-        told = root.with_suffix(".pickle")
+        stored_result = root.with_suffix(".pickle")
         with FileLock(root.with_suffix(".lock")):
-            if not told.exists():
-                told.write_bytes(
-                    pickle.dumps(generate(split, SIZE, root=root, **options))
-                )
-        found: GenerationResult = pickle.loads(told.read_bytes())
-        return found
+            if not stored_result.exists():
+                new_result = generate(split, SIZE, root=root, **options)
+                stored_result.write_bytes(pickle.dumps(new_result))
+        result: GenerationResult = pickle.loads(stored_result.read_bytes())
+        return result
 
-    return made
+    return generate_once
 
 
 @pytest.fixture(scope="session")
@@ -349,49 +332,58 @@ def run(
     """A function that runs lagbench with our splits and no recorded hashes."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])
+    command = _lagbench_command()
+
+    def run_command(*words: object) -> Result:
+        return CliRunner().invoke(command, [str(word) for word in words])
+
+    return run_command
+
+
+@functools.cache
+def _lagbench_command() -> Command:
+    """Return the command line, built from its signatures once for all tests."""
+    return get_command(app)
 
 
 @pytest.fixture
 def package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[..., Path]]:
-    """A function that installs a package of another author: group of its entry point,
-    the object, its source.
+    """A function that installs a package of another author.
 
-    It returns the module's file, which is there only where a source is given.
+    It takes the group of the entry point, the object and the source of its module. It
+    returns the module's file, which is there only where a source is given.
     """
     modules: list[str] = []
 
-    def call(
+    def install_package(
         group: str, value: str, source: str | None = None, *, name: str = "mine"
     ) -> Path:
+        metadata = f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n"
+        entry_points = f"[lagbench.{group}]\n{name} = {value}\n"
+        dist_info = tmp_path / f"{name}-1.dist-info"
+        dist_info.mkdir()
+        (dist_info / "METADATA").write_text(metadata)
+        (dist_info / "entry_points.txt").write_text(entry_points)
+
         module = value.partition(":")[0]
-        about = tmp_path / f"{name}-1.dist-info"
-        about.mkdir()
-        (about / "METADATA").write_text(
-            f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n"
-        )
-        (about / "entry_points.txt").write_text(
-            f"[lagbench.{group}]\n{name} = {value}\n"
-        )
+        module_file = tmp_path / f"{module}.py"
         if source is not None:
-            (tmp_path / f"{module}.py").write_text(source)
+            module_file.write_text(source)
             modules.append(module)
         monkeypatch.syspath_prepend(tmp_path)
         monkeypatch.delenv("LAGBENCH_DEBUG", raising=False)
-        return tmp_path / f"{module}.py"
+        return module_file
 
-    yield call
+    yield install_package
     for module in modules:
         sys.modules.pop(module, None)
 
 
 @pytest.fixture
 def copied(generated: GenerationResult, tmp_path: Path) -> Callable[[], Path]:
-    """A function that copies the generated data set to a root folder that a test may
-    damage.
-    """
+    """A function that copies the generated data to a root that a test may damage."""
     return lambda: shutil.copytree(generated.root, tmp_path / "root")
 
 
@@ -408,7 +400,8 @@ def s3() -> Iterator[str]:
 def original(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
     """A data set of four files of about 40 kB."""
     folder = tmp_path_factory.mktemp("original")
-    np.save(folder / "runs.npy", np.stack(straight_runs(4, frames=12, particles=400)))
+    runs = straight_runs(4, frames=12, particles=400)
+    np.save(folder / "runs.npy", np.stack(runs))
     return adopt(
         folder / "runs.npy",
         output=folder / "root" / "own",

@@ -16,7 +16,7 @@ from .model import BoardRow, ReferenceRow, Tab, Value
 
 TableRow = BoardRow | ReferenceRow
 
-MAIN_METRICS = 5
+MAIN_METRICS = 4
 """Metrics of the first table, the ranking one among them; with more it would be wider
 than a screen.
 """
@@ -387,9 +387,13 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     """Return the keys of each preset that has something to show, main first, all
     last.
     """
+    metric_count = MAIN_METRICS
+    if AGAINST_CLASSICAL.key in columns:
+        # main fits into 1280 pixels
+        metric_count -= 1
     main = (
         "against_classical",
-        *tab.columns[:MAIN_METRICS],
+        *tab.columns[:metric_count],
         "kind",
         "speed_up",
         "budget",

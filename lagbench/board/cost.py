@@ -18,13 +18,12 @@ from lagbench.figures.chart import WIDTH, Plot, Spot, close_logarithmic
 from lagbench.figures.html import Markup, tag, text, words
 from lagbench.metrics.table import METRICS, ranking_metric
 from lagbench.references.shipped import shipped, solver_seconds
+from lagbench.references.table import REFERENCES
 
 from .entry import EntryCost
 from .model import Board, Tab
 
 HEIGHT = 330
-
-COARSE_SOLVER = "coarse-solver"
 
 # The axis of time reaches so many times the dearest, so that its name has a place
 # beside it.
@@ -42,17 +41,19 @@ STYLE = """
 .middle{text-anchor:middle}
 .dot circle{fill:#fff;stroke:#2458d3;stroke-width:1.8}
 .dot.best circle{fill:#2458d3}
-.dot.floor circle{stroke:#667085}
-.dot.coarse circle{fill:#667085;stroke:#667085}
-.dot .reach,.dot.best .reach,.dot.coarse .reach,.dot.floor .reach{fill:none;stroke:none}
+.dot.naive circle{stroke:#667085}
+.dot.classical circle{fill:#667085;stroke:#667085}
+.classical-front{fill:none;stroke:#667085;stroke-width:1.5}
+.dot .reach,.dot.best .reach,.dot.classical .reach,.dot.naive .reach{
+fill:none;stroke:none}
 .name{paint-order:stroke;stroke:#fff;stroke-width:4px}
 """
 """Colours of a picture on its own; on the page the style sheets have them."""
 
 DESCRIPTIONS = {
     "entry": "",
-    "floor": ", a reference predictor",
-    "coarse": ", the solver on a coarser grid",
+    "naive": ", a naive predictor",
+    "classical": ", a classical solver",
 }
 
 
@@ -63,7 +64,7 @@ class CostPoint:
     name: str
     seconds: float  # processor time of a frame [s]
     error: float  # ranking metric
-    kind: str  # "entry", "floor" (a reference predictor) or "coarse", the coarse solver
+    kind: str  # "entry", "naive" or "classical"
     href: str | None = None
 
     @property
@@ -89,10 +90,11 @@ def points_of(tab: Tab) -> list[CostPoint]:
         points.append(point)
     for reference in tab.references:
         if reference.cost is not None and tab.ranking in reference.values:
-            point = _reference_point(
-                reference.name,
+            point = CostPoint(
+                name=reference.name,
                 seconds=reference.cost.seconds_per_frame,
                 error=reference.values[tab.ranking].mean,
+                kind=str(reference.kind),
             )
             points.append(point)
     drawable_points = []
@@ -107,13 +109,6 @@ def _seconds_here(cost: EntryCost, solver_seconds_here: float | None) -> float:
     if solver_seconds_here is None or cost.speed_up is None:
         return cost.seconds_per_frame
     return solver_seconds_here / cost.speed_up
-
-
-def _reference_point(name: str, *, seconds: float, error: float) -> CostPoint:
-    kind = "floor"
-    if name == COARSE_SOLVER:
-        kind = "coarse"
-    return CostPoint(name=name, seconds=seconds, error=error, kind=kind)
 
 
 def find_front(points: Iterable[CostPoint]) -> list[CostPoint]:
@@ -158,6 +153,10 @@ def draw(
     front_times = [point.seconds for point in front]
     front_errors = [point.error for point in front]
     plot.line(front_times, front_errors, "front")
+    solvers = find_front(point for point in points if point.kind == "classical")
+    solver_times = [point.seconds for point in solvers]
+    solver_errors = [point.error for point in solvers]
+    plot.line(solver_times, solver_errors, "classical-front")
     spots = []
     for point in points:
         spots.append(_spot_of(point, ranking, is_best=point in front))
@@ -198,12 +197,14 @@ def cost_figure(tab: Tab) -> Markup:
     points = points_of(tab)
     caption = (
         "Further left is cheaper, further down more accurate; the line joins the "
-        "methods that no other beats in both. The upright line is the time of the "
-        "solver itself. Costs of entries are self-reported, brought to the machine of "
+        "methods that no other beats in both. The full grey line joins the classical "
+        "solvers: an entry below it is more accurate than every solver of its cost. "
+        "The upright line is the time of the solver itself. Costs of entries are "
+        "self-reported, brought to the machine of "
         "the solver by their speed-up."
     )
-    if any(point.kind == "coarse" for point in points):
-        caption += " Filled grey is the solver on a coarser grid."
+    if any(point.kind == "classical" for point in points):
+        caption += " Filled grey dots are classical solvers, hollow ones naive."
     silent_count = sum(row.active and row.entry.cost is None for row in tab.rows)
     if silent_count == 1:
         caption += " 1 entry states no cost."
@@ -270,10 +271,11 @@ def picture(board: Board, size: Size) -> str:
 def _shipped_points(size: Size, ranking: str) -> list[CostPoint]:
     points = []
     for name, reference in (shipped(size) or {}).items():
-        point = _reference_point(
-            name,
+        point = CostPoint(
+            name=name,
             seconds=reference.seconds_per_frame,
             error=reference.scores[ranking].mean,
+            kind=str(REFERENCES[name].kind),
         )
         points.append(point)
     return points

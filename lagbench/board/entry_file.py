@@ -173,7 +173,26 @@ def schema_bytes() -> bytes:
     schema = Entry.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "Entry of the lagbench leaderboard"
+    _join_description_lines(schema)
     return f"{json.dumps(schema, indent=1, ensure_ascii=False)}\n".encode()
+
+
+def _join_description_lines(value: object) -> None:
+    """Join the lines of every paragraph of every description of a schema, in place.
+
+    Descriptions come from docstrings, whose wrapping means nothing.
+    """
+    if isinstance(value, list):
+        for member in value:
+            _join_description_lines(member)
+    if not isinstance(value, dict):
+        return
+    for key, member in value.items():
+        if key == "description" and isinstance(member, str):
+            paragraphs = member.split("\n\n")
+            value[key] = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
+        else:
+            _join_description_lines(member)
 
 
 def entry_bytes(entry: Entry) -> bytes:

@@ -88,7 +88,7 @@ def _draw_line(view: TableView, line: Line) -> Markup:
             tag("td", "", class_="rank"),
             _reference_heading(row),
             *cells,
-            class_="floor",
+            class_="reference",
             data_reference=line.id,
         )
     return tag(

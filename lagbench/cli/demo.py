@@ -1,82 +1,140 @@
-"""The command that shows everything once, from nothing to a leaderboard: demo.
+"""The command demo: from nothing to data sets, a trained model and a leaderboard.
 
-Data at size ``tiny``, a trained model, its scores, a page. Everything lies under one
-root folder, which the demo may fill as it likes: the data sets, ``pictures/``,
-``runs/`` and a leaderboard of its own, never the one of the repository.
+Everything lies under one root folder: the data sets of size ``tiny``, ``pictures/``,
+``runs/``, and a leaderboard of the demo's own, never that of the repository.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
+from lagbench.board.build import BuildResult, build
+from lagbench.board.entry import Meta
+from lagbench.board.folder import Folder
+from lagbench.board.publish import SubmitResult
+from lagbench.board.submit import submit
+from lagbench.data.checksums import round_digits
+from lagbench.data.local import resolve_root
+from lagbench.data.registry import Registry, load
 from lagbench.errors import (
     DataError,
     LagbenchError,
     UnreadableFileError,
     UsageError,
-    check_installed,
 )
+from lagbench.figures.plot import plot_frame
+from lagbench.make.generate import GenerationResult, generate
+from lagbench.make.verify import VerificationResult, verify
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.work.progress import Progress
 
+from .model_options import TRAINING_LIBRARIES, require_libraries
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
-from .output import print_table, progress_bar, show, spell_seconds
+from .output import format_seconds, print_result, print_table
+from .progress import progress_bar
+from .solver_bench import SolverBench, bench_apart
 
 if TYPE_CHECKING:
     from lagbench.baselines.predict import PredictionResult
     from lagbench.baselines.train import TrainingResult
-    from lagbench.board.build import BuildResult
-    from lagbench.board.publish import SubmitResult
-    from lagbench.data.registry import Registry
-    from lagbench.make.generate import GenerationResult
-    from lagbench.make.verify import VerificationResult
-    from lagbench.scoring.card import ScoreCard
-    from lagbench.work.progress import Progress
-
-    from .machine import SolverBench
-
 
 DEMO_SIZE = "tiny"
+# the reference model that the demo trains, and the split that it learns
 MODEL = "neuralmpm"
-# the baseline that the demo trains, and the split that it learns
 MODEL_SPLIT = "cavity"
 SETTINGS = ("training.steps=150",)
-"""Changes to the recipe of size tiny: half a minute, and better than what costs no
-learning with any seed.
+"""Changes to the recipe of size tiny.
+
+So many steps take half a minute. With any seed the model then beats the naive
+baselines.
 """
 
 METRICS = ("position_rmse_20", "vorticity_pearson", "outside_share")
-"""What the table of scores shows beside the metric that ranks."""
+"""Metrics that the table of scores shows beside the one that ranks."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoResult:
-    """One split of the demo: what was generated, how it verified, and its picture."""
+    """One split of the demo."""
 
-    generation: GenerationResult  # result of generate
-    verification: VerificationResult  # result of verify
+    generation: GenerationResult
+    verification: VerificationResult
     picture: Path  # PNG of the first test scenario at its last frame of interest
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelResult:
-    """The model of the demo: how it was trained, what it predicted, how it scored, the
-    page.
-    """
+    """The model of the demo, from its training to the leaderboard's page."""
 
-    training: TrainingResult  # result of train
-    prediction: PredictionResult  # result of predict
-    card: ScoreCard  # its scores beside those of the floors
-    # what our solver takes here; None where it cannot be timed
+    training: TrainingResult
+    prediction: PredictionResult
+    card: ScoreCard  # its scores beside those of the reference predictors
+    # cost of our solver on this machine; None where it cannot be timed
     solver: SolverBench | None
-    entry: SubmitResult  # its entry of the leaderboard
-    page: BuildResult  # the leaderboard's page
+    entry: SubmitResult
+    page: BuildResult
+
+
+def demo_command(
+    root: RootOption = None,
+    workers: WorkersOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Make data sets, train a model, score it and draw a leaderboard page.
+
+    An interrupted call goes on where it stopped.
+    """
+    start = time.monotonic()
+    registry = load()
+    model_left_out = explain_missing_model(registry)
+    if model_left_out is None:
+        demo_board(root)
+
+    splits: dict[str, DemoResult] = {}
+    for split in demo_splits(registry):
+        if not quiet:
+            typer.echo(f"{split}: generating, verifying, drawing", err=True)
+        with progress_bar(quiet=quiet) as progress:
+            splits[split] = demo_split(
+                split, root=root, workers=workers, progress=progress
+            )
+    if not (as_json or quiet):
+        _print_splits(splits)
+
+    model = None
+    if model_left_out is None:
+        if not quiet:
+            steps = f"training {MODEL}, predicting, scoring, submitting"
+            typer.echo(f"{MODEL_SPLIT}: {steps}", err=True)
+        with progress_bar(quiet=quiet, unit="done") as progress:
+            model = demo_model(root=root, progress=progress)
+
+    seconds = time.monotonic() - start
+    model_value = None
+    if model is not None:
+        model_value = {**vars(model), "card": model.card.as_json()}
+    value = {
+        "splits": splits,
+        "model": model_value,
+        "model_left_out": model_left_out,
+        "seconds": seconds,
+    }
+    print_result(
+        value,
+        _describe(len(splits), model, model_left_out=model_left_out, seconds=seconds),
+        as_json=as_json,
+        quiet=quiet,
+    )
 
 
 def demo_splits(registry: Registry) -> list[str]:
@@ -91,15 +149,14 @@ def demo_split(
     workers: int | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> DemoResult:
-    """Generate, verify and draw one split at size ``tiny``; the picture lies in
-    ``pictures/`` of the root.
-    """
-    from lagbench.data.local import resolve_root
-    from lagbench.data.registry import load
-    from lagbench.figures.plot import plot_frame
-    from lagbench.make.generate import generate
-    from lagbench.make.verify import verify
+    """Generate and verify one split at size ``tiny``, and draw it into ``pictures/``.
 
+    Args:
+        split: name of the split.
+        root: folder of all data sets.
+        workers: worker processes; one per core when None.
+        progress: called as the generation advances.
+    """
     folder = resolve_root(root)
     size = load().size(split, DEMO_SIZE)
     generation = generate(
@@ -107,43 +164,42 @@ def demo_split(
     )
     verification = verify(split, DEMO_SIZE, root=folder, complete=True)
     verification.check()
-    pictures = folder / "pictures"
-    pictures.mkdir(exist_ok=True)
-    first = size.subsets["test"][0]
+
+    picture_folder = folder / "pictures"
+    picture_folder.mkdir(exist_ok=True)
+    scenario_file = size.path(folder, size.subsets["test"][0])
     frame = size.task.frames_of_interest[-1]
-    picture = plot_frame(size.path(folder, first), frame, pictures / f"{split}.png")
+    picture = plot_frame(scenario_file, frame, picture_folder / f"{split}.png")
     return DemoResult(generation=generation, verification=verification, picture=picture)
 
 
-def model_left_out(registry: Registry) -> str | None:
+def explain_missing_model(registry: Registry) -> str | None:
     """Return why there can be no model, and what helps; None where there can be one."""
     if MODEL_SPLIT not in demo_splits(registry):
         return f"the registry has no {MODEL_SPLIT} {DEMO_SIZE}"
     try:
-        for module in ("torch", "torch_geometric", "lightning_fabric"):
-            check_installed(module, extra="baselines")
+        require_libraries(TRAINING_LIBRARIES)
     except UsageError as error:
         return f"{error.what}; {error.fix}"
     return None
 
 
 def demo_board(root: str | Path | None = None) -> Path:
-    """Return the folder of the demo's leaderboard; refuse one with entries of other
-    sizes.
-    """
-    from lagbench.board.folder import Folder
-    from lagbench.data.local import resolve_root
+    """Return the folder of the demo's leaderboard.
 
+    Raises:
+        UsageError: the leaderboard there has entries of other sizes.
+    """
     board = Folder(resolve_root(root) / "leaderboard")
-    others = [path for path in board.entries() if path.parts[2] != DEMO_SIZE]
-    if others:
-        raise UsageError(
-            "the demo would write into another leaderboard",
-            where=str(board.path),
-            expected=f"entries of size {DEMO_SIZE} only, or none",
-            got=others[0].as_posix(),
-            fix="give the demo a folder of its own: --root demo",
-        )
+    for entry in board.entries():
+        if entry.parts[2] != DEMO_SIZE:
+            raise UsageError(
+                "the demo would write into another leaderboard",
+                where=str(board.path),
+                expected=f"entries of size {DEMO_SIZE} only, or none",
+                got=entry.as_posix(),
+                fix="give the demo a folder of its own: --root demo",
+            )
     return board.path
 
 
@@ -152,43 +208,33 @@ def demo_model(
     root: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
 ) -> ModelResult:
-    """Train a small model, predict, score and submit it, draw the page.
+    """Train a small model, predict, score and submit, and draw the leaderboard's page.
 
-    The data set must be there, see :func:`demo_split`. One thread: a model as small as
-    this gains nothing by a second, and the same machine trains the same weights.
-    Interrupted, it goes on with the training at the next call.
+    :func:`demo_split` makes the data set before. The model is so small that a second
+    thread gains nothing, and with one thread the same machine trains the same weights.
+    An interrupted training goes on at the next call.
     """
     from lagbench.baselines.catalogue import find
     from lagbench.baselines.predict import predict
-    from lagbench.baselines.train import train
-    from lagbench.board.build import build
-    from lagbench.board.entry import Meta
-    from lagbench.board.submit import submit
-    from lagbench.data.checksums import round_digits
-    from lagbench.data.local import resolve_root
-    from lagbench.scoring.score import score
 
     folder = resolve_root(root)
     board = demo_board(root)
-    run = folder / "runs" / f"{MODEL_SPLIT}-{MODEL}"
-    here: dict[str, Any] = {
-        "root": folder,
-        "device": "cpu",
-        "threads": 1,
-        "progress": progress,
-    }
-    begin = partial(
-        train, MODEL, MODEL_SPLIT, DEMO_SIZE, settings=SETTINGS, output=run, **here
+    run_folder = folder / "runs" / f"{MODEL_SPLIT}-{MODEL}"
+    training = _train_model(folder, run_folder, progress)
+    prediction = predict(
+        training.weights,
+        run_folder / "predictions.nc",
+        method=MODEL,
+        root=folder,
+        device="cpu",
+        threads=1,
+        progress=progress,
     )
-    try:
-        training = begin()
-    except (UsageError, DataError, UnreadableFileError):
-        # What is left of another version or was damaged is the demo's own: not worth an
-        # error.
-        training = begin(fresh=True)
-    prediction = predict(training.weights, run / "predictions.nc", method=MODEL, **here)
-    solver = _solver_time()
-    said = Meta(
+    solver = bench_demo_solver()
+    solver_seconds = None
+    if solver is not None:
+        solver_seconds = round_digits(solver.seconds_per_frame, 6)
+    meta = Meta(
         method=MODEL,
         name=f"{find(MODEL).model.method}, {training.steps} steps",
         authors=("lagbench demo",),
@@ -197,12 +243,10 @@ def demo_model(
         "model can do.",
         hardware=prediction.device,
         command="lagbench demo",
-        solver_seconds_per_frame=None
-        if solver is None
-        else round_digits(solver.seconds_per_frame, 6),
+        solver_seconds_per_frame=solver_seconds,
     )
     entry = submit(
-        [prediction.path], said, board=board, root=folder, replace=True, new_board=True
+        [prediction.path], meta, board=board, root=folder, replace=True, new_board=True
     )
     return ModelResult(
         training=training,
@@ -214,90 +258,90 @@ def demo_model(
     )
 
 
-def _solver_time() -> SolverBench | None:
-    from .machine import bench_apart
+def _train_model(
+    folder: Path,
+    run_folder: Path,
+    progress: Callable[[Progress], None] | None,
+) -> TrainingResult:
+    """Train the model; files of another version or damaged ones are trained anew."""
+    from lagbench.baselines.train import train
 
+    train_model = partial(
+        train,
+        MODEL,
+        MODEL_SPLIT,
+        DEMO_SIZE,
+        settings=SETTINGS,
+        root=folder,
+        output=run_folder,
+        device="cpu",
+        threads=1,
+        progress=progress,
+    )
+    try:
+        return train_model()
+    except (UsageError, DataError, UnreadableFileError):
+        # The folder is the demo's own: an earlier training there is not worth an error.
+        return train_model(fresh=True)
+
+
+def bench_demo_solver() -> SolverBench | None:
+    """Return the cost of our solver; without it the page shows no speed-up."""
     try:
         return bench_apart(MODEL_SPLIT, DEMO_SIZE)
     except LagbenchError:
         return None
 
 
-def demo(
-    root: RootOption = None,
-    workers: WorkersOption = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-) -> None:
-    """From nothing to data sets, a trained model, its scores and a leaderboard page."""
-    from lagbench.data.registry import load
-
-    started = time.monotonic()
-    registry = load()
-    left_out = model_left_out(registry)
-    if left_out is None:
-        demo_board(root)
-    splits: dict[str, DemoResult] = {}
-    for split in demo_splits(registry):
-        if not quiet:
-            typer.echo(f"{split}: generating, verifying, drawing", err=True)
-        with progress_bar(quiet=quiet) as draw:
-            splits[split] = demo_split(split, root=root, workers=workers, progress=draw)
-    if not (as_json or quiet):
-        rows = [
-            (
-                split,
-                (one.generation.dataset_sha256 or "")[:16],
-                one.verification.verdict,
-                one.picture,
-            )
-            for split, one in splits.items()
-        ]
-        print_table("", ("split", "hash", "data set", "picture"), rows)
-    model = None
-    if left_out is None:
-        if not quiet:
-            what = f"training {MODEL}, predicting, scoring, submitting"
-            typer.echo(f"{MODEL_SPLIT}: {what}", err=True)
-        with progress_bar(quiet=quiet, counted="done") as draw:
-            model = demo_model(root=root, progress=draw)
-    seconds = time.monotonic() - started
-    if model is None:
-        made = None
-    else:
-        made = {**vars(model), "card": model.card.as_json()}
-    value = {
-        "splits": splits,
-        "model": made,
-        "model_left_out": left_out,
-        "seconds": seconds,
-    }
-    show(
-        value,
-        _summary(len(splits), model, left_out, seconds),
-        as_json=as_json,
-        quiet=quiet,
-    )
+def _print_splits(splits: Mapping[str, DemoResult]) -> None:
+    rows = []
+    for split, result in splits.items():
+        sha256 = result.generation.dataset_sha256 or ""
+        rows.append((split, sha256[:16], result.verification.verdict, result.picture))
+    print_table("", ("split", "hash", "data set", "picture"), rows)
 
 
-def _summary(
-    splits: int, model: ModelResult | None, left_out: str | None, seconds: float
+def _describe(
+    split_count: int,
+    model: ModelResult | None,
+    *,
+    model_left_out: str | None,
+    seconds: float,
 ) -> Iterator[str]:
-    done = f"{splits} data sets, verified and drawn"
+    """Print the table of scores, if there is a model, then yield the lines below it."""
+    work = f"{split_count} data sets, verified and drawn"
+    duration = format_seconds(seconds)
     if model is None:
-        yield f"{done}, in {spell_seconds(seconds)}"
-        yield f"no model, no leaderboard: {left_out}"
+        yield f"{work}, in {duration}"
+        yield f"no model, no leaderboard: {model_left_out}"
     else:
-        card = model.card
-        training = model.training
-        names = tuple(dict.fromkeys((card.ranking, *METRICS)))
-        rows = []
-        for row, scores in card.scores.items():
-            means = [scores[name].mean for name in names]
-            spelt = ["-" if math.isnan(mean) else f"{mean:.4g}" for mean in means]
-            rows.append((training.baseline if row == "submission" else row, *spelt))
-        what = f"{training.baseline}, {training.steps} steps, on {training.split} {training.size}"
-        print_table(f"{what}, test scenarios", ("method", *names), rows)
-        yield f"{done}; a model trained, predicted, scored and submitted; in {spell_seconds(seconds)}"
+        _print_scores(model)
+        yield (
+            f"{work}; a model trained, predicted, scored and submitted; in {duration}"
+        )
         yield f"leaderboard page: {model.page.page}"
     yield "next: lagbench generate --split cavity --size mini"
+
+
+def _print_scores(model: ModelResult) -> None:
+    training = model.training
+    card = model.card
+    metrics = tuple(dict.fromkeys((card.ranking, *METRICS)))
+    rows = []
+    for row_name, scores in card.scores.items():
+        method = row_name
+        if row_name == "submission":
+            method = training.baseline
+        cells = [_format_mean(scores[metric].mean) for metric in metrics]
+        rows.append((method, *cells))
+    title = (
+        f"{training.baseline}, {training.steps} steps, on {training.split} "
+        f"{training.size}, test scenarios"
+    )
+    print_table(title, ("method", *metrics), rows)
+
+
+def _format_mean(mean: float) -> str:
+    if math.isnan(mean):
+        return "-"
+    return f"{mean:.4g}"

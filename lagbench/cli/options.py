@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,74 +13,128 @@ import typer
 from lagbench.errors import UsageError
 
 
-def root_of(text: str) -> Path:
-    """Return a root; an empty one would be the current folder as a path."""
+def parse_root(text: str) -> Path:
+    """Return a root folder; an empty text would mean the current folder as a path."""
     if not text.strip():
-        raise typer.BadParameter("it is empty: name a folder, or leave it out")
+        raise typer.BadParameter("it is empty: name a folder, or leave the option out")
     return Path(text)
 
 
-def option(words: str, told: str, **how: Any) -> Any:  # noqa: ANN401
-    """Return an option as its help shows it: its names, then what stands for the value,
-    as in ``-o FILE``.
+def option(names_and_value: str, help_text: str, **settings: Any) -> Any:  # noqa: ANN401
+    """Return an option that is written as its help shows it, as in ``-o FILE``.
+
+    Args:
+        names_and_value: the names of the option, then the placeholder of its value.
+        help_text: what the option does.
+        settings: passed on to ``typer.Option``.
     """
-    names = [word for word in words.split() if word.startswith("-")]
-    return typer.Option(
-        *names, metavar=" ".join(words.split()[len(names) :]) or None, help=told, **how
-    )
+    words = names_and_value.split()
+    names = [word for word in words if word.startswith("-")]
+    placeholder = " ".join(words[len(names) :])
+    return typer.Option(*names, metavar=placeholder or None, help=help_text, **settings)
 
 
 SplitArgument = Annotated[
     str | None, typer.Argument(metavar="SPLIT", help="The same as --split.")
 ]
 SplitOption = Annotated[
-    str | None, option("--split NAME", "Data set; `lagbench list` names them.")
+    str | None,
+    option("--split NAME", "Name of the data set; `lagbench list` shows all names."),
 ]
 NewSizeOption = Annotated[
     str | None, option("--size NAME", "tiny, mini or full; mini by default.")
 ]
 PresentSizeOption = Annotated[
     str | None,
-    option("--size NAME", "tiny, mini or full; by default the only one there is."),
+    option(
+        "--size NAME",
+        "tiny, mini or full; by default the only size that has data here.",
+    ),
 ]
 SubsetOption = Annotated[
-    str | None, option("--subset NAMES", "Some of train,valid,test; all by default.")
+    str | None,
+    option("--subset NAMES", "Subsets, as in train,valid,test; all by default."),
 ]
 ScenariosOption = Annotated[
     str | None,
-    option("--scenarios IDS", "Some scenarios, as in 0,3-5; all by default."),
+    option("--scenarios IDS", "Scenarios, as in 0,3-5; all by default."),
 ]
 RootOption = Annotated[
     Path | None,
     option(
         "--root FOLDER",
-        "Where data sets live, or s3://bucket/prefix; else LAGBENCH_ROOT, else "
-        "user data.",
-        parser=root_of,
+        "Folder of all data sets, or s3://bucket/prefix. By default LAGBENCH_ROOT, or "
+        "else the folder for user data.",
+        parser=parse_root,
     ),
 ]
 WorkersOption = Annotated[
     int | None,
     option("--workers N", "Worker processes; one per core by default.", min=1),
 ]
-DeviceOption = Annotated[
-    str, option("--device NAME", "cpu, parallel (its threads) or cuda.")
-]
 SchedulerOption = Annotated[
-    str | None, option("--scheduler ADDRESS", "Dask scheduler, as in tcp://host:8786.")
+    str | None,
+    option("--scheduler ADDRESS", "Dask scheduler, as in tcp://host:8786."),
 ]
+DEFAULT_BOARD = Path("leaderboard")
+BoardOption = Annotated[Path, option("--board FOLDER", "Folder of the leaderboard.")]
 JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]
-QuietFlag = Annotated[bool, option("--quiet -q", "Print nothing but errors.")]
+QuietFlag = Annotated[bool, option("--quiet -q", "Print errors only.")]
 
 
-def chosen(argument: str | None, option: str | None) -> str:
-    """Return the split that a user named, by argument or by option; refuse none and
-    two.
+def choose_split(argument: str | None, option: str | None) -> str:
+    """Return the split that a user names by the argument SPLIT or the option --split.
+
+    Raises:
+        UsageError: no split is named, or two different ones.
     """
-    given = {name for name in (argument, option) if name is not None}
-    if len(given) != 1:
-        what = f"{'two splits are' if given else 'no split is'} named"
-        got = " and ".join(sorted(given)) or None
-        fix = "name one, as in --split cavity; `lagbench list` shows them"
-        raise UsageError(what, where="--split", got=got, fix=fix)
-    return given.pop()
+    fix = "name one, as in --split cavity; `lagbench list` shows all splits"
+    names = {name for name in (argument, option) if name is not None}
+    if not names:
+        raise UsageError("no split is named", where="--split", fix=fix)
+    if len(names) > 1:
+        raise UsageError(
+            "two splits are named",
+            where="--split",
+            got=" and ".join(sorted(names)),
+            fix=fix,
+        )
+    return names.pop()
+
+
+def accept_split(command: Callable[..., None]) -> Callable[..., None]:
+    """Let users name the split of a command by SPLIT or by --split.
+
+    The command has one parameter, ``split``. Its command line gets the argument and the
+    option instead, and :func:`choose_split` decides between them.
+    """
+    parameters = [
+        _split_parameter("split_argument", SplitArgument),
+        _split_parameter("split_option", SplitOption),
+    ]
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        if parameter.name != "split":
+            keyword = parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            parameters.append(keyword)
+
+    @functools.wraps(command)
+    def choose_and_run(
+        *, split_argument: str | None, split_option: str | None, **others: object
+    ) -> None:
+        command(split=choose_split(split_argument, split_option), **others)
+
+    # typer reads the parameters of a command from these two attributes.
+    signature = inspect.Signature(parameters)
+    annotations = {parameter.name: parameter.annotation for parameter in parameters}
+    choose_and_run.__signature__ = signature  # type: ignore[attr-defined]
+    choose_and_run.__annotations__ = annotations
+    return choose_and_run
+
+
+def _split_parameter(name: str, annotation: object) -> inspect.Parameter:
+    return inspect.Parameter(
+        name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=annotation,
+    )

@@ -1,173 +1,47 @@
-"""What commands print: JSON for machines, tables and sentences for people.
-
-Progress on stderr: a bar where a person watches, else a line per minute.
-"""
+"""The output of commands: JSON for machines, tables and sentences for people."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table as DrawnTable
+from rich.text import Text
 
 from lagbench.figures.tables import Table
-from lagbench.work.progress import watched
 
 if TYPE_CHECKING:
     from lagbench.submission.issues import ValidationResult
-    from lagbench.work.progress import Progress as State
 
 WIDTH = 80  # characters that a table may be wide; a wider one comes in blocks
+PIPE_WIDTH = 120  # width of the output where it is no terminal [characters]
 GAP = 3  # characters between two columns
-LAST = 24  # characters to which the last column, which wraps, may shrink
-SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
+LAST_COLUMN = 24  # characters to which the last column, which wraps, may shrink
 
 
-def counted(number: int, noun: str) -> str:
+def format_count(number: int, noun: str) -> str:
     """Return a number with its noun.
 
-    >>> counted(1, "finding"), counted(2, "entry")
-    ('1 finding', '2 entries')
+    >>> format_count(1, "error"), format_count(2, "entry")
+    ('1 error', '2 entries')
     """
+    if number == 1:
+        return f"1 {noun}"
     if noun.endswith("y"):
-        many = f"{noun[:-1]}ies"
-    else:
-        many = f"{noun}s"
-    return f"{number} {noun if number == 1 else many}"
+        return f"{number} {noun[:-1]}ies"
+    return f"{number} {noun}s"
 
 
-def say(text: str, *, quiet: bool = False) -> None:
-    """Print a line on stdout unless the user asked for silence."""
-    if not quiet:
-        typer.echo(text)
-
-
-def print_json(value: object) -> None:
-    """Print a value, a dataclass too, as one JSON object on stdout."""
-    typer.echo(json.dumps(_plain(value), indent=2, sort_keys=True, allow_nan=False))
-
-
-def show(
-    value: object, words: Iterable[str], *, as_json: bool, quiet: bool = False
-) -> None:
-    """Print a result as one JSON object, or the lines that say it in words, formed only
-    then.
-    """
-    if as_json:
-        print_json(value)
-    elif not quiet:
-        for line in words:
-            typer.echo(line)
-
-
-def complain(result: ValidationResult) -> None:
-    """Tell on stderr what rejects a file; the error that follows names the first
-    finding only.
-    """
-    if len(result.errors) > 1:
-        typer.echo("\n".join(str(finding) for finding in result.errors), err=True)
-
-
-def blocks(table: Table, width: int = WIDTH) -> Iterator[Table]:
-    """Yield a table in pieces that are no wider, each with the columns that say what a
-    row is.
-    """
-    columns = list(zip(table.columns, *table.rows, strict=True))
-    widths = [
-        max(len(line) for cell in column for line in cell.split("\n"))
-        for column in columns
-    ]
-    widths[-1] = min(widths[-1], LAST)
-    own = sum(widths[: table.keys]) + GAP * table.keys
-    chosen = list[list[int]]([[]])
-    for i in range(table.keys, len(columns)):
-        taken = own + sum(widths[j] + GAP for j in chosen[-1])
-        if chosen[-1] and taken + widths[i] > width:
-            chosen.append([])
-        chosen[-1].append(i)
-    for number, block in enumerate(chosen):
-        heads, *rows = zip(
-            *columns[: table.keys], *(columns[i] for i in block), strict=True
-        )
-        yield Table("" if number else table.title, heads, tuple(rows), table.keys)
-
-
-def print_blocks(tables: Iterable[Table]) -> None:
-    """Print tables in blocks that fit."""
-    for table in tables:
-        for block in blocks(table):
-            print_table(block.title, block.columns, block.rows)
-
-
-def _plain(value: object) -> object:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {
-            f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)
-        }
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    return value
-
-
-def print_table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
-) -> None:
-    """Print a table on stdout; only its last column wraps, numbers stand on the
-    right.
-    """
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table as Drawn
-    from rich.text import Text
-
-    cells = [[str(cell) for cell in row] for row in rows]
-    if title:
-        heading = Text(title)
-    else:
-        heading = None
-    table = Drawn(
-        title=heading,
-        box=SIMPLE_HEAD,
-        title_justify="left",
-        pad_edge=False,
-        show_edge=False,
-    )
-    for number, column in enumerate(columns, start=1):
-        numeric = all(row[number - 1][:1] in "0123456789-" for row in cells)
-        table.add_column(
-            Text(column),
-            justify="right" if numeric else "left",
-            no_wrap=number < len(columns),
-        )
-    for row in cells:
-        table.add_row(*(Text(cell) for cell in row))
-    console = Console()
-    # In a file or a pipe the width is fixed, so that the output is the same everywhere.
-    if console.is_terminal:
-        width = console.width
-    else:
-        width = 120
-    # On a narrow terminal long lines run on to the next: a number cut short would be
-    # worse.
-    widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
-    least = sum(widths[:-1]) + min(widths[-1], LAST) + GAP * len(widths)
-    Console(width=max(width, least)).print(table, "")
-
-
-def spell_bytes(count: float) -> str:
+def format_bytes(count: float) -> str:
     """Return a number of bytes with a decimal unit.
 
-    >>> spell_bytes(4_720_000_000)
+    >>> format_bytes(4_720_000_000)
     '4.7 GB'
     """
     for unit in ("B", "kB", "MB", "GB"):
@@ -179,10 +53,10 @@ def spell_bytes(count: float) -> str:
     return f"{count:.1f} {unit}"
 
 
-def spell_seconds(seconds: float) -> str:
+def format_seconds(seconds: float) -> str:
     """Return a duration in the units that people use.
 
-    >>> spell_seconds(4000)
+    >>> format_seconds(4000)
     '67 min'
     """
     if seconds < 100:
@@ -193,80 +67,162 @@ def spell_seconds(seconds: float) -> str:
     return f"{minutes / 60:.1f} h"
 
 
-@contextmanager
-def progress_bar(
-    *, quiet: bool, counted: str = "scenarios"
-) -> Iterator[Callable[[State], None] | None]:
-    """Yield what tells of progress: how much is done, how fast, and the time left; None
-    for silence.
+def print_line(text: str, *, quiet: bool = False) -> None:
+    """Print a line on stdout unless the user asked for silence."""
+    if not quiet:
+        typer.echo(text)
 
-    A terminal shows a bar; a file or a pipe gets a line per minute, so that short work
-    leaves none. ``counted`` is what the work is counted in.
+
+def print_warning(text: str) -> None:
+    """Print a warning on stderr."""
+    typer.echo(f"warning: {text}", err=True)
+
+
+def print_note(text: str) -> None:
+    """Print on stderr what a command does meanwhile."""
+    typer.echo(f"lagbench: {text}", err=True)
+
+
+def print_json(value: object) -> None:
+    """Print a value, a dataclass too, as one JSON object on stdout."""
+    plain_value = _to_plain(value)
+    text = json.dumps(plain_value, indent=2, sort_keys=True, allow_nan=False)
+    typer.echo(text)
+
+
+def print_result(
+    value: object, lines: Iterable[str], *, as_json: bool, quiet: bool = False
+) -> None:
+    """Print a result as one JSON object, or as lines of text.
+
+    The lines are formed only where they are printed: they may come from a generator.
     """
-    if quiet:
-        from lagbench.store.copy import silence_fetching
+    if as_json:
+        print_json(value)
+    elif not quiet:
+        for line in lines:
+            typer.echo(line)
 
-        with silence_fetching():
-            yield None
-        return
-    if not watched():
-        yield _in_lines(counted)
-        return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeRemainingColumn,
+
+def print_errors(result: ValidationResult) -> None:
+    """Print on stderr all errors of a file where it has several.
+
+    The command then ends with the first of them, which is not printed here where it is
+    the only one.
+    """
+    if len(result.errors) > 1:
+        lines = [str(error) for error in result.errors]
+        typer.echo("\n".join(lines), err=True)
+
+
+def split_table(table: Table, width: int = WIDTH) -> Iterator[Table]:
+    """Yield a table in blocks that are no wider than a width.
+
+    Each block begins with the key columns, which say what a row is. The first block has
+    the title.
+    """
+    columns = list(zip(table.columns, *table.rows, strict=True))
+    column_widths = [_column_width(column) for column in columns]
+    column_widths[-1] = min(column_widths[-1], LAST_COLUMN)
+    key_width = sum(column_widths[: table.keys]) + GAP * table.keys
+
+    # numbers of the columns of each block, without the key columns
+    column_groups: list[list[int]] = [[]]
+    block_width = key_width
+    for number in range(table.keys, len(columns)):
+        column_width = column_widths[number]
+        if column_groups[-1] and block_width + column_width > width:
+            column_groups.append([])
+            block_width = key_width
+        column_groups[-1].append(number)
+        block_width += column_width + GAP
+
+    title = table.title
+    for column_group in column_groups:
+        block_columns = columns[: table.keys]
+        block_columns += [columns[number] for number in column_group]
+        headings, *rows = zip(*block_columns, strict=True)
+        yield Table(title, headings, tuple(rows), table.keys)
+        title = ""
+
+
+def _column_width(cells: Iterable[str]) -> int:
+    """Return the length of the longest line of a column, its heading included."""
+    lines: list[str] = []
+    for cell in cells:
+        lines += cell.split("\n")
+    return max(len(line) for line in lines)
+
+
+def print_tables(tables: Iterable[Table]) -> None:
+    """Print tables, each in blocks that fit."""
+    for table in tables:
+        for block in split_table(table):
+            print_table(block.title, block.columns, block.rows)
+
+
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+) -> None:
+    """Print a table on stdout.
+
+    Only the last column wraps. Columns of numbers are set flush right.
+    """
+    cells = [[str(cell) for cell in row] for row in rows]
+    table_title = None
+    if title:
+        table_title = Text(title)
+    table = DrawnTable(
+        title=table_title,
+        box=SIMPLE_HEAD,
+        title_justify="left",
+        pad_edge=False,
+        show_edge=False,
     )
+    last = len(columns) - 1
+    for number, heading in enumerate(columns):
+        is_numeric = all(row[number][:1] in "0123456789-" for row in cells)
+        table.add_column(
+            Text(heading),
+            justify="right" if is_numeric else "left",
+            no_wrap=number < last,
+        )
+    for row in cells:
+        table.add_row(*map(Text, row))
 
-    stage = TextColumn("{task.description}")
-    count = TextColumn("{task.fields[count]}")
-    columns = (stage, BarColumn(), TaskProgressColumn(), count, TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=None, count="")
-
-        def draw(news: State) -> None:
-            told: dict[str, Any] = {
-                "description": news.stage,
-                "count": _count(news, counted),
-            }
-            bar.update(task, total=news.total or None, completed=news.done, **told)
-
-        yield draw
-
-
-def _in_lines(counted: str) -> Callable[[State], None]:
-    last = time.monotonic()
-
-    def tell(news: State) -> None:
-        nonlocal last
-        if (now := time.monotonic()) - last < SECONDS_PER_LINE:
-            return
-        last = now
-        known = news.scenarios and news.rate
-        if known:
-            left = (news.scenarios - news.scenarios_done) / news.rate
-        else:
-            left = math.inf
-        if math.isfinite(left):
-            still = f", {spell_seconds(left)} left"
-        else:
-            still = ""
-        if news.total:
-            share = f"{news.done / news.total:.0%}, "
-        else:
-            share = ""
-        with suppress(OSError):  # the work goes on without a reader
-            typer.echo(f"{news.stage}: {share}{_count(news, counted)}{still}", err=True)
-
-    return tell
+    # On a narrow terminal long lines run on to the next: a number cut short would be
+    # worse.
+    width = max(_output_width(), _least_width(columns, cells))
+    Console(width=width).print(table, "")
 
 
-def _count(news: State, counted: str) -> str:
-    if news.scenarios:
-        of = f"/{news.scenarios}"
-    else:
-        of = ""
-    return f"{news.scenarios_done}{of} {counted}, {news.rate:.2f}/s"
+def _output_width() -> int:
+    """Return the width of the terminal; a fixed one gives equal files everywhere."""
+    console = Console()
+    if console.is_terminal:
+        return console.width
+    return PIPE_WIDTH
+
+
+def _least_width(columns: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+    widths = []
+    for column in zip(columns, *cells, strict=True):
+        widths.append(max(map(len, column)))
+    widths[-1] = min(widths[-1], LAST_COLUMN)
+    return sum(widths) + GAP * len(widths)
+
+
+def _to_plain(value: object) -> object:
+    """Return a value in the types that JSON has."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {}
+        for field in dataclasses.fields(value):
+            fields[field.name] = _to_plain(getattr(value, field.name))
+        return fields
+    if isinstance(value, Mapping):
+        return {str(key): _to_plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_to_plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value

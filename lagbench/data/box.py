@@ -110,6 +110,21 @@ class Box:
         return float(np.prod(self.lengths))
 
     @property
+    def centre(self) -> Floats:
+        """Middle of the box [length], shape [axis]."""
+        return np.asarray(np.mean(self.bounds, axis=1), np.float64)
+
+    @cached_property
+    def lower_walls(self) -> Floats:
+        """Lower wall of each axis [length], -inf along periodic axes, shape [axis]."""
+        return np.where(self.periodic, -np.inf, self.low)
+
+    @cached_property
+    def upper_walls(self) -> Floats:
+        """Upper wall of each axis [length], inf along periodic axes, shape [axis]."""
+        return np.where(self.periodic, np.inf, self.high)
+
+    @property
     def is_periodic(self) -> bool:
         """Whether any axis repeats itself."""
         return any(self.periodic)
@@ -155,9 +170,14 @@ class Box:
             if is_periodic:
                 low = self.low[axis]
                 high = self.high[axis]
-                column = low + np.mod(points[..., axis] - low, high - low)
+                column = points[..., axis]
+                with np.errstate(invalid="ignore"):  # infinity becomes NaN
+                    moved = low + np.mod(column - low, high - low)
                 # The sum can round up to the upper end, which is the lower one.
-                wrapped[..., axis] = np.where(column < high, column, low)
+                moved = np.where(moved >= high, low, moved)
+                # Components that lie inside keep their bits.
+                is_inside = (column >= low) & (column < high)
+                wrapped[..., axis] = np.where(is_inside, column, moved)
         return wrapped
 
     def inside(self, position: ArrayLike) -> Floats:
@@ -166,10 +186,33 @@ class Box:
         Args:
             position: points [length], shape [..., axis].
         """
-        walled = ~np.asarray(self.periodic)
-        low = np.where(walled, self.low, -np.inf)
-        high = np.where(walled, self.high, np.inf)
-        return self.wrap(np.clip(position, low, high))
+        return self.wrap(np.clip(position, self.lower_walls, self.upper_walls))
+
+    def has_whole_cells(self, cells: int) -> bool:
+        """Tell whether every periodic axis is three or more whole cells long.
+
+        Args:
+            cells: cells across a length of 1.
+        """
+        periods = self.lengths[np.asarray(self.periodic)] * cells
+        count = np.rint(periods)
+        is_whole = np.abs(periods - count) <= 1e-9 * count
+        return bool((is_whole & (count >= 3)).all())
+
+    def unwrap(self, position: ArrayLike) -> Floats:
+        """Return the points of one body as one piece: the images nearest to the first.
+
+        Along an axis with walls the components stay as they are. A body must be
+        smaller than half a period.
+
+        Args:
+            position: points of a body [length], shape [particle, axis].
+        """
+        points = np.asarray(position)
+        if not self.is_periodic or not len(points):
+            return points
+        first = points[0]
+        return np.asarray(first + self.displacement(first, points))
 
     def contains(
         self, position: ArrayLike, *, tolerance: float = 0.0
@@ -189,6 +232,34 @@ class Box:
         finite = np.isfinite(points)
         along_axis = np.where(self.periodic, finite, above & below)
         return np.asarray(along_axis.all(axis=-1))
+
+
+UNIT_SQUARE = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)])
+"""The box of side 1 with four walls."""
+
+
+def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
+    """Return for each axis whether it is named, shape [axis].
+
+    >>> parse_periodic(["x"], 2)
+    (True, False)
+
+    Args:
+        axes: names of the periodic axes, such as ``["x", "y"]``.
+        dimension: number of axes of the box.
+
+    Raises:
+        UsageError: a name is that of no axis of the box, or appears twice.
+    """
+    names = AXES[:dimension]
+    if len(set(axes)) != len(axes) or not set(axes) <= set(names):
+        raise UsageError(
+            "periodic axes are named once each",
+            where="periodic",
+            expected=f"some of {', '.join(names)}",
+            got=", ".join(map(str, axes)),
+        )
+    return tuple(name in axes for name in names)
 
 
 def period_multiple(way: Floats, period: Floats) -> Floats:

@@ -1,19 +1,23 @@
 """Grid fields of particles: quadratic B-spline transfer, vorticity, divergence.
 
-Node velocity is ``sum_p(w u) / sum_p(w)`` with ``w(d) = b(d_x / h) b(d_y / h)`` and
+Node velocity is ``sum_p(w u) / sum_p(w)``. The weight w is the product over the axes of
+``b(d / h)``, with d the way from node to particle along the axis and
 
     b(s) = 3/4 - s^2             for |s| <= 1/2,
     b(s) = (3/2 - |s|)^2 / 2     for 1/2 <= |s| <= 3/2, else 0.
 
 The scorer, the plots and the differentiable twin in the training loss share this one
-definition. Arrays of particles have shape [..., particle, 2], fields [..., x node, y
-node]; leading axes are frames or scenarios, and a batch gives the same bits as its
-frames alone.
+definition. A box has two or three axes, between walls or periodic. Arrays of particles
+have shape [..., particle, axis]. Fields have one axis of nodes for each axis of the
+box: [..., x node, y node] in two dimensions, written [..., *node] below. Leading axes
+are frames or scenarios, and a batch gives the same bits as its frames alone.
 """
 
 from __future__ import annotations
 
 import enum
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -21,6 +25,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import UsageError
+
+from .box import UNIT_SQUARE, Box
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -48,15 +54,18 @@ class Placement(enum.StrEnum):
 
 @dataclass(frozen=True)
 class Grid:
-    """Square grid of nodes over the unit box.
+    """Grid of nodes with one spacing along all axes.
+
+    Along an axis with walls the nodes cover [0, 1], along a periodic axis the box.
 
     >>> Grid(4, Placement.CELL_CENTRES).axis
     array([0.125, 0.375, 0.625, 0.875])
     """
 
-    cells: int  # cells across the box
+    cells: int  # cells across a length of 1
     # nodes at (i + 1/2) / cells (cell centres) or at i / cells (nodes)
     placement: Placement = Placement.CELL_CENTRES
+    box: Box = UNIT_SQUARE  # that holds the particles
 
     def __post_init__(self) -> None:
         """Accept the placement's name as it stands in datasets.yaml."""
@@ -68,6 +77,42 @@ class Grid:
                 got=self.cells,
             )
         object.__setattr__(self, "placement", Placement(self.placement))
+        if not self.box.has_whole_cells(self.cells):
+            raise UsageError(
+                "a periodic axis is no whole number of cells long",
+                where="cells",
+                expected="3 or more whole cells along every periodic axis",
+                got=f"{self.cells} cells across a length of 1, box {self.box.bounds}",
+                fix="another number of cells",
+            )
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return self.box.dimension
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Nodes along each axis."""
+        node_counts = []
+        for length, is_periodic in zip(
+            self.box.lengths, self.box.periodic, strict=True
+        ):
+            if is_periodic:
+                node_counts.append(round(float(length) * self.cells))
+            else:
+                node_counts.append(self.nodes)
+        return tuple(node_counts)
+
+    @property
+    def start(self) -> Floats:
+        """Lower end of the grid [length], shape [axis]."""
+        return np.where(self.box.periodic, self.box.low, 0.0)
+
+    def places(self, axis: int) -> Floats:
+        """Return the positions of the nodes along an axis [length], shape [node]."""
+        steps = np.arange(self.shape[axis]) + self.origin
+        return np.asarray(self.start[axis] + steps / self.cells, np.float64)
 
     @property
     def spacing(self) -> float:
@@ -76,37 +121,37 @@ class Grid:
 
     @property
     def nodes(self) -> int:
-        """Nodes along one side."""
+        """Nodes along an axis with walls."""
         return self.cells + (self.placement is Placement.NODES)
 
     @property
     def origin(self) -> float:
-        """Position of node 0 in units of h: 1/2 or 0."""
+        """Way from the lower end of the grid to node 0 in units of h: 1/2 or 0."""
         if self.placement is Placement.CELL_CENTRES:
             return 0.5
         return 0.0
 
     @property
     def axis(self) -> Floats:
-        """Positions of the nodes along one side [length], shape [nodes]."""
+        """Positions of the nodes along an axis with walls [length], shape [nodes]."""
         return (np.arange(self.nodes) + self.origin) / self.cells
 
     def full_weight(self, particles: int, area: float) -> float:
-        """Return the weight ``N h^2 / A`` of a node deep inside the material [1].
+        """Return the weight ``N h^d / A`` of a node deep inside the material [1].
 
         Args:
             particles: particles N of the scenario.
-            area: area A that they cover at first [length^2].
+            area: area or volume A that they cover at first [length^d].
         """
-        return particles * self.spacing**2 / area
+        return particles * self.spacing**self.dimension / area
 
 
 @dataclass(frozen=True)
 class Transfer:
     """Sums over the particles around each node."""
 
-    weight: Floats  # sum(w) [1], shape [..., x node, y node]
-    momentum: Floats  # sum(w u) [unit of u], shape [..., x node, y node, 2]
+    weight: Floats  # sum(w) [1], shape [..., *node]
+    momentum: Floats  # sum(w u) [unit of u], shape [..., *node, axis]
 
 
 @dataclass(frozen=True)
@@ -114,32 +159,38 @@ class Fields:
     """Grid fields of one frame or a batch of frames."""
 
     grid: Grid  # where the nodes lie
-    weight: Floats  # sum(w) [1], shape [..., x node, y node]
-    # node velocity, 0 at empty nodes [unit of u], shape [..., x node, y node, 2]
+    weight: Floats  # sum(w) [1], shape [..., *node]
+    # node velocity, 0 at empty nodes [unit of u], shape [..., *node, axis]
     velocity: Floats
-    counted: Mask  # nodes that count, shape [..., x node, y node]
+    counted: Mask  # nodes that count, shape [..., *node]
     full: float  # weight of a full interior node [1]
 
     @property
     def density(self) -> Floats:
-        """Density relative to the initial one [1], shape [..., x node, y node]."""
+        """Density relative to the initial one [1], shape [..., *node]."""
         return self.weight / self.full
 
     @cached_property
     def differentiable(self) -> Mask:
-        """Nodes with vorticity and divergence, shape [..., x node, y node]."""
-        return differentiable_nodes(self.counted)
+        """Nodes with vorticity and divergence, shape [..., *node]."""
+        return differentiable_nodes(self.counted, self.grid.box.periodic)
 
     @cached_property
     def vorticity(self) -> Floats:
-        """``dv/dx - du/dy`` [unit of u / length], NaN where not differentiable."""
-        slope = vorticity(self.velocity, self.grid.spacing)
-        return np.where(self.differentiable, slope, np.nan)
+        """The curl [unit of u / length], NaN where not differentiable.
+
+        Its shape is [..., *node]; in three dimensions [..., *node, axis].
+        """
+        slope = curl(self.velocity, self.grid.spacing, self.grid.box.periodic)
+        is_defined = self.differentiable
+        if self.grid.dimension == 3:
+            is_defined = is_defined[..., None]
+        return np.where(is_defined, slope, np.nan)
 
     @cached_property
     def divergence(self) -> Floats:
-        """``du/dx + dv/dy`` [unit of u / length], NaN where not differentiable."""
-        slope = divergence(self.velocity, self.grid.spacing)
+        """Sum of slopes [unit of u / length], NaN where not differentiable."""
+        slope = divergence(self.velocity, self.grid.spacing, self.grid.box.periodic)
         return np.where(self.differentiable, slope, np.nan)
 
 
@@ -154,8 +205,8 @@ def fields(
     """Return the grid fields of particles.
 
     Args:
-        position: particle positions [length], shape [..., particle, 2].
-        velocity: particle velocities u, shape [..., particle, 2]; per frame gives
+        position: particle positions [length], shape [..., particle, axis].
+        velocity: particle velocities u, shape [..., particle, axis]; per frame gives
             1/frame.
         grid: grid of the fields.
         full: weight of a full interior node, :meth:`Grid.full_weight` [1].
@@ -171,35 +222,81 @@ def fields(
 def transfer(position: ArrayLike, velocity: ArrayLike, grid: Grid) -> Transfer:
     """Sum weights and momenta of the particles at the nodes.
 
-    Particles outside the unit box, or with a position that is no number, carry no
-    weight.
+    Particles outside the unit box along an axis with walls, or with a position that is
+    no number, carry no weight. Along a periodic axis the nodes repeat.
 
     Args:
-        position: particle positions [length], shape [..., particle, 2].
-        velocity: particle velocities u, shape [..., particle, 2].
+        position: particle positions [length], shape [..., particle, axis].
+        velocity: particle velocities u, shape [..., particle, axis].
         grid: grid of the fields.
 
     Raises:
-        UsageError: the shapes differ or do not end in [particle, 2].
+        UsageError: the shapes differ or do not end in [particle, axis].
     """
     x = np.asarray(position, np.float64)
     u = np.asarray(velocity, np.float64)
-    if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != 2:
+    dimension = grid.dimension
+    if x.shape != u.shape or x.ndim < 2 or x.shape[-1] != dimension:
         raise UsageError(
             "positions and velocities do not fit",
-            expected="two arrays of one shape [..., particle, 2]",
+            expected=f"two arrays of one shape [..., particle, {dimension}]",
             got=f"{x.shape} and {u.shape}",
         )
-    # sum(w) and both components of sum(w u), shape [..., 3, x node, y node]
-    sums = np.empty((*x.shape[:-2], 3, grid.nodes, grid.nodes))
+    scatter = scatter_in_box
+    if dimension == 2 and not grid.box.is_periodic:
+        scatter = _scatter_between_walls
+
+    # sum(w) and the components of sum(w u), shape [..., 1 + axis, *node]
+    sums = np.empty((*x.shape[:-2], 1 + dimension, *grid.shape))
     for frame in np.ndindex(x.shape[:-2]):  # a frame fits the cache, a batch does not
-        _scatter(x[frame], u[frame], grid, sums[frame])
-    momentum = np.moveaxis(sums[..., 1:, :, :], -3, -1)
-    return Transfer(weight=sums[..., 0, :, :], momentum=momentum)
+        scatter(x[frame], u[frame], grid, sums[frame])
+    by_component = np.moveaxis(sums, -1 - dimension, -1)  # [..., *node, 1 + axis]
+    return Transfer(weight=by_component[..., 0], momentum=by_component[..., 1:])
 
 
-def _scatter(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
-    """Write ``sum(w)`` and both components of ``sum(w u)`` of one frame.
+def scatter_in_box(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
+    """Write ``sum(w)`` and the components of ``sum(w u)`` of one frame.
+
+    It serves any number of axes, with walls or periodic.
+
+    Args:
+        x: particle positions [length], shape [particle, axis].
+        u: particle velocities, shape [particle, axis].
+        grid: grid of the fields.
+        out: receives the sums, shape [1 + axis, *node].
+    """
+    periodic = np.asarray(grid.box.periodic)
+    x = grid.box.wrap(x)
+    between_walls = (x >= 0.0) & (x <= 1.0)
+    is_inside = np.where(periodic, np.isfinite(x), between_walls).all(axis=1)
+    x = x[is_inside]
+    carried = np.column_stack([np.ones(len(x)), u[is_inside]])  # (1, u)
+    base, weights = _spline_weights(x - grid.start, grid)
+
+    # Along axes with walls the stencil may reach past the grid: nodes in a margin.
+    margin = np.where(periodic, 0, _ROWS_BELOW)
+    padding = np.where(periodic, 0, _ROWS_BELOW + _ROWS_ABOVE)
+    padded_shape = tuple(np.add(grid.shape, padding).tolist())
+    sums = np.zeros((len(out), int(np.prod(padded_shape))))
+    for offsets in itertools.product(range(3), repeat=grid.dimension):
+        node = np.zeros(len(x), np.intp)
+        weight = np.ones(len(x))
+        for axis, offset in enumerate(offsets):
+            along = base[axis].astype(np.intp) + margin[axis] + offset
+            node = node * padded_shape[axis] + along % padded_shape[axis]
+            weight *= weights[axis, offset]
+        for row, values in zip(sums, carried.T, strict=True):
+            row += np.bincount(node, weights=weight * values, minlength=len(row))
+
+    inner = tuple(
+        slice(start, start + count)
+        for start, count in zip(margin, grid.shape, strict=True)
+    )
+    out[:] = sums.reshape(-1, *padded_shape)[(slice(None), *inner)]
+
+
+def _scatter_between_walls(x: Floats, u: Floats, grid: Grid, out: Floats) -> None:
+    """Do the same as :func:`scatter_in_box` in two dimensions between walls, faster.
 
     Args:
         x: particle positions [length], shape [particle, 2].
@@ -282,20 +379,94 @@ def node_velocity(sums: Transfer, full: float) -> Floats:
     return velocity
 
 
-def differentiable_nodes(counted: Mask) -> Mask:
-    """Return the nodes whose four neighbours exist and count."""
-    inner = np.zeros_like(counted)
-    inner[..., 1:-1, 1:-1] = (
-        counted[..., 2:, 1:-1]
-        & counted[..., :-2, 1:-1]
-        & counted[..., 1:-1, 2:]
-        & counted[..., 1:-1, :-2]
-    )
+def differentiable_nodes(
+    counted: Mask, periodic: Sequence[bool] = (False, False)
+) -> Mask:
+    """Return the nodes whose neighbours along every axis exist and count.
+
+    Args:
+        counted: nodes that count, shape [..., *node].
+        periodic: whether each axis repeats itself, shape [axis].
+    """
+    inner = np.ones_like(counted)
+    for axis, is_periodic in enumerate(periodic):
+        place = axis - len(periodic)
+        neighbour = np.moveaxis(counted, place, -1)
+        along = np.moveaxis(inner, place, -1)  # a view
+        along[..., 1:-1] &= neighbour[..., 2:] & neighbour[..., :-2]
+        if is_periodic:
+            along[..., 0] &= neighbour[..., 1] & neighbour[..., -1]
+            along[..., -1] &= neighbour[..., 0] & neighbour[..., -2]
+        else:
+            along[..., 0] = False
+            along[..., -1] = False
     return inner
 
 
+def slope_along(
+    field: Floats, axis: int, spacing: float, *, is_periodic: bool = False
+) -> Floats:
+    """Return central differences of a field along an axis [unit of the field / length].
+
+    Between walls they are 0 on the rim of the grid, where there is none.
+
+    Args:
+        field: values at the nodes, shape [..., *node].
+        axis: axis of the array, counted from its end: -1 for the last.
+        spacing: distance h between nodes [length].
+        is_periodic: whether the last node has the first one beside it.
+    """
+    slope = np.zeros(field.shape)
+    value = np.moveaxis(field, axis, -1)
+    along = np.moveaxis(slope, axis, -1)  # a view
+    along[..., 1:-1] = (value[..., 2:] - value[..., :-2]) / (2.0 * spacing)
+    if is_periodic:
+        along[..., 0] = (value[..., 1] - value[..., -1]) / (2.0 * spacing)
+        along[..., -1] = (value[..., 0] - value[..., -2]) / (2.0 * spacing)
+    return slope
+
+
+def curl(
+    velocity: Floats, spacing: float, periodic: Sequence[bool] | None = None
+) -> Floats:
+    """Return the curl of a velocity field by central differences (Eq. 5.19).
+
+    In two dimensions it is ``dv/dx - du/dy``, in three the vector ``d_j u_k - d_k u_j``
+    for cyclic axes. A solid-body rotation Omega gives 2 Omega. Between walls the slopes
+    are 0 on the rim of the grid.
+
+    Args:
+        velocity: node velocity, shape [..., *node, axis].
+        spacing: distance h between nodes [length].
+        periodic: whether each axis repeats itself, shape [axis]; none by default.
+
+    Returns:
+        Shape [..., *node] in two dimensions, [..., *node, axis] in three.
+    """
+    dimension = velocity.shape[-1]
+    if periodic is None:
+        periodic = [False] * dimension
+    if dimension == 2 and not any(periodic):
+        return vorticity(velocity, spacing)
+
+    def slope(component: int, axis: int) -> Floats:
+        return slope_along(
+            velocity[..., component],
+            axis - dimension,
+            spacing,
+            is_periodic=periodic[axis],
+        )
+
+    if dimension == 2:
+        return slope(1, 0) - slope(0, 1)
+    components = []
+    for j, k in ((1, 2), (2, 0), (0, 1)):
+        components.append(slope(k, j) - slope(j, k))
+    return np.stack(components, axis=-1)
+
+
 def vorticity(velocity: Floats, spacing: float) -> Floats:
-    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19).
+    """Return ``omega = dv/dx - du/dy`` (Eq. 5.19) in two dimensions between walls.
 
     Solid-body rotation Omega gives 2 Omega. Central differences, 0 on the rim of the
     grid where there is none.
@@ -312,18 +483,27 @@ def vorticity(velocity: Floats, spacing: float) -> Floats:
     return slope
 
 
-def divergence(velocity: Floats, spacing: float) -> Floats:
-    """Return ``du/dx + dv/dy``; an incompressible flow gives 0.
+def divergence(
+    velocity: Floats, spacing: float, periodic: Sequence[bool] | None = None
+) -> Floats:
+    """Return ``du/dx + dv/dy (+ dw/dz)``; an incompressible flow gives 0.
 
-    The differences are those of the vorticity.
+    The differences are those of :func:`curl`.
 
     Args:
-        velocity: node velocity, shape [..., x node, y node, 2].
+        velocity: node velocity, shape [..., *node, axis].
         spacing: distance h between nodes [length].
+        periodic: whether each axis repeats itself, shape [axis]; none by default.
+
+    Returns:
+        Shape [..., *node].
     """
-    u = velocity[..., 0]
-    v = velocity[..., 1]
-    slope = np.zeros(u.shape)
-    slope[..., 1:-1, :] = (u[..., 2:, :] - u[..., :-2, :]) / (2.0 * spacing)
-    slope[..., 1:-1] += (v[..., 2:] - v[..., :-2]) / (2.0 * spacing)
-    return slope
+    dimension = velocity.shape[-1]
+    if periodic is None:
+        periodic = [False] * dimension
+    total = np.zeros(velocity.shape[:-1])
+    for axis, is_periodic in enumerate(periodic):
+        total += slope_along(
+            velocity[..., axis], axis - dimension, spacing, is_periodic=is_periodic
+        )
+    return total

@@ -246,7 +246,7 @@ def _collect_entries(
     files: Iterable[FileEntry],
     subsets: Mapping[str, Sequence[int]],
 ) -> dict[int, FileEntry]:
-    """Return old and new entries by id; old ones count in their own subset only."""
+    """Return entries by id; old ones only if their subset still lists them."""
     entries = {}
     if old is not None:
         for entry in old.files:

@@ -39,6 +39,8 @@ from lagbench.errors import (
     suggest_name,
 )
 
+from .box import Box, parse_periodic
+from .grid import Grid, Placement
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
 from .limits import Value, check_frames, check_parameters, check_subsets
@@ -156,8 +158,18 @@ class _SizeEntry(_RegistryModel):
     subsets: dict[str, Ids]
     frames: int | dict[int, Ids]
     bounds: tuple[Interval, Interval] = Field(strict=False)
+    periodic: tuple[str, ...] = Field((), strict=False)  # axes without walls, by name
     parameters: dict[str, Value]
     task: Task
+
+    @model_validator(mode="after")
+    def _check_periodic(self) -> _SizeEntry:
+        try:
+            parse_periodic(self.periodic, len(self.bounds))
+        except UsageError as error:
+            text = f"{error.what}: expected {error.expected}, got {error.got}"
+            raise ValueError(text) from None
+        return self
 
 
 class Size(BaseModel):
@@ -172,6 +184,7 @@ class Size(BaseModel):
     subsets: dict[str, tuple[int, ...]]
     frames: int | dict[int, tuple[int, ...]]
     bounds: tuple[Interval, Interval]
+    periodic: tuple[str, ...] = ()  # names of the axes that have no walls
     parameters: dict[str, Parameter]
     task: Task
     measured: Measured | None = None
@@ -186,6 +199,18 @@ class Size(BaseModel):
     def simulated(self) -> bool:
         """Whether scenarios can be simulated; those of local splits cannot."""
         return self.generator != NO_GENERATOR
+
+    @property
+    def box(self) -> Box:
+        """The box that holds the particles."""
+        periodic = parse_periodic(self.periodic, len(self.bounds))
+        return Box.from_bounds(self.bounds, periodic)
+
+    @property
+    def field_grid(self) -> Grid:
+        """Grid of the scorer's fields."""
+        score_grid = self.task.score_grid
+        return Grid(score_grid.cells, Placement(score_grid.placement), self.box)
 
     def value(self, name: str) -> Any:  # noqa: ANN401
         """Return a parameter's value."""
@@ -360,6 +385,7 @@ class Registry:
             subsets=entry.subsets,
             frames=entry.frames,
             bounds=entry.bounds,
+            periodic=entry.periodic,
             parameters=parameters,
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),

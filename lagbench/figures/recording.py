@@ -61,9 +61,7 @@ class Scene:
     @cached_property
     def fields(self) -> gridding.Fields:
         """Fields on the size's score grid; vorticity and divergence in 1/frame."""
-        score_grid = self.recording.size.task.score_grid
-        placement = gridding.Placement(score_grid.placement)
-        grid = gridding.Grid(score_grid.cells, placement)
+        grid = self.recording.size.field_grid
         full = grid.full_weight(self.recording.particles, self.recording.area)
         return gridding.fields(self.position, self.displacement, grid, full=full)
 
@@ -174,7 +172,8 @@ class Recording:
         position = self._read_particles("position", number)
         velocity = self._read_particles("velocity", number)
         if number > 0:
-            displacement = position - self._read_particles("position", number - 1)
+            before = self._read_particles("position", number - 1)
+            displacement = self.size.box.displacement(before, position)
         else:
             displacement = velocity * self.size.frame_interval
         return Scene(self, number, position, velocity, displacement)

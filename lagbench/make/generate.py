@@ -358,10 +358,10 @@ def _scan_folder(
     force: bool,
     gathered: Collection[int] | None = None,
 ) -> _Scan:
-    """Inspect the files of a folder.
+    """Find the files that are right, and which wanted ids must be simulated.
 
-    With ``gathered``, the ids that would be there, nothing is written and the hashes of
-    the manifest are trusted.
+    Nothing is written. ``gathered`` is given in a dry run: the ids that gathering would
+    bring. They count as right, and hashes of the manifest are trusted.
     """
     size = setup.size
     old = read_or_empty(size, setup.root)
@@ -385,7 +385,7 @@ def _scan_folder(
     results = setup.read_files(run_inspection, inspections, paths)
 
     hashed = []
-    bad_ids = set(suspects)
+    bad_ids = set(suspects)  # until an inspection proves a file right
     for result in results:
         if result.entry:
             hashed.append(result.entry)
@@ -589,7 +589,8 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         paths = {}
         for i in train_ids:
             paths[f"scenario {i}"] = setup.path(i)
-        moments = setup.read_files(file_moments, paths, paths.values())
+        read_moments = partial(file_moments, box=setup.size.box)
+        moments = setup.read_files(read_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     keeper.keep(manifest)
 

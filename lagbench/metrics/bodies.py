@@ -20,12 +20,49 @@ from .metric import Direction, Metric
 def rigid_residual(truth: Floats, prediction: Floats) -> float:
     """Return the RMS distance after the best rigid fit of prediction to truth [length].
 
-    With both centred, the best rotation (Kabsch, in two dimensions) is by
-    ``atan2(X, D)`` with ``D = sum(p . t)`` and ``X = sum(p x t)`` over positions of
-    shape [particle, 2]. A mirrored body does not fit.
+    A mirrored body does not fit.
+
+    Args:
+        truth: true positions of a body in one piece [length], shape [particle, axis].
+        prediction: predicted positions, likewise.
     """
     t = truth - np.mean(truth, axis=0)
     p = prediction - np.mean(prediction, axis=0)
+    if p.shape[1] == 2:
+        rotated = rotate_in_plane(t, p)
+    else:
+        rotated = p @ fit_rotation(t, p).T
+    squares = np.sum((rotated - t) ** 2, axis=1)  # shape [particle]
+    return math.sqrt(float(np.mean(squares)))
+
+
+def fit_rotation(t: Floats, p: Floats) -> Floats:
+    """Return the rotation R that makes ``sum |R p - t|^2`` least, shape [axis, axis].
+
+    ``R = V diag(1, .., det(V U^T)) U^T`` with ``sum(p t^T) = U S V^T`` (Kabsch 1976,
+    doi 10.1107/S0567739476001873), in any dimension.
+
+    Args:
+        t: true positions about their mean [length], shape [particle, axis].
+        p: predicted positions about their mean [length], shape [particle, axis].
+    """
+    covariance = np.einsum("pi,pj->ij", p, t)
+    u, _, vh = np.linalg.svd(covariance)
+    signs = np.ones(len(covariance))
+    signs[-1] = np.sign(np.linalg.det(u) * np.linalg.det(vh))
+    return np.asarray((vh.T * signs) @ u.T, np.float64)
+
+
+def rotate_in_plane(t: Floats, p: Floats) -> Floats:
+    """Return p rotated to fit t best in two dimensions, shape [particle, 2].
+
+    The angle is ``atan2(X, D)`` with ``D = sum(p . t)`` and ``X = sum(p x t)``. No
+    decomposition is needed.
+
+    Args:
+        t: true positions about their mean [length], shape [particle, 2].
+        p: predicted positions about their mean [length], shape [particle, 2].
+    """
     px = p[:, 0]
     py = p[:, 1]
 
@@ -40,9 +77,7 @@ def rigid_residual(truth: Floats, prediction: Floats) -> float:
 
     rotated_x = cos * px - sin * py
     rotated_y = sin * px + cos * py
-    rotated = np.stack([rotated_x, rotated_y], axis=1)
-    squares = np.sum((rotated - t) ** 2, axis=1)  # shape [particle]
-    return math.sqrt(float(np.mean(squares)))
+    return np.stack([rotated_x, rotated_y], axis=1)
 
 
 def shape_error(pair: FramePair, material: str) -> float:
@@ -52,8 +87,9 @@ def shape_error(pair: FramePair, material: str) -> float:
     spacing; a body that melts reaches its own radius.
     """
     members = pair.scenario.members[material]
-    truth = pair.truth.position[members]
-    prediction = pair.prediction.position[members]
+    box = pair.scenario.config.box
+    truth = box.unwrap(pair.truth.position[members])
+    prediction = box.unwrap(pair.prediction.position[members])
     return rigid_residual(truth, prediction)
 
 

@@ -109,25 +109,32 @@ def active_frames(pair: FramePair) -> float:
 
 
 def momentum(snapshot: Snapshot) -> Floats:
-    """Return ``sum(u)``: momentum over the particle mass [length/frame], shape [2]."""
+    """Return ``sum(u)``: momentum over the particle mass [length/frame], [axis]."""
     return np.asarray(snapshot.velocity.sum(axis=0))
 
 
-def angular_momentum(snapshot: Snapshot) -> float:
+def angular_momentum(snapshot: Snapshot) -> Floats:
     """Return ``sum(r x u)`` about the box centre (Eq. 5.1) [length^2/frame].
 
-    The angular momentum is given over the particle mass.
+    The angular momentum is given over the particle mass. It is a scalar in two
+    dimensions, a vector of shape [axis] in three.
     """
     r = snapshot.lever_arms
     u = snapshot.velocity
-    return dot(r[:, 0], u[:, 1]) - dot(r[:, 1], u[:, 0])
+
+    def component(j: int, k: int) -> float:
+        return dot(r[:, j], u[:, k]) - dot(r[:, k], u[:, j])
+
+    if u.shape[1] == 2:
+        return np.array(component(0, 1))
+    return np.array([component(1, 2), component(2, 0), component(0, 1)])
 
 
 @metric(unit="length/frame", source="section 5.2")
 def momentum_gap(pair: FramePair) -> float:
     """Error of total momentum, unscaled."""
-    dx, dy = momentum(pair.prediction) - momentum(pair.truth)
-    return math.hypot(dx, dy)
+    difference = momentum(pair.prediction) - momentum(pair.truth)
+    return math.hypot(*difference)
 
 
 @metric(unit="length/frame", source="section 5.2")
@@ -145,7 +152,8 @@ def momentum_error(gap: Floats, scale: Floats) -> Floats:
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
 def angular_momentum_gap(pair: FramePair) -> float:
     """Error of angular momentum about the box centre, unscaled."""
-    return abs(angular_momentum(pair.prediction) - angular_momentum(pair.truth))
+    difference = angular_momentum(pair.prediction) - angular_momentum(pair.truth)
+    return math.hypot(*np.atleast_1d(difference))
 
 
 @metric(unit="length^2/frame", source="section 5.2, Eq. 5.1")
@@ -188,9 +196,9 @@ def divergence_rms_true(pair: FramePair) -> float:
 
 
 def _divergence_rms(pair: FramePair, snapshot: Snapshot) -> float:
-    spacing = pair.scenario.config.grid.spacing
-    rate = divergence(snapshot.fields.velocity, spacing)[pair.nodes]  # [1/frame]
-    return math.sqrt(mean_squared_error(rate))
+    grid = pair.scenario.config.grid
+    rate = divergence(snapshot.fields.velocity, grid.spacing, grid.box.periodic)
+    return math.sqrt(mean_squared_error(rate[pair.nodes]))  # [1/frame]
 
 
 @_error(unit="%", source="docs/scoring.md")

@@ -11,9 +11,12 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .frame import Floats, FramePair, average
 from .metric import (
@@ -138,28 +141,63 @@ def _cosines(nodes: int) -> Floats:
     return np.asarray(cosines, np.float64)
 
 
-def energy_spectrum(velocity: Floats) -> Floats:
-    """Return the kinetic energy of node velocities in shells of half waves, [shell].
+def energy_spectrum(velocity: Floats, periodic: Sequence[bool] | None = None) -> Floats:
+    """Return the kinetic energy of node velocities in shells of wave numbers, [shell].
 
-    Cosine modes (k, l) of both components, summed over
-    ``round(sqrt(k^2 + l^2)) = 1, 2, ...``: a box with walls has no period, and cosines,
-    unlike a Fourier series, put no jump at them (Denis, Cote and Laprise, Monthly
-    Weather Review 2002). Shell 0, the mean flow, is left out, as are the corners of the
-    wave-number plane beyond the shorter side. Velocities have the shape [x node, y
-    node, 2].
+    Modes of all components are summed over ``round(|k|) = 1, 2, ...``. Along an axis
+    with walls k counts half waves of cosines: a box with walls has no period, and
+    cosines, unlike a Fourier series, put no jump at them (Denis, Cote and Laprise,
+    Monthly Weather Review 2002). Along a periodic axis the modes are those of the
+    discrete Fourier transform. Where all axes are periodic k counts whole waves on the
+    longest of them, else half waves. Shell 0, the mean flow, is left out, as are the
+    corners of the wave-number space beyond what the axes with the fewest modes resolve.
+
+    All transforms are unitary: the shells of a field with all its modes sum to
+    ``sum |u|^2`` over the nodes less that of the mean.
+
+    Args:
+        velocity: node velocity, shape [*node, axis].
+        periodic: whether each axis repeats itself, shape [axis]; none by default.
     """
-    rows, columns = velocity.shape[:2]
+    dimension = velocity.shape[-1]
+    if periodic is None:
+        periodic = [False] * dimension
+    node_counts = velocity.shape[:-1]
+    half_waves = 1 if all(periodic) else 2  # of a whole wave
+    longest = max(node_counts)
 
-    # einsum, not BLAS: the bits must not depend on the number of threads
-    x_modes = np.einsum("ki,ijc->kjc", _cosines(rows), velocity)
-    modes = np.einsum("lj,kjc->klc", _cosines(columns), x_modes)
-    power = np.sum(modes**2, axis=-1)  # shape [k, l]
+    modes: NDArray[Any] = velocity
+    wave_numbers = []  # of each axis, shape [mode]
+    limits = []  # the first wave number that an axis does not resolve
+    for axis, count in enumerate(node_counts):
+        if periodic[axis]:
+            modes = np.fft.fft(modes, axis=axis, norm="ortho")
+            waves = np.abs(np.fft.fftfreq(count, 1.0 / count))
+            scale = half_waves * longest / count
+            wave_numbers.append(waves * scale)
+            limits.append(int((count // 2) * scale) + 1)
+        else:
+            modes = _transform_by_cosines(modes, axis)
+            wave_numbers.append(np.arange(count, dtype=np.float64))
+            limits.append(count)
+    power = np.sum(np.abs(modes) ** 2, axis=-1)  # shape [*mode]
 
-    k, l = np.ogrid[:rows, :columns]  # noqa: E741 - wave numbers
-    shell = np.rint(np.hypot(k, l)).astype(np.intp)
+    squares = [numbers**2 for numbers in np.ix_(*wave_numbers)]
+    shell = np.rint(np.sqrt(sum(squares))).astype(np.intp)
     sums = np.bincount(shell.ravel(), weights=power.ravel())
     energy = np.asarray(sums, np.float64)
-    return energy[1 : min(rows, columns)]
+    return energy[1 : min(limits)]
+
+
+def _transform_by_cosines(field: NDArray[Any], axis: int) -> NDArray[Any]:
+    """Return the modes of a field along an axis of nodes, of the field's shape."""
+    cosines = _cosines(field.shape[axis])
+    nodes = "xyz"[: field.ndim - 1]
+    modes = nodes.replace(nodes[axis], "k")
+    # einsum, not BLAS: the bits must not depend on the number of threads
+    subscripts = f"k{nodes[axis]},{nodes}c->{modes}c"
+    modes_of_field: NDArray[Any] = np.einsum(subscripts, cosines, field)
+    return modes_of_field
 
 
 def _at_slow_frames_of_full_box(pair: FramePair) -> bool:
@@ -179,14 +217,21 @@ def spectrum_error(pair: FramePair) -> float:
     smoothing and noise at once. A ratio counts at most :data:`DECADES`, a prediction at
     rest exactly that. NaN where the truth rests.
     """
-    # the rectangle that holds the counted nodes
+    # the cuboid that holds the counted nodes, all nodes along periodic axes
     counted = pair.truth.fields.counted
-    x = np.flatnonzero(counted.any(axis=1))
-    y = np.flatnonzero(counted.any(axis=0))
-    box = (slice(x[0], x[-1] + 1), slice(y[0], y[-1] + 1))
+    periodic = pair.scenario.config.box.periodic
+    ranges = []
+    for axis, is_periodic in enumerate(periodic):
+        across = tuple(other for other in range(counted.ndim) if other != axis)
+        places = np.flatnonzero(counted.any(axis=across))
+        if is_periodic:
+            ranges.append(slice(None))
+        else:
+            ranges.append(slice(places[0], places[-1] + 1))
+    cuboid = tuple(ranges)
 
-    true = energy_spectrum(pair.truth.fields.velocity[box])
-    predicted = energy_spectrum(pair.prediction.fields.velocity[box])
+    true = energy_spectrum(pair.truth.fields.velocity[cuboid], periodic)
+    predicted = energy_spectrum(pair.prediction.fields.velocity[cuboid], periodic)
     has_energy = true > 0.0
     if not has_energy.any():
         return math.nan

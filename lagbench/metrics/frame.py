@@ -10,19 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.grid import Fields, Grid, Placement, fields, vorticity
+from lagbench.data.box import UNIT_SQUARE, Box
+from lagbench.data.grid import Fields, Grid, Placement, curl, fields
 from lagbench.errors import ChecksFailedError, UsageError
 
 Floats = NDArray[np.float64]
 
 DIRECTIONS = 64
-"""Directions on which clouds are projected, at equal angles over a half turn."""
+"""Directions on which clouds are projected."""
+
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+"""Angle from one direction to the next on the spiral of a Fibonacci lattice [rad]."""
 
 WALL_TOLERANCE = 1e-6
 """A particle is outside when it is this far past a wall, a few float32 ulp [length].
@@ -75,12 +79,19 @@ def dot(a: Floats, b: Floats) -> float:
 
 def lengths(vectors: Floats) -> Floats:
     """Return the Euclidean length of vectors, shape [particle]."""
-    squares = vectors[:, 0] ** 2 + vectors[:, 1] ** 2
-    return np.asarray(np.sqrt(squares), np.float64)
+    return np.asarray(np.sqrt(sum_of_squares(vectors)), np.float64)
+
+
+def sum_of_squares(vectors: Floats) -> Floats:
+    """Return the squared Euclidean length of vectors, shape [particle]."""
+    squares = vectors[:, 0] ** 2
+    for component in vectors.T[1:]:
+        squares = squares + component**2
+    return np.asarray(squares, np.float64)
 
 
 def mean_square(vectors: Floats) -> Floats:
-    """Return the mean over particles of the square of each component, shape [2]."""
+    """Return the mean over particles of the square of each component, shape [axis]."""
     sums = np.array([dot(component, component) for component in vectors.T])
     return sums / len(vectors)
 
@@ -88,21 +99,48 @@ def mean_square(vectors: Floats) -> Floats:
 def sorted_projections(points: ArrayLike) -> NDArray[np.float32]:
     """Return the coordinates along each direction in ascending order [length].
 
-    The shape is [direction, particle]. The precision is single, as that of stored
-    positions: the sort is several times faster, and distances are good to 1e-7 of the
-    box.
-    """
-    x, y = np.asarray(points, np.float32).T
-    angles = np.arange(DIRECTIONS) * (math.pi / DIRECTIONS)
-    projections = np.empty((DIRECTIONS, len(x)), np.float32)
+    The precision is single, as that of stored positions: the sort is several times
+    faster, and distances are good to 1e-7 of the box. Along a periodic axis the points
+    are taken where they lie in the box, not at their nearest images.
 
-    for row, angle in zip(projections, angles, strict=True):
-        cosine = np.float32(math.cos(angle))
-        sine = np.float32(math.sin(angle))
-        row[:] = x * cosine + y * sine
+    Args:
+        points: points [length], shape [particle, axis].
+
+    Returns:
+        Shape [direction, particle].
+    """
+    components = np.asarray(points, np.float32).T
+    dimension, particle_count = components.shape
+    projections = np.empty((DIRECTIONS, particle_count), np.float32)
+
+    for row, direction in zip(projections, directions(dimension), strict=True):
+        row[:] = components[0] * direction[0]
+        for component, share in zip(components[1:], direction[1:], strict=True):
+            row += component * share
         row.sort()
 
     return projections
+
+
+@cache
+def directions(dimension: int) -> NDArray[np.float32]:
+    """Return the fixed unit vectors on which clouds are projected, [direction, axis].
+
+    In two dimensions they stand at equal angles over a half turn. In three they are a
+    Fibonacci lattice on the half sphere z > 0 (Swinbank and Purser 2006, doi
+    10.1256/qj.05.227): opposite directions sort a cloud alike.
+    """
+    number = np.arange(DIRECTIONS)
+    if dimension == 2:
+        angles = number * (math.pi / DIRECTIONS)
+        rows = [(math.cos(angle), math.sin(angle)) for angle in angles]
+        return np.array(rows, np.float32)
+
+    height = (number + 0.5) / DIRECTIONS  # equal areas of the half sphere
+    radius = np.sqrt(1.0 - height**2)
+    angles = number * GOLDEN_ANGLE
+    columns = (radius * np.cos(angles), radius * np.sin(angles), height)
+    return np.stack(columns, axis=1).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -111,33 +149,46 @@ class Bonds:
 
     pairs: NDArray[np.intp]  # numbers of the particles within the body, shape [pair, 2]
     breaking_length: Floats  # length beyond which a bond is broken [length], [pair]
+    box: Box = UNIT_SQUARE  # that holds the particles
 
     @classmethod
-    def within(cls, radius: float, position: Floats) -> Bonds:
-        """Return the bonds of particles closer than a radius in the first frame."""
+    def within(cls, radius: float, position: Floats, box: Box = UNIT_SQUARE) -> Bonds:
+        """Return the bonds of particles closer than a radius in the first frame.
+
+        Args:
+            radius: largest length of a bond [length].
+            position: positions in the first frame [length], shape [particle, axis].
+            box: box that holds the particles.
+        """
         # splits without bodies save a fifth of a second
         from scipy.spatial import cKDTree
 
-        neighbours = cKDTree(position).query_pairs(radius, output_type="ndarray")
+        points = position
+        period = None
+        if box.is_periodic:
+            points = np.asarray(box.wrap(position) - box.low)
+            period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
+        tree = cKDTree(points, boxsize=period)
+        neighbours = tree.query_pairs(radius, output_type="ndarray")
         pairs = np.asarray(neighbours, np.intp).reshape(-1, 2)
-        first_length = np.sqrt(_squared_lengths(position, pairs))
-        return cls(pairs, STRETCH * first_length)
+        first_length = np.sqrt(_squared_lengths(position, pairs, box))
+        return cls(pairs, STRETCH * first_length, box)
 
     def intact_share(self, position: Floats) -> float:
         """Return the share of unbroken bonds at these positions [1], NaN without bonds.
 
-        Positions have the shape [particle, 2].
+        Positions have the shape [particle, axis].
         """
         if not len(self.pairs):
             return math.nan
-        is_intact = _squared_lengths(position, self.pairs) <= self.breaking_length**2
-        return float(np.mean(is_intact))
+        square = _squared_lengths(position, self.pairs, self.box)
+        return float(np.mean(square <= self.breaking_length**2))
 
 
-def _squared_lengths(position: Floats, pairs: NDArray[np.intp]) -> Floats:
+def _squared_lengths(position: Floats, pairs: NDArray[np.intp], box: Box) -> Floats:
     """Return the squared distance of each pair [length^2], shape [pair]."""
-    gap = position[pairs[:, 0]] - position[pairs[:, 1]]
-    return np.asarray(gap[:, 0] ** 2 + gap[:, 1] ** 2, np.float64)
+    gap = box.displacement(position[pairs[:, 1]], position[pairs[:, 0]])
+    return sum_of_squares(gap)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,13 +201,17 @@ class TaskConfig:
     horizon: int  # frames that the model predicts
     # absolute frames at which slow metrics are measured
     frames_of_interest: tuple[int, ...]
-    # of x, y [length] and u, v [length/frame] over train
-    attribute_std: tuple[float, float, float, float]
+    # of the position's components [length], then the velocity's [length/frame], over
+    # train
+    attribute_std: tuple[float, ...]
     radius: float  # distance of neighbours in the first frame [length]
     # of the split; two or more have metrics of their own
     materials: tuple[str, ...] = ("liquid",)
-    # walls [length]
-    bounds: tuple[tuple[float, float], tuple[float, float]] = (0.0, 1.0), (0.0, 1.0)
+
+    @property
+    def box(self) -> Box:
+        """The box that holds the particles."""
+        return self.grid.box
 
     @property
     def is_full_box(self) -> bool:
@@ -178,8 +233,9 @@ class TaskConfig:
 class Snapshot:
     """Particles of one frame, of truth or of a prediction."""
 
-    position: Floats  # x(f) [length], shape [particle, 2]
-    velocity: Floats  # u(f) = x(f) - x(f-1) [length/frame], shape [particle, 2]
+    position: Floats  # x(f) [length], shape [particle, axis]
+    # u(f), the way from x(f-1) to x(f) [length/frame], shape [particle, axis]
+    velocity: Floats
     scenario: Scenario  # that they belong to
 
     @cached_property
@@ -194,9 +250,9 @@ class Snapshot:
 
     @cached_property
     def lever_arms(self) -> Floats:
-        """Positions relative to the centre of the box [length], shape [particle, 2]."""
-        centre = np.mean(self.scenario.config.bounds, axis=1)
-        return np.asarray(self.position - centre, np.float64)
+        """Ways from the centre of the box [length], shape [particle, axis]."""
+        box = self.scenario.config.box
+        return box.displacement(box.centre, self.position)
 
     @cached_property
     def fields(self) -> Fields:
@@ -231,7 +287,7 @@ class Scenario:
     """Properties that all frames of one scenario share."""
 
     config: TaskConfig  # of the split and size
-    # true positions from frame 0 to the last input frame, [frame, particle, 2]
+    # true positions from frame 0 to the last input frame, [frame, particle, axis]
     input_positions: NDArray[np.floating]
     # index into lagbench.data.MATERIALS, shape [particle]
     material: NDArray[np.integer]
@@ -243,13 +299,19 @@ class Scenario:
     def __post_init__(self) -> None:
         """Refuse shapes that would only fail later, with a worse message."""
         shape = self.input_positions.shape
-        if len(shape) == 3 and shape[0] >= 2 and shape[1:] == (len(self.material), 2):
+        if len(shape) == 3 and shape[0] >= 2 and shape[1:] == self._frame_shape:
             return
         raise UsageError(
             "the input frames do not fit the scenario",
-            expected=f"[2 or more frames, {len(self.material)} particles, 2]",
+            expected=f"[2 or more frames, {len(self.material)} particles, "
+            f"{self.config.box.dimension}]",
             got=str(shape),
         )
+
+    @property
+    def _frame_shape(self) -> tuple[int, int]:
+        """Shape of the positions of one frame: particles and axes."""
+        return len(self.material), self.config.box.dimension
 
     @cached_property
     def full_weight(self) -> float:
@@ -286,15 +348,19 @@ class Scenario:
         bonds = {}
         for name, particles in self.members.items():
             if name in ELASTIC:
-                bonds[name] = Bonds.within(self.config.radius, first[particles])
+                bonds[name] = Bonds.within(
+                    self.config.radius, first[particles], self.config.box
+                )
         return bonds
 
     def snapshot(self, position: ArrayLike, previous: ArrayLike) -> Snapshot:
         """Return the snapshot of a frame from its positions and those one frame before.
 
+        Along periodic axes positions are wrapped into the box.
+
         Args:
-            position: positions of the frame [length], shape [particle, 2].
-            previous: positions one frame before [length], shape [particle, 2].
+            position: positions of the frame [length], shape [particle, axis].
+            previous: positions one frame before [length], shape [particle, axis].
 
         Raises:
             UsageError: an array has another shape.
@@ -304,7 +370,7 @@ class Scenario:
         x = np.asarray(position, np.float64, order="F")
         before = np.asarray(previous, np.float64, order="F")
 
-        expected = (len(self.material), 2)
+        expected = self._frame_shape
         if x.shape != expected or before.shape != expected:
             raise UsageError(
                 "wrong shape of positions",
@@ -321,7 +387,8 @@ class Scenario:
                 fix="freeze the rollout at its last finite frame",
             )
 
-        return Snapshot(x, x - before, self)
+        box = self.config.box
+        return Snapshot(box.wrap(x), box.displacement(before, x), self)
 
 
 def snapshots(
@@ -334,7 +401,7 @@ def snapshots(
 
     Args:
         scenario: the scenario of the particles.
-        positions: positions of each frame [length], shape [particle, 2].
+        positions: positions of each frame [length], shape [particle, axis].
         previous: positions one frame before the first; by default those of the last
             input frame.
     """
@@ -360,22 +427,26 @@ class FramePair:
 
     @cached_property
     def position_error(self) -> Floats:
-        """Predicted minus true position [length], shape [particle, 2]."""
-        return self.prediction.position - self.truth.position
+        """Ways from true to predicted positions [length], shape [particle, axis].
+
+        Along periodic axes they are the shortest (minimum image).
+        """
+        box = self.scenario.config.box
+        return box.displacement(self.truth.position, self.prediction.position)
 
     @cached_property
     def velocity_error(self) -> Floats:
-        """Predicted minus true velocity [length/frame], shape [particle, 2]."""
+        """Predicted minus true velocity [length/frame], shape [particle, axis]."""
         return self.prediction.velocity - self.truth.velocity
 
     @cached_property
     def position_square(self) -> Floats:
-        """Mean squared position error of each component [length^2], shape [2]."""
+        """Mean squared position error of each component [length^2], shape [axis]."""
         return mean_square(self.position_error)
 
     @cached_property
     def velocity_square(self) -> Floats:
-        """Mean squared velocity error by component [length^2/frame^2], shape [2]."""
+        """Mean squared velocity error by component [length^2/frame^2], [axis]."""
         return mean_square(self.velocity_error)
 
     @cached_property
@@ -387,19 +458,13 @@ class FramePair:
     def outside_share(self) -> float:
         """Share of predicted particles that are past a wall [1]."""
         position = self.prediction.position
-        is_outside = []  # by component, where any particle is outside
-
-        for x, (low, high) in zip(position.T, self.scenario.config.bounds, strict=True):
-            lowest = low - WALL_TOLERANCE
-            highest = high + WALL_TOLERANCE
-            # nearly always; False for NaN too
-            all_inside = x.min() >= lowest and x.max() <= highest
-            if not all_inside:
-                is_outside.append((x < lowest) | (x > highest))
-
-        if not is_outside:
+        box = self.scenario.config.box
+        corners = np.stack([position.min(axis=0), position.max(axis=0)])
+        # Nearly always: where both corners lie inside, all particles do.
+        if box.contains(corners, tolerance=WALL_TOLERANCE).all():
             return 0.0
-        return np.count_nonzero(np.logical_or.reduce(is_outside)) / len(position)
+        is_inside = box.contains(position, tolerance=WALL_TOLERANCE)
+        return np.count_nonzero(~is_inside) / len(position)
 
     @property
     def nodes(self) -> NDArray[np.bool_]:
@@ -413,17 +478,21 @@ class FramePair:
 
     @cached_property
     def true_vorticity(self) -> Floats:
-        """Omega of the truth at the compared nodes [1/frame], shape [node]."""
+        """Omega of the truth at the compared nodes [1/frame], shape [node].
+
+        In three dimensions the components of every node, shape [3 node].
+        """
         return self._vorticity(self.truth)
 
     @cached_property
     def predicted_vorticity(self) -> Floats:
-        """Omega of the prediction at the compared nodes [1/frame], shape [node]."""
+        """Omega of the prediction at the compared nodes, as that of the truth."""
         return self._vorticity(self.prediction)
 
     def _vorticity(self, snapshot: Snapshot) -> Floats:
-        spacing = self.scenario.config.grid.spacing
-        return vorticity(snapshot.fields.velocity, spacing)[self.nodes]
+        grid = self.scenario.config.grid
+        omega = curl(snapshot.fields.velocity, grid.spacing, grid.box.periodic)
+        return omega[self.nodes].reshape(-1)
 
     @cached_property
     def truth_rotates(self) -> bool:

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lagbench.data.grid import Grid, Placement, node_velocity, transfer
+from lagbench.data.grid import node_velocity, transfer
 from lagbench.data.scenario import ScenarioFile, read_scenario
 
 from .assignment import assign_particles
@@ -61,8 +61,7 @@ class InitialCloud:
 
 def describe_start(given: Given, mirror: Mirror | None = None) -> InitialCloud:
     """Return how a scenario, or a mirror image of it, starts."""
-    score_grid = given.size.task.score_grid
-    grid = Grid(score_grid.cells, Placement(score_grid.placement))
+    grid = given.size.field_grid
     position = given.last
     velocity = given.step
     if mirror is not None:
@@ -138,9 +137,8 @@ def _carry(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
     before = mirror.positions(_frame(file, frames[0] - 1))
     for frame in frames:
         after = mirror.positions(_frame(file, frame))
-        points, velocities = with_wall_images(
-            given, before, after - before, walls[frame]
-        )
+        step = given.box.displacement(before, after)  # [length/frame]
+        points, velocities = with_wall_images(given, before, step, walls[frame])
         field = linear_field(points, velocities)
         position = given.inside(position + field(position))
         before = after

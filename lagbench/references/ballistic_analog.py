@@ -83,9 +83,15 @@ def _chosen() -> Mapping[str, Mapping[str, int]]:
 
 
 def choice_for(size: Size) -> Choice:
-    """Return what was chosen for a data set; the default for those of a user."""
-    key = f"{size.split}-{size.name}-v{size.major}"
-    return Choice(**_chosen().get(key, {}))
+    """Return what was chosen for a data set, or for size mini of its split.
+
+    Data sets of a user have the default.
+    """
+    for name in (size.name, "mini"):
+        chosen = _chosen().get(f"{size.split}-{name}-v{size.major}")
+        if chosen is not None:
+            return Choice(**chosen)
+    return Choice()
 
 
 def label_bodies(position: Floats, radius: float) -> NDArray[np.intp]:
@@ -123,8 +129,8 @@ def frames_of_flight(given: Given) -> int:
     """Return how many frames on the bodies still fly freely, at most the horizon."""
     radius = given.size.task.radius
     body = label_bodies(given.last, radius)
-    low = np.asarray(given.box.low) + 1e-9
-    high = np.asarray(given.box.high) - 1e-9
+    low = given.box.lower_walls + 1e-9
+    high = given.box.upper_walls - 1e-9
     for frames_on in range(1, len(given.predicted_frames)):
         position = ballistic_positions(given, frames_on)
         on_wall = ((position <= low) | (position >= high)).any(axis=1)
@@ -196,7 +202,8 @@ def _analogs_of(
         previous = given.last
     elif flown > 1:
         previous = ballistic_positions(given, flown - 1)
-    feature = describe_state(position, position - previous, given.material)
+    velocity = given.box.displacement(previous, position)  # [length/frame]
+    feature = describe_state(position, velocity, given.material)
     states = library.nearest(feature, count=choice.analogs, without=without)
     followed = []
     for number, state in enumerate(states):
@@ -211,7 +218,7 @@ def _analogs_of(
         )
         stop = frame + 1 + len(given.predicted_frames)
         paths = mirror.positions(motion.position[frame:stop, partner])
-        offset = position[members] - paths[0]
+        offset = given.box.displacement(paths[0], position[members])
         followed.append(FollowedAnalog(members, paths, offset))
     return followed
 

@@ -96,7 +96,7 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
     carriers = spread_subset(position, given.material, count)
     others = np.setdiff1d(np.arange(len(position)), carriers)
     leader = _leaders(given, carriers, others)
-    offset = position[others] - position[carriers][leader]
+    offset = given.box.displacement(position[carriers][leader], position[others])
     before = position[carriers]
     solver = _solver(replace(solver_constants(coarse), particles=count))
     solver.load([_state(given, carriers)])
@@ -105,7 +105,10 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
         after = solver.position()[0].astype(np.float64)
         if fills_box(given.size) and others.size:
             points, velocities = with_wall_images(
-                given, before, after - before, given.walls[frame]
+                given,
+                before,
+                given.box.displacement(before, after),
+                given.walls[frame],
             )
             field = linear_field(points, velocities)
             position[others] += field(position[others])
@@ -156,9 +159,8 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
     interval = given.size.frame_interval
     count = len(carriers)
     if fills_box(given.size):
-        velocity = (
-            1.5 * given.step - 0.5 * (given.position[-2] - given.position[-3])
-        ) / interval
+        step_before = given.box.displacement(given.position[-3], given.position[-2])
+        velocity = (1.5 * given.step - 0.5 * step_before) / interval
     else:
         velocity = given.step / interval + [
             0.0,
@@ -208,8 +210,8 @@ def _describe(name: str, times: int, share: str) -> ReferencePredictor:
         title=f"Coarse solver, {share} of the cells",
         kind=Kind.CLASSICAL,
         definition=f"The solver itself on a grid with {share} of the cells along each"
-        " axis, with its time step: it knows the equations, the materials and what"
-        " drives the flow.",
+        " axis, with the longer time step of that grid: it knows the equations, the"
+        " materials and what drives the flow.",
         applies=has_grid,
         predict=predict_scenario,
     )

@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lagbench.data.box import Box
+
 from .predictor import (
     Floats,
     Given,
@@ -25,13 +27,15 @@ from .predictor import (
 )
 
 
-def decay(position: Floats) -> float:
+def decay(position: Floats, box: Box) -> float:
     """Return the factor on the speed from frame to frame, fitted to given frames [1].
 
     Args:
         position: the given frames [length], shape [frame, particle, 2].
+        box: box that holds the particles.
     """
-    speed = np.sqrt(np.mean(np.diff(position, axis=0) ** 2, axis=(1, 2)))
+    steps = box.displacement(position[:-1], position[1:])
+    speed = np.sqrt(np.mean(steps**2, axis=(1, 2)))
     if len(speed) < 2 or not speed.all():
         return 1.0
     slope = np.polyfit(np.arange(len(speed)), np.log(speed), 1)[0]
@@ -40,14 +44,13 @@ def decay(position: Floats) -> float:
 
 def predict(given: Given) -> Prediction:
     """Yield positions that the last given field carries."""
-    middle = (given.position[-1] + given.position[-2]) / 2.0
     wall = given.walls[given.size.task.input_frames - 1]
-    field = linear_field(*with_wall_images(given, middle, given.step, wall))
+    field = linear_field(*with_wall_images(given, given.middle, given.step, wall))
     factor = 1.0
     if given.driven:
         rate = 1.0
     else:
-        rate = decay(given.position)
+        rate = decay(given.position, given.box)
     now = given.last
     for _ in given.predicted_frames:
         factor *= rate

@@ -67,7 +67,7 @@ class Given:
     @cached_property
     def box(self) -> Box:
         """The box that holds the particles."""
-        return Box.from_bounds(self.size.bounds)
+        return self.size.box
 
     @property
     def last(self) -> Floats:
@@ -78,6 +78,16 @@ class Given:
     def step(self) -> Floats:
         """Last given velocity [length/frame], shape [particle, 2]."""
         return self.box.displacement(self.position[-2], self.position[-1])
+
+    @property
+    def middle(self) -> Floats:
+        """Positions half a frame before the last given one, [particle, 2] [length].
+
+        There the particles have the velocity :attr:`step`.
+        """
+        if self.box.is_periodic:
+            return self.box.wrap(self.last - self.step / 2.0)
+        return np.asarray((self.position[-1] + self.position[-2]) / 2.0)
 
     @property
     def fall(self) -> Floats:
@@ -192,6 +202,8 @@ def with_wall_images(
 ) -> tuple[Floats, Floats]:
     """Return points and velocities together with their images behind the walls.
 
+    Along a periodic axis the images are those of the neighbouring periods.
+
     Args:
         given: what is given of the scenario: its box, and whether walls move.
         points: points in the box [length], shape [point, 2].
@@ -209,6 +221,13 @@ def with_wall_images(
         near = np.abs(points[:, axis] - wall_place) < depth
         image = points[near].copy()
         speed = values[near].copy()
+        if box.periodic[axis]:
+            # The lower end repeats beyond the upper one, and the other way round.
+            period = box.lengths[axis]
+            image[:, axis] += -period if side else period
+            places.append(image)
+            speeds.append(speed)
+            continue
         image[:, axis] = 2.0 * wall_place - image[:, axis]
         if given.driven:
             speed = 2.0 * motion - speed

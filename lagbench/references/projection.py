@@ -43,9 +43,8 @@ def predict(given: Given, resolution: float) -> Prediction:
         no_slip=given.driven,
     )
     first = given.predicted_frames[0]
-    middle = (given.position[-1] + given.position[-2]) / 2.0
     field = grid.from_particles(
-        middle, given.step / interval, wall_velocity=walls[first - 1]
+        given.middle, given.step / interval, wall_velocity=walls[first - 1]
     )
     field = grid.advance(
         field,

@@ -1,11 +1,11 @@
-"""Scores of reference predictors, measured once per data set, shipped with the package.
+"""Scores of the reference predictors, measured once per data set and shipped.
 
 ``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value
-of every metric per scenario. For metrics with a value per frame it has the mean over
-scenarios too: at the reported frames, and for the metrics in :data:`CURVES` at all
-frames (of long rollouts at a hundred, linear between). Numbers have five significant
-digits, means at frames four, curves three. The file also has what a frame costs the
-reference predictors and the solver itself on the machine that measured.
+of every metric per scenario. For metrics that have a value at each frame it has the
+mean over scenarios: at the reported frames, and for the metrics in :data:`CURVES` at
+all frames (of long rollouts at a hundred, linear between). Scores have five significant
+digits, means at frames four, curves three. Beside them stands what a frame costs each
+predictor and the solver itself, timed in one run on one machine.
 """
 
 from __future__ import annotations
@@ -51,89 +51,89 @@ CURVES = (
 )
 """Metrics of which reports and boards draw curves."""
 
-KNOTS = 100  # most frames of a curve
-
 DIGITS = 5
 FRAME_DIGITS = 4
 CURVE_DIGITS = 3
 COST_DIGITS = 3
 
+MOST_KNOTS = 100
+"""Frames at which a curve is kept, at most."""
+
+REPORTED_CORRELATION = 54
+"""Frame whose correlation of vorticity is shipped; in shorter tasks the last one."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceScores:
-    """Scores of a reference predictor on one split and size."""
+    """Scores and cost of a reference predictor on one split and size."""
 
-    name: str  # name of the reference predictor
+    name: str  # name of the predictor
     # scores by metric; per_frame has one row, the mean over scenarios, NaN where it is
     # not kept
     scores: Mapping[str, Score]
-    # CPU time to predict a frame on the machine that measured [s], which is no score
+    # processor time to predict a frame, on the machine that timed all of them [s]
     seconds_per_frame: float
     # of vorticity at frame 54 [1], NaN where undefined, shape [scenario]
     correlation: NDArray[np.float64]
 
 
 def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
-    """Return the correlation of vorticity at frame 54, or the last one, shape
-    [scenario].
-    """
+    """Return the correlation of vorticity at frame 54 or the last one, [scenario]."""
     pearson = scores["vorticity_pearson"]
-    return pearson.at(min(54, pearson.frames[-1]))
+    return pearson.at(min(REPORTED_CORRELATION, pearson.frames[-1]))
 
 
 def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
-    """Return the file with the shipped scores of a split and size."""
+    """Return the file with the scores of the references of a split and size."""
     return folder / f"{size.split}-{size.name}.json"
 
 
 def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, ReferenceScores] | None:
-    """Return the scores of the reference predictors of a split and size, by name.
+    """Return the scores of the references of a split and size, by name.
 
     None where none were measured on the data set that the registry describes.
     """
     content = _read(size, folder)
     if content is None:
         return None
-
     references = {}
-    for name, reference in content["floors"].items():
+    for name, record in content["floors"].items():
         references[name] = ReferenceScores(
             name=name,
-            scores=_scores_from_json(reference, content),
-            seconds_per_frame=reference["seconds_per_frame"],
-            correlation=_floats(reference["correlation"]),
+            scores=_scores_in(record, content),
+            seconds_per_frame=record["seconds_per_frame"],
+            correlation=_to_array(record["correlation"]),
         )
     return references
 
 
-def _scores_from_json(
-    reference: Mapping[str, Any], content: Mapping[str, Any]
+def _scores_in(
+    record: Mapping[str, Any], content: Mapping[str, Any]
 ) -> dict[str, Score]:
-    """Return the scores of a reference predictor; content is that of the whole file."""
+    """Return the scores in the record of a predictor, by metric."""
     first, last = content["frames"]
     frames = range(first, last + 1)
     scenarios = tuple(content["scenarios"])
     reported = [frames.index(frame) for frame in content["reported_frames"]]
-    always_defined = [0] * len(scenarios)
-
     metrics = available()
     scores = {}
-    for name, values in reference["values"].items():
+    for name, values in record["values"].items():
         if name not in metrics:
             continue  # of a package that is not installed here
         per_frame = np.full((1, len(frames)), np.nan)
-        if name in reference["curves"]:
-            curve = _floats(reference["curves"][name])
+        if name in record["curves"]:
+            curve = _to_array(record["curves"][name])
             per_frame[0] = np.interp(frames, _knots(frames), curve)
-        if name in reference["at"]:
-            per_frame[0, reported] = _floats(reference["at"][name])
+        if name in record["at"]:
+            per_frame[0, reported] = _to_array(record["at"][name])
+        undefined = record["undefined"].get(name, [0] * len(scenarios))
         scores[name] = Score(
             metrics[name],
             scenarios,
             tuple(frames),
             per_frame,
-            _floats(values),
-            tuple(reference["undefined"].get(name, always_defined)),
+            _to_array(values),
+            tuple(undefined),
         )
     return scores
 
@@ -141,7 +141,7 @@ def _scores_from_json(
 def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
     """Return the processor time of a frame of the solver itself [s].
 
-    It was measured on the machine that measured the reference predictors.
+    It was timed where the references were timed; None where it was not.
     """
     content = _read(size, folder)
     if content is None:
@@ -150,13 +150,13 @@ def solver_seconds(size: Size, folder: Path = FOLDER) -> float | None:
 
 
 def _read(size: Size, folder: Path) -> dict[str, Any] | None:
-    """Return the content of the file of a data set; None without one that fits it."""
+    """Return the content of a file; None where it is of other data, or not there."""
     path = shipped_path(size, folder)
     if size.measured is None or not path.is_file():
         return None
     content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    has_format = content["lagbench_floors"] == FORMAT
-    if has_format and content["dataset_sha256"] == size.measured.dataset_sha256:
+    is_current = content["dataset_sha256"] == size.measured.dataset_sha256
+    if content["lagbench_floors"] == FORMAT and is_current:
         return content
     return None
 
@@ -172,12 +172,12 @@ def _require(size: Size, folder: Path) -> dict[str, Any]:
 
 
 def _knots(frames: Sequence[int]) -> NDArray[np.intp]:
-    """Return the frames at which the file has a curve, first and last included."""
-    count = min(len(frames), KNOTS)
+    """Return the frames at which a curve is kept, first and last included."""
+    count = min(len(frames), MOST_KNOTS)
     return np.rint(np.linspace(frames[0], frames[-1], count)).astype(np.intp)
 
 
-def _floats(values: Sequence[float | None]) -> NDArray[np.float64]:
+def _to_array(values: Sequence[float | None]) -> NDArray[np.float64]:
     return np.array([math.nan if value is None else value for value in values])
 
 
@@ -190,50 +190,76 @@ def write_shipped(
     folder: Path = FOLDER,
     partial: bool = False,
 ) -> Path:
-    """Write the scores of a data set: equal bytes for equal scores and costs.
+    """Write the scores of the references of a data set.
 
-    With ``partial`` the other reference predictors stay as they are, and so do all
-    costs, which compare only within one run on one machine.
+    Equal scores and costs give equal bytes.
+
+    Args:
+        size: the split and size.
+        references: scores by name.
+        dataset_sha256: hash of the data set.
+        reported: frames at which the scorer reports.
+        folder: folder of shipped scores.
+        partial: whether the other references stay as they are, and so do all costs,
+            which compare only within one run on one machine.
+
+    Raises:
+        DataError: with ``partial``, where nothing was measured on this data set.
     """
-    entries = {}
+    any_reference = next(iter(references.values()))
+    any_score = next(iter(any_reference.scores.values()))
+    records = {}
     for name, reference in references.items():
-        entries[name] = _reference_as_json(reference, reported)
-
+        records[name] = _record_of(reference, reported)
     costs: dict[str, Any] = {}
     if partial:
-        earlier = _require(size, folder)
-        earlier_entries = earlier["floors"]
-        for name in entries.keys() & earlier_entries.keys():
-            seconds = earlier_entries[name]["seconds_per_frame"]
-            entries[name]["seconds_per_frame"] = seconds
-        entries = {**earlier_entries, **entries}
-        if "solver_seconds_per_frame" in earlier:
-            seconds = earlier["solver_seconds_per_frame"]
-            costs["solver_seconds_per_frame"] = seconds
-
-    first_reference = next(iter(references.values()))
-    first_score = next(iter(first_reference.scores.values()))
+        before = _require(size, folder)
+        for name in records.keys() & before["floors"].keys():
+            cost = before["floors"][name]["seconds_per_frame"]
+            records[name]["seconds_per_frame"] = cost
+        records = {**before["floors"], **records}
+        if "solver_seconds_per_frame" in before:
+            cost = before["solver_seconds_per_frame"]
+            costs["solver_seconds_per_frame"] = cost
     content = {
         "lagbench_floors": FORMAT,
         "split": size.split,
         "size": size.name,
         "dataset_version": size.version,
         "dataset_sha256": dataset_sha256,
-        "scenarios": list(first_score.scenarios),
-        "frames": [first_score.frames[0], first_score.frames[-1]],
+        "scenarios": list(any_score.scenarios),
+        "frames": [any_score.frames[0], any_score.frames[-1]],
         "reported_frames": list(reported),
         **costs,
-        "floors": entries,
+        "floors": records,
     }
     return _write(size, content, folder)
 
 
-def write_solver_seconds(size: Size, seconds: float, folder: Path = FOLDER) -> Path:
-    """Add the processor time of a frame of the solver itself to a file [s]."""
+def write_costs(
+    size: Size,
+    seconds: Mapping[str, float],
+    *,
+    solver: float,
+    folder: Path = FOLDER,
+) -> Path:
+    """Write what a frame costs each reference and the solver itself, timed in one run.
+
+    Args:
+        size: the split and size.
+        seconds: processor time of a frame by name of the reference [s].
+        solver: processor time of a frame of the solver itself [s].
+        folder: folder of shipped scores.
+
+    Raises:
+        DataError: nothing was measured on this data set.
+    """
     content = _require(size, folder)
-    entries = content.pop("floors")
-    content["solver_seconds_per_frame"] = _number(seconds, COST_DIGITS)
-    content["floors"] = entries
+    references = content.pop("floors")
+    for name, value in seconds.items():
+        references[name]["seconds_per_frame"] = _round(value, COST_DIGITS)
+    content["solver_seconds_per_frame"] = _round(solver, COST_DIGITS)
+    content["floors"] = references
     return _write(size, content, folder)
 
 
@@ -243,64 +269,57 @@ def _write(size: Size, content: Mapping[str, Any], folder: Path) -> Path:
     return path
 
 
-def _reference_as_json(
-    reference: ReferenceScores, reported: Sequence[int]
-) -> dict[str, Any]:
+def _record_of(reference: ReferenceScores, reported: Sequence[int]) -> dict[str, Any]:
+    """Return the scores and the cost of a reference as the file holds them."""
     values = {}
     undefined = {}
-    at = {}
+    means_at_frames = {}
+    curves = {}
     for name, score in reference.scores.items():
-        values[name] = _numbers(score.values, DIGITS)
+        values[name] = _round_all(score.values.tolist(), DIGITS)
         if any(score.undefined):
             undefined[name] = list(score.undefined)
-        if score.metric.per_frame:
-            at[name] = _means_at(score, reported, FRAME_DIGITS)
-
-    curves = {}
+        if not score.metric.per_frame:
+            continue
+        means = [_finite_mean(score.at(frame)) for frame in reported]
+        means_at_frames[name] = _round_all(means, FRAME_DIGITS)
     for name in CURVES:
-        score_of_curve = reference.scores.get(name)
-        if score_of_curve is not None and score_of_curve.metric.per_frame:
-            knots = _knots(score_of_curve.frames).tolist()
-            curves[name] = _means_at(score_of_curve, knots, CURVE_DIGITS)
+        if name in means_at_frames:
+            score = reference.scores[name]
+            knots = _knots(score.frames).tolist()
+            curve = [_finite_mean(score.at(frame)) for frame in knots]
+            curves[name] = _round_all(curve, CURVE_DIGITS)
+    correlation = reference.correlation.tolist()
     return {
-        "seconds_per_frame": _number(reference.seconds_per_frame, COST_DIGITS),
-        "correlation": _numbers(reference.correlation, FRAME_DIGITS),
+        "seconds_per_frame": _round(reference.seconds_per_frame, COST_DIGITS),
+        "correlation": _round_all(correlation, FRAME_DIGITS),
         "values": values,
         "undefined": undefined,
-        "at": at,
+        "at": means_at_frames,
         "curves": curves,
     }
 
 
-def _means_at(score: Score, frames: Sequence[int], digits: int) -> list[float | None]:
-    """Return the means over the scenarios that have a value, at some frames."""
-    means = []
-    for frame in frames:
-        values = score.at(frame)
-        means.append(_number(mean(values[np.isfinite(values)]), digits))
-    return means
+def _finite_mean(values: NDArray[np.float64]) -> float:
+    return mean(values[np.isfinite(values)])
 
 
-def _numbers(values: NDArray[np.float64], digits: int) -> list[float | None]:
-    return [_number(value, digits) for value in values.tolist()]
+def _round_all(values: Sequence[float], digits: int) -> list[float | None]:
+    return [_round(value, digits) for value in values]
 
 
-def _number(value: float, digits: int) -> float | None:
+def _round(value: float, digits: int) -> float | None:
     if math.isfinite(value):
         return round_digits(value, digits)
     return None
 
 
 def _format(value: object, depth: int = 0) -> str:
-    """Return JSON with each entry of a mapping in its own line.
-
-    A comparison of two versions then shows which entry changed.
-    """
+    """Return JSON with one line per entry of a mapping, for readable changes."""
     if not isinstance(value, dict) or not value:
         return json.dumps(value, allow_nan=False, separators=(",", ":"))
-    indent = " " * (depth + 1)
-    entries = []
+    lines = []
     for key, member in value.items():
-        entries.append(f"{indent}{json.dumps(key)}: {_format(member, depth + 1)}")
-    body = ",\n".join(entries)
-    return f"{{\n{body}\n{' ' * depth}}}"
+        indent = " " * (depth + 1)
+        lines.append(f"{indent}{json.dumps(key)}: {_format(member, depth + 1)}")
+    return "{\n" + ",\n".join(lines) + f"\n{' ' * depth}}}"

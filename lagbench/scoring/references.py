@@ -31,6 +31,9 @@ from lagbench.work.run import run_all
 from .scenario import measure_rows, predict_reference
 from .task import ScoredTask, load_scored_task
 
+TIMED_SCENARIOS = 2
+"""Test scenarios on which the references are timed."""
+
 TOLERANCE = 1e-4
 """Relative difference of equal values: libraries round differently."""
 
@@ -164,6 +167,23 @@ def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
     if job.saved is not None:
         _save(result, job.saved)
     return result
+
+
+def time_references(size: Size, root: Path) -> dict[str, float]:
+    """Return the processor time of a frame by name of the reference [s].
+
+    The median over the frames of the first test scenarios, one core, no scoring.
+    """
+    task = load_scored_task(size, root)
+    seconds: dict[str, list[float]] = {}
+    for scenario in task.scenarios[:TIMED_SCENARIOS]:
+        with task.opened(scenario) as truth:
+            given = given_in(truth.file, size, root)
+        for reference in references_of(size):
+            times = seconds.setdefault(reference.name, [])
+            for _ in _time_frames(predict_reference(reference, given), times):
+                pass
+    return {name: float(np.median(times)) for name, times in seconds.items()}
 
 
 def _time_frames(

@@ -54,7 +54,7 @@ class PreviewRecorder:
         particles = _spaced(range(len(scenario.material)), PARTICLES)
 
         maps = (2, len(map_frames))
-        nodes = (config.grid.nodes, config.grid.nodes)
+        nodes = config.grid.shape
         film = (2, len(film_frames), len(particles), 2)
         nan = np.float32(np.nan)
         self.preview = Preview(

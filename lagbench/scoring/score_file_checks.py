@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
-from lagbench.data.grid import Grid, Placement
 from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import Size
 from lagbench.data.structure import Structure, check_structure
@@ -184,9 +183,9 @@ def _check_shapes(preview: Preview) -> None:
     map_count = len(preview.map_frames)
     film_count = len(preview.film_frames)
     particle_count = len(preview.particles)
-    nodes = preview.vorticity.shape[-1]
+    nodes = preview.vorticity.shape[2:4]
     shapes = {
-        "vorticity": (preview.vorticity.shape, (2, map_count, nodes, nodes)),
+        "vorticity": (preview.vorticity.shape, (2, map_count, *nodes)),
         "histogram": (preview.histogram.shape, (2, map_count, BINS)),
         "histogram_range": (preview.histogram_range.shape, (map_count, 2)),
         "material": (preview.material.shape, (particle_count,)),
@@ -218,9 +217,7 @@ def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> N
     if scores.ranking != ranking_metric(size) or preview.scenario != ids[0]:
         raise ValueError("another ranking metric or another pictured scenario")
 
-    score_grid = size.task.score_grid
-    nodes = Grid(score_grid.cells, Placement(score_grid.placement)).nodes
-    has_other_grid = preview.vorticity.shape[-1] != nodes
+    has_other_grid = preview.vorticity.shape[2:] != size.field_grid.shape
     if has_other_grid or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
     film_frames = preview.film_frames

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data import MATERIALS
-from lagbench.data.grid import Grid, Placement
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import Manifest, read_manifest
 from lagbench.data.registry import Size
@@ -128,14 +127,13 @@ def load_scored_task(
 
     task = size.task
     config = TaskConfig(
-        grid=Grid(task.score_grid.cells, Placement(task.score_grid.placement)),
+        grid=size.field_grid,
         input_frames=task.input_frames,
         horizon=task.horizon,
         frames_of_interest=task.frames_of_interest,
         attribute_std=_attribute_std(size, root, statistics),
         radius=task.radius,
         materials=tuple(name for name in MATERIALS if name in present),
-        bounds=size.bounds,
     )
     return ScoredTask(
         truth=truth,
@@ -178,21 +176,21 @@ def _materials(truth: Truth, scenario: int) -> set[str]:
 
 def _attribute_std(
     size: Size, root: Path, statistics: Mapping[str, tuple[float, ...]]
-) -> tuple[float, float, float, float]:
-    """Return the standard deviations of x, y, u, v over train."""
-    try:
-        x, y = statistics["position_std"]
-        u, v = statistics["velocity_std"]
-    except (KeyError, ValueError):
+) -> tuple[float, ...]:
+    """Return the standard deviations of position and velocity components over train."""
+    dimension = size.box.dimension
+    position_std = statistics.get("position_std", ())
+    velocity_std = statistics.get("velocity_std", ())
+    if len(position_std) != dimension or len(velocity_std) != dimension:
         raise DataError(
             "the statistics of train are not recorded",
             where=f"datasets.yaml, and the manifest of {size.split} {size.name} "
             f"in {root}",
-            expected="position_std and velocity_std, two numbers each",
+            expected=f"position_std and velocity_std, {dimension} numbers each",
             got=", ".join(statistics) or "nothing",
             fix=suggest_repair(size, root=root),
-        ) from None
-    return x, y, u, v
+        )
+    return (*position_std, *velocity_std)
 
 
 def _predictability_limit(

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import AXES, Box
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
 
@@ -22,8 +23,6 @@ MAX_DISTANCE = 10.0
 
 FILL = np.float32(9.969209968386869e36)
 """What netCDF puts where a float32 was never written."""
-
-AXES = "xy"
 
 Block = NDArray[np.float32]
 """Consecutive frames of positions [length], shape [frame, particle, space]."""
@@ -61,21 +60,23 @@ class ScenarioScan:
     def add(self, first: int, block: Block, size: Size) -> None:
         """Take in consecutive frames, the first of which has the number ``first``."""
         block = self._mask_bad_values(first, block)
-        self._add_places(first, block, size)
+        box = size.box
+        self._add_places(first, block, box=box, cell=1.0 / size.grid)
         if self._last_frame is None:
             self._first_frame = (first, block[:1].copy())
             self.last_moving_frame = first
-            self._add_steps(first + 1, block)
+            self._add_steps(first + 1, block, box)
         else:
-            self._add_steps(first, np.concatenate([self._last_frame, block]))
+            frames = np.concatenate([self._last_frame, block])
+            self._add_steps(first, frames, box)
         self._last_frame = block[-1:].copy()
 
-    def add_given_frame(self, position: NDArray[np.floating]) -> None:
+    def add_given_frame(self, position: NDArray[np.floating], box: Box) -> None:
         """Take in the step from the last given frame to the first predicted one."""
         if self._first_frame is None:
             return
         first, predicted = self._first_frame
-        self._add_jumps(first, np.concatenate([position[None], predicted]))
+        self._add_jumps(first, np.concatenate([position[None], predicted]), box)
 
     def _mask_bad_values(self, first: int, block: Block) -> Block:
         """Return the block with NaN where values are not finite or never written."""
@@ -95,15 +96,13 @@ class ScenarioScan:
         self.unwritten_values += int(np.count_nonzero(is_unwritten))
         return np.where(is_bad, np.float32(np.nan), block)
 
-    def _add_places(self, first: int, block: Block, size: Size) -> None:
+    def _add_places(self, first: int, block: Block, *, box: Box, cell: float) -> None:
         self.position_count += block[..., 0].size
-        cell = 1.0 / size.grid
-        low, high = np.array(size.bounds, np.float64).T
-        if is_inside(block, low=low, high=high, slack=cell):
+        if is_inside(block, box, slack=cell):
             return  # nearly always, and 20 times as fast
 
         # distance outside the box along an axis, shape [frame, particle]
-        beyond = np.fmax(low - block, block - high).max(axis=-1)
+        beyond = np.fmax(box.lower_walls - block, block - box.upper_walls).max(axis=-1)
         is_outside = beyond > cell
         if not is_outside.any():
             return
@@ -112,27 +111,28 @@ class ScenarioScan:
             self.first_outside = (first + frame, particle)
         self.outside_box += int(np.count_nonzero(is_outside))
         self.farthest = max(self.farthest, float(beyond[is_outside].max()))
-        is_outside_grid = ((block < 0) | (block > 1)).any(axis=-1)
+        places = box.wrap(block)
+        is_outside_grid = ((places < 0) | (places > 1)).any(axis=-1)
         self.outside_grid += int(np.count_nonzero(is_outside_grid))
         if self.first_lost is None and self.farthest > MAX_DISTANCE:
             frame, particle = first_index(beyond > MAX_DISTANCE)
             self.first_lost = (first + frame, particle)
 
-    def _add_steps(self, first: int, frames: Block) -> None:
+    def _add_steps(self, first: int, frames: Block, box: Box) -> None:
         """Take in steps; the first of them leads to the frame ``first``."""
         has_moved = (frames[1:] != frames[:-1]).any(axis=(1, 2))
         moved_steps = np.flatnonzero(has_moved)
         if moved_steps.size:
             self.last_moving_frame = first + int(moved_steps[-1])
-        self._add_jumps(first, frames)
+        self._add_jumps(first, frames, box)
 
-    def _add_jumps(self, first: int, frames: NDArray[np.floating]) -> None:
+    def _add_jumps(self, first: int, frames: NDArray[np.floating], box: Box) -> None:
         """Take in steps; the first of them leads to the frame ``first``."""
         before = frames[0].astype(np.float64)
         # A frame fits the cache of a processor, a block does not.
         for step, frame in enumerate(frames[1:]):
             after = frame.astype(np.float64)
-            squares = squared_lengths(after - before)
+            squares = squared_lengths(box.displacement(before, after))
             before = after
             if np.isnan(squares.max()):
                 squares = np.nan_to_num(squares)
@@ -147,14 +147,13 @@ def first_index(mask: NDArray[np.bool_]) -> tuple[int, ...]:
     return tuple(int(places[0]) for places in np.nonzero(mask))
 
 
-def is_inside(
-    block: Block, *, low: NDArray[np.float64], high: NDArray[np.float64], slack: float
-) -> bool:
-    """Return whether no position lies more than a slack [length] outside the box.
+def is_inside(block: Block, box: Box, *, slack: float) -> bool:
+    """Return whether no position lies more than a slack [length] beyond a wall.
 
     NaN is not inside.
     """
-    for axis, (lowest, highest) in enumerate(zip(low, high, strict=True)):
+    walls = zip(box.lower_walls, box.upper_walls, strict=True)
+    for axis, (lowest, highest) in enumerate(walls):
         values = block[..., axis]
         beyond_low = lowest - values.min()
         beyond_high = values.max() - highest
@@ -278,8 +277,7 @@ def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) 
         f"{share:.2%} of the positions lie outside the box",
         where=f"first in scenario {outside_scans[0].scenario}, frame {frame}, "
         f"particle {particle}",
-        expected=f"x in {size.bounds[0]}, y in {size.bounds[1]}, up to a solver "
-        f"cell beyond",
+        expected=f"{format_walls(size.box)}, up to a solver cell beyond",
         got=f"up to {farthest:.3g} outside; {outside_grid} positions are outside the "
         f"unit box and carry no grid weight",
         fix="positions are in lengths of the unit box, the walls' places are the "
@@ -297,7 +295,7 @@ def check_jumps(
     """Flag particles that jump much farther in a frame than any true particle."""
     for scan in scans:
         start = starts[scan.scenario]
-        scan.add_given_frame(start.last_given)
+        scan.add_given_frame(start.last_given, start.box)
         limit = JUMP * largest_true_displacement(
             start, truth=truth, scenario=scan.scenario, enough=scan.jump / JUMP
         )
@@ -318,11 +316,23 @@ def check_jumps(
     issues.complete("max_displacement")
 
 
+def format_walls(box: Box) -> str:
+    """Return the walls of a box for a message.
+
+    >>> format_walls(Box.from_bounds([(0, 1), (0, 2)], periodic=[True, False]))
+    'y in (0.0, 2.0)'
+    """
+    parts = []
+    for axis, is_periodic in enumerate(box.periodic):
+        if not is_periodic:
+            parts.append(f"{AXES[axis]} in {box.bounds[axis]}")
+    return ", ".join(parts)
+
+
 def outside_share(opened: Predictions, size: Size) -> float:
     """Return the share of positions more than a solver cell outside the box."""
-    low, high = np.array(size.bounds).T
-    lowest = low - 1.0 / size.grid
-    highest = high + 1.0 / size.grid
+    lowest = size.box.lower_walls - 1.0 / size.grid
+    highest = size.box.upper_walls + 1.0 / size.grid
     outside_count = 0
     position_count = 0
     for scenario in opened.header.scenarios:

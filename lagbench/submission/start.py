@@ -14,6 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import Box
+
 from .issues import IssueCollector
 from .predictions import Predictions
 from .truth import Truth, squared_steps
@@ -31,6 +33,7 @@ class StartFrames:
     # the last given frame and the true ones after it, [2 or 3, particle, space]
     truth: Positions
     predicted: Positions  # the first predicted frame, [particle, space]
+    box: Box  # that holds the particles
 
     @property
     def last_given(self) -> Positions:
@@ -47,7 +50,7 @@ class StartFrames:
     @cached_property
     def true_displacement(self) -> float:
         """Largest distance that a particle of the truth moves in a frame [length]."""
-        return float(np.sqrt(np.max(squared_steps(self.truth))))
+        return float(np.sqrt(np.max(squared_steps(self.truth, self.box))))
 
     @cached_property
     def jump(self) -> float:
@@ -56,7 +59,8 @@ class StartFrames:
         The root mean square over particles; NaN where a position is no number.
         """
         with np.errstate(all="ignore"):
-            step = self.predicted.astype(np.float64) - self.last_given
+            predicted = self.predicted.astype(np.float64)
+            step = self.box.displacement(self.last_given, predicted)
             mean_square = np.einsum("ij,ij->", step, step) / len(step)
             return float(np.sqrt(mean_square))
 
@@ -69,7 +73,8 @@ def read_starts(predictions: Predictions, truth: Truth) -> dict[int, StartFrames
     starts = {}
     for scenario in scenarios:
         predicted = predictions.frames(scenario, first_frame, 1)[0]
-        starts[scenario] = StartFrames(truth.frames_around_start(scenario), predicted)
+        true_frames = truth.frames_around_start(scenario)
+        starts[scenario] = StartFrames(true_frames, predicted, truth.size.box)
     return starts
 
 

@@ -97,8 +97,8 @@ def check_dataset(
             where=where,
             expected=expected_hash or "64 hex digits",
             got=quote(stored_hash),
-            fix=f"{predict_again}; {verify} --root {quote_root(root)} says whether it is "
-            f"the data set that lies here",
+            fix=f"{predict_again}; {verify} --root {quote_root(root)} says whether it"
+            " is the data set that lies here",
         )
 
 

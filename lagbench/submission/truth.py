@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import Box
 from lagbench.data.layout import quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import (
@@ -144,7 +145,8 @@ class Truth:
 
     def _hint_for_damage(self) -> str:
         verify = f"lagbench verify --split {self.size.split} --size {self.size.name}"
-        return f"{self._hint()}; {verify} --root {quote_root(self.root)} says what is wrong"
+        place = quote_root(self.root)
+        return f"{self._hint()}; {verify} --root {place} says what is wrong"
 
     def open(self, scenario: int) -> ScenarioFile:
         """Open a scenario, and check that it is the one that the registry means.
@@ -221,19 +223,25 @@ class Truth:
             for start in range(0, frame_count - 1, BLOCK):
                 stop = min(start + BLOCK + 1, frame_count)
                 frames = file.read("position", slice(start, stop))
-                largest_square = np.max(squared_steps(frames))
+                largest_square = np.max(squared_steps(frames, self.size.box))
                 largest = max(largest, float(np.sqrt(largest_square)))
                 if largest >= enough:
                     break
         return largest
 
 
-def squared_steps(frames: NDArray[np.floating]) -> NDArray[np.float64]:
+def squared_steps(frames: NDArray[np.floating], box: Box) -> NDArray[np.float64]:
     """Return the squared distances that particles move from frame to frame [length^2].
 
-    The result has shape [frame - 1, particle].
+    Args:
+        frames: positions [length], shape [frame, particle, space].
+        box: box that holds the particles.
+
+    Returns:
+        Shape [frame - 1, particle].
     """
-    return squared_lengths(np.diff(frames.astype(np.float64), axis=0))
+    exact_frames = frames.astype(np.float64)
+    return squared_lengths(box.displacement(exact_frames[:-1], exact_frames[1:]))
 
 
 def squared_lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -244,4 +252,6 @@ def squared_lengths(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     vectors *= vectors
     # ten times as fast as a sum over the axis
     squares: NDArray[np.float64] = vectors[..., 0] + vectors[..., 1]
+    for axis in range(2, vectors.shape[-1]):
+        squares += vectors[..., axis]
     return squares

@@ -193,6 +193,11 @@ class Pool:
     def _list_busy(self) -> list[_Worker]:
         return [worker for worker in self._workers if worker.attempt is not None]
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether no item waits and no worker has one."""
+        return not self._queue and not self._list_busy()
+
     def process_ids(self) -> list[int]:
         """Return the process ids of the living workers."""
         return [worker.process.pid for worker in self._workers]

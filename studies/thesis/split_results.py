@@ -27,10 +27,15 @@ from lagbench.errors import UnreadableFileError
 from lagbench.metrics.aggregate import Score, mean_over_seeds
 from lagbench.metrics.metric import mean
 from lagbench.metrics.table import ranking_metric
-from lagbench.references.shipped import shipped, shipped_path
-from lagbench.references.table import NAIVE, REFERENCES
+from lagbench.references.shipped import shipped, shipped_path, solver_seconds
+from lagbench.references.table import CLASSICAL, NAIVE, REFERENCES
 from lagbench.scoring.score_file import NETCDF_NAME, read_statistics
-from lagbench.scoring.skill import best_reference
+from lagbench.scoring.skill import (
+    AgainstClassical,
+    best_reference,
+    compute_against_classical,
+    seconds_where_measured,
+)
 
 from .roster import ROSTER
 
@@ -387,6 +392,43 @@ class SplitResults:
         score = self.methods[name].scores[self.ranking].mean
         naive_score = self.methods[naive].scores[self.ranking].mean
         return 1.0 - score / naive_score
+
+    def seconds_per_frame(self, name: str) -> float | None:
+        """Return what a frame costs a method where the references were timed [s].
+
+        Entries state the time of our solver on their machine: theirs is scaled by it.
+        """
+        cost = self.methods[name].cost
+        if cost is None:
+            return None
+        if name in REFERENCES:
+            return cost.seconds_per_frame
+        return seconds_where_measured(
+            seconds_per_frame=cost.seconds_per_frame,
+            solver_seconds=cost.solver_seconds_per_frame,
+            solver_seconds_here=solver_seconds(self.size),
+        )
+
+    def against_classical(self, name: str) -> AgainstClassical | None:
+        """Return the score over that of the best classical solver of no greater cost.
+
+        None where a cost is not known, or every classical solver costs more.
+        """
+        seconds = self.seconds_per_frame(name)
+        if seconds is None:
+            return None
+        solvers = {}
+        costs = {}
+        for solver in CLASSICAL.intersection(self.methods):
+            cost = self.seconds_per_frame(solver)
+            if cost is not None and self.ranking in self.methods[solver].scores:
+                solvers[solver] = self.methods[solver].scores[self.ranking]
+                costs[solver] = cost
+        trainings = self.methods[name].trainings
+        seeds = [training.scores[self.ranking] for training in trainings]
+        return compute_against_classical(
+            seeds, solvers, seconds=costs, seconds_per_frame=seconds
+        )
 
     def was_trained(self, name: str) -> bool:
         """Return whether a training of a model is recorded, with scores or without."""

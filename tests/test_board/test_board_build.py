@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import PLACE, BoardBench, copied, master, noisy
+from board_bench import PLACE, BoardBench, copied, master, noisy
 from numpy.typing import NDArray
 
 from lagbench.board.build import (
@@ -211,7 +211,8 @@ def test_residual_histograms(card: ScoreCard) -> None:
         half_bin = greatest / (RESIDUAL_BINS - 1)
         end = greatest + half_bin
         counts, _ = np.histogram(residual, bins=RESIDUAL_BINS, range=(-end, end))
-        assert (histogram.low, histogram.high) == (-greatest, greatest)
+        assert histogram.low == -greatest
+        assert histogram.high == greatest
         assert histogram.shares == pytest.approx(counts / residual.size)
 
 
@@ -295,10 +296,12 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
     folder.
     """
     own.entry("noisy").rename(own.folder / PLACE / "other.yaml")
-    with pytest.raises(ChecksFailedError, match="another place"):
+    with pytest.raises(ChecksFailedError) as caught:
         collect(own.folder, registry=own.registry)
-    with pytest.raises(UsageError, match="no leaderboard here"):
+    assert caught.value.where == "submissions/cavity/tiny/other.yaml"
+    with pytest.raises(UsageError) as caught:
         collect(own.folder / "nothing", registry=own.registry)
+    assert caught.value.where.endswith("leaderboard/nothing")
 
 
 def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:
@@ -331,7 +334,7 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
     for reference in board.tabs[0].references:
         row = rows[reference.name]
         assert row[0] == "-"
-        assert row[-1] == "reference"
+        assert row[-1] == f"{reference.kind} reference"
     damped = rows["damped"]
     assert damped[0] == str(row_of(board, "damped").rank)
     assert " ± " in damped[3]

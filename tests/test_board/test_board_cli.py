@@ -98,9 +98,11 @@ def test_machines_are_answered_in_json(run: Run) -> None:
         return json.loads(run("leaderboard", command, *board, *words, "--json").stdout)
 
     built = told("build")
-    assert (built["rows"], built["tabs"]) == (1, 1)
+    assert built["rows"] == 1
+    assert built["tabs"] == 1
     seen = told("check", "--page")
-    assert (seen["findings"], seen["page_checked"]) == ([], True)
+    assert seen["findings"] == []
+    assert seen["page_checked"]
     again = told("check", "--predictions", "predictions.nc", "--record")
     assert again["recorded"] == [f"submissions/{SPLIT}/{SIZE}/toy-model.yaml"]
     shown = told("show")
@@ -182,7 +184,7 @@ def test_scores_of_earlier_tasks_alone(run: Run, tmp_path: Path) -> None:
     for words in ((), (SPLIT, "--size", SIZE)):
         result = run("leaderboard", "show", *words)
         assert result.exit_code == 0, result.output
-        assert "scores of earlier tasks" in result.output
+        assert "lagbench submit" in result.output
     result = run("leaderboard", "show", "fluid")
     assert result.exit_code == 2
     assert f"{SPLIT} {SIZE}" in result.stderr  # what there is

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from board_worlds import make_board
+from sample_boards import make_board
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app
@@ -85,8 +85,8 @@ def test_dots_stand_where_their_numbers_say(tab: Tab) -> None:
     points = [
         point(0.001, 1.0),
         point(0.01, 0.5),
-        point(0.1, 0.25, "coarse"),
-        point(0.05, 0.9, "floor"),
+        point(0.1, 0.25, "classical"),
+        point(0.05, 0.9, "naive"),
     ]
     svg = ElementTree.fromstring(draw(points, 0.02, "vorticity_nrmse", "title"))
     dots = [element for element in svg.iter() if "dot" in classes_of(element)]

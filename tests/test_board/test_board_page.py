@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from html_check import Element, read_html
 from page_reader import element_text, read_page_data
+from sample_boards import make_board, with_entry
 
 from lagbench.board.columns import columns_of
 from lagbench.board.entry import EntryCost, EntryFlag, Weights
@@ -184,7 +184,7 @@ def test_references_are_judged_like_entries(board: Board) -> None:
     assert view.lines[0].row is reference
     assert view.lines[0].cells[tab.ranking].classes == ("best", "heat0")
     page = render(replace(board, tabs=(changed,)))
-    (first_line,) = re.findall(r"<tbody>(<tr class=\"floor\"[^>]*>)", page)
+    (first_line,) = re.findall(r"<tbody>(<tr class=\"reference\"[^>]*>)", page)
     assert f'data-reference="{reference.name}"' in first_line
 
 

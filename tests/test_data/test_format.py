@@ -299,8 +299,9 @@ def test_missing_foreign_and_impossible_files(
     damaged(written[0], "damaged", "variable 'odd'", check=rehash)
     (tmp_path / "root").mkdir()
     (tmp_path / "root" / "cavity").write_text("in the way")
-    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--root") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         write_scenario(tmp_path / "root", KEY)
+    assert caught.value.where.endswith("root/cavity/tiny/v2/test/0003.nc")
     assert caught.value.exit_code == 5
 
 
@@ -405,13 +406,14 @@ def test_reading_parts(written: tuple[Path, str]) -> None:
             np.concatenate(list(file.blocks("position"))), truth
         )
         assert file.read("particle_mass") == 1e-4 / 8
-        assert (file.header.frames, file.header.particles, file.header.key) == (
-            4,
-            8,
-            KEY,
-        )
-        with pytest.raises(DataError, match="variable 'density'"):
+        assert file.header.frames == 4
+        assert file.header.particles == 8
+        assert file.header.key == KEY
+        with pytest.raises(DataError) as caught:
             file.read("density")
+        assert caught.value.where.endswith(
+            "cavity/tiny/v2/test/0003.nc, variable 'density'"
+        )
 
 
 def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(
@@ -460,8 +462,9 @@ def test_wrong_frames_are_refused(tmp_path: Path) -> None:
     with writer(tmp_path / "c.nc") as file:
         file.append(frame, frame)
         file.append(frame, frame)
-        with pytest.raises(DataError, match="too many values"):
+        with pytest.raises(DataError) as caught:
             file.append(frame, frame)
+        assert caught.value.where == "variable 'position'"
 
 
 @pytest.mark.parametrize(
@@ -477,5 +480,6 @@ def test_parameters_that_cannot_be_stored(
     """Names that would hide an attribute of the format, what netCDF would give back as
     something else.
     """
-    with pytest.raises(DataError, match="cannot be"):
+    with pytest.raises(DataError) as caught:
         write_scenario(tmp_path, KEY, parameters={name: value})
+    assert caught.value.where.endswith("cavity/tiny/v2/test/0003.nc")

@@ -160,11 +160,9 @@ def test_gns_metadata(flows: dict[str, Path]) -> None:
     """
     metadata = read_metadata(flows["gns-npz"])
     assert metadata.keys() == GNS_KEYS
-    assert (metadata["sequence_length"], metadata["dim"], metadata["dt"]) == (
-        26,
-        2,
-        0.1,
-    )
+    assert metadata["sequence_length"] == 26
+    assert metadata["dim"] == 2
+    assert metadata["dt"] == 0.1
     assert metadata["bounds"] == [[0.05, 0.95], [0.05, 0.95]]
     assert metadata["default_connectivity_radius"] == 0.062
 
@@ -177,9 +175,12 @@ def test_lagrangebench_metadata(flows: dict[str, Path]) -> None:
     assert metadata.keys() == H5_KEYS
     assert metadata["dt"] * metadata["write_every"] == pytest.approx(0.1)
     assert metadata["write_every"] == 12
-    assert (metadata["sequence_length_train"], metadata["num_trajs_train"]) == (25, 2)
-    assert (metadata["sequence_length_test"], metadata["num_trajs_test"]) == (25, 2)
-    assert (metadata["num_particles_max"], metadata["free_slip"]) == (506, True)
+    assert metadata["sequence_length_train"] == 25
+    assert metadata["num_trajs_train"] == 2
+    assert metadata["sequence_length_test"] == 25
+    assert metadata["num_trajs_test"] == 2
+    assert metadata["num_particles_max"] == 506
+    assert metadata["free_slip"]
     assert metadata["periodic_boundary_conditions"] == [False, False]
     # The area of the box over the particles is the square of their distance.
     assert metadata["dx"] == pytest.approx(np.sqrt(0.9**2 / 506))
@@ -246,11 +247,9 @@ def test_lagrangebench_layout(flows: dict[str, Path]) -> None:
     with h5py.File(flows["lagrangebench-h5"] / "test.h5") as file:
         assert list(file) == ["00000", "00001"]
         position = file["00000/position"]
-        assert (position.chunks, position.compression, position.shuffle) == (
-            (1, 506, 2),
-            "gzip",
-            True,
-        )
+        assert position.chunks == (1, 506, 2)
+        assert position.compression == "gzip"
+        assert position.shuffle
         assert file["00000/particle_type"].dtype.kind == "i"
     names = {path.name for path in flows["lagrangebench-h5"].iterdir()}
     assert names == {"train.h5", "valid.h5", "test.h5", "metadata.json"}
@@ -286,7 +285,8 @@ def test_unequal_lengths(mixed: LocalSplit, tmp_path: Path) -> None:
     gns = export(str(mixed.folder), format="gns-npz", output=tmp_path / "a")
     h5 = export(str(mixed.folder), format="lagrangebench-h5", output=tmp_path / "b")
     assert [len(run) for run, _ in read_gns(tmp_path / "a" / "train.npz")] == [12, 30]
-    assert (gns.left_out, read_metadata(tmp_path / "a")["sequence_length"]) == (0, 12)
+    assert gns.left_out == 0
+    assert read_metadata(tmp_path / "a")["sequence_length"] == 12
     runs = read_h5(tmp_path / "b" / "train.h5")
     whole = read_gns(tmp_path / "a" / "train.npz")[1][0]
     assert [len(run) for run, _ in runs] == [12, 12, 12]
@@ -328,8 +328,9 @@ def test_the_same_data_give_the_same_bytes(
     assert [path.read_bytes() for path in one.files] == [
         path.read_bytes() for path in two.files
     ]
-    with pytest.raises(UsageError, match="files of that name"):
+    with pytest.raises(UsageError) as caught:
         export(str(mixed.folder), format=form, output=tmp_path / "a")
+    assert caught.value.where.endswith("/a")
     export(
         str(mixed.folder),
         format=form,
@@ -519,13 +520,14 @@ def test_a_program_beside_the_data_is_refused(
 ) -> None:
     """The folder of an export must not hold a force.py: its readers would run it."""
     (tmp_path / "force.py").write_text("raise SystemExit")
-    with pytest.raises(UsageError, match="a program that readers"):
+    with pytest.raises(UsageError) as caught:
         export(
             str(mixed.folder),
             format="lagrangebench-h5",
             output=tmp_path,
             force=True,
         )
+    assert caught.value.where.endswith("force.py")
     assert [path.name for path in tmp_path.iterdir()] == ["force.py"]
 
 
@@ -542,8 +544,9 @@ def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     )
     train = made.folder / "full" / "v1" / "train"
     (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())
-    with pytest.raises(DataError, match="not that of the registry"):
+    with pytest.raises(DataError) as caught:
         export(str(made.folder), format="gns-npz", output=tmp_path / "out")
+    assert caught.value.where.endswith("own/full/v1/train/0000.nc")
     (train / "0000.nc").unlink()
     with pytest.raises(DataError) as caught:
         export(str(made.folder), format="gns-npz", output=tmp_path / "out")

@@ -17,7 +17,7 @@ from typer.testing import Result
 import lagbench
 from lagbench.data.local import locate
 from lagbench.data.registry import Registry
-from lagbench.errors import DataError, UnreadableFileError
+from lagbench.errors import UnreadableFileError
 from lagbench.exchange import export, import_split
 from lagbench.make.generate import GenerationResult
 
@@ -34,8 +34,9 @@ def positions(folder: Path, subset: str = "train") -> np.ndarray:
 def test_an_export_comes_back(
     generated: GenerationResult, unmeasured: Registry, tmp_path: Path, form: str
 ) -> None:
-    """Every subset has the stored bits again, and the task is the one that was
-    exported.
+    """Every subset has the stored bits again, and the task is the exported one.
+
+    Only the effective viscosity, which was fitted to our data, is not in those formats.
     """
     name, _, walls = form.partition(" ")
     options: dict[str, Any] = {
@@ -64,7 +65,9 @@ def test_an_export_comes_back(
             mass = data["particle_mass"].values[0]
     here = locate(str(made.folder)).size
     there = unmeasured.size("curl-noise", "tiny")
-    assert (here.task, here.bounds) == (there.task, there.bounds)
+    expected_task = there.task.model_copy(update={"effective_viscosity": None})
+    assert here.task == expected_task
+    assert here.bounds == there.bounds
     assert here.frame_interval == there.frame_interval
     with lagbench.open_split(str(made.folder)) as data:
         assert data["particle_mass"].values[0] == pytest.approx(mass, rel=1e-12)
@@ -147,8 +150,9 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
     """
     kinds = np.array([0] * 30 + [1] * 6 + [-1] * 4)
     source = write_h5(tmp_path / "in", straight_runs(3), kinds)
-    with pytest.raises(UnreadableFileError, match=r"1 \(solid wall\)"):
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    assert caught.value.where.endswith("in/train.h5, group '00000'")
     named = import_split(
         source,
         format="lagrangebench-h5",
@@ -161,26 +165,29 @@ def test_kinds_without_a_material(tmp_path: Path) -> None:
         output=tmp_path / "b",
         kinds={1: "drop"},
     )
-    assert (named.particles, dropped.particles) == ((36, 36), (30, 30))
+    assert named.particles == (36, 36)
+    assert dropped.particles == (30, 30)
     np.testing.assert_array_equal(
         positions(dropped.folder)[0], straight_runs(3)[0][:, :30]
     )
 
 
-def test_periodic_boxes(tmp_path: Path) -> None:
-    """Periodic data come in where nothing crosses the boundary; a jump of more than
-    half the box is told.
-    """
+def test_a_crossing_of_a_periodic_boundary_is_a_short_step(tmp_path: Path) -> None:
+    """The metadata say that the box is periodic; the split says it too."""
     runs = straight_runs(3)
-    periodic = {"periodic_boundary_conditions": [True, True]}
+    runs[1][4:, 0] = [0.999, 0.5]
+    runs[1][5:, 0] = [0.003, 0.5]
+    periodic = {
+        "periodic_boundary_conditions": [True, True],
+        "bounds": [[0, 1], [0, 1]],
+    }
     source = write_h5(tmp_path / "in", runs, **periodic)
-    import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
-    runs[1][5:, 0, 0] += np.float32(0.42 if runs[1][5, 0, 0] < 0.5 else -0.42)
-    source = write_h5(tmp_path / "in", runs, **periodic)
-    with pytest.raises(
-        DataError, match=r"periodic boundary\n  where: .*valid.h5.*frame 5"
-    ):
-        import_split(source, format="lagrangebench-h5", output=tmp_path / "other")
+    made = import_split(source, format="lagrangebench-h5", output=tmp_path / "own")
+    size = locate(str(made.folder)).size
+    assert size.box.periodic == (True, True)
+    with lagbench.open_split(str(made.folder), subset="valid") as data:
+        velocity = np.asarray(data["velocity"].values)[0, 5, 0]  # [length/s]
+    assert velocity[0] * size.frame_interval == pytest.approx(0.004, rel=1e-3)
 
 
 def test_what_the_user_says_goes_before_the_metadata(
@@ -216,7 +223,9 @@ def test_what_the_user_says_goes_before_the_metadata(
     done = run(*arguments, *options)
     assert done.exit_code == 0, done.output
     size = locate(str(tmp_path / "own")).size
-    assert (size.task.radius, size.task.input_frames, size.task.horizon) == (0.1, 2, 4)
+    assert size.task.radius == 0.1
+    assert size.task.input_frames == 2
+    assert size.task.horizon == 4
     assert size.task.score_grid.placement == "cell_centres"
     assert size.value("spacing") == 0.05
 
@@ -225,6 +234,6 @@ def test_the_other_format_is_recognised(tmp_path: Path) -> None:
     """Where the files are those of the other format, the message names it."""
     for subset in SUBSETS:
         (tmp_path / f"{subset}.h5").touch()
-    with pytest.raises(UnreadableFileError, match=r"no train\.npz") as caught:
+    with pytest.raises(UnreadableFileError) as caught:
         import_split(tmp_path, format="gns-npz", output=tmp_path / "own")
     assert "--format lagrangebench-h5" in str(caught.value)

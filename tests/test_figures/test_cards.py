@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import PAINT
+from conftest import PAINT_PICTURES
 from hypothesis import given
 from hypothesis import strategies as st
 from rotating_disc import write_swirl
@@ -88,7 +88,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     size, manifest = make(root)
     assert manifest.complete
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(painting, "paint_pictures", PAINT)
+        patch.setattr(painting, "paint_pictures", PAINT_PICTURES)
         written = write(root, size, manifest)
     folder = dataset_folder(root, "cavity", "tiny", 2)
     names = {p.relative_to(folder).as_posix() for p in written}

@@ -43,10 +43,8 @@ def test_arrays_are_exact_and_inside(split: str, size: str) -> None:
     for state in all_of(split, size)[:12]:
         assert state.position.shape == state.velocity.shape == (entry.particles, 2)
         assert state.affine.shape == (entry.particles, 2, 2)
-        assert (state.material.shape, state.material.dtype) == (
-            (entry.particles,),
-            np.int8,
-        )
+        assert state.material.shape == (entry.particles,)
+        assert state.material.dtype == np.int8
         for values in (
             state.position,
             state.velocity,
@@ -78,7 +76,8 @@ def test_kinds_are_spread_evenly_over_test(split: str, kind: str, size: str) -> 
     """
     entry = registry.load().size(split, size)
     count = 20 if split == "cavity" else 16
-    assert (len(entry.subsets["test"]), len(entry.subsets["valid"])) == (count, 8)
+    assert len(entry.subsets["test"]) == count
+    assert len(entry.subsets["valid"]) == 8
     everywhere = {state.parameters[kind] for state in all_of(split, size)}
     found = Counter(
         state_of(split, size, i).parameters[kind] for i in entry.subsets["test"]

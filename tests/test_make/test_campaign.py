@@ -80,7 +80,8 @@ def test_equal_hashes_are_told(
     result = generate(
         SPLIT, SIZE, root=copied(), registry=with_measured(unmeasured, right)
     )
-    assert (result.verdict, result.simulated) == ("equal to datasets.yaml", ())
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.simulated == ()
 
 
 def test_a_forged_file_is_made_anew(
@@ -139,11 +140,13 @@ def test_other_bits_of_another_machine_are_kept_and_told(
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     assert generate(SPLIT, SIZE, **options).simulated == ()  # type: ignore[arg-type]
     # A broken promise is never tolerated: bitwise still, and no card says more.
-    with pytest.raises(DataError, match="have another hash"):
+    with pytest.raises(DataError) as caught:
         generate(SPLIT, SIZE, force=True, **options)  # type: ignore[arg-type]
+    assert caught.value.where == "curl-noise tiny, scenarios 4"
     root = tmp_path / "other"
-    with pytest.raises(DataError, match="1 of 1 scenarios have another hash") as caught:
+    with pytest.raises(DataError) as caught:
         generate(SPLIT, SIZE, **{**options, "root": root})  # type: ignore[arg-type]
+    assert caught.value.where == "curl-noise tiny, scenarios 4"
     assert caught.value.exit_code == 4
     assert manifest_of(root).identity == "bitwise"
     assert not (root / SPLIT / SIZE / "v2" / "README.md").exists()
@@ -201,7 +204,9 @@ def test_a_second_call_hashes_each_file_once_and_draws_nothing(
     generate(SPLIT, SIZE, root=root, registry=unmeasured, progress=news.append)
     assert read == {f"{i:04d}.nc": 1 for i in range(5)}
     checking = [state for state in news if state.stage == "checking"]
-    assert (checking[0].done, checking[-1].done, checking[-1].total) == (0, 5, 5)
+    assert checking[0].done == 0
+    assert checking[-1].done == 5
+    assert checking[-1].total == 5
 
 
 def test_values_are_hashed_once(

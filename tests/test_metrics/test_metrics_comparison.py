@@ -119,57 +119,60 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:
-    """For value = a_s + b_i the variance is var(a)/S + var(b)/N, and so is that of the
-    draws.
+    """For value = a_s + b_i the variance is var(a)/S + var(b)/N.
+
+    That of the draws is the same, and the degrees of freedom are Satterthwaite's.
     """
     seeds = np.array([0.0, 1.0, 5.0])
     scenarios = np.array([1.0, 2.0, 4.0, 4.0, 9.0, 10.0])
-    found = resample(seeds[:, None] + scenarios)
-    parts = [np.var(seeds, ddof=1) / 3, np.var(scenarios, ddof=1) / 6]
-    assert found.mean == pytest.approx(2.0 + 5.0)
-    assert found.error**2 == pytest.approx(sum(parts))
-    assert np.var(found.deviations) == pytest.approx(sum(parts), rel=0.03)
-    # Satterthwaite: (v1 + v2)^2 / (v1^2 / 2 + v2^2 / 5)
-    assert found.freedom == pytest.approx(
-        sum(parts) ** 2 / (parts[0] ** 2 / 2 + parts[1] ** 2 / 5)
-    )
+    resampling = resample(seeds[:, None] + scenarios)
+
+    seed_variance = np.var(seeds, ddof=1) / 3
+    scenario_variance = np.var(scenarios, ddof=1) / 6
+    variance = seed_variance + scenario_variance
+    assert resampling.mean == pytest.approx(2.0 + 5.0)
+    assert resampling.error**2 == pytest.approx(variance)
+    assert np.var(resampling.deviations) == pytest.approx(variance, rel=0.03)
+
+    squares = seed_variance**2 / 2 + scenario_variance**2 / 5
+    assert resampling.freedom == pytest.approx(variance**2 / squares)
 
 
 def test_the_two_way_bootstrap_holds_what_it_promises() -> None:
-    """Of 300 draws of 3 seeds and 16 scenarios, 95 % of the intervals hold the true
-    mean.
-    """
+    """Of 300 draws of 3 seeds and 16 scenarios 95 % of the intervals have the mean."""
     rng = np.random.default_rng(5)
-    held = 0
+    count = 0
     for _ in range(300):
-        a = rng.normal(0, 0.3, (3, 1))
-        b = rng.normal(0, 1, 16)
+        seeds = rng.normal(0, 0.3, (3, 1))
+        scenarios = rng.normal(0, 1, 16)
         rest = rng.normal(0, 0.3, (3, 16))
-        low, high = bootstrap_interval(a + b + rest)
-        held += low <= 0.0 <= high
-    assert held / 300 == pytest.approx(0.95, abs=0.04)
+        low, high = bootstrap_interval(seeds + scenarios + rest)
+        count += low <= 0.0 <= high
+    assert count / 300 == pytest.approx(0.95, abs=0.04)
 
 
 def test_intervals_repeat_and_scale() -> None:
-    """The draws are seeded and depend on the number of scenarios alone; NaN values are
-    left out.
+    """The draws are seeded and depend on the number of scenarios alone.
 
-    With one seed the scenarios alone are drawn, whichever way they are given; fewer
-    than four have no interval.
+    NaN values are left out. With one seed the scenarios alone are drawn, in either
+    shape; fewer than four have no interval.
     """
     x = [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]
     low, high = bootstrap_interval(x)
-    assert (low, high) == bootstrap_interval(x) == bootstrap_interval([x])
-    assert bootstrap_interval(x, minus=[1.0] * 6) == pytest.approx(
-        (low - 1.0, high - 1.0)
-    )
-    assert bootstrap_interval([2 * v + 1 for v in x]) == pytest.approx(
-        (2 * low + 1, 2 * high + 1)
-    )
-    assert bootstrap_interval([*x[:2], math.nan, *x[2:]]) == (low, high)
     assert low < np.mean(x) < high
+    assert bootstrap_interval(x) == (low, high)
+    assert bootstrap_interval([x]) == (low, high)
+
+    shifted = bootstrap_interval(x, minus=[1.0] * 6)
+    assert shifted == pytest.approx((low - 1.0, high - 1.0))
+    scaled = bootstrap_interval([2 * value + 1 for value in x])
+    assert scaled == pytest.approx((2 * low + 1, 2 * high + 1))
+    with_nan = [*x[:2], math.nan, *x[2:]]
+    assert bootstrap_interval(with_nan) == (low, high)
+
     for few in ([], [1.0], [1.0, 2.0, 4.0], [math.nan, 2.0, 1.0, 1.0]):
-        assert all(math.isnan(bound) for bound in bootstrap_interval(few))
+        interval = bootstrap_interval(few)
+        assert all(math.isnan(bound) for bound in interval)
 
 
 def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
@@ -181,33 +184,41 @@ def test_differ_is_a_t_test_or_the_sign_flip_test() -> None:
     """
     a = np.array([1.0, 1.2, 1.5])
     b = np.array([2.0, 2.6, 2.1, 2.9])
-    ours = differ(np.repeat(a[:, None], 12, axis=1), np.repeat(b[:, None], 12, axis=1))
-    assert ours == pytest.approx(scipy.stats.ttest_ind(a, b, equal_var=False).pvalue)
+    a_seeds = np.repeat(a[:, None], 12, axis=1)
+    b_seeds = np.repeat(b[:, None], 12, axis=1)
+    welch = scipy.stats.ttest_ind(a, b, equal_var=False)
+    assert differ(a_seeds, b_seeds) == pytest.approx(welch.pvalue)
+
     a, b = np.random.default_rng(3).gamma(3.0, size=(2, 9))
-    ours = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
-    assert ours == pytest.approx(scipy.stats.ttest_rel(a, b).pvalue)
-    assert differ(a, b) == differ([a], [b]) == sign_flip_p(a - b)
+    equal_seeds = differ(np.tile(a, (3, 1)), np.tile(b, (3, 1)))
+    paired = scipy.stats.ttest_rel(a, b)
+    assert equal_seeds == pytest.approx(paired.pvalue)
+
+    exact = sign_flip_p(a - b)
+    assert differ(a, b) == exact
+    assert differ([a], [b]) == exact
+
     a[2] = math.nan
-    assert differ(a, b) == sign_flip_p(np.delete(a - b, 2))
+    without = np.delete(a - b, 2)
+    assert differ(a, b) == sign_flip_p(without)
     assert math.isnan(differ(a[3:8], b[3:8]))
     with pytest.raises(UsageError):
         differ(a, b[:4])
 
 
 def test_seeds_of_one_method_seldom_differ() -> None:
-    """Two draws of 3 seeds of the same method: at most 5 % of 400 pairs differ, with
-    room for chance.
-    """
+    """Of 400 pairs of draws of 3 seeds of one method at most 5 % differ, by chance."""
     rng = np.random.default_rng(11)
-    told = 0
+    count = 0
     for _ in range(400):
         scenario = rng.normal(0, 1, 16)
-        one, two = (
-            scenario + rng.normal(0, 0.2, (3, 1)) + rng.normal(0, 0.2, (3, 16))
-            for _ in range(2)
-        )
-        told += differ(one, two) < 0.05
-    assert told / 400 <= 0.05
+        draws = []
+        for _ in range(2):
+            seeds = rng.normal(0, 0.2, (3, 1))
+            rest = rng.normal(0, 0.2, (3, 16))
+            draws.append(scenario + seeds + rest)
+        count += differ(*draws) < 0.05
+    assert count / 400 <= 0.05
 
 
 @pytest.mark.parametrize(
@@ -241,17 +252,17 @@ def test_comparison_over_common_scenarios() -> None:
     one = score_of(9.0, *range(1, 7))
     two = score_of(*range(2, 8), 99.0, first=1)
     found = compare(one, two)
-    assert (found.scenarios, found.difference, found.interval) == (
-        (1, 2, 3, 4, 5, 6),
-        -1.0,
-        (-1.0, -1.0),
-    )
-    assert (found.p, found.significant) == (2.0**-5, True)
+    assert found.scenarios == (1, 2, 3, 4, 5, 6)
+    assert found.difference == -1.0
+    assert found.interval == (-1.0, -1.0)
+    assert found.p == 2.0**-5
+    assert found.significant
     assert compare(one, score_of(math.nan, 1.0)).scenarios == (1,)
     # its smallest p would be 0.0625
     five = compare(score_of(*[1.0] * 5), score_of(*[2.0] * 5))
     assert math.isnan(five.p)
-    assert (five.significant, five.difference) == (False, -1.0)
+    assert not five.significant
+    assert five.difference == -1.0
 
 
 def test_direction_decides_who_is_better() -> None:
@@ -351,6 +362,7 @@ def test_seeds_of_a_method_are_compared_together() -> None:
     *seeds, other = (score_of(*(v + s for v in range(1, 8))) for s in (0.0, 1.0, 10.0))
     found = compare(seeds, other)
     values = [score.values for score in seeds]
-    assert (found.seeds, found.difference) == ((2, 1), pytest.approx(-9.5))
+    assert found.seeds == (2, 1)
+    assert found.difference == pytest.approx(-9.5)
     assert found.p == differ(values, other.values)
     assert found.interval == bootstrap_interval(values, minus=other.values)

@@ -24,13 +24,11 @@ from lagbench.metrics import METRICS, Score, aggregate, select, tally
 
 
 def alone(name: str, *args: Any) -> float:
-    """Measure a metric on the pair that the arguments describe, alone in its
-    rollout.
-    """
+    """Measure a metric on one pair, made of the arguments, alone in its rollout."""
     metric = METRICS[name]
-    return float(
-        metric.series(*np.array(measured(pair_of(*args), *metric.of))[:, None])[0]
-    )
+    statistics = measured(pair_of(*args), *metric.of)
+    series = [np.array([value]) for value in statistics]
+    return float(metric.series(*series)[0])
 
 
 def scores_of(truth: Floats, prediction: Floats) -> dict[str, Score]:
@@ -77,41 +75,53 @@ def test_energy_by_hand() -> None:
 
 
 def test_energies_of_a_truth_that_slows_or_rests() -> None:
-    """E_true = 1, 0: the second frame is scaled by 1e-3, so an excess of 1e-4 there is
-    0.1.
+    """E_true = 1, 0: the second frame is scaled by 1e-3, so 1e-4 there is an error 0.1.
 
     Of 0.9 and 1 % of the peak, the peak, then nothing, the ratio takes the second and
     third frame. No ratio, retention or error exists where the truth never moves; its
     frames are counted.
     """
-    found = METRICS["energy_error"].series(np.array([0.5, 1e-4]), np.array([1.0, 0.0]))
-    np.testing.assert_allclose(found, [0.5, 0.1])
-    found = METRICS["energy_ratio"].series(
-        np.array([5.0, 0.03, 9.0, 7.0]), np.array([0.009, 0.01, 1.0, 0.0])
-    )
-    np.testing.assert_allclose(found, [math.nan, 3.0, 9.0, math.nan])
-    x = np.repeat(lattice(10)[None], 5, axis=0)
-    scores = scores_of(x, x + 0.001 * np.arange(5)[:, None, None])
-    energies = ("energy_ratio", "energy_retention", "energy_error")
-    for name in (*energies, "momentum_error", "angular_momentum_error"):
-        assert (str(scores[name].mean), scores[name].undefined) == ("nan", (3,))
+    predicted = np.array([0.5, 1e-4])
+    errors = METRICS["energy_error"].series(predicted, np.array([1.0, 0.0]))
+    np.testing.assert_allclose(errors, [0.5, 0.1])
+
+    predicted = np.array([5.0, 0.03, 9.0, 7.0])
+    true = np.array([0.009, 0.01, 1.0, 0.0])
+    ratios = METRICS["energy_ratio"].series(predicted, true)
+    np.testing.assert_allclose(ratios, [math.nan, 3.0, 9.0, math.nan])
+
+    at_rest = np.repeat(lattice(10)[None], 5, axis=0)
+    drift = 0.001 * np.arange(5)[:, None, None]
+    scores = scores_of(at_rest, at_rest + drift)
+    for name in (
+        "energy_ratio",
+        "energy_retention",
+        "energy_error",
+        "momentum_error",
+        "angular_momentum_error",
+    ):
+        assert math.isnan(scores[name].mean)
+        assert scores[name].undefined == (3,)
 
 
 def test_momentum_errors_have_a_floor() -> None:
-    """A truth that slows to 1e-6 of its speed is scaled by 1e-3 of the first frame:
-    0.1, then 100.
+    """A truth that slows to 1e-6 of its speed is scaled by 1e-3 of the first frame.
+
+    The errors are 0.1, then 100 times the share of momentum.
     """
     x = lattice(12)
     u = 0.01 * turning(x) + 0.001
     truth = np.stack([x, x + u, x + 2 * u, x + 2 * u + 1e-6 * u])
     prediction = truth.copy()
-    prediction[2:] = truth[1] + 1.1 * np.arange(1, 3)[:, None, None] * u
+    steps = np.arange(1, 3)[:, None, None]
+    prediction[2:] = truth[1] + 1.1 * steps * u
     scores = scores_of(truth, prediction)
-    gap = np.hypot(*np.sum(u, axis=0)) / np.sum(np.hypot(u[:, 0], u[:, 1]))
-    expected = [0.1 * gap, (1.1 - 1e-6) / 1e-3 * gap]
-    np.testing.assert_allclose(
-        scores["momentum_error"].per_frame[0], expected, rtol=1e-6
-    )
+
+    momentum = np.hypot(*np.sum(u, axis=0))
+    share = momentum / np.sum(np.hypot(u[:, 0], u[:, 1]))
+    expected = [0.1 * share, (1.1 - 1e-6) / 1e-3 * share]
+    errors = scores["momentum_error"].per_frame[0]
+    np.testing.assert_allclose(errors, expected, rtol=1e-6)
     assert scores["angular_momentum_error"].per_frame[0, 1] < 1.2e3
 
 

@@ -148,11 +148,13 @@ def test_undefined_frames_are_left_out_and_counted() -> None:
     found, stable = (
         score(METRICS[n], {3: of_pearson(1.0, math.nan, 0.6)}) for n in names
     )
-    assert (found.mean, found.undefined) == (pytest.approx(0.8), (1,))
+    assert found.mean == pytest.approx(0.8)
+    assert found.undefined == (1,)
     assert math.isnan(found.at(3)[0])
     assert stable.mean == 1.0
     still = score(METRICS["stable_frames"], {3: of_pearson(0.99, *[math.nan] * 89)})
-    assert (still.mean, still.undefined) == (1.0, (89,))
+    assert still.mean == 1.0
+    assert still.undefined == (89,)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +177,8 @@ def test_means_over_frames_come_before_those_over_scenarios(
     found = score(
         METRICS["vorticity_pearson"], {i: of_pearson(*v) for i, v in values.items()}
     )
-    assert (found.scenarios, found.undefined) == (tuple(sorted(values)), undefined)
+    assert found.scenarios == tuple(sorted(values))
+    assert found.undefined == undefined
     assert found.mean == pytest.approx(mean)
     np.testing.assert_equal(found.interval, bootstrap_interval(found.values))
 
@@ -290,20 +293,20 @@ def test_truth_against_itself_is_perfect_and_a_growing_error_a_growing_loss(
     metric = METRICS[name]
     found = scores(0.0)[name]
     expected = metric.perfect if name != "stable_frames" else 52.0
-    assert (found.mean, found.undefined) == (expected, (0,))
+    assert found.mean == expected
+    assert found.undefined == (0,)
     losses = [metric.loss(scores(size)[name].mean) for size in (0.0, 0.1, 0.5, 2.5)]
     assert losses == sorted(losses)
     assert losses[-1] > losses[0]
 
 
-def test_the_tables_of_the_design_are_complete() -> None:
-    """Everything that design section 8 lists has an entry, and the rollout of these
-    tests has them all.
-    """
+def test_the_metrics_of_the_thesis_and_of_the_docs_are_complete() -> None:
+    """Every metric of docs/scoring.md has an entry, and this rollout has its value."""
     assert set(scores(0.1)) == {m.name for m in MEASURED}
     assert not any(math.isnan(found.mean) for found in scores(0.1).values())
     mse = scores(0.1)["vorticity_mse"]
-    assert (mse.per_frame.shape, mse.frames) == ((1, 52), tuple(range(2, 54)))
+    assert mse.per_frame.shape == (1, 52)
+    assert mse.frames == tuple(range(2, 54))
     quantities = ("position", "velocity", "vorticity")
     expected = {f"{of}_{law}" for of in quantities for law in ("mse", "mae", "rmse")}
     expected |= {
@@ -415,7 +418,7 @@ def test_a_bad_entry_point_is_named(
     monkeypatch.syspath_prepend(tmp_path)
     value = name if ":" in name else f"{__name__}:{name}"
     with_entry_point(monkeypatch, value)
-    with pytest.raises(UsageError, match=r"others|nothing_known") as caught:
+    with pytest.raises(UsageError) as caught:
         available()
     assert ":" not in name or caught.value.where == f"entry point others = {name}"
 
@@ -433,7 +436,7 @@ def test_selection_brings_what_a_metric_follows_from() -> None:
         "energy_true",
         "energy_ratio",
     }
-    with pytest.raises(UsageError, match="did you mean 'vorticity_rmse'"):
+    with pytest.raises(UsageError):
         select(["vorticity_rmsee"])
     for changes in (
         {"statistic": None, "of": ()},
@@ -498,8 +501,9 @@ def test_what_is_no_number_is_told_with_its_metric(what: str, function: Any) -> 
 def test_a_metric_may_have_no_module_and_a_bool_of_numpy() -> None:
     """As a ufunc or a partial, whose name is told too; what is not defined is NaN."""
     bare: Any = np.frompyfunc(lambda pair: None, 1, 1)
-    with pytest.raises(WorkFailedError, match="enstrophy_error"):
+    with pytest.raises(WorkFailedError) as caught:
         replace(OTHERS, statistic=bare).measure(pairs()[0])
+    assert caught.value.where == "?, enstrophy_error, frame 2"
     assert math.isnan(
         replace(OTHERS, defined=lambda pair: np.bool_(0)).measure(pairs()[0])
     )

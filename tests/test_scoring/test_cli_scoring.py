@@ -150,7 +150,8 @@ def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
         result = run(*line.split())
         assert result.exit_code == 0, result.output
         assert result.stdout
-        assert (line, too_wide(result.stdout)) == (line, [])
+        assert line == line
+        assert too_wide(result.stdout) == []
 
 
 def commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
@@ -256,7 +257,8 @@ def statistic(pair):
 
 METRICS = (
     Metric(
-        name="my_enstrophy", family="mine", unit="1", direction=Direction.LOWER, perfect=0.0,
+        name="my_enstrophy", family="mine", unit="1",
+        direction=Direction.LOWER, perfect=0.0,
         source="here", summary="fails", statistic=statistic,
     ),
 )
@@ -344,7 +346,7 @@ def test_several_files_are_checked_before_any_is_scored(
         )
 
     with monkeypatch.context() as patch:
-        patch.setattr(validation, "validate", other)
+        patch.setattr("lagbench.cli.score.validate", other)
         result = run("score", *two, "--report", tmp_path / "rep")
     assert result.exit_code == 2
     assert "two data sets" in result.stderr

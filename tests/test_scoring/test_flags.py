@@ -38,53 +38,63 @@ def trace_of(truth: Floats, prediction: Floats) -> Trace:
 
 
 def made(error: Sequence[float], *, cosine: float = 1.0, motion: float = 1.0) -> Trace:
-    """Return a trace with these RMS errors, one cosine between neighbours, and no
-    better shift.
+    """Return a trace with these RMS errors and one cosine between neighbours.
+
+    No shift fits better.
     """
     e = np.array(error)
-    overlap = np.concatenate([[np.nan], cosine * e[1:] * e[:-1]])
     ones = np.ones(len(e))
-    shifted = dict.fromkeys(SHIFTS, 4.0 * e**2)
+    products = cosine * e[1:] * e[:-1]
     return Trace(
-        e**2, overlap, motion**2 * ones, motion**2 * ones, shifted, ones, 0.0 * ones
+        error=e**2,
+        overlap=np.concatenate([[np.nan], products]),
+        motion=motion**2 * ones,
+        predicted_motion=motion**2 * ones,
+        shifted=dict.fromkeys(SHIFTS, 4.0 * e**2),
+        occupancy=ones,
+        outside=0.0 * ones,
     )
 
 
 def test_trace_of_an_offset_that_grows() -> None:
-    """Predicted = true + f (1, 0) / 100: error f^2 / 2, overlap f (f - 1) / 2, in units
-    of 1e-4.
+    """Predicted = true + f (1, 0) / 100: error f^2 / 2, overlap f (f - 1) / 2.
+
+    In units of 1e-4.
     """
     truth = rollout()
-    growth = np.array([0, 0, 1, 2, 3, 4, 5, 6])[:, None, None] * np.array([0.01, 0.0])
-    trace = trace_of(truth, truth + growth)
-    np.testing.assert_allclose(
-        trace.error * 1e4, [0.5, 2.0, 4.5, 8.0, 12.5, 18.0], rtol=1e-9
-    )
-    np.testing.assert_allclose(
-        trace.overlap[1:] * 1e4, [1.0, 3.0, 6.0, 10.0, 15.0], rtol=1e-9
-    )
+    frames = np.array([0, 0, 1, 2, 3, 4, 5, 6])[:, None, None]
+    trace = trace_of(truth, truth + frames * np.array([0.01, 0.0]))
+    errors = [0.5, 2.0, 4.5, 8.0, 12.5, 18.0]
+    overlaps = [1.0, 3.0, 6.0, 10.0, 15.0]
+    np.testing.assert_allclose(trace.error * 1e4, errors, rtol=1e-9)
+    np.testing.assert_allclose(trace.overlap[1:] * 1e4, overlaps, rtol=1e-9)
     assert math.isnan(trace.overlap[0])
-    found = analyse_error(trace)
+
     # cosine 1 throughout; the smallest ratio is 6/5; the last quarter is the last
     # frame: 6/1
-    assert found.autocorrelation == pytest.approx(1.0)
-    assert found.drop == pytest.approx(1.2)
-    assert found.growth == pytest.approx(6.0)
+    dynamics = analyse_error(trace)
+    assert dynamics.autocorrelation == pytest.approx(1.0)
+    assert dynamics.drop == pytest.approx(1.2)
+    assert dynamics.growth == pytest.approx(6.0)
 
 
 @pytest.mark.parametrize("shift", SHIFTS)
 def test_trace_finds_the_shift(shift: int) -> None:
-    """Predicting the truth s frames away leaves no error at shift s; ends without a
-    partner are NaN.
+    """Predicting the truth s frames away leaves no error at shift s.
+
+    Ends without a partner are NaN.
     """
     truth = rollout(frames=12)
     moved = np.roll(truth, -shift, axis=0)
     trace = trace_of(truth[:8], moved[:8])
-    known = ~np.isnan(trace.shifted[shift])
-    assert np.count_nonzero(known) == (HORIZON if shift < 0 else HORIZON - shift)
-    np.testing.assert_allclose(trace.shifted[shift][known], 0.0, atol=1e-30)
-    found = analyse_error(trace)
-    assert (found.shift, found.shift_gain) == (shift, 0.0)
+    shifted = trace.shifted[shift]
+    defined = shifted[~np.isnan(shifted)]
+    assert len(defined) == HORIZON - max(0, shift)
+    np.testing.assert_allclose(defined, 0.0, atol=1e-30)
+
+    dynamics = analyse_error(trace)
+    assert dynamics.shift == shift
+    assert dynamics.shift_gain == 0.0
 
 
 def test_trace_occupancy_and_outside() -> None:
@@ -133,29 +143,30 @@ def test_copy_suspect_by_hand(trace: Trace, reason: str | None) -> None:
 
 
 def test_twin_floor_and_physics_by_hand() -> None:
-    """Below the twin in frames 0 and 3; at frame 3 the twin is past a tenth of
-    persistence: 1 of 3 counts.
+    """Below the perturbed run in frames 0 and 3; only the first of these counts.
 
-    A prediction at rest and one of twenty times the energy are raised, one of twice is
-    not.
+    At frame 3 the perturbed run is past a tenth of persistence. A prediction at rest
+    and one of twenty times the energy are raised, one of twice is not.
     """
-    twin = [1e-6, 1e-5, 1e-4, 0.5]
+    limit = [1e-6, 1e-5, 1e-4, 0.5]
     persistence = np.array([0.01, 0.1, 0.5, 1.0])
-    flag = judge_predictability(np.array([5e-7, 1e-3, 1e-2, 0.4]), persistence, twin)
+    close = np.array([5e-7, 1e-3, 1e-2, 0.4])
+    flag = judge_predictability(close, persistence, limit)
     assert flag.raised
     assert flag.evidence == {"frames_below": 1.0, "frames_compared": 3.0}
-    honest = judge_predictability(np.array([5e-5, 1e-3, 1e-2, 0.4]), persistence, twin)
-    assert honest.raised is False
+    honest = np.array([5e-5, 1e-3, 1e-2, 0.4])
+    assert judge_predictability(honest, persistence, limit).raised is False
     assert judge_predictability(persistence, persistence, ()).raised is None
+
     # as workers send it
-    trace = pickle.loads(pickle.dumps(trace_of(rollout(), rollout(speed=0.012))))
+    faster = trace_of(rollout(), rollout(speed=0.012))
+    trace = pickle.loads(pickle.dumps(faster))
     assert set(trace.shifted) == set(SHIFTS)
+
     rest = made([1, 2, 3])
     for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):
-        assert (
-            judge_physics([replace(rest, predicted_motion=factor * rest.motion)]).raised
-            == raised
-        )
+        trace = replace(rest, predicted_motion=factor * rest.motion)
+        assert judge_physics([trace]).raised == raised
     wide = replace(rest, occupancy=2.0 * rest.occupancy)
     assert "area" in judge_physics([wide]).reasons[0]
 

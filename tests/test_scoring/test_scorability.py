@@ -30,20 +30,24 @@ FRAMES = 5
 
 
 def lattice(side: int, *, seed: int = 0, speed: float = 0.1) -> NDArray[np.float32]:
-    """Return particles that fill the unit box and turn a little about its centre,
-    [frame, particle, 2].
+    """Return particles that fill the unit box and rotate a little about its centre.
+
+    The shape is [frame, particle, 2].
     """
     axis = (np.arange(side) + 0.5) / side
-    start = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    start = (
-        start + np.random.default_rng(seed).uniform(-0.1, 0.1, start.shape) / side - 0.5
-    )
-    turns = speed * np.arange(FRAMES)[:, None] * (1.0 - 4.0 * np.max(start**2, axis=1))
-    turned = [
-        np.cos(turns) * start[:, 0] - np.sin(turns) * start[:, 1],
-        np.sin(turns) * start[:, 0] + np.cos(turns) * start[:, 1],
-    ]
-    return np.clip(0.5 + np.stack(turned, axis=-1), 0.0, 1.0).astype(np.float32)
+    regular = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    jitter = np.random.default_rng(seed).uniform(-0.1, 0.1, regular.shape)
+    start = regular + jitter / side - 0.5
+    x = start[:, 0]
+    y = start[:, 1]
+
+    # slower towards the walls, shape [frame, particle]
+    rate = speed * (1.0 - 4.0 * np.max(start**2, axis=1))
+    angle = np.arange(FRAMES)[:, None] * rate
+    rotated_x = np.cos(angle) * x - np.sin(angle) * y
+    rotated_y = np.sin(angle) * x + np.cos(angle) * y
+    position = 0.5 + np.stack([rotated_x, rotated_y], axis=-1)
+    return np.clip(position, 0.0, 1.0).astype(np.float32)
 
 
 def own_split(

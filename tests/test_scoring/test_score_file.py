@@ -207,7 +207,8 @@ def test_both_files_read_back(card: ScoreCard) -> None:
         assert score.undefined == card.submission[name].undefined, name
     for scenario, tally in card.tallies[SUBMISSION].items():
         again = stored.tallies[scenario]
-        assert (again.names, again.frames) == (tally.names, tally.frames)
+        assert again.names == tally.names
+        assert again.frames == tally.frames
         for field in ("total", "weight", "undefined"):
             np.testing.assert_array_equal(getattr(again, field), getattr(tally, field))
     published = read_scores(card.files[0])
@@ -240,8 +241,9 @@ def test_damaged_json_is_unreadable(card: ScoreCard, tmp_path: Path) -> None:
         card.files[0].read_bytes()[:500],
     ):
         path.write_bytes(content)
-        with pytest.raises(UnreadableFileError, match="lagbench score"):
+        with pytest.raises(UnreadableFileError) as caught:
             read_scores(path)
+        assert caught.value.where.endswith("scores.json")
 
 
 @pytest.mark.parametrize("length", [0, 100, 5000, 20000])
@@ -253,5 +255,6 @@ def test_truncated_netcdf_is_unreadable(
     path.write_bytes(card.files[1].read_bytes()[:length])
     with pytest.raises(UnreadableFileError):
         read_statistics(path)
-    with pytest.raises(UnreadableFileError, match=r"not a scores\.nc"):
+    with pytest.raises(UnreadableFileError) as caught:
         read_statistics(card.files[1].parent / "predictions.nc")
+    assert caught.value.where.endswith("predictions.nc")

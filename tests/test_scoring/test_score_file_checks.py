@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from made_up import SCORES, BoardBench, copied
+from board_bench import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
 from lagbench.errors import UnreadableFileError
@@ -141,7 +141,11 @@ def test_the_child_is_limited_and_started_anew(
     bad = own.folder / SCORES / "flipping.nc"
     bad.write_bytes(bad.read_bytes()[:5000])
     assert set(find_unreadable([good, bad, good])) == {bad}
-    program = "import os\ndef read(path):\n    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
+    program = (
+        "import os\n"
+        "def read(path):\n"
+        "    if 'flipping' in path: os.kill(os.getpid(), 11)\n"
+    )
     use_child(monkeypatch, own.folder.parent, program)
     stopped = find_unreadable([good, bad, good])
     assert set(stopped) == {bad}

@@ -53,110 +53,129 @@ def scored(
 
 
 def test_skill_is_one_minus_the_ratio_of_means() -> None:
-    """Means 1 and 4: skill 3/4 beside the better floor; a perfect score has 1, twice
-    the floor's -1.
+    """Means 1 and 4: skill 3/4; a perfect score has 1, twice the reference's -1.
 
-    The coarse solver knows the equations: however good, skill is measured against what
-    does not; nor are strangers. A scenario that is undefined on one side is left out on
-    both.
+    The coarse solver knows the equations: however good, skill is measured against
+    references that do not; unknown ones do not count. A scenario that is undefined in
+    one of the two is left out of both.
     """
-    floors = {"persistence": scored([6.0, 6.0]), "frozen-field": scored([3.0, 5.0])}
-    found = [
-        compute_skill([scored(v)], floors)
-        for v in ([0.5, 1.5], [0.0, 0.0], [6.0, 10.0])
-    ]
-    assert [(one.reference, one.value) for one in found] == [
-        ("frozen-field", v) for v in (0.75, 1.0, -1.0)
-    ]
-    floors = {
+    references = {
+        "persistence": scored([6.0, 6.0]),
+        "frozen-field": scored([3.0, 5.0]),
+    }
+    for values, expected in (
+        ([0.5, 1.5], 0.75),
+        ([0.0, 0.0], 1.0),
+        ([6.0, 10.0], -1.0),
+    ):
+        result = compute_skill([scored(values)], references)
+        assert result.reference == "frozen-field"
+        assert result.value == expected
+
+    references = {
         "analog": scored([2.0]),
         "coarse-solver": scored([0.1]),
-        "stranger": scored([0.1]),
+        "unknown": scored([0.1]),
     }
-    assert (
-        best_reference({name: floors[name] for name in NAIVE.intersection(floors)})
-        == "analog"
-    )
-    gappy = compute_skill([scored([1.0, 9.0])], {"analog": scored([4.0, math.nan])})
-    np.testing.assert_equal((gappy.value, gappy.interval), (0.75, (math.nan, math.nan)))
+    counting = {name: references[name] for name in NAIVE.intersection(references)}
+    assert best_reference(counting) == "analog"
+
+    partial = {"analog": scored([4.0, math.nan])}
+    result = compute_skill([scored([1.0, 9.0])], partial)
+    assert result.value == 0.75
+    assert all(math.isnan(bound) for bound in result.interval)
 
 
 def test_what_skill_and_its_interval_need() -> None:
-    """No floor, an undefined one, a perfect one, other scenarios, or a metric of which
-    more is better.
+    """No reference, an undefined one, a perfect one, or other scenarios: no skill.
 
-    A ratio that is 1/2 in every scenario is certain; three scenarios have no interval.
+    The same holds for a metric of which more is better. A ratio that is 1/2 in every
+    scenario is certain; three scenarios have no interval.
     """
-    ours = scored([1.0, 1.0])
+    method = scored([1.0, 1.0])
+    assert compute_skill([method], {}) is None
+    undefined = scored([math.nan] * 2)
+    perfect = scored([0.0, 0.0])
+    elsewhere = scored([1.0, 1.0], first=7)
+    for reference in (undefined, perfect, elsewhere):
+        assert compute_skill([method], {"analog": reference}) is None
     pearson = scored([0.5, 0.5], "vorticity_pearson")
-    assert compute_skill([ours], {}) is None
-    for floor in (
-        scored([math.nan] * 2),
-        scored([0.0, 0.0]),
-        scored([1.0, 1.0], first=7),
-    ):
-        assert compute_skill([ours], {"analog": floor}) is None
     assert compute_skill([pearson], {"analog": pearson}) is None
-    base = [1.0, 2.0, 5.0, 3.0]
-    certain = compute_skill([scored([0.5, 1.0, 2.5, 1.5])], {"analog": scored(base)})
-    assert (certain.value, certain.interval) == (0.5, (0.5, 0.5))
-    few = compute_skill([scored([1.0, 1.0, 4.0])], {"analog": scored(base[:3])})
+
+    base = scored([1.0, 2.0, 5.0, 3.0])
+    half = scored([0.5, 1.0, 2.5, 1.5])
+    certain = compute_skill([half], {"analog": base})
+    assert certain.value == 0.5
+    assert certain.interval == (0.5, 0.5)
+    short_base = scored([1.0, 2.0, 5.0])
+    few = compute_skill([scored([1.0, 1.0, 4.0])], {"analog": short_base})
     assert all(math.isnan(bound) for bound in few.interval)
 
 
 def test_the_interval_is_that_of_resampled_ratios() -> None:
-    """Scenarios drawn together, 20 of them: SciPy's percentiles of the ratio, Student's
-    widening aside.
-    """
+    """SciPy's percentiles of the ratio, Student's widening aside, of 20 scenarios."""
     rng = np.random.default_rng(3)
     base = rng.gamma(9.0, size=20)
-    ours = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
-    found = compute_skill([scored(ours.tolist())], {"analog": scored(base.tolist())})
+    method = 0.3 * base * rng.gamma(25.0, 0.04, size=20)
+    references = {"analog": scored(base.tolist())}
+    result = compute_skill([scored(method.tolist())], references)
 
-    def ratio(a: Any, b: Any, axis: int) -> Any:
+    def skill_of(a: Any, b: Any, axis: int) -> Any:
         return 1.0 - a.mean(axis=axis) / b.mean(axis=axis)
 
-    options = {"paired": True, "method": "percentile", "rng": np.random.default_rng(1)}
-    theirs = scipy.stats.bootstrap((ours, base), ratio, **options).confidence_interval
-    stretch = (
-        math.sqrt(20 / 19) * scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
+    bootstrap = scipy.stats.bootstrap(
+        (method, base),
+        skill_of,
+        paired=True,
+        method="percentile",
+        rng=np.random.default_rng(1),
     )
-    expected = [found.value + stretch * (bound - found.value) for bound in theirs]
-    assert found.interval == pytest.approx(
-        expected, abs=0.1 * (expected[1] - expected[0])
-    )
+    student = scipy.stats.t.ppf(0.975, 19) / scipy.stats.norm.ppf(0.975)
+    stretch = math.sqrt(20 / 19) * student
+    expected = [
+        result.value + stretch * (bound - result.value)
+        for bound in bootstrap.confidence_interval
+    ]
+    width = expected[1] - expected[0]
+    assert result.interval == pytest.approx(expected, abs=0.1 * width)
 
 
 def test_the_interval_of_skill_stays_below_one() -> None:
-    """No ratio of means is negative, whatever of six scenarios is drawn; a perfect one
-    is certain.
+    """No ratio of means is negative in any draw of six scenarios.
+
+    A perfect method is certain.
     """
     base = [1.0, 1.1, 0.9, 1.2, 0.8, 1.0]
-    wild = compute_skill(
-        [scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])], {"analog": scored(base)}
-    )
-    assert wild.interval[0] < wild.value < wild.interval[1] < 1.0
-    perfect = compute_skill([scored([0.0] * 6)], {"analog": scored(base)})
-    assert (perfect.value, perfect.interval) == (1.0, (1.0, 1.0))
+    references = {"analog": scored(base)}
+    wild = scored([0.01, 0.02, 0.01, 9.0, 0.03, 0.02])
+    result = compute_skill([wild], references)
+    low, high = result.interval
+    assert low < result.value < high < 1.0
+
+    perfect = compute_skill([scored([0.0] * 6)], references)
+    assert perfect.value == 1.0
+    assert perfect.interval == (1.0, 1.0)
     few = compute_skill([scored([0.0] * 3)], {"analog": scored(base[:3])})
-    np.testing.assert_equal((few.value, few.interval), (1.0, (math.nan, math.nan)))
+    assert few.value == 1.0
+    assert all(math.isnan(bound) for bound in few.interval)
 
 
 def test_seeds_widen_the_interval_of_skill() -> None:
-    """Where scenarios agree and seeds do not, the interval is that of the seeds:
-    Student's, two degrees.
-    """
+    """Where only seeds scatter, the interval is theirs: Student's, two degrees."""
     base = np.full(12, 4.0)
-    share = np.array([0.4, 0.5, 0.9])
-    seeds = [scored((part * base).tolist()) for part in share]
-    found = compute_skill(seeds, {"analog": scored(base.tolist())})
-    assert (found.value, found.std) == pytest.approx((0.4, np.std(share, ddof=1)))
-    reach = np.std(share, ddof=1) / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
-    reaches = [
-        math.log((1.0 - bound) / (1.0 - found.value)) for bound in found.interval
-    ]
-    assert reaches[0] - reaches[1] == pytest.approx(2 * reach / 0.6, rel=0.15)
-    alone = compute_skill(seeds[:1], {"analog": scored(base.tolist())})
+    ratios = np.array([0.4, 0.5, 0.9])
+    seeds = [scored((ratio * base).tolist()) for ratio in ratios]
+    references = {"analog": scored(base.tolist())}
+    result = compute_skill(seeds, references)
+    std = np.std(ratios, ddof=1)
+    assert result.value == pytest.approx(0.4)
+    assert result.std == pytest.approx(std)
+
+    half_width = std / math.sqrt(3) * scipy.stats.t.ppf(0.975, 2)
+    low, high = result.interval
+    width = math.log((1.0 - low) / (1.0 - high))  # of the logarithm of the ratio
+    assert width == pytest.approx(2 * half_width / 0.6, rel=0.15)
+    alone = compute_skill(seeds[:1], references)
     assert alone.interval == pytest.approx((0.6, 0.6))
 
 
@@ -331,7 +350,7 @@ def test_scoring_takes_what_is_shipped(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """With shipped scores nothing but the submission is measured, and the card is equal.
+    """With shipped scores only the submission is measured, and the card is equal.
 
     Without them only the references that count are measured.
     """
@@ -359,8 +378,6 @@ def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
     assert REFERENCES[said["floor"]].counts
     assert said["value"] == pytest.approx(standing.skill.value)
     again = read_statistics(standing.files[1]).skill()
-    assert (again.reference, again.value) == (
-        standing.skill.reference,
-        standing.skill.value,
-    )
+    assert again.reference == standing.skill.reference
+    assert again.value == standing.skill.value
     assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")

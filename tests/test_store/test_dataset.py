@@ -44,10 +44,8 @@ def test_ragged_scenarios_are_padded(ragged: Path) -> None:
             frames = 5 - place
             particles = 6 + place
             one = data.sel(scenario=scenario)
-            assert (int(one["frame_count"]), int(one["particle_count"])) == (
-                frames,
-                particles,
-            )
+            assert int(one["frame_count"]) == frames
+            assert int(one["particle_count"]) == particles
             expected = np.full((5, 6 + len(TEST_IDS) - 1, 2), np.nan, np.float32)
             expected[:frames, :particles] = frames_of(scenario, frames, particles)
             np.testing.assert_array_equal(one["position"], expected)
@@ -73,11 +71,9 @@ def test_types_survive_the_padding(
             for name in ("position", "velocity", "wall_velocity", "material")
         ]
         assert types == ["float32", "float32", "float32", "int8"]
-        assert (data.attrs["split"], data.attrs["size"], data.attrs["subset"]) == (
-            "cavity",
-            "tiny",
-            "test",
-        )
+        assert data.attrs["split"] == "cavity"
+        assert data.attrs["size"] == "tiny"
+        assert data.attrs["subset"] == "test"
         assert "content_sha256" not in {*data.attrs, *data["position"].attrs}
 
 
@@ -187,11 +183,9 @@ def test_load_manifest(tmp_path: Path) -> None:
     """The manifest of a generated set is read; where there is none the command is
     named.
     """
-    with pytest.raises(
-        DataError,
-        match=r"(?s)no manifest.*lagbench generate --split cavity --size tiny",
-    ):
+    with pytest.raises(DataError) as caught:
         load_manifest("cavity", size="tiny", root=tmp_path)
+    assert caught.value.where.endswith("cavity/tiny/v2")
     names: dict[str, Any] = {"split": "cavity", "size": "tiny", "version": "2.0.0"}
     manifest = build_manifest(None, [], **names, subsets={"test": (3,)}, environment={})
     write_manifest(tmp_path, manifest)
@@ -206,5 +200,5 @@ def test_public_names_load_on_first_use() -> None:
     assert set(lagbench.__all__) <= set(dir(lagbench))
     assert lagbench.open_split is open_split
     assert lagbench.__version__[0].isdigit()
-    with pytest.raises(AttributeError, match="opensplit"):
+    with pytest.raises(AttributeError):
         lagbench.opensplit  # noqa: B018

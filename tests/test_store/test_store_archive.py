@@ -155,8 +155,10 @@ def test_releases_have_one_address(
     with serving(tmp_path / "out") as running:
         monkeypatch.setenv(archive.RELEASES_VARIABLE, running.url)
         result = download(SPLIT, SIZE, root=tmp_path / "here", or_generate=False)
-    assert (result.downloaded, result.mirror) == ((0, 1, 2, 3, 4), running.url)
-    assert (result.verdict, result.complete) == ("equal to datasets.yaml", True)
+    assert result.downloaded == (0, 1, 2, 3, 4)
+    assert result.mirror == running.url
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.complete
     assert running.count(".nc") == 0
     here, there = (
         {path.relative_to(root): path.read_bytes() for path in root.rglob("*.nc")}
@@ -175,7 +177,8 @@ def test_nobody_is_asked(
         patch.setattr(archive, "open_object", None)
         with pytest.raises(UsageError) as caught:
             download(SPLIT, SIZE, root=here, or_generate=False)
-    assert (caught.value.exit_code, caught.value.where) == (2, f"{SPLIT} {SIZE}")
+    assert caught.value.exit_code == 2
+    assert caught.value.where == f"{SPLIT} {SIZE}"
     assert archive.RELEASES in str(caught.value.got)
     monkeypatch.setenv(archive.RELEASES_VARIABLE, server.url)
     with pytest.raises(UsageError):
@@ -209,7 +212,8 @@ def test_only_what_is_missing_is_asked_for(
         server.faults = {".tar": fault}
     last = fetched(server.url, here)
     assert {*first.downloaded, *last.downloaded} == {0, 1, 2, 3}
-    assert (last.kept, last.complete) == (first.downloaded, True)
+    assert last.kept == first.downloaded
+    assert last.complete
     if not fault:
         assert any(wanted for path, wanted in server.asked if path.endswith(".tar"))
 
@@ -345,7 +349,8 @@ def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -
     rewritten(target, change)
     with pytest.raises(error) as caught:
         fetched(server.url, here)
-    assert (type(caught.value), caught.value.exit_code) == (error, 4)
+    assert type(caught.value) is error
+    assert caught.value.exit_code == 4
     assert str(caught.value.where).startswith(f"{server.url}/{packed.name}")
     with tarfile.open(packed) as tar:
         assert left(here) <= {f"own/full/v1/{name}" for name in tar.getnames()}

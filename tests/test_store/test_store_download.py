@@ -157,7 +157,8 @@ def test_wrong_objects_are_refused(
         store.put(name, changed[change])
     with pytest.raises(error) as caught:
         download("own", root=here, mirror=store.url, connections=1, or_generate=False)
-    assert (type(caught.value), caught.value.exit_code) == (error, 4)
+    assert type(caught.value) is error
+    assert caught.value.exit_code == 4
     assert caught.value.where == f"{store.url}/{name}"
     assert not [name for name in left(here) if name == "0000.nc" or "partial" in name]
     store.put(name, good)
@@ -245,7 +246,8 @@ def test_each_lie_has_its_error_and_leaves_nothing(
     server.faults = faults
     with pytest.raises(error) as caught:
         download("own", root=here, mirror=server.url, connections=1)
-    assert (type(caught.value), caught.value.exit_code) == (error, 4)
+    assert type(caught.value) is error
+    assert caught.value.exit_code == 4
     assert caught.value.where == f"{server.url}/own/full/v1/{next(iter(faults))}"
     assert not [name for name in left(here) if name == "0000.nc" or "partial" in name]
     assert FIRST in faults or server.count(".nc") == 0
@@ -287,10 +289,8 @@ def test_an_interrupted_download_goes_on(
         objects.TooSlowError if fault == "slow" else objects.ConnectionLostError
     ) as caught:
         download("own", root=here, mirror=server.url, scenarios="0", or_generate=False)
-    assert (caught.value.exit_code, caught.value.where) == (
-        5,
-        f"{server.url}/own/full/v1/{name}",
-    )
+    assert caught.value.exit_code == 5
+    assert caught.value.where == f"{server.url}/own/full/v1/{name}"
     assert not (here / "own/full/v1" / FIRST).exists()
     server.faults = {}
     result = download("own", root=here, mirror=server.url, scenarios="0")
@@ -379,11 +379,10 @@ def test_simulated_splits_come_from_a_store_or_are_simulated(
     with serving(generated.root) as running:
         running.faults = {"0003.nc": "gone"}
         result = download("curl-noise", "tiny", mirror=running.url, **where)
-    assert (result.downloaded, result.generated) == ((0, 1, 2, 4), (3,))
-    assert (result.verdict, result.dataset_sha256) == (
-        "equal to datasets.yaml",
-        generated.dataset_sha256,
-    )
+    assert result.downloaded == (0, 1, 2, 4)
+    assert result.generated == (3,)
+    assert result.verdict == "equal to datasets.yaml"
+    assert result.dataset_sha256 == generated.dataset_sha256
     (one,) = told
     assert f"{running.url}/curl-noise/tiny/v2/test/0003.nc" in one
     assert lagbench.verify("curl-noise", "tiny", root=tmp_path).warnings == ()

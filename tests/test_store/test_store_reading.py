@@ -102,7 +102,7 @@ def test_a_subset_comes_and_nothing_else(
     store.remove(f"{FOLDER}/test/0003.nc")
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     assert not store.server or store.server.count("0004.nc") == 1
-    with pytest.raises(DataError, match="0-1"):
+    with pytest.raises(DataError):
         lagbench.open_split(
             SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing"
         )
@@ -118,7 +118,8 @@ def test_scores_are_those_of_the_folder(
         SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny
     ).path
     result = lagbench.validate(written, root=url, require_truth=True, registry=tiny)
-    assert (result.valid, dict(result.skipped)) == (True, {})
+    assert result.valid
+    assert dict(result.skipped) == {}
     assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
     far, near = (
         lagbench.score(written, root=root, write=False, registry=tiny).as_json()
@@ -131,8 +132,9 @@ def test_scores_are_those_of_the_folder(
 def test_baselines_and_exports_read_from_a_store(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """DatasetInfo, training files and the bytes of an export, which needs all subsets, are
-    those of the folder.
+    """Dataset info, training files and the bytes of an export are those of the folder.
+
+    An export needs all subsets.
     """
     assert read_dataset_info(SPLIT, SIZE, root=url) == read_dataset_info(
         SPLIT, SIZE, root=generated.root
@@ -163,7 +165,8 @@ def test_baselines_and_exports_read_from_a_store(
 def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
     """Of a store the manifest counts, not the working copy; nothing is fetched."""
     found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
-    assert (found.state, found.present) == ("yes", {"train": 2, "valid": 1, "test": 2})
+    assert found.state == "yes"
+    assert found.present == {"train": 2, "valid": 1, "test": 2}
     assert here(url) == []
     assert (
         overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"

@@ -136,7 +136,9 @@ def test_another_machine_ends_what_one_began(
     assert len(begun) == 5
     machine(monkeypatch, tmp_path / "second")
     result = run(url)
-    assert (len(result.simulated), len(result.kept), result.complete) == (1, 4, True)
+    assert len(result.simulated) == 1
+    assert len(result.kept) == 4
+    assert result.complete
     assert objects(url) == files(generated.root)
     assert url_of(result.root) == url
 
@@ -147,9 +149,13 @@ def test_what_is_there_is_neither_simulated_nor_fetched(
     """A second machine adds nothing, and has nothing but the manifest afterwards."""
     before = objects(full)
     result = run(full)
-    assert (result.simulated, result.kept, result.missing) == ((), (0, 1, 2, 3, 4), ())
+    assert result.simulated == ()
+    assert result.kept == (0, 1, 2, 3, 4)
+    assert result.missing == ()
     assert result.dataset_sha256 == generated.dataset_sha256
-    assert (objects(full), wrote, [*files(result.root)]) == (before, [], [MANIFEST])
+    assert objects(full) == before
+    assert wrote == []
+    assert [*files(result.root)] == [MANIFEST]
 
 
 def test_the_manifest_comes_last(
@@ -210,7 +216,9 @@ def test_a_damaged_object_is_replaced_and_not_named_meanwhile(
     run(simulated_here(full))
     assert objects(full) == files(generated.root)
     (first, there), (second, _), *_, (last, _) = wrote
-    assert (first, second, last) == ("manifest.json", "train/0001.nc", "manifest.json")
+    assert first == "manifest.json"
+    assert second == "train/0001.nc"
+    assert last == "manifest.json"
     assert "train/0001.nc" not in named(there["manifest.json"])
     put(full, MANIFEST, b"{}")
     run(full)
@@ -246,7 +254,8 @@ def test_two_writers_do_no_harm(
     everything = named((generated.folder / "manifest.json").read_bytes())
     assert sorted(named(objects(url)[MANIFEST])) == sorted(everything)
     result = run(url)
-    assert (result.simulated, result.complete) == ((), True)
+    assert result.simulated == ()
+    assert result.complete
     found = objects(url)
     wanted = files(generated.root)
     assert all(
@@ -271,8 +280,10 @@ def test_a_dry_run_only_looks(full: str, run: Run) -> None:
     remove(full, f"{FOLDER}/valid/0002.nc")
     before = objects(full)
     result = run(full, dry_run=True)
-    assert (result.simulated, result.kept) == ((2,), (0, 1, 3, 4))
-    assert (objects(full), files(result.root)) == (before, {})
+    assert result.simulated == (2,)
+    assert result.kept == (0, 1, 3, 4)
+    assert objects(full) == before
+    assert files(result.root) == {}
 
 
 def test_a_file_that_changed_is_not_put(
@@ -295,7 +306,8 @@ def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
     (resolve_root(url) / "own").mkdir(parents=True)
     shutil.copy(original.folder / "split.yaml", resolve_root(url) / "own")
     result = download("own", root=url, mirror=original.folder.parent.as_uri())
-    assert (result.downloaded, result.complete) == ((0, 1, 2, 3), True)
+    assert result.downloaded == (0, 1, 2, 3)
+    assert result.complete
     there = {
         name.removeprefix("own/full/v1/"): data for name, data in objects(url).items()
     }
@@ -311,7 +323,8 @@ def test_a_download_goes_into_a_store(original: LocalSplit, url: str) -> None:
         for name in named(manifest)
     }
     again = download("own", root=url, mirror="file:///nowhere")
-    assert (again.downloaded, again.kept) == ((), (0, 1, 2, 3))
+    assert again.downloaded == ()
+    assert again.kept == (0, 1, 2, 3)
 
 
 def test_what_was_made_anew_is_not_fetched_back(

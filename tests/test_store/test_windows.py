@@ -214,8 +214,11 @@ def test_what_is_published_comes_along(
     scenarios share them.
     """
     box = lagbench.windows("cavity", size="tiny", root=root, registry=registry)
-    assert (box.history, box.future, box.length) == (6, 1, 7)
-    assert (box.gravity, box.viscosity) == (0.0, None)
+    assert box.history == 6
+    assert box.future == 1
+    assert box.length == 7
+    assert box.gravity == 0.0
+    assert box.viscosity is None
     for i in unmeasured.size("fluid", "tiny").subsets["valid"]:
         frames = unmeasured.size("fluid", "tiny").frame_count(i)
         write_scenario(
@@ -227,7 +230,9 @@ def test_what_is_published_comes_along(
     splash = lagbench.windows(
         "fluid", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
     )
-    assert (splash.history, splash.gravity, splash.viscosity) == (2, 2.5, 1e-3)
+    assert splash.history == 2
+    assert splash.gravity == 2.5
+    assert splash.viscosity == 1e-3
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
@@ -240,7 +245,8 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
     windows = [data[2], data[34 + 20 + 1]]
     batch = collate(windows)
     assert batch.sample.tolist() == 8 * [0] + 11 * [1]
-    assert (batch.scenario.tolist(), batch.frame.tolist()) == ([0, 2], [2, 1])
+    assert batch.scenario.tolist() == [0, 2]
+    assert batch.frame.tolist() == [2, 1]
     assert torch.equal(batch.position[8:], windows[1].position)
     assert batch.material.shape == (19,)
     assert batch.wall_velocity is not None
@@ -251,8 +257,9 @@ def test_collate_puts_windows_side_by_side(train: Open) -> None:
         [window, train(history=3)[0]],
         [window, window._replace(wall_velocity=None)],
     ):
-        with pytest.raises(UsageError, match="side by side"):
+        with pytest.raises(UsageError) as caught:
             collate(windows)
+        assert caught.value.where == "collate"
 
 
 def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None:
@@ -372,7 +379,8 @@ def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
     data = train()
     for index in (np.array(-1), torch.tensor(-1)):
         window = data[index]  # type: ignore[index]
-        assert (window.scenario, window.frame) == (data[-1].scenario, data[-1].frame)
+        assert window.scenario == data[-1].scenario
+        assert window.frame == data[-1].frame
         assert type(window.frame) is int
         assert int(index) == -1
 
@@ -413,8 +421,9 @@ def test_ranks_share_out_one_order(
         : WINDOWS // 3 * 3
     ]
     for rank, count in ((2, 2), (-1, 2), (0, WINDOWS + 1)):
-        with pytest.raises(UsageError, match="rank"):
+        with pytest.raises(UsageError) as caught:
             WindowSampler(data, seed=0, rank=rank, ranks=count)
+        assert caught.value.where == "WindowSampler"
     for name, value in {
         "is_initialized": True,
         "get_rank": 1,
@@ -472,7 +481,8 @@ def test_worker_processes_read_the_same(train: Open) -> None:
     data = train()
     first = data[0]
     sent = pickle.loads(pickle.dumps(data))
-    assert (sent.store.cached_bytes, len(sent.store._open_scenarios)) == (0, 0)
+    assert sent.store.cached_bytes == 0
+    assert len(sent.store._open_scenarios) == 0
     assert torch.equal(sent[0].position, first.position)
     batches = [
         list(
@@ -506,10 +516,12 @@ def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
     assert scenario_batch(paths[4]).frames == 26
     assert scenario_batch(paths[4], slice(-2, None)).frame.tolist() == [24]
     for frames in (slice(50, 60), slice(0, 10, 2), slice(5, 5)):
-        with pytest.raises(UsageError, match="no consecutive frames"):
+        with pytest.raises(UsageError) as caught:
             scenario_batch(paths[4], frames)
-    with pytest.raises(UsageError, match="side by side"):
+        assert caught.value.where.endswith("cavity/tiny/v2/test/0004.nc")
+    with pytest.raises(UsageError) as caught:
         scenario_batch(sorted(root.rglob("*.nc")))
+    assert caught.value.where == "collate"
 
 
 @pytest.mark.parametrize(
@@ -569,10 +581,9 @@ def test_another_scenario_under_its_name_is_refused(
     measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
     store = store_windows.FrameStore(size, {2: folder / "0002.nc"})
-    with pytest.raises(
-        DataError, match=r"(?s)not that of the registry.*content hash 0{16}"
-    ):
+    with pytest.raises(DataError) as caught:
         store.frames(2, 0, 2)
+    assert caught.value.where.endswith("cavity/tiny/v2/train/0002.nc")
 
 
 def drifting(batch: Batch) -> torch.Tensor:
@@ -670,8 +681,9 @@ def test_predictions_are_rollouts_from_what_the_task_gives(
     where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
     found = dict(predict(step, "cavity", history=history, device="cpu", **where))
     for wrong in (0, 7):  # none, or more than the task gives
-        with pytest.raises(UsageError, match="from 1 to 6"):
+        with pytest.raises(UsageError) as caught:
             next(predict(drifting, "cavity", history=wrong, **where))
+        assert caught.value.where == "predict"
     task = registry.size("cavity", "tiny").task
     assert list(found) == [4, 5]
     files = scenario_paths("cavity", **where)

@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 from bad_submissions import FAULTS
-from faulty import positions, rows, store
+from fault_registry import positions, rows, store
 from numpy.typing import ArrayLike
 from scenario_factory import make_key, write_scenario
 from submission_data import (
@@ -60,7 +60,8 @@ def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:
     """
     result = changed(bench, 1.5, (1, 4, 9, 0))
     flag = next(f for f in result.findings if f.check == "in_domain")
-    assert (flag.severity, result.exit_code) == (Severity.WARNING, 0)
+    assert flag.severity == Severity.WARNING
+    assert result.exit_code == 0
     assert flag.where == "first in scenario 4, frame 7, particle 9"
     # 1 / (3 * 8 * 48) = 0.087 %
     assert "0.09%" in flag.what
@@ -150,7 +151,8 @@ def test_all_findings_are_reported_together(bench: Bench) -> None:
         "scenarios",
         "finite",
     ]
-    assert (result.verdict, result.exit_code) == ("not valid", 4)
+    assert result.verdict == "not valid"
+    assert result.exit_code == 4
 
 
 def test_without_the_data_set_what_needs_no_truth_is_checked(
@@ -168,8 +170,9 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
     assert "lagbench generate --split cavity" in result.skipped["start"]
     required = elsewhere.validate(bench.valid, require_truth=True)
     assert required.exit_code == 4
-    with pytest.raises(DataError, match="3 of 3 test scenarios are not generated"):
+    with pytest.raises(DataError) as caught:
         required.check()
+    assert caught.value.where.endswith("cavity/tiny/v2/test")
     result = validate(
         bench.valid,
         root=tmp_path,
@@ -177,7 +180,8 @@ def test_without_the_data_set_what_needs_no_truth_is_checked(
         isolated=False,
     )
     flag = next(f for f in result.findings if f.check == "dataset")
-    assert (flag.severity, "datasets.yaml" in flag.got) == (Severity.WARNING, True)
+    assert flag.severity == Severity.WARNING
+    assert "datasets.yaml" in flag.got
 
 
 @pytest.mark.parametrize(
@@ -269,8 +273,10 @@ def test_a_damaged_data_set_is_told_from_a_bad_submission(
     else:
         change(path)
     result = own.validate(own.valid)
-    assert (result.exit_code, {f.check for f in result.errors}) == (4, {"dataset"})
-    assert (result.valid, result.verdict) == (False, "not judged")
+    assert result.exit_code == 4
+    assert {f.check for f in result.errors} == {"dataset"}
+    assert not result.valid
+    assert result.verdict == "not judged"
     assert str(path) in result.errors[0].where
     command = "lagbench generate --split cavity --size tiny --subset test --root"
     assert f"{command} {shlex.quote(str(own.root))}" in result.errors[0].fix
@@ -287,7 +293,8 @@ def test_a_change_after_the_check_is_seen(own: Bench, hashed: mock.Mock) -> None
     hashed.reset_mock()
     with pytest.raises(DataError) as caught:
         truth_of(own).check()
-    assert (caught.value.exit_code, hashed.mock_calls) == (4, [mock.call(path)])
+    assert caught.value.exit_code == 4
+    assert hashed.mock_calls == [mock.call(path)]
 
 
 def test_other_notes_count_for_nothing(

@@ -116,11 +116,9 @@ def test_what_stops_the_child_is_a_finding(
     monkeypatch.setattr(validation, "run_in_child", lambda *_, **__: ([], "a reason"))
     result = bench.validate(bench.valid, isolated=True)
     assert result.errors[0].got == "a reason"
-    assert (result.errors[0].check, result.exit_code, result.passed) == (
-        "readable",
-        3,
-        (),
-    )
+    assert result.errors[0].check == "readable"
+    assert result.exit_code == 3
+    assert result.passed == ()
     assert set(result.skipped) == set(CHECKS) - {"readable"}
     assert validation.WALL_SECONDS >= 100.0 * validation.CPU_SECONDS
     path = bench.copy("sparse.nc")

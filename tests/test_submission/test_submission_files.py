@@ -17,7 +17,7 @@ import pytest
 import torch
 import xarray as xr
 from bad_submissions import FAULTS
-from faulty import DIMS, positions, rows, store
+from fault_registry import DIMS, positions, rows, store
 from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -94,11 +94,9 @@ def test_the_template_is_the_last_given_frame_repeated(
     """
     made: dict[str, Any] = {"root": bench.root, "registry": bench.registry}
     result = template("cavity", "tiny", output=bench.folder / "t.nc", **made)
-    assert (result.scenarios, result.frames, result.particles) == (
-        TESTS,
-        (GIVEN, FRAMES - 1),
-        PARTICLES,
-    )
+    assert result.scenarios == TESTS
+    assert result.frames == (GIVEN, FRAMES - 1)
+    assert result.particles == PARTICLES
     assert bench.validate(result.path).exit_code == 0
     with open_predictions(result.path) as predictions:
         assert predictions.header.method == "persistence"
@@ -113,12 +111,11 @@ def test_the_template_is_the_last_given_frame_repeated(
         assert file["position"].chunks == (1, 1, PARTICLES, 2)
     again = template("cavity", "tiny", output=bench.folder / "twice.nc", **made)
     assert again.path.read_bytes() == result.path.read_bytes()
-    with pytest.raises(
-        DataError, match="lagbench generate --split cavity --size tiny --subset test"
-    ):
+    with pytest.raises(DataError) as caught:
         template(
             "cavity", "tiny", output=tmp_path / "t.nc", **{**made, "root": tmp_path}
         )
+    assert caught.value.where.endswith("cavity/tiny/v2/test")
     assert not (tmp_path / "t.nc").exists()
 
 
@@ -133,8 +130,9 @@ def test_without_a_recorded_hash_one_must_be_given(
         "method": "m",
         "registry": unmeasured,
     }
-    with pytest.raises(DataError, match="hash of the data set is not known"):
+    with pytest.raises(DataError) as caught:
         write(tmp_path / "p.nc", zeros, root=tmp_path, **more)
+    assert caught.value.where == "cavity tiny"
     path = write(
         tmp_path / "p.nc",
         zeros,
@@ -284,10 +282,9 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
-    with pytest.raises(
-        WorkFailedError, match="cannot write"
-    ) as told:  # a parent that is a file
+    with pytest.raises(WorkFailedError) as told:
         write(bench.valid / "p.nc", RIGHT, **options(bench))
+    assert told.value.where.endswith("valid.nc/p.nc")
     assert "--output" in str(told.value.fix)
 
 
@@ -314,7 +311,7 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
     with PredictionsWriter(path, **options(bench)) as writer:
         for scenario in reversed(TESTS):
             writer.add(scenario, truth(scenario))
-        with pytest.raises(UsageError, match="written twice"):
+        with pytest.raises(UsageError):
             writer.add(3, truth(3))
         writer.label(
             seconds_per_frame=np.float32(0.5),
@@ -323,11 +320,9 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
         )
     with open_predictions(path) as predictions:
         header = predictions.header
-        assert (header.seconds_per_frame, header.seed, header.device) == (
-            0.5,
-            2,
-            "one core",
-        )
+        assert header.seconds_per_frame == 0.5
+        assert header.seed == 2
+        assert header.device == "one core"
 
 
 def test_a_writer_that_failed_begins_anew(bench: Bench) -> None:
@@ -370,17 +365,20 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
         got = predictions.frames(4, 5, 3)
         header = predictions.header
         for place in ((9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)):
-            with pytest.raises(UsageError, match="no such frames"):
+            with pytest.raises(UsageError) as caught:
                 predictions.frames(*place)
+            assert caught.value.where.endswith("valid.nc")
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
-    assert (header.split, header.size, header.method) == ("cavity", "tiny", "truth")
-    assert (header.scenarios, header.frames, header.particles) == (
-        TESTS,
-        tuple(ALL),
-        PARTICLES,
-    )
-    assert (header.seconds_per_frame, header.seed, header.device) == (0.25, 7, None)
+    assert header.split == "cavity"
+    assert header.size == "tiny"
+    assert header.method == "truth"
+    assert header.scenarios == TESTS
+    assert header.frames == tuple(ALL)
+    assert header.particles == PARTICLES
+    assert header.seconds_per_frame == 0.25
+    assert header.seed == 7
+    assert header.device is None
 
 
 def test_scenarios_in_another_order_are_matched_by_id(bench: Bench) -> None:

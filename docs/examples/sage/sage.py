@@ -1,4 +1,4 @@
-"""GraphSAGE as an aggregation: a graph network of one's own."""
+"""GraphSAGE as the operator of a graph network: an example of your own model."""
 
 from torch import Generator, Tensor
 from torch_geometric.nn import SAGEConv
@@ -7,8 +7,10 @@ from lagbench.baselines.operators.operator import Losses, Operator
 
 
 class Sage(Operator):
-    """Mean of the neighbours (Hamilton et al. 2017); edges come in by their sum in
-    ``node``.
+    """Mean over the neighbours (Hamilton et al. 2017).
+
+    SAGEConv takes no edge features. The sum of the messages, which is part of ``node``,
+    brings them in.
     """
 
     method = "GNS + SAGEConv"
@@ -25,5 +27,5 @@ class Sage(Operator):
         *,
         generator: Generator | None = None,
     ) -> tuple[Tensor, Losses]:
-        """Return what each node gathers, and no loss of its own."""
+        """Return the aggregation of each node, and no loss of the operator."""
         return self.conv(node, edge_index), {}

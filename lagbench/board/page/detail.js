@@ -16,7 +16,7 @@ function drawDetail(tab, state, row) {
 
 /** Return the reference predictors of a tab, each with the class of its marks. */
 function referencesOf(tab) {
-  return tab.references.map((reference, i) => [`floor${i}`, reference]);
+  return tab.references.map((reference, i) => [`reference${i}`, reference]);
 }
 
 function leaderOf(tab) {
@@ -86,7 +86,7 @@ function scenarioChart(tab, by, rows) {
 
 /** Return a mark: a dot for an entry, hollow ones of two shapes for reference predictors. */
 function spot(kind, x = 11, y = 5) {
-  if (/^floor.*[13579]$/.test(kind)) return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
+  if (/^reference.*[13579]$/.test(kind)) return svg("path", { d: `M${(x - 4).toFixed(1)} ${y.toFixed(1)}l4 -4l4 4l-4 4Z`, class: `spot ${kind}` });
   return svg("circle", { cx: x.toFixed(1), cy: y.toFixed(1), r: kind === "s0" ? 5 : 3.8, class: `spot ${kind}` });
 }
 

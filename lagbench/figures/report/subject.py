@@ -91,7 +91,7 @@ class Subject:
         reference_scores = dict(self.entries[0].card.scores)
         del reference_scores[SUBMISSION]
         for number, (name, scores) in enumerate(reference_scores.items()):
-            kind = f"floor{number}"
+            kind = f"reference{number}"
             rows.append(ReportRow(name=name, kind=kind, scores=scores))
         return tuple(rows)
 

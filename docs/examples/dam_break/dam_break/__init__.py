@@ -1,4 +1,4 @@
-"""A column of liquid that collapses: a split of one's own."""
+"""A column of liquid that collapses: an example of your own split."""
 
 from pathlib import Path
 
@@ -12,25 +12,30 @@ from lagbench.generators.split import FreeSurfaceParameters, InitialState
 
 REGISTRY = Path(__file__).with_name("dam_break.yaml")
 
+GAP = 0.01
+"""Distance of the column from the left wall and from the floor [length]."""
+
 
 def solver_parameters(size: Size) -> FreeSurfaceParameters:
-    """Return the constants that the registry names."""
+    """Return the solver's constants, as the registry states them."""
     return constants(FreeSurfaceParameters, size)
 
 
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
-    """Draw the column's width and height; only ``rng.random`` may be used."""
-    low, _ = free_surface_walls(size)
+    """Draw the width and height of the column; use ``rng.random`` only."""
     width = uniform(rng, 0.2, 0.4)
     height = uniform(rng, 0.4, 0.7)
-    column = body_at(
-        Rectangle(width, height), low + 0.01 + width / 2, low + 0.01 + height / 2
-    )
+
+    wall, _ = free_surface_walls(size)
+    centre_x = wall + GAP + width / 2
+    centre_y = wall + GAP + height / 2
+    column = body_at(Rectangle(width, height), centre_x, centre_y)
+
     return InitialState(
         position=sample_points(rng, column, size.particles),
         velocity=np.zeros((size.particles, 2)),
         affine=np.zeros((size.particles, 2, 2)),
-        material=np.zeros(size.particles, np.int8),
+        material=np.zeros(size.particles, np.int8),  # 0: liquid
         area=width * height,
         parameters={"width": width, "height": height},
     )

@@ -1,0 +1,102 @@
+"""The command cite."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import lagbench
+from lagbench.data.local import locate_split
+from lagbench.data.registry import Split
+
+from .options import (
+    JsonFlag,
+    RootOption,
+    SplitArgument,
+    SplitOption,
+    choose_split,
+    option,
+)
+from .output import print_result
+
+# Title and year of this version, as in CITATION.cff.
+TITLE = (
+    "lagbench: bit-reproducible data sets and benchmarks "
+    "for neural surrogates of Lagrangian continuum simulators"
+)
+RELEASE_YEAR = 2026
+
+
+def cite_command(
+    split_argument: SplitArgument = None,
+    split_option: SplitOption = None,
+    bibtex: Annotated[
+        bool, option("--bibtex", "Print BibTeX; without a split, of lagbench itself.")
+    ] = False,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Print how to cite a split: version, hashes and original works."""
+    if bibtex and not (split_argument or split_option):
+        version = lagbench.__version__
+        fields = {"title": TITLE, "version": version}
+        text = _format_bibtex("software", "lagbench", fields)
+        print_result({"bibtex": text}, [text], as_json=as_json)
+        return
+
+    split = choose_split(split_argument, split_option)
+    name, _, registry = locate_split(split, root=root)
+    entry = registry.split(name)
+    hashes = {}
+    for size, measured in registry.measured.get(name, {}).items():
+        hashes[size] = measured.dataset_sha256
+    if bibtex:
+        text = _split_bibtex(name, entry, hashes)
+        print_result({"bibtex": text}, [text], as_json=as_json)
+        return
+
+    citation = {
+        "split": name,
+        "version": entry.version,
+        "title": entry.title,
+        "licence": entry.licence,
+        "citation": entry.citation,
+        "dataset_sha256": hashes,
+    }
+    lines = [
+        f"lagbench, split {name!r} ({entry.title}), version {entry.version}, "
+        f"{entry.licence}.",
+        f"After: {entry.citation}.",
+    ]
+    for size, sha256 in hashes.items():
+        lines.append(f"Data set hash of size {size}: {sha256}")
+    print_result(citation, lines, as_json=as_json)
+
+
+def _split_bibtex(name: str, entry: Split, hashes: Mapping[str, str]) -> str:
+    listing = ", ".join(f"{size} {sha256}" for size, sha256 in hashes.items())
+    fields = {
+        "title": f"{entry.title}: split {name} of lagbench",
+        "version": entry.version,
+        "license": entry.licence,
+        "note": f"After {entry.citation}. SHA-256 of the data sets: {listing}",
+    }
+    return _format_bibtex("misc", f"lagbench-{name}", fields)
+
+
+def _format_bibtex(kind: str, key: str, fields: Mapping[str, str]) -> str:
+    """Return a BibTeX entry by the authors of lagbench.
+
+    Characters that TeX would read as commands are escaped.
+    """
+    replacements = {"\\": "/"}
+    for character in "&%$#_{}":
+        replacements[character] = f"\\{character}"
+    escapes = str.maketrans(replacements)
+
+    # The inner braces keep BibTeX from taking the name of the authors apart.
+    lines = [f"@{kind}{{{key},", "  author = {{The lagbench authors}},"]
+    for name, value in {**fields, "year": str(RELEASE_YEAR)}.items():
+        lines.append(f"  {name} = {{{value.translate(escapes)}}},")
+    lines.append("}")
+    return "\n".join(lines)

@@ -1,0 +1,43 @@
+"""The command clean."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from lagbench.make.clean import clean
+
+from .options import (
+    JsonFlag,
+    PresentSizeOption,
+    QuietFlag,
+    RootOption,
+    accept_split,
+    option,
+)
+from .output import format_bytes, print_result
+
+
+@accept_split
+def clean_command(
+    split: str,
+    size: PresentSizeOption = None,
+    root: RootOption = None,
+    leftovers: Annotated[
+        bool,
+        option("--leftovers", "Remove only temporary files of interrupted commands."),
+    ] = False,
+    dry_run: Annotated[
+        bool, option("--dry-run", "Print the files without removing them.")
+    ] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Remove a generated data set, or only its temporary files."""
+    result = clean(split, size, root=root, leftovers=leftovers, dry_run=dry_run)
+    action = "removed"
+    if dry_run:
+        action = "would be removed"
+    total_size = format_bytes(result.bytes)
+    lines = [str(path) for path in result.removed]
+    lines.append(f"{len(result.removed)} files, {total_size} {action}")
+    print_result(result, lines, as_json=as_json, quiet=quiet)

@@ -1,0 +1,52 @@
+"""The command compare."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from lagbench.scoring.compare import compare
+from lagbench.scoring.tables import comparison_tables
+
+from .options import JsonFlag, QuietFlag, RootOption, WorkersOption, option
+from .output import print_json, print_line, print_tables
+
+
+def compare_command(
+    first: Annotated[
+        str,
+        typer.Argument(
+            metavar="A",
+            help="scores.json, scores.nc, predictions.nc, or a folder of a method's "
+            "scores, of one or of several seeds.",
+        ),
+    ],
+    second: Annotated[
+        str,
+        typer.Argument(
+            metavar="B", help="The same, or the name of a reference predictor."
+        ),
+    ],
+    metric: Annotated[
+        list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
+    ] = None,
+    root: RootOption = None,
+    workers: WorkersOption = None,
+    every: Annotated[bool, option("--all", "Show every metric.")] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Compare two methods with statistical tests and confidence intervals.
+
+    The comparison runs over the test scenarios, and over seeds where there are several.
+    """
+    result = compare(first, second, metrics=metric or (), root=root, workers=workers)
+    if as_json:
+        print_json(result.as_json())
+    elif not quiet:
+        if result.namesakes:
+            print_line(f"{result.first}: {first}")
+            print_line(f"{result.second}: {second}")
+        print_tables(comparison_tables(result, every=every or bool(metric)))
+        print_line(result.verdict)

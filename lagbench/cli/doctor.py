@@ -1,0 +1,154 @@
+"""The command doctor: checks of the machine, which a bug report needs."""
+
+from __future__ import annotations
+
+import os
+import platform
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from lagbench.data.local import resolve_root
+from lagbench.data.registry import load
+from lagbench.errors import ChecksFailedError, LagbenchError
+from lagbench.make.plan import free_bytes
+from lagbench.work.machine import available_cores
+
+from .options import JsonFlag, RootOption
+from .output import print_json, print_table
+
+REQUIRED_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "xarray",
+    "netCDF4",
+    "h5py",
+    "dask",
+    "pandas",
+    "pydantic",
+    "PyYAML",
+    "typer",
+    "rich",
+    "platformdirs",
+    "filelock",
+    "fsspec",
+)
+OPTIONAL_LIBRARIES = {
+    "taichi": "generate",
+    "matplotlib": "plots",
+    "imageio": "plots",
+    "torch": "baselines",
+    "distributed": "cluster",
+    "s3fs": "s3",
+}
+"""Libraries of our extras, each with the name of its extra."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstallationCheck:
+    """The check of one part of the installation."""
+
+    name: str  # the part
+    state: str  # "ok", "missing" (something optional) or "broken"
+    detail: str  # what the check found, and how to mend it
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """All checks of the installation."""
+
+    checks: tuple[InstallationCheck, ...]  # in the order in which they were made
+
+    @property
+    def broken_parts(self) -> list[str]:
+        """Names of the parts that are broken."""
+        return [check.name for check in self.checks if check.state == "broken"]
+
+
+def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
+    """Check this machine: libraries, cores, disk, registry."""
+    diagnosis = diagnose(root)
+    if as_json:
+        print_json(diagnosis)
+    else:
+        rows = [(check.name, check.state, check.detail) for check in diagnosis.checks]
+        print_table("", ("check", "state", "detail"), rows)
+    broken_parts = diagnosis.broken_parts
+    if broken_parts:
+        raise ChecksFailedError(
+            "this machine cannot run lagbench",
+            got=f"broken: {', '.join(broken_parts)}",
+        )
+
+
+def diagnose(root: str | Path | None = None) -> Diagnosis:
+    """Check what lagbench needs, with data sets under ``root``; nothing is changed."""
+    folder = resolve_root(root)
+    checks = [
+        InstallationCheck(name="lagbench", state="ok", detail=version("lagbench")),
+        InstallationCheck(
+            name="python",
+            state="ok",
+            detail=f"{platform.python_version()} on {platform.platform()}",
+        ),
+        InstallationCheck(name="processor", state="ok", detail=_describe_processor()),
+    ]
+    for library in REQUIRED_LIBRARIES:
+        checks.append(_check_library(library))
+    for library, extra in OPTIONAL_LIBRARIES.items():
+        checks.append(_check_library(library, extra))
+    checks.append(_check_part("registry", _describe_registry))
+    checks.append(_check_part("data folder", lambda: _describe_folder(folder)))
+    return Diagnosis(checks=tuple(checks))
+
+
+def _describe_processor() -> str:
+    machine = platform.machine()
+    if machine in {"x86_64", "AMD64"} and platform.system() == "Linux":
+        promise = "bits as in datasets.yaml"
+    else:
+        promise = "bits may differ: see docs/determinism.md"
+    return f"{machine}, {available_cores()} of {os.cpu_count()} cores; {promise}"
+
+
+def _check_library(name: str, extra: str | None = None) -> InstallationCheck:
+    """Check a library; that of an extra may be missing, and nothing is broken."""
+    try:
+        return InstallationCheck(name=name, state="ok", detail=version(name))
+    except PackageNotFoundError:
+        if extra is None:
+            state = "broken"
+            detail = "not installed: pip install lagbench"
+        else:
+            state = "missing"
+            detail = f"pip install 'lagbench[{extra}]'"
+        return InstallationCheck(name=name, state=state, detail=detail)
+
+
+def _check_part(name: str, describe: Callable[[], str]) -> InstallationCheck:
+    """Check a part by describing it, which fails where the part is broken."""
+    try:
+        return InstallationCheck(name=name, state="ok", detail=describe())
+    except (LagbenchError, OSError) as error:
+        return InstallationCheck(name=name, state="broken", detail=str(error))
+
+
+def _describe_registry() -> str:
+    registry = load()
+    hash_count = sum(len(sizes) for sizes in registry.measured.values())
+    return f"{len(registry.splits)} splits, hashes of {hash_count} sizes"
+
+
+def _describe_folder(folder: Path) -> str:
+    """Return the folder of all data sets and its free space.
+
+    Raises:
+        OSError: nothing can be written there.
+    """
+    existing = folder
+    while not existing.exists():
+        existing = existing.parent
+    with tempfile.TemporaryFile(dir=existing):
+        return f"{folder}, {free_bytes(folder)} bytes free"

@@ -1,0 +1,89 @@
+"""The command export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from lagbench.data.local import locate
+from lagbench.exchange.exporting import ExportResult, export
+
+from .options import (
+    JsonFlag,
+    PresentSizeOption,
+    QuietFlag,
+    RootOption,
+    accept_split,
+    option,
+)
+from .output import format_bytes, print_result
+from .progress import progress_bar
+
+
+@accept_split
+def export_command(
+    split: str,
+    size: PresentSizeOption = None,
+    file_format: Annotated[
+        str, option("--format NAME", "gns-npz or lagrangebench-h5.")
+    ] = "gns-npz",
+    output: Annotated[
+        Path | None,
+        option(
+            "--output -o FOLDER",
+            "Folder of the new files; by default SPLIT-SIZE-FORMAT here.",
+        ),
+    ] = None,
+    root: RootOption = None,
+    from_walls: Annotated[
+        bool | None,
+        option(
+            "--from-walls/--unit-box",
+            "lagrangebench-h5: measure positions from the lower walls, as is the "
+            "default for closed boxes.",
+        ),
+    ] = None,
+    wall_particles: Annotated[
+        bool,
+        option(
+            "--wall-particles",
+            "Closed boxes: add particles that move along with the walls.",
+        ),
+    ] = False,
+    force: Annotated[bool, option("--force", "Replace an earlier export.")] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Write a split in the file format of another code base.
+
+    The folder holds the subsets train, valid and test, and a file of metadata.
+    """
+    size_name = locate(split, size, root=root).size.name
+    folder = output or Path(f"{Path(split).name}-{size_name}-{file_format}")
+    with progress_bar(quiet=quiet) as progress:
+        result = export(
+            split,
+            size_name,
+            format=file_format,
+            output=folder,
+            root=root,
+            from_walls=from_walls,
+            wall_particles=wall_particles,
+            force=force,
+            progress=progress,
+        )
+    print_result(result, _describe(result), as_json=as_json, quiet=quiet)
+
+
+def _describe(result: ExportResult) -> list[str]:
+    lines = [f"{result.split} {result.size} as {result.format} in {result.folder}"]
+    for subset, count in result.trajectories.items():
+        frame_count = result.frames[subset]
+        lines.append(f"  {subset:<6}{count} trajectories, {frame_count} frames")
+    if result.left_out:
+        lines.append(
+            f"  {result.left_out} frames left out: "
+            "readers of this format need trajectories of equal lengths"
+        )
+    lines.append(f"  {format_bytes(result.bytes)}")
+    return lines

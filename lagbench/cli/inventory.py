@@ -1,0 +1,202 @@
+"""The commands list and info: the splits, their cost, and the data on this machine."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from lagbench.data.layout import url_of
+from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
+from lagbench.data.registry import Registry, Size, Split, format_ids, load
+from lagbench.errors import LagbenchError
+from lagbench.make.inventory import Overview, overview
+
+from .options import JsonFlag, RootOption, accept_split, option
+from .output import (
+    format_bytes,
+    format_seconds,
+    print_json,
+    print_line,
+    print_table,
+    print_warning,
+)
+
+COLUMNS = (
+    "split",
+    "size",
+    "scenarios",
+    "particles",
+    "frames",
+    "disk <=",
+    "time",
+    "here",
+)
+"""Columns of a table of sizes."""
+
+
+def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
+    """List all splits and sizes, their cost, and the data on this machine."""
+    folder = resolve_root(root)
+    overviews = _list_overviews(folder)
+    if as_json:
+        print_json({"root": folder, "sizes": overviews})
+        return
+    print_table("", COLUMNS, map(_format_row, overviews))
+    for line in _describe_times(overviews):
+        print_line(line)
+    print_line(f"data sets live in {url_of(folder) or folder}")
+
+
+def _list_overviews(folder: Path) -> list[Overview]:
+    """Return the overview of every size, those of local splits last.
+
+    A local split whose description cannot be read is left out with a warning.
+    """
+    registry = load_rooted_registry(folder, load())
+    overviews: list[Overview] = []
+    for name in registry.splits:
+        overviews += _overviews_of_split(registry, name, folder)
+    for name in registry.local_names():
+        try:
+            overviews += _overviews_of_split(registry, name, folder)
+        except (LagbenchError, OSError) as error:
+            print_warning(f"{name} is left out: {error}")
+    return overviews
+
+
+def _overviews_of_split(registry: Registry, split: str, folder: Path) -> list[Overview]:
+    sizes = registry.split(split).sizes
+    return [overview(registry.size(split, size), folder) for size in sizes]
+
+
+def _describe_times(overviews: Sequence[Overview]) -> list[str]:
+    """Return the line that says where the times of a table come from, if it has any."""
+    estimated_splits: list[str] = []
+    has_measured = False
+    for entry in overviews:
+        if not entry.seconds:
+            continue
+        if entry.measured:
+            has_measured = True
+        elif entry.split not in estimated_splits:
+            estimated_splits.append(entry.split)
+
+    if not estimated_splits:
+        if has_measured:
+            return ["time: at the rate measured here"]
+        return []
+    subject = "time"
+    if has_measured:
+        subject = f"time of {', '.join(estimated_splits)}"
+    return [f"{subject}: estimated; measured after the first generate"]
+
+
+def _format_row(entry: Overview) -> tuple[object, ...]:
+    duration = "-"
+    if entry.seconds:
+        duration = format_seconds(entry.seconds)
+    return (
+        entry.split,
+        entry.size,
+        "/".join(map(str, entry.scenarios.values())),
+        entry.particles,
+        entry.frames,
+        format_bytes(entry.bytes),
+        duration,
+        entry.state,
+    )
+
+
+@accept_split
+def info_command(
+    split: str,
+    size: Annotated[
+        str | None, option("--size NAME", "One size; all sizes by default.")
+    ] = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Show the parameters, sizes, cost and local data of a split."""
+    name, folder, registry = locate_split(split, root=root)
+    entry = registry.split(name)
+    all_sizes = [registry.size(name, size_name) for size_name in entry.sizes]
+    if size:
+        shown_sizes = [registry.size(name, size)]
+    else:
+        shown_sizes = all_sizes
+    overviews = [overview(shown_size, folder) for shown_size in shown_sizes]
+    if as_json:
+        sizes = {}
+        for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
+            sizes[shown_size.name] = _size_as_json(shown_size, size_overview)
+        print_json({"split": name, **_split_as_json(entry), "sizes": sizes})
+        return
+
+    description = textwrap.fill(entry.description, 79, break_on_hyphens=False)
+    print_line(f"{entry.title} ({name} {entry.version}, {entry.licence})")
+    print_line(f"{description}\n")
+    print_table("Sizes", COLUMNS, map(_format_row, overviews))
+    for line in _describe_times(overviews):
+        print_line(line)
+    print_line("")
+    _print_parameters(entry, all_sizes)
+    for shown_size, size_overview in zip(shown_sizes, overviews, strict=True):
+        for line in _describe_size(shown_size, size_overview):
+            print_line(line)
+
+
+def _split_as_json(entry: Split) -> dict[str, Any]:
+    """Return what the JSON of info says of a split as a whole."""
+    return {
+        "version": entry.version,
+        "title": entry.title,
+        "description": entry.description,
+        "citation": entry.citation,
+        "licence": entry.licence,
+    }
+
+
+def _size_as_json(size: Size, size_overview: Overview) -> dict[str, Any]:
+    parameters = {}
+    for name, parameter in size.parameters.items():
+        parameters[name] = parameter.model_dump()
+    return {
+        "overview": size_overview,
+        "parameters": parameters,
+        "task": size.task.model_dump(),
+        "subsets": size.subsets,
+        "bounds": size.bounds,
+        "dt": size.dt,
+        "frame_interval": size.frame_interval,
+    }
+
+
+def _print_parameters(entry: Split, sizes: Sequence[Size]) -> None:
+    rows = []
+    for name, parameter in entry.parameters.items():
+        values = [size.value(name) for size in sizes]
+        rows.append((name, *values, f"[{parameter.unit}] {parameter.description}"))
+    columns = ("name", *entry.sizes, "[unit] meaning")
+    print_table("Parameters", columns, rows)
+
+
+def _describe_size(size: Size, size_overview: Overview) -> Iterator[str]:
+    subsets = []
+    for name, ids in size.subsets.items():
+        subsets.append(f"{name} {format_ids(ids)}")
+    task = size.task
+    yield f"{size_overview.split} {size_overview.size}"
+    yield f"  scenarios  {'; '.join(subsets)}"
+    yield (
+        f"  task       {task.input_frames} frames given, {task.horizon} to predict, "
+        f"radius {task.radius}"
+    )
+    yield (
+        f"  frame      {size.frame_interval:.6g} s, "
+        f"{size.substeps_per_frame} substeps of {size.dt:.6g} s"
+    )
+    yield f"  hash       {size_overview.dataset_sha256 or 'not measured yet'}"
+    yield f"  folder     {size_overview.folder} (there: {size_overview.state})"
+    yield f"  picture    {size_overview.picture or 'none'}"

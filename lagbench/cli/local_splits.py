@@ -1,0 +1,226 @@
+"""The commands import and adopt, which make local splits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from lagbench.data.registry import parse_ids
+from lagbench.errors import UsageError
+from lagbench.exchange.adoption import adopt, import_split
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.exchange.metadata import parse_kinds
+from lagbench.exchange.trajectory import DataOptions, read_options
+
+from .options import JsonFlag, QuietFlag, option
+from .output import print_result, print_warning
+from .progress import progress_bar
+
+OutputOption = Annotated[
+    Path,
+    option("--output -o FOLDER", "New folder; its last part is the split's name."),
+]
+DescribeOption = Annotated[
+    Path | None,
+    option(
+        "--describe FILE",
+        "YAML file that describes the data, see docs/exchange.md; other options win.",
+    ),
+]
+RadiusOption = Annotated[
+    float | None, option("--radius LENGTH", "Connectivity radius of graph models.")
+]
+IntervalOption = Annotated[
+    float | None, option("--frame-interval SECONDS", "Time between two frames.")
+]
+BoundsOption = Annotated[
+    str | None, option("--bounds X0,X1,Y0,Y1", "Positions of the walls.")
+]
+PeriodicOption = Annotated[
+    str | None,
+    option("--periodic AXES", "Axes of the box without walls, as in x,y; or none."),
+]
+RescaleFlag = Annotated[
+    bool,
+    option("--rescale", "Scale the bounds into the unit box, by a power of two."),
+]
+InputFramesOption = Annotated[
+    int | None,
+    option("--input-frames N", "Frames that a model is given; 6 by default."),
+]
+HorizonOption = Annotated[
+    int | None, option("--horizon N", "Frames to predict; all others by default.")
+]
+InterestOption = Annotated[
+    str | None,
+    option("--frames-of-interest FRAMES", "As in 15,25; the last one by default."),
+]
+CellsOption = Annotated[
+    int | None, option("--cells N", "Cells of the score grid along an axis.")
+]
+FullBoxFlag = Annotated[
+    bool | None,
+    option(
+        "--full-box/--free-surface",
+        "Whether material fills the box; then a metric of vorticity ranks.",
+    ),
+]
+
+
+def import_command(
+    ctx: typer.Context,
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER", help="Folder of train, valid, test and metadata."
+        ),
+    ],
+    file_format: Annotated[
+        str, option("--format NAME", "gns-npz or lagrangebench-h5.")
+    ],
+    output: OutputOption,
+    kinds: Annotated[
+        str | None,
+        option("--kinds LIST", "Materials of particle kinds, as in 3=jelly,0=drop."),
+    ] = None,
+    describe: DescribeOption = None,
+    radius: RadiusOption = None,
+    frame_interval: IntervalOption = None,
+    bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
+    rescale: RescaleFlag = False,
+    input_frames: InputFramesOption = None,
+    horizon: HorizonOption = None,
+    frames_of_interest: InterestOption = None,
+    cells: CellsOption = None,
+    full_box: FullBoxFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Make a local split from the data of another code base.
+
+    Models train and are scored on a local split as on any other.
+    """
+    with progress_bar(quiet=quiet) as progress:
+        local_split = import_split(
+            source,
+            format=file_format,
+            output=output,
+            kinds=parse_kinds(kinds),
+            progress=progress,
+            **_data_options(ctx.params),
+        )
+    _print_local_split(local_split, as_json=as_json, quiet=quiet)
+
+
+def adopt_command(
+    ctx: typer.Context,
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them."
+        ),
+    ],
+    output: OutputOption,
+    describe: DescribeOption = None,
+    radius: RadiusOption = None,
+    frame_interval: IntervalOption = None,
+    valid: Annotated[
+        int | None, option("--valid N", "Trajectories of valid; a tenth by default.")
+    ] = None,
+    test: Annotated[
+        int | None, option("--test N", "Trajectories of test; a tenth by default.")
+    ] = None,
+    bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
+    rescale: RescaleFlag = False,
+    input_frames: InputFramesOption = None,
+    horizon: HorizonOption = None,
+    frames_of_interest: InterestOption = None,
+    cells: CellsOption = None,
+    full_box: FullBoxFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Make a local split from your own trajectories.
+
+    The trajectories are NumPy arrays or netCDF files.
+    """
+    with progress_bar(quiet=quiet) as progress:
+        local_split = adopt(
+            sources,
+            output=output,
+            valid=valid,
+            test=test,
+            progress=progress,
+            **_data_options(ctx.params),
+        )
+    _print_local_split(local_split, as_json=as_json, quiet=quiet)
+
+
+def _data_options(parameters: Mapping[str, Any]) -> Any:  # noqa: ANN401 (a DataOptions)
+    """Return the options that describe the data, those of ``--describe`` included."""
+    options: dict[str, Any] = {}
+    for name in DataOptions.__annotations__:
+        value = parameters.get(name)
+        if value is not None:
+            options[name] = value
+    # A flag that the user leaves out must not win over the file.
+    if not options["rescale"]:
+        del options["rescale"]
+    if "bounds" in options:
+        options["bounds"] = _parse_bounds(options["bounds"])
+    if "periodic" in options:
+        options["periodic"] = _parse_axes(options["periodic"])
+    if "frames_of_interest" in options:
+        options["frames_of_interest"] = parse_ids(
+            options["frames_of_interest"], where="--frames-of-interest", noun="frame"
+        )
+    if parameters["describe"] is None:
+        return options
+    return {**read_options(parameters["describe"]), **options}
+
+
+def _parse_bounds(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the lowest and the highest position along x and along y."""
+    try:
+        left, right, bottom, top = map(float, text.split(","))
+    except ValueError:
+        raise UsageError(
+            "bad bounds",
+            where="--bounds",
+            expected="x0,x1,y0,y1, as in 0,2,0,1",
+            got=text,
+        ) from None
+    return (left, right), (bottom, top)
+
+
+def _parse_axes(text: str) -> tuple[str, ...]:
+    """Return the names of axes; "none" stands for no axis."""
+    if text == "none":
+        return ()
+    return tuple(text.split(","))
+
+
+def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -> None:
+    counts = []
+    for subset, count in local_split.scenarios.items():
+        counts.append(f"{count} {subset}")
+    fewest, most = local_split.particles
+    particles = f"{fewest} to {most}"
+    if fewest == most:
+        particles = f"{fewest}"
+    lines = [
+        f"{local_split.folder}: {', '.join(counts)}, {local_split.frames} frames, "
+        f"{particles} particles",
+        f"  task    {local_split.input_frames} frames given, "
+        f"{local_split.horizon} to predict",
+        f"  hash    {local_split.dataset_sha256}",
+        f"  use it  lagbench template --split {local_split.folder}/",
+    ]
+    print_result(local_split, lines, as_json=as_json, quiet=quiet)
+    for note in local_split.notes:
+        print_warning(note)

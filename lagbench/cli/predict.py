@@ -1,0 +1,161 @@
+"""The command predict."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lagbench.data.registry import load
+from lagbench.errors import LagbenchError
+
+from .model_options import (
+    PREDICTION_LIBRARIES,
+    DeviceOption,
+    ThreadsOption,
+    require_libraries,
+)
+from .options import JsonFlag, QuietFlag, RootOption, option
+from .output import print_result, print_warning
+from .progress import progress_bar
+from .solver_bench import SolverBench, bench_apart
+
+if TYPE_CHECKING:
+    from lagbench.baselines.predict import PredictionResult
+
+
+def predict_command(
+    checkpoint: Annotated[
+        Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")
+    ],
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
+        "predictions.nc"
+    ),
+    size: Annotated[
+        str | None,
+        option("--size NAME", "Size to predict; by default that of the training."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        option(
+            "--set KEY=VALUE",
+            "Change the model, as in model.average=true; repeatable.",
+        ),
+    ] = None,
+    root: RootOption = None,
+    device: DeviceOption = "auto",
+    threads: ThreadsOption = None,
+    batch: Annotated[
+        int | None,
+        option(
+            "--batch N",
+            "Scenarios to predict together; by default 1 on a CPU, all on a GPU.",
+            min=1,
+        ),
+    ] = None,
+    method: Annotated[
+        str | None, option("--method NAME", "Name of the method on a leaderboard.")
+    ] = None,
+    bench: Annotated[
+        bool, option("--bench/--no-bench", "Time our solver too, for the speed-up.")
+    ] = True,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Predict the test scenarios with a trained model.
+
+    The predictions go into a predictions.nc.
+    """
+    require_libraries(PREDICTION_LIBRARIES)
+    from lagbench.baselines.predict import predict
+
+    is_replaced = output.is_file()
+    solver: SolverBench | None = None
+
+    def time_solver(split: str, size: str) -> float | None:
+        nonlocal solver
+        solver = _bench_solver(split, size, quiet=quiet)
+        if solver is None:
+            return None
+        return solver.seconds_per_frame
+
+    with progress_bar(quiet=quiet) as progress:
+        result = predict(
+            checkpoint,
+            output,
+            root=root,
+            size=size,
+            settings=tuple(settings or ()),
+            device=device,
+            threads=threads,
+            batch=batch,
+            method=method,
+            time_solver=time_solver if bench else None,
+            progress=progress,
+        )
+    lines = _describe(result, solver=solver, is_replaced=is_replaced, root=root)
+    value = {**vars(result), "solver": solver}
+    print_result(value, lines, as_json=as_json, quiet=quiet)
+
+
+def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:
+    """Return the cost of our solver on this machine.
+
+    None stands for local splits, and for machines where the solver cannot run, with a
+    warning.
+    """
+    if split not in load().splits:
+        return None
+    try:
+        return bench_apart(split, size)
+    except LagbenchError as error:
+        if not quiet:
+            print_warning(f"no speed-up over the solver: {error}")
+        return None
+
+
+def _describe(
+    result: PredictionResult,
+    *,
+    solver: SolverBench | None,
+    is_replaced: bool,
+    root: Path | None,
+) -> Iterator[str]:
+    method_parts = [result.method]
+    if result.trained_size != result.size:
+        method_parts.append(f"trained at {result.trained_size}")
+    method_parts += result.settings
+    yield (
+        f"{result.path}: {', '.join(method_parts)}, {result.scenarios} scenarios, "
+        f"{result.frames} frames"
+    )
+    if is_replaced:
+        yield "  in place of the predictions that were there"
+    yield (
+        f"  model   {result.seconds_per_frame:.3g} s per frame "
+        f"({result.seconds_without_search:.3g} s without the neighbour search) "
+        f"on {result.device}"
+    )
+    if solver is not None:
+        yield (
+            f"  solver  {solver.seconds_per_frame:.3g} s per frame on one core of this "
+            f"machine: {_compare_speed(result, solver)}"
+        )
+    if result.diverged:
+        marks = []
+        for scenario, frame in result.diverged.items():
+            marks.append(f"scenario {scenario} at frame {frame}")
+        yield f"  frozen  {', '.join(marks)}: not finite from there on"
+    root_option = ""
+    if root:
+        root_option = f" --root {root}"
+    yield f"next: lagbench score {result.path}{root_option}"
+
+
+def _compare_speed(result: PredictionResult, solver: SolverBench) -> str:
+    ratio = result.seconds_per_frame / solver.seconds_per_frame
+    if ratio > 1:
+        return f"{ratio:.2g} times as fast as the model"
+    return f"the model is {1 / ratio:.2g} times as fast"

@@ -1,0 +1,108 @@
+"""Progress on stderr: a bar where a person watches, else a line per minute."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    TaskProgressColumn,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as ProgressDisplay
+
+from lagbench.store.copy import silence_fetching
+from lagbench.work.progress import Progress, watched
+
+from .output import format_seconds
+
+SECONDS_PER_LINE = 60.0  # time between two lines of progress that go to a file [s]
+
+Listener = Callable[[Progress], None]
+
+
+@contextmanager
+def progress_bar(*, quiet: bool, unit: str = "scenarios") -> Iterator[Listener | None]:
+    """Yield a function that shows progress: the share done, the rate and the time left.
+
+    A terminal shows a bar. A file or a pipe gets a line per minute, so that short work
+    prints none.
+
+    Args:
+        quiet: whether to show nothing; None is yielded then.
+        unit: what the work is counted in.
+    """
+    if quiet:
+        with silence_fetching():
+            yield None
+        return
+    if not watched():
+        yield _print_lines(unit)
+        return
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[count]}"),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    with ProgressDisplay(*columns, console=console, transient=True) as display:
+        task = display.add_task("starting", total=None, count="")
+
+        def update_bar(progress: Progress) -> None:
+            display.update(
+                task,
+                description=progress.stage,
+                completed=progress.done,
+                total=progress.total or None,
+                count=_format_rate(progress, unit),
+            )
+
+        yield update_bar
+
+
+def _print_lines(unit: str) -> Listener:
+    """Return a function that prints a line, at most one a minute."""
+    last_time = time.monotonic()
+
+    def print_progress(progress: Progress) -> None:
+        nonlocal last_time
+        now = time.monotonic()
+        if now - last_time < SECONDS_PER_LINE:
+            return
+        last_time = now
+
+        share = ""
+        if progress.total:
+            share = f"{progress.done / progress.total:.0%}, "
+        remaining = ""
+        seconds_left = _seconds_left(progress)
+        if math.isfinite(seconds_left):
+            remaining = f", {format_seconds(seconds_left)} left"
+        rate = _format_rate(progress, unit)
+        with suppress(OSError):  # the work goes on without a reader
+            typer.echo(f"{progress.stage}: {share}{rate}{remaining}", err=True)
+
+    return print_progress
+
+
+def _seconds_left(progress: Progress) -> float:
+    """Return the time that the rest takes [s]; infinity where it cannot be known."""
+    if not progress.scenarios or not progress.rate:
+        return math.inf
+    return (progress.scenarios - progress.scenarios_done) / progress.rate
+
+
+def _format_rate(progress: Progress, unit: str) -> str:
+    count = f"{progress.scenarios_done}"
+    if progress.scenarios:
+        count = f"{count}/{progress.scenarios}"
+    return f"{count} {unit}, {progress.rate:.2f}/s"

@@ -1,0 +1,196 @@
+"""The command score."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lagbench.data.local import locate_split
+from lagbench.errors import UsageError
+from lagbench.figures.report.report import check_folder, write_report
+from lagbench.scoring.card import ScoreCard
+from lagbench.scoring.score import score
+from lagbench.scoring.tables import card_tables, flag_lines
+from lagbench.submission.issues import ValidationResult
+from lagbench.submission.validation import validate
+
+from .options import (
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    SchedulerOption,
+    WorkersOption,
+    option,
+)
+from .output import print_errors, print_json, print_line, print_tables
+from .progress import progress_bar
+from .validate import ExpectedSplitOption, require_split
+
+
+def score_command(
+    predictions: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...", help="A predictions.nc; several with --report."
+        ),
+    ],
+    split: ExpectedSplitOption = None,
+    root: RootOption = None,
+    output: Annotated[
+        Path | None,
+        option(
+            "--output -o FOLDER",
+            "Folder of the scores; by default that of predictions.nc. A file of "
+            "another name, and each of several files, gets a folder of its own name.",
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None,
+        option("--report FOLDER", "Write index.html with all figures there."),
+    ] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
+    extras: Annotated[
+        str,
+        option("--extras NAMES", "Extras whose metrics are added, as in transport."),
+    ] = "",
+    every: Annotated[bool, option("--all", "Show every metric.")] = False,
+    all_references: Annotated[
+        bool,
+        option(
+            "--all-floors", "Show every reference predictor, not only the best one."
+        ),
+    ] = False,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Score a predictions.nc; write scores.json and scores.nc.
+
+    The scores stand beside those of the reference predictors.
+    """
+    if len(predictions) > 1 and report is None:
+        raise UsageError(
+            "several files are scored for one report only",
+            where="FILE",
+            expected="one file",
+            got=f"{len(predictions)} files",
+            fix="add --report FOLDER",
+        )
+    folders = _score_folders(predictions, output)
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root)
+    validations: Sequence[ValidationResult | None] = [None]
+    if len(predictions) > 1:
+        validations = _validate_together(predictions, root)
+    if report is not None:
+        check_folder(report)
+
+    def examine(result: ValidationResult) -> None:
+        require_split(result, expected_split)
+        print_errors(result)
+
+    cards = []
+    for path, folder, validation in zip(predictions, folders, validations, strict=True):
+        with progress_bar(quiet=quiet) as progress:
+            card = score(
+                path,
+                root=root,
+                output_dir=folder,
+                workers=workers,
+                scheduler=scheduler,
+                extras=tuple(name for name in extras.split(",") if name),
+                progress=progress,
+                examined=examine,
+                validated=validation,
+            )
+        cards.append(card)
+
+    page = None
+    try:
+        # The report comes before the first printed word: a reader such as head may
+        # close the pipe.
+        if report is not None:
+            page = write_report(report, cards, predictions, root=root)
+    finally:
+        if as_json:
+            _print_cards_as_json(cards)
+        elif not quiet:
+            _print_cards(cards, every=every, all_references=all_references)
+    if page is not None:
+        print_line(f"report: {page}", quiet=quiet or as_json)
+
+
+def _print_cards_as_json(cards: Sequence[ScoreCard]) -> None:
+    """Print the scores of one file as an object, those of several as a list."""
+    if len(cards) == 1:
+        print_json(cards[0].as_json())
+    else:
+        print_json([card.as_json() for card in cards])
+
+
+def _print_cards(
+    cards: Sequence[ScoreCard], *, every: bool, all_references: bool
+) -> None:
+    for card in cards:
+        print_tables(card_tables(card, every=every, floors=all_references))
+        for line in flag_lines(card):
+            print_line(line)
+        print_line(f"written: {', '.join(map(str, card.files))}")
+
+
+def _score_folders(
+    predictions: Sequence[Path], output: Path | None
+) -> Sequence[Path | None]:
+    """Return the folder for the scores of each file; None stands for the default.
+
+    Raises:
+        UsageError: the scores of two files would go to one folder.
+    """
+    if len(predictions) == 1:
+        return [output]
+    folders = []
+    files_by_folder: dict[Path, Path] = {}
+    for path in predictions:
+        folder = (output or path.parent) / path.stem
+        folders.append(folder)
+        other_path = files_by_folder.setdefault(folder.resolve(), path)
+        if other_path is not path:
+            raise UsageError(
+                "the scores of two files would go to one folder",
+                where=str(folder),
+                got=f"{other_path} and {path}",
+                fix="name each file once, give the files different names, or leave "
+                "--output out",
+            )
+    return folders
+
+
+def _validate_together(
+    predictions: Sequence[Path], root: Path | None
+) -> list[ValidationResult]:
+    """Return the validation of every file, before the first is scored.
+
+    Raises:
+        UsageError: the files are for different data sets.
+        LagbenchError: a file is invalid.
+    """
+    results: list[ValidationResult] = []
+    for path in predictions:
+        result = validate(path, root=root, require_truth=True)
+        print_errors(result)
+        result.check()
+        results.append(result)
+        first = results[0]
+        if (result.split, result.size) != (first.split, first.size):
+            raise UsageError(
+                "one report, two data sets",
+                where=str(path),
+                expected=f"{first.split} {first.size}, as in {first.path}",
+                got=f"{result.split} {result.size}",
+                fix="write one report for each data set",
+            )
+    return results

@@ -1,0 +1,90 @@
+"""The time that our solver takes, which a surrogate has to beat on the same machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from lagbench.data.registry import load
+from lagbench.errors import check_installed
+from lagbench.generators.batch import draw_initial_state
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.solver import build
+from lagbench.work.pool import Pool, Report, WorkItem
+
+WARM_UP_FRAMES = 2  # before the clock starts: kernels compile when they first run
+LEAST_SECONDS = 0.5  # shortest processor time over which the mean is taken [s]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverBench:
+    """The cost of a frame for the solver, which simulates one scenario on one core."""
+
+    split: str  # name of the split
+    size: str  # name of the size
+    particles: int  # particles of the scenario
+    substeps: int  # solver steps of a frame
+    frames: int  # frames that were timed
+    # mean processor time of a frame [s], so that other work on the machine does not
+    # count; writing it to disk is not part of it
+    seconds_per_frame: float
+
+
+def bench_solver(split: str, size: str, *, frames: int = 20) -> SolverBench:
+    """Simulate the first test scenario and time its frames.
+
+    Taichi starts once per process: call this from a process of its own, as
+    :func:`bench_apart` does.
+
+    Args:
+        split: name of a split.
+        size: name of a size.
+        frames: least number of frames to time; more if they take under half a second.
+    """
+    tier = load().size(split, size)
+    check_installed("taichi", extra="generate")
+    solver = build(solver_constants(tier))
+    first_scenario = tier.subsets["test"][0]
+    solver.load([draw_initial_state(tier, first_scenario)])
+    solver.advance(WARM_UP_FRAMES * tier.substeps_per_frame)
+
+    start = time.process_time()
+    seconds = 0.0
+    frame_count = 0
+    while frame_count < frames or seconds < LEAST_SECONDS:
+        solver.advance(tier.substeps_per_frame)
+        solver.position()
+        frame_count += 1
+        seconds = time.process_time() - start
+    return SolverBench(
+        split=split,
+        size=size,
+        particles=tier.particles,
+        substeps=tier.substeps_per_frame,
+        frames=frame_count,
+        seconds_per_frame=seconds / frame_count,
+    )
+
+
+def bench_apart(split: str, size: str) -> SolverBench:
+    """Time the solver in a process of its own.
+
+    The memory and the threads of this process do not disturb it there.
+    """
+    load().size(split, size)
+    check_installed("taichi", extra="generate")
+    item = WorkItem(
+        name=f"bench of {split} {size}",
+        function=_bench_in_worker,
+        arguments=(split, size),
+    )
+    with Pool(1) as pool:
+        pool.submit(item)
+        results = [event.value for event in pool.events() if event.kind == "done"]
+    result: SolverBench = results[0]
+    return result
+
+
+def _bench_in_worker(split: str, size: str, report: Report) -> SolverBench:
+    """Time the solver in a worker process; there is nothing to report meanwhile."""
+    return bench_solver(split, size)

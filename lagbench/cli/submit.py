@@ -1,0 +1,146 @@
+"""The command submit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lagbench.board.entry_file import read_meta
+from lagbench.board.folder import VERIFIED
+from lagbench.board.publish import SubmitResult
+from lagbench.board.submit import submit
+
+from .options import (
+    DEFAULT_BOARD,
+    BoardOption,
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    WorkersOption,
+    option,
+)
+from .output import print_errors, print_result, print_warning
+from .progress import progress_bar
+
+
+def submit_command(
+    predictions: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", help="A predictions.nc for each seed."),
+    ],
+    source: Annotated[
+        Path | None,
+        option(
+            "--from FILE",
+            "YAML file that describes the method, see docs/submitting.md; other "
+            "options win.",
+        ),
+    ] = None,
+    method: Annotated[
+        str | None, option("--method ID", "Name of the entry, as in my-model.")
+    ] = None,
+    authors: Annotated[
+        list[str] | None, option("--author NAME", "Author; repeatable.")
+    ] = None,
+    command: Annotated[
+        str | None, option("--command TEXT", "Command that makes the predictions.")
+    ] = None,
+    urls: Annotated[
+        list[str] | None,
+        option("--url URL", "Address of a FILE; one for each FILE."),
+    ] = None,
+    weights: Annotated[
+        list[Path] | None,
+        option(
+            "--weights FILE",
+            "weights.pt to keep beside the entry; at most one for each seed.",
+        ),
+    ] = None,
+    replace: Annotated[
+        bool, option("--replace", "Replace the entry of that name.")
+    ] = False,
+    add: Annotated[
+        bool,
+        option("--add", "Add seeds to the entry of that name and keep its others."),
+    ] = False,
+    new_board: Annotated[
+        bool, option("--new-board", "Begin a leaderboard in the folder of --board.")
+    ] = False,
+    board: BoardOption = DEFAULT_BOARD,
+    root: RootOption = None,
+    workers: WorkersOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Score predictions and add them to a leaderboard as an entry.
+
+    The entry and its score files go into the leaderboard's folder.
+    """
+    description = {
+        "method": method,
+        "authors": authors,
+        "command": command,
+        "urls": urls,
+    }
+    meta = read_meta(source, description)
+    with progress_bar(quiet=quiet or as_json) as progress:
+        result = submit(
+            predictions,
+            meta,
+            weights=weights or (),
+            board=board,
+            root=root,
+            replace=replace,
+            add=add,
+            new_board=new_board,
+            workers=workers,
+            progress=progress,
+            examined=print_errors,
+        )
+    print_result(result, _describe(result), as_json=as_json, quiet=quiet)
+
+
+def _describe(result: SubmitResult) -> Iterator[str]:
+    is_default_board = result.board == DEFAULT_BOARD
+    yield (
+        f"{result.method} on {result.split} {result.size}: {result.ranking} "
+        f"{_format_mean(result)}"
+    )
+    for flag in result.flags:
+        yield f"flag {flag}: raised"
+    if result.size == "tiny" and is_default_board:
+        print_warning(
+            "tiny has too few scenarios to rank anything; "
+            "use it for trials: --board trial --new-board"
+        )
+    yield f"written: {', '.join(map(str, result.files))}"
+    if result.kept:
+        paths = ", ".join(map(str, result.kept))
+        yield f"kept from the earlier entry: {paths}"
+    if result.removed:
+        paths = ", ".join(map(str, result.removed))
+        yield f"removed from the earlier entry: {paths}"
+    if result.board / VERIFIED in result.files:
+        yield (
+            "the entry lost its line in verified.yaml: "
+            "maintainers score it again to verify it"
+        )
+    board_option = ""
+    if not is_default_board:
+        board_option = f" --board {result.board}"
+    yield (
+        f"next: lagbench leaderboard check{board_option}; "
+        f"to see the page: lagbench leaderboard build{board_option}"
+    )
+
+
+def _format_mean(result: SubmitResult) -> str:
+    if result.mean is None:
+        return "undefined"
+    mean = f"{result.mean:.4g}"
+    if result.std is None:
+        return mean
+    return f"{mean} ± {result.std:.2g} over seeds"

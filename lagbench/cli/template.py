@@ -1,0 +1,42 @@
+"""The command template."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from lagbench.submission.writer import template
+
+from .options import (
+    JsonFlag,
+    PresentSizeOption,
+    QuietFlag,
+    RootOption,
+    accept_split,
+    option,
+)
+from .output import format_bytes, print_result
+
+
+@accept_split
+def template_command(
+    split: str,
+    size: PresentSizeOption = None,
+    output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
+        "predictions.nc"
+    ),
+    overwrite: Annotated[
+        bool, option("--overwrite", "Replace a file of that name.")
+    ] = False,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Write a valid predictions.nc, the persistence prediction, to fill in."""
+    result = template(split, size, output=output, overwrite=overwrite, root=root)
+    first, last = result.frames
+    line = (
+        f"{result.path}: {len(result.scenarios)} scenarios, frames {first} to {last}, "
+        f"{result.particles} particles, {format_bytes(result.bytes)}"
+    )
+    print_result(result, [line], as_json=as_json, quiet=quiet)

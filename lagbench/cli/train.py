@@ -1,0 +1,259 @@
+"""The command train."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from lagbench.data.local import locate
+from lagbench.errors import LagbenchError, UsageError
+from lagbench.scoring.scorability import check_scorability
+
+from .model_options import (
+    TRAINING_LIBRARIES,
+    DeviceOption,
+    ThreadsOption,
+    require_libraries,
+    root_option,
+)
+from .options import (
+    JsonFlag,
+    PresentSizeOption,
+    QuietFlag,
+    RootOption,
+    accept_split,
+    option,
+)
+from .output import format_seconds, print_result, print_warning
+from .progress import progress_bar
+
+if TYPE_CHECKING:
+    from lagbench.baselines.train import TrainingResult
+
+
+@accept_split
+def train_command(
+    split: str,
+    baseline: Annotated[
+        str | None,
+        option("--baseline NAME", "Reference model, as in gns; see docs/baselines.md."),
+    ] = None,
+    size: PresentSizeOption = None,
+    recipe: Annotated[
+        str | None,
+        option("--recipe NAME", "Variant of the recipe, as in short; or a YAML file."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        option(
+            "--set KEY=VALUE",
+            "Change the recipe, as in training.steps=100; repeatable.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None, option("--seed N", "Seed of all random numbers.", min=0)
+    ] = None,
+    start: Annotated[
+        Path | None,
+        option(
+            "--start FILE",
+            "weights.pt to start from; they may be of another size.",
+        ),
+    ] = None,
+    root: RootOption = None,
+    output: Annotated[
+        Path | None,
+        option(
+            "--output -o FOLDER",
+            "Folder of the run; by default in runs/, named after recipe, baseline and "
+            "seed.",
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        option("--resume/--no-resume", "Continue an earlier training of the folder."),
+    ] = True,
+    fresh: Annotated[
+        bool, option("--fresh", "Start anew and replace an earlier training.")
+    ] = False,
+    device: DeviceOption = "auto",
+    processes: Annotated[
+        int, option("--processes N", "Processes, each with a device (DDP).", min=1)
+    ] = 1,
+    threads: ThreadsOption = None,
+    workers: Annotated[
+        int, option("--workers N", "Processes that read windows ahead.", min=0)
+    ] = 0,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Train a reference model.
+
+    An interrupted call goes on where it stopped.
+    """
+    if baseline is None:
+        raise UsageError(
+            "no model is named",
+            where="--baseline",
+            fix="name one, as in --baseline gns",
+        )
+    if fresh and not resume:
+        raise UsageError(
+            "two options that exclude each other",
+            where="--fresh and --no-resume",
+            fix="give --fresh to replace an earlier training, or --no-resume to keep "
+            "it and stop",
+        )
+    require_libraries(TRAINING_LIBRARIES)
+    # Torch takes seconds to load, so the data are looked for before. Of several
+    # processes only the first does it, for an error to be printed once.
+    if "LOCAL_RANK" not in os.environ:
+        locate(split, size, root=root)
+
+    with progress_bar(quiet=quiet):
+        from lagbench.baselines.machine import is_helper
+        from lagbench.baselines.train import train
+
+    changes = tuple(settings or ())
+    is_helper_process = is_helper()
+    if is_helper_process:
+        quiet = True
+        as_json = False
+    else:
+        _warn_of_scorability(
+            split, size, root=root, baseline=baseline, recipe=recipe, changes=changes
+        )
+    with (
+        _errors_of_one_process(is_helper=is_helper_process),
+        progress_bar(quiet=quiet, unit="steps") as progress,
+    ):
+        result = train(
+            baseline,
+            split,
+            size,
+            recipe=recipe,
+            settings=changes,
+            seed=seed,
+            start=start,
+            root=root,
+            output=output,
+            resume=resume,
+            fresh=fresh,
+            device=device,
+            processes=processes,
+            threads=threads,
+            workers=workers,
+            progress=progress,
+        )
+    lines = _describe(result, root_option(split, root))
+    print_result(result, lines, as_json=as_json, quiet=quiet)
+
+
+def _warn_of_scorability(
+    split: str,
+    size: str | None,
+    *,
+    root: Path | None,
+    baseline: str,
+    recipe: str | None,
+    changes: tuple[str, ...],
+) -> None:
+    """Warn before the training where a user's own data cannot be scored."""
+    from lagbench.baselines.catalogue import find
+    from lagbench.baselines.recipe import recipe_for
+
+    tier, folder, _ = locate(split, size, root=root)
+    if tier.simulated:
+        return
+    plan = recipe_for(
+        find(baseline), tier.split, tier.name, variant=recipe, settings=changes
+    )
+    is_validated = plan.training.validate_every != 0
+    reasons = list(check_scorability(tier, folder, validated=is_validated))
+    if reasons:
+        warning = "predictions of this model cannot be scored as they should"
+        print_warning("\n  ".join([warning, *reasons]))
+
+
+@contextmanager
+def _errors_of_one_process(*, is_helper: bool) -> Iterator[None]:
+    """Let one process of each machine print an error that all processes raise.
+
+    An interruption is printed by the very first process only.
+    """
+    try:
+        yield
+    except KeyboardInterrupt:
+        if is_helper:
+            raise typer.Exit(128 + signal.SIGINT) from None
+        raise
+    except LagbenchError as error:
+        is_first_of_machine = os.environ.get("LOCAL_RANK", "0") == "0"
+        # An error with a cause, as where memory is full, befell this process only.
+        if is_first_of_machine or error.__cause__ is not None:
+            raise
+        raise typer.Exit(error.exit_code) from error
+
+
+def _describe(result: TrainingResult, root_option: str) -> Iterator[str]:
+    yield (
+        f"{result.baseline} on {result.recipe}: {result.state}, "
+        f"step {result.step} of {result.steps}, {_describe_time(result)}"
+    )
+    if result.start:
+        yield (
+            f"  started    from {result.start}; "
+            "hours and track count the training of these weights too"
+        )
+    yield f"  parameters {result.parameters}"
+    yield f"  loss       {_describe_loss(result)}"
+    if result.best_value is not None:
+        best = f"{result.best_value:.4g} on valid, step {result.best_step}"
+        if result.best_step == 0:
+            best += ": nothing better than the weights that it started from"
+        yield f"  best       {result.metric} {best}"
+    yield f"  budget     {_describe_budget(result)}"
+    yield f"  weights    {result.weights}"
+    if result.size == "tiny":
+        yield "hint: tiny is for tests: it is too small to learn from; try --size mini"
+    yield f"next: lagbench predict {result.weights}{root_option} -o predictions.nc"
+
+
+def _describe_time(result: TrainingResult) -> str:
+    wall_time = format_seconds(result.wall_seconds)
+    cpu_time = format_seconds(result.cpu_seconds)
+    text = f"{wall_time}, {cpu_time} of processor time"
+    if result.gpu_seconds:
+        text += f", {format_seconds(result.gpu_seconds)} of GPU time"
+    if result.first_step == result.step:
+        text += "; the training was over before, --fresh trains anew"
+    elif result.first_step:
+        text += f"; this call went on from step {result.first_step}"
+    return text
+
+
+def _describe_loss(result: TrainingResult) -> str:
+    """Return all terms of the loss, their sum last."""
+    terms = sorted(result.loss)
+    if "total" in terms:
+        terms.remove("total")
+        terms.append("total")
+    return ", ".join(f"{term} {result.loss[term]:.4g}" for term in terms)
+
+
+def _describe_budget(result: TrainingResult) -> str:
+    windows = ""
+    if result.windows_seen:
+        windows = f"{result.windows_seen:,} windows, "
+    validation_share = result.validation_cpu_seconds / (result.cpu_seconds or 1.0)
+    return (
+        f"{windows}{result.epochs:.3g} epochs; "
+        f"{validation_share:.0%} of the processor time for validations; "
+        f"{result.device}, {result.threads} thread(s); track: {result.track or 'none'}"
+    )

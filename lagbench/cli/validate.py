@@ -1,0 +1,79 @@
+"""The command validate, and the option that says which split predictions are for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lagbench.data.local import locate_split
+from lagbench.errors import UsageError
+from lagbench.submission.issues import ValidationResult
+from lagbench.submission.validation import validate
+
+from .options import JsonFlag, QuietFlag, RootOption, option
+from .output import format_count, print_result
+
+ExpectedSplitOption = Annotated[
+    str | None,
+    option(
+        "--split NAME",
+        "Refuse predictions for another split; a local split is named by its folder.",
+    ),
+]
+
+
+def validate_command(
+    predictions: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A predictions.nc.")
+    ],
+    split: ExpectedSplitOption = None,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Check a predictions.nc; print every error and how to fix it."""
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root)
+    result = validate(predictions, root=root)
+    require_split(result, expected_split)
+    print_result(result, _describe(result), as_json=as_json, quiet=quiet)
+    raise typer.Exit(result.exit_code)
+
+
+def require_split(result: ValidationResult, expected_split: str | None) -> None:
+    """Refuse predictions for another split than the expected one.
+
+    Predictions that name no split pass here; their validation rejects them.
+
+    Raises:
+        UsageError: the predictions are for another split.
+    """
+    if expected_split is None or result.split in (None, expected_split):
+        return
+    raise UsageError(
+        "the predictions are for another split",
+        where=str(result.path),
+        expected=expected_split,
+        got=ascii(result.split),
+        fix="name that split, or leave --split out",
+    )
+
+
+def _describe(result: ValidationResult) -> list[str]:
+    lines = [str(issue) for issue in result.findings]
+
+    skipped_checks: dict[str, list[str]] = {}
+    for check, reason in result.skipped.items():
+        skipped_checks.setdefault(reason, []).append(check)
+    for reason, checks in skipped_checks.items():
+        lines.append(f"not made, since {reason}: {', '.join(checks)}")
+
+    error_count = format_count(len(result.errors), "error")
+    warning_count = format_count(len(result.warnings), "warning")
+    check_count = format_count(len(result.passed), "check")
+    counts = f"{error_count}, {warning_count}, {check_count} passed"
+    lines.append(f"{result.path}: {result.verdict}, {counts}")
+    return lines

@@ -1,0 +1,417 @@
+"""The commands train, predict and bench, as users and clusters call them."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pickle
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from unittest.mock import Mock
+
+import netCDF4
+import pytest
+import torch
+from click.testing import Result
+from typer.testing import CliRunner
+
+from lagbench.__main__ import app
+from lagbench.baselines.catalogue import list_names
+from lagbench.baselines.checkpoint import load
+from lagbench.errors import DataError, WorkFailedError
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.generate import GenerationResult
+from lagbench.submission.validation import validate
+
+Command = Callable[..., Result]
+
+
+TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
+
+
+@pytest.fixture
+def lagbench(
+    generated: GenerationResult,
+    unmeasured_path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Command:
+    """Run a command on the tiny curl-noise data, in an empty folder."""
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
+    monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: str) -> Result:
+        return CliRunner().invoke(app, list(words))
+
+    return call
+
+
+BROKEN = """
+from simple_models import Drift
+
+class Mine(Drift):
+    def forward(self, batch, generator=None):
+        raise RuntimeError("my own mistake")
+"""
+
+
+def test_a_fault_of_a_package_is_told_as_one(
+    lagbench: Command, package: Callable[..., Path]
+) -> None:
+    """What a user's own class raises is not to be reported to us: its line is named."""
+    module = package("baselines", "my_model:Mine", BROKEN)
+    result = lagbench("train", "--baseline", "mine", *TINY, "--set", "training.steps=2")
+    assert result.exit_code == 5
+    assert f"{module}, line 6" in result.stderr
+
+
+@pytest.mark.parametrize("baseline", list_names())
+def test_every_baseline_trains_and_predicts(lagbench: Command, baseline: str) -> None:
+    """Two commands lead from a baseline's name to predictions that are valid and say
+    their cost.
+    """
+    steps = ["--set", "training.steps=2", "--set", "training.validate_every=0"]
+    settings = steps if not baseline.startswith("var") else []
+    trained = lagbench("train", "--baseline", baseline, *TINY, *settings, "--json")
+    assert trained.exit_code == 0, trained.output
+    result = json.loads(trained.stdout)
+    assert result["folder"] == f"runs/curl-noise/tiny/{baseline}-0"
+    predicted = lagbench(
+        "predict", result["weights"], "--threads", "1", "--no-bench", "--json"
+    )
+    assert predicted.exit_code == 0, predicted.output
+    assert json.loads(predicted.stdout)["seconds_per_frame"] > 0
+    assert validate("predictions.nc", isolated=False).valid
+
+
+def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
+    """Without --json each command says what it did and which one comes next, down to
+    the scores.
+    """
+    train = (
+        "train",
+        "curl-noise",
+        "--size",
+        "tiny",
+        "--baseline",
+        "gns",
+        "--set",
+        "training.steps=1",
+    )
+    trained = lagbench(*train)
+    assert (
+        "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
+    )
+    assert "hint: tiny is for tests" in trained.stdout
+    assert "was over before" in lagbench(*train).stdout
+    assert "was over before" not in trained.stdout
+    predict = (
+        "predict",
+        "runs/curl-noise/tiny/gns-0/weights.pt",
+        "--threads",
+        "1",
+        "--no-bench",
+    )
+    assert lagbench(*predict, "--set", "model.latent=7").exit_code == 2
+    predicted = lagbench(*predict, "--set", "model.clamp=false")
+    with netCDF4.Dataset("predictions.nc") as data:
+        assert "model.clamp=false" in data.getncattr("training")
+    assert "without the neighbour search" in predicted.stdout
+    assert "in place of" not in predicted.stdout
+    assert "in place of" in lagbench(*predict).stdout
+    assert "next: lagbench score predictions.nc" in predicted.stdout
+    scored = lagbench("score", "predictions.nc", "--workers", "1", "--json")
+    assert "position_rmse" in json.loads(scored.stdout)["rows"]["submission"]
+    silent = ("--no-bench", "--quiet", "--threads", "1")
+    assert (
+        lagbench("predict", "runs/curl-noise/tiny/gns-0/checkpoint.pt", *silent).stdout
+        == ""
+    )
+
+
+def test_the_speed_up_needs_the_solver(
+    lagbench: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where Taichi is missing, predict says that there is no speed-up to tell, and goes
+    on.
+    """
+    lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *rest: None if name == "taichi" else find(name, *rest),
+    )
+    predicted = lagbench(
+        "predict", "runs/curl-noise/tiny/gns-0/weights.pt", "--threads", "1"
+    )
+    assert predicted.exit_code == 0
+    assert "no speed-up" in predicted.stderr
+    assert (
+        json.loads(Path("predictions.json").read_text())["solver_seconds_per_frame"]
+        is None
+    )
+    assert "lagbench[generate]" in predicted.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (("--baseline", "supergatt", *TINY), 2, "did you mean 'supergat'"),
+        (TINY, 2, "--baseline gns"),
+        (("--baseline", "gns", "--split", "curl-nose"), 2, "did you mean 'curl-noise'"),
+        (
+            ("--baseline", "gns", *TINY, "--set", "model.latant=3"),
+            2,
+            "did you mean 'latent'",
+        ),
+        (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
+        (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
+        (("--baseline", "gns", *TINY, "--fresh", "--no-resume"), 2, "--no-resume"),
+        (
+            ("--baseline", "gns", "--split", "cavity", "--size", "mini"),
+            4,
+            "lagbench generate",
+        ),
+        (("--baseline", "gns", *TINY, "--output", "/proc/none"), 5, "--output"),
+    ],
+)
+def test_mistakes_of_train(
+    lagbench: Command, words: tuple[str, ...], code: int, message: str
+) -> None:
+    """Every mistake has its exit code, and a message that says how to mend it."""
+    result = lagbench("train", *words)
+    assert result.exit_code == code
+    assert message in result.stderr
+
+
+def test_mistakes_of_predict(lagbench: Command, tmp_path: Path) -> None:
+    """A pickle, a missing file and data of another version are refused with 3, 3 and
+    4.
+    """
+    (tmp_path / "bomb.pt").write_bytes(pickle.dumps(os.getcwd))
+    assert (
+        lagbench("predict", "bomb.pt").exit_code
+        == lagbench("predict", "none.pt").exit_code
+        == 3
+    )
+    lagbench("train", "--baseline", "gns", *TINY, "--set", "training.steps=1")
+    weights = tmp_path / "runs/curl-noise/tiny/gns-0/weights.pt"
+    content = torch.load(weights, weights_only=True)
+    about = json.loads(content["about"])
+    about["facts"]["dataset_sha256"] = "f" * 64
+    torch.save({**content, "about": json.dumps(about)}, weights)
+    result = lagbench("predict", str(weights))
+    assert result.exit_code == 4
+    assert "another version" in result.stderr
+
+
+@pytest.mark.filterwarnings("default")
+def test_what_is_not_the_best_is_warned_of(lagbench: Command, tmp_path: Path) -> None:
+    """Predicting before the end, in one line on stderr; and predicting from and
+    starting at checkpoint.pt.
+
+    The latter where weights.pt lies beside it.
+    """
+    lagbench(
+        "train", "--baseline", "mlp", *TINY, "--set", "training.steps=2", "-o", "run"
+    )
+    early = ("predict", "run/weights.pt", "--threads", "1", "--no-bench", "--json")
+    assert lagbench(*early).stderr == ""
+    told = (tmp_path / "run/training.json").read_text()
+    unfinished = json.loads(told) | {"state": "interrupted", "step": 1}
+    (tmp_path / "run/training.json").write_text(json.dumps(unfinished))
+    done = lagbench(*early)
+    assert done.stderr.startswith("warning: ")
+    assert done.stderr.count("\n") == 1
+    assert "step 1 of 2" in done.stderr
+    (tmp_path / "run/training.json").write_text(told)
+    predict = (
+        "predict",
+        "run/checkpoint.pt",
+        "--threads",
+        "1",
+        "--no-bench",
+        "--quiet",
+    )
+    more = ("train", "--baseline", "mlp", *TINY, "--set", "training.steps=1", "--quiet")
+    for words in (predict, (*more, "--start", "run/checkpoint.pt", "-o", "more")):
+        done = lagbench(*words)
+        assert done.exit_code == 0
+        assert "run/weights.pt" in done.stderr
+    assert lagbench(*more, "--start", "run/weights.pt", "-o", "best").stderr == ""
+    (tmp_path / "run/weights.pt").unlink()
+    assert lagbench(*predict).stderr == ""
+
+
+def command(*words: str) -> subprocess.CompletedProcess[str]:
+    """Run Python's module in a process of its own, on one thread."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, "-m", *words]
+    return subprocess.run(
+        line, capture_output=True, text=True, env=environment, timeout=300
+    )
+
+
+def test_bench_of_the_solver(lagbench: Command, original: LocalSplit) -> None:
+    """The solver is timed in a process of its own; nothing else can be timed, and no
+    local split.
+    """
+    done = command(
+        "lagbench",
+        "bench",
+        "solver",
+        "--split",
+        "curl-noise",
+        "--size",
+        "tiny",
+        "--frames",
+        "3",
+        "--json",
+    )
+    found = json.loads(done.stdout)
+    assert found["particles"] == 506
+    assert found["substeps"] == 12
+    assert found["frames"] >= 3
+    assert found["frames"] * found["seconds_per_frame"] >= 0.5
+    # 506 particles x 12 substeps at 30 to 40 ns each: a fifth of a millisecond; never a
+    # tenth of a second.
+    assert 1e-5 < found["seconds_per_frame"] < 0.1
+    assert lagbench("bench", "model", "--split", "curl-noise").exit_code == 2
+    refused = lagbench("bench", "solver", "--split", str(original.folder))
+    assert refused.exit_code == 2
+    assert "simulated" in refused.stderr
+
+
+def test_the_second_process_says_nothing(
+    lagbench: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A helper of a training over several processes prints and writes nothing, no error
+    either.
+    """
+    from lagbench.baselines import train
+    from lagbench.baselines.machine import is_helper
+
+    def told(error: BaseException, **ranks: str) -> tuple[int, str]:
+        for name in ("RANK", "LOCAL_RANK"):
+            monkeypatch.setenv(name, ranks.get(name, "0"))
+        assert is_helper() == bool(ranks)
+        monkeypatch.setattr(train, "train", Mock(side_effect=error))
+        result = lagbench("train", "--baseline", "gns", *TINY)
+        return result.exit_code, result.output
+
+    full = WorkFailedError("out of memory")
+    full.__cause__ = MemoryError()
+    for error, code in (
+        (KeyboardInterrupt(), 130),
+        (WorkFailedError("the loss is not finite"), 5),
+    ):
+        assert told(error)[0] == code
+        assert told(error)[1] != ""
+        assert told(error, RANK="1", LOCAL_RANK="1") == (code, "")
+    # What befell one process alone, and what another machine lacks, no other process
+    # tells.
+    assert "out of memory" in told(full, RANK="1", LOCAL_RANK="1")[1]
+    assert "no data" in told(DataError("no data"), RANK="1")[1]
+    assert told(KeyboardInterrupt(), RANK="1") == (130, "")
+
+
+@pytest.mark.slow
+def test_two_processes_tell_an_error_once(lagbench: Command) -> None:
+    """A loss that overflows ends both processes, and one of them says so."""
+    settings = [word for key in SHARED for word in ("--set", key)]
+    settings += ["--set", "training.steps=9", "--set", "training.learning_rate=1e30"]
+    ended = command(
+        "lagbench", "train", "--baseline", "mlp", *TINY, *settings, "--processes", "2"
+    )
+    assert ended.returncode == 5
+    assert ended.stderr.count("the loss is not finite") == 1
+
+
+SHARED = (
+    "model.widths=[8]",
+    "model.noise_std=0",
+    "training.steps=8",
+    "training.validate_every=0",
+)
+"""A training that takes no time."""
+
+
+def launched(*words: str) -> list[subprocess.CompletedProcess[str]]:
+    """Return what two torchrun agents, of one process each, made of a command."""
+    with socket.socket() as held:  # a port that nobody listens on
+        held.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{held.getsockname()[1]}"
+    agent = [
+        "torch.distributed.run",
+        "--nnodes",
+        "2",
+        "--nproc-per-node",
+        "1",
+        "--rdzv-id",
+        "lagbench",
+    ]
+    agent += [
+        "--rdzv-backend",
+        "c10d",
+        "--rdzv-endpoint",
+        address,
+        "-m",
+        "lagbench",
+        *words,
+    ]
+    with ThreadPoolExecutor() as both:
+        return list(both.map(lambda _: command(*agent), range(2)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [1, 2])
+def test_two_processes_make_the_weights_of_one(
+    lagbench: Command, tmp_path: Path, nodes: int
+) -> None:
+    """Three windows on each of two gloo processes give the weights of six on one, at
+    twice the rate.
+
+    The gradient is the mean over processes (thesis section 5.7.3). They are started by
+    the command on one node, by torchrun on two.
+    """
+
+    def options(folder: str, batch: int, rate: float) -> tuple[str, ...]:
+        keys = (*SHARED, "training.schedule=constant", f"training.batch={batch}")
+        settings = [
+            word
+            for key in (*keys, f"training.learning_rate={rate}")
+            for word in ("--set", key)
+        ]
+        return "train", "--baseline", "mlp", *TINY, "-o", folder, *settings
+
+    together = options("shared", 3, 1e-3)
+    shared = (
+        launched(*together)
+        if nodes == 2
+        else [command("lagbench", *together, "--processes", "2")]
+    )
+    assert [one.returncode for one in shared] == [0] * nodes, [
+        one.stderr for one in shared
+    ]
+    assert "".join(one.stdout for one in shared).count("finished, step 8 of 8") == 1
+    assert (
+        json.loads((tmp_path / "shared" / "training.json").read_text())["processes"]
+        == 2
+    )
+    assert lagbench(*options("alone", 6, 2e-3)).exit_code == 0
+    one, other = (
+        load(tmp_path / name / "checkpoint.pt").weights for name in ("shared", "alone")
+    )
+    assert one.keys() == other.keys()
+    for name, value in one.items():
+        # Adam's step where a gradient is nearly nothing follows its rounding: compare
+        # norms, not numbers.
+        assert (value - other[name]).norm() <= 1e-4 * value.norm(), name

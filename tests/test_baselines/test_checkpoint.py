@@ -1,0 +1,394 @@
+"""Checkpoints: what comes back; what is refused, larger models too; and that nothing in
+a file is run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+import tracemalloc
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simple_models import INFO, Drift, install
+
+from lagbench.baselines import checkpoint
+from lagbench.baselines.catalogue import find, list_names
+from lagbench.baselines.checkpoint import (
+    Checkpoint,
+    check_data,
+    load,
+    restore,
+    round_weights,
+    save,
+)
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.make.generate import GenerationResult
+
+
+def example(**changes: Any) -> Checkpoint:
+    """Return a checkpoint of a Drift whose parameter needs all bits of a float32."""
+    model = Drift.build({"start": 1 / 3}, INFO)
+    fields = {
+        "baseline": "drift",
+        "options": {"start": 1 / 3},
+        "info": INFO,
+        "weights": model.state_dict(),
+        "training": {"step": 3, "recipe": {"training": {"seed": 4}}},
+    }
+    return Checkpoint(**{**fields, **changes})
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    """Everything comes back as it was stored, the optimiser's state too."""
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.AdamW([weight])
+    weight.grad = torch.tensor([0.5, 2.0])
+    optimizer.step()
+    stored = example(optimizer=optimizer.state_dict())
+    save(tmp_path / "a.pt", stored)
+    found = load(tmp_path / "a.pt")
+    assert found.baseline == stored.baseline
+    assert found.options == stored.options
+    assert found.info == INFO
+    assert found.training == stored.training
+    assert torch.equal(found.weights["a"], stored.weights["a"])
+    # Adam's first moment after one step: (1 - 0.9) x gradient.
+    assert found.optimizer["state"][0]["exp_avg"].tolist() == pytest.approx([0.05, 0.2])
+
+
+def test_rounding() -> None:
+    """Parameters are rounded to nearest-even in their upper 16 bits; buffers keep every
+    bit.
+    """
+    model = torch.nn.BatchNorm1d(1000)
+    torch.nn.init.normal_(model.weight, generator=torch.Generator().manual_seed(0))
+    torch.nn.init.normal_(
+        model.running_mean, generator=torch.Generator().manual_seed(1)
+    )
+    bits = model.weight.detach().numpy().view(np.uint32)
+    expected = ((bits + 0x7FFF + ((bits >> 16) & 1)) >> 16) << 16
+    found = round_weights(model)
+    assert found["weight"].dtype is torch.bfloat16
+    assert np.array_equal(found["weight"].float().numpy().view(np.uint32), expected)
+    assert torch.equal(found["running_mean"], model.running_mean)
+
+
+class Bomb:
+    """Unpickling it makes a folder."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Name what unpickling runs."""
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("writer", ["pickle", "torch", "torch, old layout", "inside"])
+def test_a_pickle_is_refused_and_not_run(tmp_path: Path, writer: str) -> None:
+    """A file that would run code when unpickled is refused, and the code is not run."""
+    file = tmp_path / "bomb.pt"
+    target = tmp_path / "exploded"
+    bomb = Bomb(target)
+    if writer == "pickle":
+        file.write_bytes(pickle.dumps(bomb))
+    elif writer == "inside":
+        torch.save(
+            {"lagbench_checkpoint": 1, "about": "{}", "weights": {}, "optimizer": bomb},
+            file,
+        )
+    else:
+        torch.save(bomb, file, _use_new_zipfile_serialization=writer == "torch")
+    with pytest.raises(UnreadableFileError) as caught:
+        load(file)
+    assert caught.value.where.endswith("bomb.pt")
+    assert "weights_only" not in str(
+        caught.value
+    )  # torch's own words advise to load it unsafely
+    assert not target.exists()
+    pickle.loads(pickle.dumps(bomb))  # the bomb is a real one
+    assert target.exists()
+
+
+def test_text_is_no_pickle(tmp_path: Path) -> None:
+    """Of any other file it is said that it is no checkpoint; of a folder, which file to
+    name.
+    """
+    (tmp_path / "notes.md").write_text("# hello\n")
+    with pytest.raises(UnreadableFileError) as caught:
+        load(tmp_path / "notes.md")
+    assert caught.value.where.endswith("notes.md")
+    with pytest.raises(UnreadableFileError) as caught:
+        load(tmp_path)
+    assert "weights.pt" not in str(caught.value)
+    (tmp_path / "weights.pt").touch()
+    with pytest.raises(UnreadableFileError):
+        load(tmp_path)
+
+
+def test_scripts_are_refused(tmp_path: Path) -> None:
+    """A TorchScript archive, which holds code too, is refused."""
+    with pytest.warns(DeprecationWarning, match="torch.jit"):
+        torch.jit.save(torch.jit.script(torch.nn.ReLU()), tmp_path / "script.pt")
+    with pytest.raises(UnreadableFileError):
+        load(tmp_path / "script.pt")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"not a checkpoint at all",
+        b"PK\x03\x04 broken",
+        {"weights": {}},
+        torch.zeros(3),
+        {"lagbench_checkpoint": 2, "about": "{}", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": "{", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": "{}", "weights": {}},
+        {"lagbench_checkpoint": 1, "about": 5, "weights": {}},
+    ],
+)
+def test_other_files_are_unreadable(tmp_path: Path, content: object) -> None:
+    """What is no checkpoint of ours is said to be unreadable, with the file's name."""
+    file = tmp_path / "other.pt"
+    if isinstance(content, bytes):
+        file.write_bytes(content)
+    else:
+        torch.save(content, file)
+    with pytest.raises(UnreadableFileError) as caught:
+        load(file)
+    assert caught.value.where.endswith("other.pt")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        ("training", "recipe", []),
+        ("training", "recipe", "training", []),
+        ("training", "recipe", "training", "seed", "three"),
+        ("training", "recipe", "training", "seed", 10**30),
+        ("training", "recipe", "training", "windows", [1]),
+        ("training", "recipe", "name", "x" * 10**6),
+        ("training", "step", "last"),
+        ("facts", "split", "../curl-noise"),
+        ("facts", "size", "../tiny"),
+        ("facts", "particles", -3),
+        ("facts", "radius", float("inf")),
+        ("facts", "statistics", "velocity_std", [float("nan"), 1.0]),
+        {"about": "[" * 10**5},
+        {"lagbench_checkpoint": torch.ones(2)},
+        {"lagbench_checkpoint": True},
+        {"weights": {"a": torch.zeros(1).expand(10**12)}},
+        {"weights": {"a": torch.ones(1).to_sparse()}},
+        {"weights": {"a": torch.zeros(1, dtype=torch.complex64)}},
+        {"weights": {"a": torch.zeros(1, device="meta")}},
+    ],
+)
+def test_strange_words_and_tensors_are_refused(
+    tmp_path: Path, change: tuple[Any, ...] | dict[str, Any]
+) -> None:
+    """A stranger's words are what they should be, or nothing; weights are numbers that
+    the file holds.
+    """
+    file = tmp_path / "strange.pt"
+    save(file, example())
+    content = torch.load(file, weights_only=True)
+    if isinstance(change, tuple):  # keys, and the value where they lead
+        about = place = json.loads(content["about"])
+        *path, key, value = change
+        for step in path:
+            place = place[step]
+        place[key] = value
+        change = {"about": json.dumps(about)}
+    torch.save({**content, **change}, file)
+    with pytest.raises(UnreadableFileError) as caught:
+        load(file)
+    assert caught.value.where.endswith("strange.pt")
+
+
+def test_missing_cut_and_never_written(tmp_path: Path) -> None:
+    """A missing file, one that was cut short, and a pipe, which would be waited for,
+    are unreadable.
+    """
+    os.mkfifo(tmp_path / "pipe.pt")
+    save(tmp_path / "cut.pt", example())
+    whole = (tmp_path / "cut.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+    for name, words in (
+        ("none.pt", "No such file"),
+        ("cut.pt", None),
+        ("pipe.pt", None),
+    ):
+        with pytest.raises(UnreadableFileError, match=words) as caught:
+            load(tmp_path / name)
+        assert caught.value.where == str(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"weights": {"a": torch.tensor([float("nan")]), "calls": torch.tensor(0)}},
+            "not finite",
+        ),
+        (
+            {"weights": {"a": torch.zeros(2), "calls": torch.tensor(0)}},
+            "do not fit the model",
+        ),
+        ({"weights": {"a": torch.zeros(1)}}, "do not fit the model"),
+        ({"options": {"sart": 1}}, "sart"),
+        (
+            {"baseline": "mlp", "options": {}, "info": replace(INFO, statistics={})},
+            "position_mean",
+        ),
+        (
+            {
+                "baseline": "gns",
+                "options": {},
+                "info": replace(INFO, score_placement="edges"),
+            },
+            "statistics|edges|acceleration",
+        ),
+    ],
+)
+def test_unfit_weights(
+    changes: dict[str, Any], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights that are not finite or belong to another model are refused."""
+    install(monkeypatch, drift=Drift)
+    with pytest.raises(UnreadableFileError, match=message):
+        restore(example(**changes))
+
+
+def test_unknown_baseline() -> None:
+    """A checkpoint of a baseline that is not installed says so, and which file it
+    is.
+    """
+    with pytest.raises(UsageError) as caught:
+        restore(example(), where="a.pt")
+    assert caught.value.where == "a.pt"
+    assert caught.value.where == "a.pt"
+
+
+def test_data_of_another_version(
+    generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """The data at hand must have the hash of the data that the model was trained on."""
+    root = generated.root
+    for split, there, words in (
+        ("curl-noise", root, "another version"),
+        ("curl-noise", root / "nowhere", "lagbench generate"),
+        ("my-river", root, "where: a.pt"),  # a local split of another root
+    ):
+        found = example(info=replace(INFO, split=split))
+        with pytest.raises(DataError, match=words):
+            check_data(found, root=there, registry=unmeasured, where="a.pt")
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """100 MB of zeros in 100 kB: refused by its directory, before they are unpacked."""
+    monkeypatch.setattr(checkpoint, "MOST_BYTES", 10**7)
+    save(tmp_path / "a.pt", example())
+    bomb = tmp_path / "bomb.pt"
+    with (
+        zipfile.ZipFile(tmp_path / "a.pt") as old,
+        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as new,
+    ):
+        for member in old.infolist():
+            new.writestr(member.filename, old.read(member))
+        new.writestr("big", bytes(10**8))
+    assert bomb.stat().st_size < 10**6
+    tracemalloc.start()
+    with pytest.raises(UnreadableFileError) as caught:
+        load(bomb)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert caught.value.where == str(bomb)
+    assert peak < 10**7
+
+
+def test_a_flipped_byte_is_seen(tmp_path: Path) -> None:
+    """Any byte of any member: its checksum is another. Bytes between members are
+    padding.
+    """
+    save(tmp_path / "a.pt", example())
+    data = (tmp_path / "a.pt").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.pt") as archive:
+        for member in archive.infolist():
+            if not member.file_size:
+                continue
+            name, extra = struct.unpack_from("<HH", data, member.header_offset + 26)
+            flipped = bytearray(data)
+            flipped[
+                member.header_offset + 30 + name + extra + member.file_size // 2
+            ] ^= 1
+            (tmp_path / "b.pt").write_bytes(flipped)
+            with pytest.raises(UnreadableFileError):
+                load(tmp_path / "b.pt")
+
+
+KINDS = [
+    f"{name}_{of}"
+    for name in ("position", "velocity", "acceleration")
+    for of in ("mean", "std")
+]
+WHOLE = replace(INFO, statistics=dict.fromkeys(KINDS, (0.5, 0.5)))
+
+GRAPH_NETWORK: dict[str, Any] = {"latent": 4, "layers": 2}
+SMALL_MODELS: dict[str, dict[str, Any]] = {
+    "neuralmpm": {"cells": 8, "width": 4, "materials": [0, 1, 2, 3]},
+    "mlp": {"widths": [4]},
+    "lstm": {"latent": 4, "decoder": [4]},
+    "lstm-mlp": {"latent": 4, "decoder": [4]},
+    "var": {"lags": 1},
+    "var-stable": {"rank": 2},
+}
+"""Options of small models; all others are graph networks."""
+
+
+def stored(baseline: str) -> Checkpoint:
+    """Return the checkpoint of a small model."""
+    options = SMALL_MODELS.get(baseline, GRAPH_NETWORK)
+    weights = find(baseline).model.build(options, WHOLE).state_dict()
+    return Checkpoint(baseline=baseline, options=options, info=WHOLE, weights=weights)
+
+
+@pytest.mark.parametrize("baseline", list_names())
+def test_what_the_weights_fill_is_built(baseline: str) -> None:
+    """Every baseline comes back with the numbers of its weights."""
+    found = stored(baseline)
+    model = restore(found)
+    for name, value in found.weights.items():
+        assert torch.equal(model.state_dict()[name], value), name
+
+
+def test_a_model_beyond_all_memory_is_refused() -> None:
+    """Options for 10^12 numbers and more are those of an unreadable file."""
+    checkpoint_of_var = stored("var")
+    larger = replace(checkpoint_of_var, options={"lags": 10**13})
+    with pytest.raises(UnreadableFileError) as caught:
+        restore(larger, where="theirs.pt")
+    assert caught.value.where == "theirs.pt"
+
+
+def test_weights_of_the_board_can_be_run() -> None:
+    """Every file that stands beside an entry is one that today's models are built
+    from.
+    """
+    files = sorted(
+        (Path(__file__).parents[2] / "leaderboard" / "weights").rglob("*.pt")
+    )
+    assert len(files) > 60
+    for file in files:
+        assert restore(load(file), where=str(file)).method

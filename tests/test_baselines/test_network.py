@@ -1,0 +1,386 @@
+"""The graph network: what all operators share."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simple_models import OPERATORS, graph
+from torch import Tensor, nn
+
+from lagbench.baselines import network as layers
+from lagbench.baselines.network import (
+    EdgeMLP,
+    EncodeProcessDecode,
+    LayerNorm,
+    Linear,
+    ProcessorLayer,
+    linear,
+)
+from lagbench.baselines.operators.gns import GNS
+from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.baselines.operators.supergat import SuperGAT
+from lagbench.errors import UsageError
+
+EVERY = pytest.mark.parametrize("operator", OPERATORS)
+
+
+def network(operator: type[Operator], **options: Any) -> EncodeProcessDecode:
+    """Return a small network with weights of seed 0."""
+    torch.manual_seed(0)
+    sizes = {
+        "node_features": 7,
+        "edge_features": 3,
+        "latent": 16,
+        "layers": 3,
+    } | options
+    return EncodeProcessDecode(operator, **sizes)
+
+
+def apply_to_concatenation(
+    layer: EdgeMLP, edge: Tensor, node: Tensor, edge_index: Tensor
+) -> Tensor:
+    """Return the MLP of the concatenation [edge, receiver, sender]."""
+    sender, receiver = edge_index
+    whole = torch.cat([edge, node[receiver], node[sender]], dim=1)
+    hidden = nn.functional.linear(whole, layer.first.weight, layer.first.bias)
+    update: Tensor = layer.rest(hidden)
+    return update
+
+
+def largest_relative_error(value: Tensor, expected: Tensor) -> float:
+    """Return the largest error over the largest expected value."""
+    error = (value - expected).abs().max()
+    return (error / expected.abs().max()).item()
+
+
+def test_products_per_node_give_the_mlp_of_the_concatenation() -> None:
+    """In float32 they agree to 6e-7."""
+    torch.manual_seed(0)
+    layer = EdgeMLP(128, 128)
+    node, edge_index, edge = graph(200, 1600, node=128, edge=128)
+    update = layer(edge, node, edge_index)
+    expected = apply_to_concatenation(
+        layer.double(), edge.double(), node.double(), edge_index
+    )
+    assert largest_relative_error(update, expected) < 6e-7
+
+
+@pytest.mark.parametrize(
+    ("mixed", "tolerance"),
+    [
+        (False, 1e-5),
+        (True, 2e-2),
+    ],
+)
+def test_recomputed_hidden_layers_give_the_same_gradients(
+    monkeypatch: pytest.MonkeyPatch, mixed: bool, tolerance: float
+) -> None:
+    """They give the same values too, as hidden layers that stay in memory."""
+    torch.manual_seed(0)
+    layer = EdgeMLP(16, 12)
+    inputs = graph(300, 20_000, node=16, edge=16)
+
+    def compute_update_and_gradients(largest_kept: float) -> list[Tensor]:
+        monkeypatch.setattr(layers, "LARGEST_KEPT", largest_kept)
+        node = inputs.node.clone().requires_grad_()
+        edge = inputs.edge.clone().requires_grad_()
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            update = layer(edge, node, inputs.edge_index)
+        loss = update.square().sum()
+        variables = [node, edge, *layer.parameters()]
+        return [update, *torch.autograd.grad(loss, variables)]
+
+    from_memory = compute_update_and_gradients(1e12)
+    recomputed = compute_update_and_gradients(0.0)
+    for value, expected in zip(recomputed, from_memory, strict=True):
+        assert largest_relative_error(value, expected) < tolerance
+
+
+@pytest.mark.parametrize("largest_kept", [1e12, 0.0])
+def test_gradients_of_the_edge_update_are_finite_differences(
+    monkeypatch: pytest.MonkeyPatch, largest_kept: float
+) -> None:
+    monkeypatch.setattr(layers, "LARGEST_KEPT", largest_kept)
+    torch.manual_seed(0)
+    layer = EdgeMLP(4, 3).double()
+    inputs = graph(5, 9, node=4, edge=4)
+    node = inputs.node.double().requires_grad_()
+    edge = inputs.edge.double().requires_grad_()
+
+    def update(edge: Tensor, node: Tensor, *_: Tensor) -> Tensor:
+        return layer(edge, node, inputs.edge_index)
+
+    torch.autograd.gradcheck(update, (edge, node, *layer.parameters()))
+
+
+@pytest.mark.parametrize("rows", [0, 1, 257])
+def test_linear_and_its_gradients_are_those_of_numpy(rows: int) -> None:
+    """Inputs and weights are views of wider matrices."""
+    torch.manual_seed(0)
+    wide_x = torch.randn(rows, 40)
+    wide_weight = torch.randn(24, 90)
+    bias = torch.randn(24)
+    x = wide_x[:, :30].detach()
+    weight = wide_weight[:, 30:60].detach()
+    for tensor in (x, weight, bias):
+        tensor.requires_grad_()
+    y = linear(x, weight, bias)
+    slope = torch.randn(rows, 24)
+    (y * slope).sum().backward()
+
+    def compare(value: Tensor, expected: Any) -> None:
+        np.testing.assert_allclose(value, expected, rtol=1e-4, atol=1e-4)
+
+    exact_x = x.detach().double().numpy()
+    exact_weight = weight.detach().double().numpy()
+    exact_slope = slope.double().numpy()
+    compare(y.detach(), exact_x @ exact_weight.T + bias.detach().numpy())
+    compare(x.grad, exact_slope @ exact_weight)
+    compare(weight.grad, exact_slope.T @ exact_x)
+    compare(bias.grad, exact_slope.sum(axis=0))
+
+
+def test_linear_leaves_other_types_and_shapes_to_torch() -> None:
+    """Float64, bfloat16 and inputs of three axes are nothing for oneDNN."""
+    layer = Linear(5, 4)
+    x = torch.randn(2, 3, 5)
+    expected = nn.functional.linear(x, layer.weight, layer.bias)
+    assert torch.equal(layer(x), expected)
+    assert layer.double()(x.double()).dtype == torch.float64
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer.float()(x[0]).dtype == torch.bfloat16
+
+
+def test_layer_norm_learns_in_bfloat16() -> None:
+    """Its gradients are those of float64 to two digits: long sums do not stall."""
+    torch.manual_seed(0)
+    x = torch.randn(5000, 16) * 3 + 1
+    slope = torch.randn(5000, 16) * 0.1 + 1
+    rounded_x = x.bfloat16().requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16):
+        layer = LayerNorm(16)
+        layer(rounded_x).backward(slope.bfloat16())
+    exact_layer = nn.LayerNorm(16).double()
+    exact_x = x.double().requires_grad_()
+    exact_layer(exact_x).backward(slope.double())
+
+    rounded = [rounded_x, *layer.parameters()]
+    exact = [exact_x, *exact_layer.parameters()]
+    for variable, exact_variable in zip(rounded, exact, strict=True):
+        difference = (variable.grad - exact_variable.grad).norm()
+        assert float(difference / exact_variable.grad.norm()) < 0.03
+
+
+def test_a_layer_is_the_interaction_network_node_by_node() -> None:
+    torch.manual_seed(0)
+    layer = ProcessorLayer(GNS, latent=8, hidden=6).double()
+    inputs = graph(6, 12, node=8, edge=8)
+    node = inputs.node.double()
+    edge = inputs.edge.double()
+    _, receiver = inputs.edge_index
+    new_node, new_edge, _ = layer(node, inputs.edge_index, edge)
+
+    message = apply_to_concatenation(layer.message, edge, node, inputs.edge_index)
+    torch.testing.assert_close(new_edge, edge + message, rtol=1e-10, atol=1e-10)
+    for i in range(6):
+        total = message[receiver == i].sum(dim=0)
+        update = layer.update(torch.cat([node[i], total]))
+        torch.testing.assert_close(
+            new_node[i], node[i] + update, rtol=1e-10, atol=1e-10
+        )
+
+
+@EVERY
+def test_every_layer_adds_something_else_to_the_edges(operator: type[Operator]) -> None:
+    """Ten layers are not a factor of 1024."""
+    model = network(operator, layers=10)
+    latents: list[Tensor] = []
+
+    def record_edges(_: nn.Module, inputs: tuple[Tensor, ...], __: object) -> None:
+        latents.append(inputs[2].detach())
+
+    for layer in model.processor:
+        layer.register_forward_hook(record_edges)
+    model(*graph(30, 150, node=7, edge=3))
+    changes = [after - before for before, after in itertools.pairwise(latents)]
+    for before, change in zip(latents, changes, strict=False):
+        cosine = nn.functional.cosine_similarity(before, change, dim=1)
+        assert float(change.abs().mean()) > 0.1
+        assert float(cosine.max()) < 0.999  # doubling would give 1
+    assert float(latents[-1].norm() / latents[0].norm()) < 20.0
+
+
+def test_gns_has_1_6_million_parameters() -> None:
+    """At latent 128 with 10 layers."""
+    model = network(GNS, node_features=30, latent=128, layers=10)
+    count = sum(parameter.numel() for parameter in model.parameters())
+    square = 128 * 128 + 128
+    norm = 2 * 128
+    node_encoder = 31 * 128 + 2 * square + norm
+    edge_encoder = 4 * 128 + 2 * square + norm
+    edge_update = 385 * 128 + 2 * square + norm
+    node_update = 257 * 128 + 2 * square + norm
+    decoder = 2 * square + 129 * 2
+    expected = node_encoder + edge_encoder + 10 * (edge_update + node_update) + decoder
+    assert count == expected
+    assert count == 1_591_682
+
+
+def shapes_beside_operators(model: torch.nn.Module) -> dict[str, torch.Size]:
+    """Return the shapes of all weights that do not belong to an operator."""
+    shapes = {}
+    for name, parameter in model.named_parameters():
+        if ".operator." not in name:
+            shapes[name] = parameter.shape
+    return shapes
+
+
+@EVERY
+def test_only_the_operator_differs(operator: type[Operator]) -> None:
+    """Names and shapes of all other weights are those of GNS."""
+    shapes = shapes_beside_operators(network(operator))
+    assert shapes == shapes_beside_operators(network(GNS))
+
+
+@EVERY
+def test_no_weight_is_idle(operator: type[Operator]) -> None:
+    """Gradients reach all parameters, as DistributedDataParallel needs it.
+
+    The bias of a key shifts all logits alike, so that its gradient may be 0.
+    """
+    model = network(operator)
+    prediction, losses = model(*graph(30, 150, node=7, edge=3))
+    loss = prediction.square().sum() + sum(losses.values())
+    loss.backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        if not name.endswith("lin_key.bias"):
+            assert bool(parameter.grad.any()), name
+
+
+@EVERY
+def test_windows_side_by_side(operator: type[Operator]) -> None:
+    """Two graphs in one call have the predictions of two calls."""
+    model = network(operator).eval()
+    first = graph(12, 40, node=7, edge=3, seed=1)
+    second = graph(9, 24, node=7, edge=3, seed=2)
+    node = torch.cat([first.node, second.node])
+    edge = torch.cat([first.edge, second.edge])
+    edge_index = torch.cat([first.edge_index, second.edge_index + 12], dim=1)
+    together, _ = model(node, edge_index, edge)
+    first_prediction, _ = model(*first)
+    second_prediction, _ = model(*second)
+    expected = torch.cat([first_prediction, second_prediction])
+    torch.testing.assert_close(together, expected, rtol=1e-5, atol=1e-5)
+
+
+@EVERY
+def test_mixed_precision(operator: type[Operator]) -> None:
+    """Under bfloat16 the prediction is near the exact one, and every weight learns."""
+    model = network(operator, latent=32)
+    inputs = graph(60, 400, node=7, edge=3)
+    exact, _ = model(*inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        prediction, losses = model(*inputs)
+    assert prediction.dtype == torch.float32
+    error = (prediction - exact).norm() / exact.norm()
+    assert error.item() < 0.05
+    loss = prediction.square().sum() + sum(losses.values())
+    loss.backward()
+    for parameter in model.parameters():
+        assert parameter.grad is not None
+        assert parameter.grad.isfinite().all()
+
+
+class Total(Operator):
+    """A third party's operator: the sum of a node's input and its neighbours'."""
+
+    method = "GNS + sum"
+    weights = {"size": 0.5}  # noqa: RUF012
+
+    def __init__(self, inputs: int, latent: int, hidden: int) -> None:
+        super().__init__(inputs, latent, hidden)
+        self.linear = nn.Linear(inputs, latent)
+
+    def forward(
+        self,
+        node: Tensor,
+        edge_index: Tensor,
+        edge: Tensor,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> tuple[Tensor, Losses]:
+        """Return what each node gathers and a loss of its own."""
+        sender, receiver = edge_index
+        total = node.index_add(0, receiver, node[sender])
+        return self.linear(total), {"size": total.square().mean()}
+
+
+@pytest.mark.parametrize(
+    "change_output",
+    [
+        lambda update: update,
+        lambda update: (update, None),
+        lambda update: (update[:1], {}),
+        lambda update: (torch.cat([update, update], dim=1), {}),
+        lambda update: (update, {"size": 1.0}),
+        lambda update: (update, {"size": update}),
+    ],
+)
+def test_an_operator_that_returns_something_else_is_refused(
+    change_output: Callable[[Tensor], Any],
+) -> None:
+    """No pair, another number of rows or columns, no losses of one number.
+
+    The error names the class.
+    """
+
+    class Odd(Total):
+        def forward(self, *inputs: Tensor, **options: Any) -> Any:
+            update, _ = super().forward(*inputs, **options)
+            return change_output(update)
+
+    with pytest.raises(UsageError) as caught:
+        network(Odd)(*graph(12, 40, node=7, edge=3))
+    assert "Odd" in str(caught.value.where)
+
+
+def test_the_loss_of_an_operator_is_the_mean_over_layers() -> None:
+    model = network(Total)
+    sizes: list[Tensor] = []
+
+    def record_loss(_: nn.Module, __: object, output: tuple[Any, ...]) -> None:
+        sizes.append(output[2]["size"])
+
+    for layer in model.processor:
+        layer.register_forward_hook(record_loss)
+    prediction, losses = model(*graph(12, 40, node=7, edge=3))
+    assert prediction.shape == (12, 2)
+    mean = torch.stack(sizes).mean()
+    assert losses["size"].item() == pytest.approx(mean.item())
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # torch, while it traces
+@pytest.mark.parametrize("operator", [GNS, SuperGAT])
+def test_compiled_layers_give_the_same_gradients(operator: type[Operator]) -> None:
+    """They give the same values too, for any number of edges."""
+    plain = network(operator)
+    compiled = network(operator)
+    compiled.compile_layers()
+
+    def compute_output_and_gradients(model: Any, edges: int) -> list[Tensor]:
+        inputs = graph(60, edges, node=7, edge=3)
+        output, losses = model(*inputs, torch.Generator().manual_seed(0))
+        total = output.square().sum() + sum(losses.values())
+        return [output, *torch.autograd.grad(total, list(model.parameters()))]
+
+    for edges in (500, 731):
+        expected = compute_output_and_gradients(plain, edges)
+        values = compute_output_and_gradients(compiled, edges)
+        torch.testing.assert_close(values, expected, rtol=1e-4, atol=1e-5)

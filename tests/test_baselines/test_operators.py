@@ -1,0 +1,388 @@
+"""Each operator is the equation that it says, written out in NumPy node by node."""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from simple_models import OPERATORS, Graph, graph
+from torch_geometric.nn import PointNetConv
+
+from lagbench.baselines.operators.gat import GAT, GATv2
+from lagbench.baselines.operators.gns import GNS
+from lagbench.baselines.operators.operator import Operator
+from lagbench.baselines.operators.pointnet import PointNet
+from lagbench.baselines.operators.supergat import (
+    START,
+    SuperGAT,
+    SuperGATDot,
+    draw_unlinked_pairs,
+)
+from lagbench.baselines.operators.transformer import Transformer
+
+Array = NDArray[np.float64]
+Weights = dict[str, Array]
+Neighbours = list[tuple[int, Array]]
+"""Sender and edge of each neighbour of a node."""
+
+LATENT = 6
+HIDDEN = 5
+
+
+def seeded(seed: int) -> torch.Generator:
+    """Return a seeded source of randomness."""
+    return torch.Generator().manual_seed(seed)
+
+
+def small_graph() -> Graph:
+    """Return 9 nodes, one of them alone, and 24 edges."""
+    return graph(9, 24, node=2 * LATENT, edge=LATENT)
+
+
+def build_random(operator: type[Operator], *, scale: float = 1.0) -> Operator:
+    """Return an operator in float64 whose every weight, biases too, is random."""
+    torch.manual_seed(1)
+    layer = operator(2 * LATENT, LATENT, HIDDEN).double()
+    for parameter in layer.parameters():
+        torch.nn.init.normal_(parameter, std=scale)
+    return layer
+
+
+def compute_update(layer: Operator, inputs: Graph) -> Array:
+    """Return what each node gathers."""
+    node, edge_index, edge = inputs
+    update, _ = layer(node.double(), edge_index, edge.double())
+    return update.detach().numpy()
+
+
+def read_weights(layer: Operator) -> Weights:
+    """Return the layer's weights by name."""
+    weights = {}
+    for name, value in layer.named_parameters():
+        weights[name] = value.detach().numpy()
+    return weights
+
+
+def softmax(logits: Sequence[float]) -> Array:
+    """Return exponentials over their sum."""
+    powers = np.exp(np.array(logits) - max(logits))
+    return powers / powers.sum()
+
+
+def sigmoid(x: Array | float) -> Array:
+    """Return the logistic function."""
+    return 1 / (1 + np.exp(-np.asarray(x)))
+
+
+def leaky(x: Array | float) -> Array:
+    """Return LeakyReLU with PyG's slope."""
+    values = np.asarray(x)
+    return np.where(values > 0, values, 0.2 * values)
+
+
+def neighbours(inputs: Graph, receiver: int, *, loop: bool) -> Neighbours:
+    """Return senders and edges of a node.
+
+    A loop's edge is the mean of the others, and 0 without any.
+    """
+    senders, receivers = inputs.edge_index.numpy()
+    edges = inputs.edge.double().numpy()
+    near = []
+    for number in np.flatnonzero(receivers == receiver):
+        near.append((int(senders[number]), edges[number]))
+    if loop:
+        mean = np.zeros(edges.shape[1])
+        if near:
+            mean = np.mean([edge for _, edge in near], axis=0)
+        near.append((receiver, mean))
+    return near
+
+
+def weighted_sum(attention: Array, value: Array, near: Neighbours) -> Array:
+    """Return the sum of the neighbours' values times their attention."""
+    total = np.zeros(value.shape[1])
+    for share, (sender, _) in zip(attention, near, strict=True):
+        total += share * value[sender]
+    return total
+
+
+def gat(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Velickovic et al. (2018), Eqs. 3 and 4, with the edge as a third part."""
+    z = x @ w["conv.lin.weight"].T
+    source = w["conv.att_src"].ravel()
+    target = w["conv.att_dst"].ravel()
+    of_edge = w["conv.att_edge"].ravel()
+    logits = []
+    for j, e in near:
+        edge = w["conv.lin_edge.weight"] @ e
+        logits.append(float(leaky(z[j] @ source + z[i] @ target + edge @ of_edge)))
+    return weighted_sum(softmax(logits), z, near) + w["conv.bias"]
+
+
+def gatv2(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Brody et al. (2022), Eq. 7."""
+    left = x @ w["conv.lin_l.weight"].T + w["conv.lin_l.bias"]
+    right = x @ w["conv.lin_r.weight"].T + w["conv.lin_r.bias"]
+    attention = w["conv.att"].ravel()
+    logits = []
+    for j, e in near:
+        edge = w["conv.lin_edge.weight"] @ e
+        logits.append(float(leaky(left[j] + right[i] + edge) @ attention))
+    return weighted_sum(softmax(logits), left, near) + w["conv.bias"]
+
+
+SCALE = START * np.sqrt(LATENT)
+"""SuperGAT divides its inputs and multiplies its values by this."""
+
+
+def supergat_mx(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Eqs. 5.26 and 5.27 of the thesis, MX, of scaled inputs.
+
+    Edges have no part in it.
+    """
+    z = x / SCALE @ w["conv.lin.weight"].T
+    left = w["conv.att_l"].ravel()
+    right = w["conv.att_r"].ravel()
+    logits = []
+    for j, _ in near:
+        gate = sigmoid(z[i] @ z[j])
+        logits.append(float(leaky((z[j] @ left + z[i] @ right) * gate)))
+    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
+
+
+def supergat_sd(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Eqs. 5.26 and 5.27 of the thesis, SD, of scaled inputs."""
+    z = x / SCALE @ w["conv.lin.weight"].T
+    logits = []
+    for j, _ in near:
+        logits.append(float(leaky(z[i] @ z[j] / np.sqrt(LATENT))))
+    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
+
+
+def transformer(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Shi et al. (2021), Eqs. 3 and 4, with a linear skip connection."""
+
+    def project(name: str) -> Array:
+        rows: Array = x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
+        return rows
+
+    total = project("skip")[i]
+    if not near:
+        return total
+    key = project("key")
+    query = project("query")
+    value = project("value")
+    edges = [w["conv.lin_edge.weight"] @ e for _, e in near]
+    logits = []
+    for (j, _), edge in zip(near, edges, strict=True):
+        logits.append(query[i] @ (key[j] + edge) / np.sqrt(LATENT))
+    for share, (j, _), edge in zip(softmax(logits), near, edges, strict=True):
+        total = total + share * (value[j] + edge)
+    return total
+
+
+def gns(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return the sum of Sanchez-Gonzalez et al. (2020)."""
+    total = np.zeros(LATENT)
+    for _, edge in near:
+        total += edge
+    return total
+
+
+Equation = Callable[[Weights, Array, int, Neighbours], Array]
+
+
+@pytest.mark.parametrize(
+    ("operator", "equation", "loop"),
+    [
+        (GNS, gns, False),
+        (GAT, gat, True),
+        (GATv2, gatv2, True),
+        (SuperGAT, supergat_mx, True),
+        (SuperGATDot, supergat_sd, True),
+        (Transformer, transformer, False),
+    ],
+)
+def test_an_operator_is_its_published_equation(
+    operator: type[Operator], equation: Equation, loop: bool
+) -> None:
+    """The equation sums over neighbours one by one."""
+    inputs = small_graph()
+    layer = build_random(operator, scale=0.4)
+    x = inputs.node.double().numpy()
+    weights = read_weights(layer)
+    expected = []
+    for receiver in range(len(x)):
+        near = neighbours(inputs, receiver, loop=loop)
+        expected.append(equation(weights, x, receiver, near))
+    update = compute_update(layer, inputs)
+    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_pointnet_is_that_of_pyg() -> None:
+    """With relative positions as edges, PointNet is PyG's PointNetConv."""
+    inputs = small_graph()
+    layer = build_random(PointNet)
+    assert isinstance(layer, PointNet)
+    position = torch.randn(len(inputs.node), LATENT, dtype=torch.float64)
+
+    first = torch.nn.Linear(3 * LATENT, HIDDEN).double()
+    with torch.no_grad():
+        first.weight[:] = torch.cat([layer.of_node.weight, layer.of_edge.weight], dim=1)
+        first.bias[:] = layer.of_node.bias
+    with torch.random.fork_rng():
+        convolution = PointNetConv()  # Its constructor would reset the weights.
+    convolution.local_nn = torch.nn.Sequential(first, *copy.deepcopy(layer.local))
+
+    sender, receiver = inputs.edge_index
+    x = inputs.node.double()
+    edge = position[sender] - position[receiver]
+    update, _ = layer(x, inputs.edge_index, edge)
+    expected = convolution(x, position, inputs.edge_index)
+    torch.testing.assert_close(update, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_the_order_of_nodes_and_edges_means_nothing(operator: type[Operator]) -> None:
+    """Nodes in another order get the same updates in that order."""
+    inputs = small_graph()
+    layer = build_random(operator).eval()
+    node_order = torch.randperm(len(inputs.node), generator=seeded(3))
+    edge_order = torch.randperm(len(inputs.edge), generator=seeded(4))
+    new_number = torch.argsort(node_order)
+    shuffled = Graph(
+        inputs.node[node_order],
+        new_number[inputs.edge_index][:, edge_order],
+        inputs.edge[edge_order],
+    )
+    update = compute_update(layer, shuffled)
+    expected = compute_update(layer, inputs)[node_order]
+    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_without_edges_updates_and_gradients_are_finite(
+    operator: type[Operator],
+) -> None:
+    layer = build_random(operator)
+    node = torch.randn(3, 2 * LATENT).double()
+    edge_index = torch.empty(2, 0, dtype=torch.int64)
+    edge = torch.empty(0, LATENT).double()
+    edge.requires_grad_()  # a plain sum has no weights
+    update, losses = layer(node, edge_index, edge)
+    assert update.isfinite().all()
+    total = update.sum() + sum(losses.values())
+    total.backward()
+    for parameter in layer.parameters():
+        if parameter.grad is not None:
+            assert parameter.grad.isfinite().all()
+
+
+def test_unlinked_pairs_are_neither_edges_nor_loops() -> None:
+    """Every other pair comes up, and the same seed gives the same pairs."""
+    edge_index = small_graph().edge_index
+    pairs = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
+    drawn = set(map(tuple, pairs.t().tolist()))
+    linked = set(map(tuple, edge_index.t().tolist()))
+    every_pair = {(j, i) for j in range(9) for i in range(9) if i != j}
+    assert drawn == every_pair - linked  # 72 - 24 = 48 pairs in 20,000 draws of 81
+    again = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
+    assert torch.equal(pairs, again)
+
+
+def test_the_link_loss_is_equation_5_28() -> None:
+    """It is the cross entropy of edges, loops and unlinked pairs."""
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+    node = inputs.node.double()
+    _, losses = layer(node, inputs.edge_index, inputs.edge, generator=seeded(2))
+
+    z = node.numpy() / SCALE @ read_weights(layer)["conv.lin.weight"].T
+
+    def link_probability(pairs: NDArray[np.int64]) -> Array:
+        sender, receiver = pairs
+        return sigmoid(np.sum(z[sender] * z[receiver], axis=1))
+
+    loops = np.tile(np.arange(9), (2, 1))
+    linked = np.concatenate([inputs.edge_index.numpy(), loops], axis=1)
+    unlinked = draw_unlinked_pairs(inputs.edge_index, 9, 12, seeded(2)).numpy()
+    of_linked = np.log(link_probability(linked))
+    of_unlinked = np.log(1 - link_probability(unlinked))
+    expected = -np.mean(np.concatenate([of_linked, of_unlinked]))
+    assert losses["link"].item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_there_is_no_link_loss_in_evaluation() -> None:
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4).eval()
+    _, losses = layer(inputs.node.double(), inputs.edge_index, inputs.edge)
+    assert not losses
+
+
+def test_the_link_loss_starts_low() -> None:
+    """At the widths of a recipe it starts near 1, not 1000."""
+    torch.manual_seed(0)
+    wide = graph(300, 2400, node=256, edge=128)
+    wide.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
+    _, losses = SuperGAT(256, 128, 128)(*wide)
+    assert 0.3 < losses["link"].item() < 3.0
+
+
+def test_supergat_learns_who_are_neighbours() -> None:
+    torch.manual_seed(0)
+    inputs = graph(40, 200, node=32, edge=16)
+    layer = SuperGAT(32, 16, 16)
+    inputs.node.mul_(8.0)  # sums of about 8 normalised messages
+    generator = seeded(0)
+    optimizer = torch.optim.Adam(layer.parameters(), lr=1e-2)
+    course = []
+    for _ in range(60):
+        _, losses = layer(*inputs, generator=generator)
+        loss = losses["link"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        course.append(loss.item())
+    assert np.mean(course[-5:]) < 0.75 * np.mean(course[:5])
+
+
+def global_random_states() -> tuple[object, ...]:
+    """Return the states of the global generators of Python, torch and NumPy."""
+    return (
+        random.getstate(),
+        torch.get_rng_state().tolist(),
+        np.random.get_state()[1].tolist(),  # noqa: NPY002
+    )
+
+
+def test_draws_leave_global_sources_alone() -> None:
+    """SuperGAT draws from its generator only, the same for the same seed."""
+    node, edge_index, edge = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+
+    def link_loss(seed: int) -> float:
+        _, losses = layer(node.double(), edge_index, edge, generator=seeded(seed))
+        return losses["link"].item()
+
+    before = global_random_states()
+    loss = link_loss(0)
+    assert link_loss(0) == loss
+    assert link_loss(1) != loss
+    assert global_random_states() == before
+
+
+def test_supergat_can_be_copied_after_training() -> None:
+    """No graph of gradients hangs on it."""
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+    layer(inputs.node.double(), inputs.edge_index, inputs.edge, generator=seeded(0))
+    copied = copy.deepcopy(layer)
+    for parameter, copied_parameter in zip(
+        layer.parameters(), copied.parameters(), strict=True
+    ):
+        assert torch.equal(parameter, copied_parameter)

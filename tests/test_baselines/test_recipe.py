@@ -1,0 +1,540 @@
+"""Recipes: layers, settings, schedules, and what is said about mistakes in them."""
+
+from __future__ import annotations
+
+import inspect
+import itertools
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+import torch
+from pydantic import ValidationError
+from simple_models import Drift, batch, info, install, rolled, swirl
+
+from lagbench.baselines.baseline import Baseline, Settings
+from lagbench.baselines.catalogue import CatalogueEntry, find, list_names, load_all
+from lagbench.baselines.recipe import (
+    Schedule,
+    TrainingOptions,
+    change_options,
+    recipe_for,
+    recipe_names,
+)
+from lagbench.baselines.recipe_changes import list_settings
+from lagbench.data.registry import load
+from lagbench.errors import UnreadableFileError, UsageError
+
+TEXT = """
+format: 1
+model: {start: 0.5}
+training: {epochs: 3, batch: 4, schedule: {kind: exponential, factor: 0.5}}
+recipes:
+  cavity/tiny: {training: {steps: 7}}
+  cavity/tiny-long: {model: {start: 2.0}, training: {steps: 70, schedule: {every: 10}}}
+  "*/mini": {training: {learning_rate: 1.0e-2}}
+  fluid/full:
+    model: {start: 1.0}
+    training: {steps: 8}
+    baselines: {gns: {training: {steps: 9}}}
+"""
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> CatalogueEntry:
+    """A baseline with recipes of its own."""
+    path = tmp_path / "drift.yaml"
+    path.write_text(TEXT)
+    return CatalogueEntry(name="drift", model=Drift, recipes=path)
+
+
+@pytest.mark.parametrize("name", list_names())
+def test_every_recipe_is_right(name: str) -> None:
+    """Every recipe of every baseline names a split and size of ours, and its options
+    are accepted.
+    """
+    entry = find(name)
+    registry = load()
+    found = recipe_names(entry)
+    assert any("tiny" in one for one in found)
+    for one in found:
+        split, _, tail = one.partition("/")
+        size, _, variant = tail.partition("-")
+        for wanted in registry.splits if split == "*" else [split]:
+            registry.size(wanted, size)
+            recipe = recipe_for(entry, wanted, size, variant=variant or None)
+            assert (
+                recipe.training.steps
+                or recipe.training.epochs
+                or hasattr(entry.model, "closed_form")
+            )
+
+
+def test_operators_share_their_recipes() -> None:
+    """The six operators have one recipe on every split; they differ in the steps alone,
+    by their cost.
+    """
+    operators = ("gns", "supergat", "gat", "gatv2", "pointnet", "transformer")
+    splits = ("cavity", "curl-noise", "fluid", "multimaterial")
+    for split, size in itertools.product(splits, ("tiny", "mini", "full")):
+        recipes = [recipe_for(find(name), split, size) for name in operators]
+        found = [
+            (one.model, one.training.model_copy(update={"steps": 1})) for one in recipes
+        ]
+        assert all(one == found[0] for one in found)
+
+
+OTHER = {
+    **{
+        "calls": 3,
+        "pushforward": 2,
+        "recovery": 4.0,
+        "noise_std": 0.5,
+        "forgetful": 0.7,
+        "loss_norm": "l1",
+    },
+    **{
+        "loss": {"vorticity": 3.0},
+        "link_weight": 2.0,
+        "rollout_loss_steps": 3,
+        "symmetry": "square",
+    },
+    **{"dropout": [0.5, 0.5], "density_weight": 5.0, "ridge": 50.0},
+}
+
+
+@pytest.mark.parametrize("name", ["neuralmpm", "supergat", "mlp", "lstm", "var-stable"])
+def test_options_of_the_training(name: str) -> None:
+    """A trained model refuses options of the training; rollouts are the same to the bit
+    whatever they are.
+
+    But the noise of a graph network, which its scales know.
+    """
+    baseline = find(name)
+    torch.manual_seed(0)
+    plain = baseline.model.build({}, info())
+    for part in plain.parameters():  # an untrained NeuralMPM changes nothing
+        torch.nn.init.normal_(part, std=0.05)
+    changes = {option: OTHER[option] for option in baseline.model.Options.in_training}
+    unseen = {
+        key: value
+        for key, value in changes.items()
+        if (name, key) != ("supergat", "noise_std")
+    }
+    other = baseline.model.build(unseen, info())
+    other.load_state_dict(plain.state_dict())
+    given = batch(swirl(0, plain.history))
+    given = replace(given, material=torch.zeros_like(given.material))
+    assert torch.equal(rolled(plain, given, 6), rolled(other, given, 6))
+    stored = plain.options.model_dump(mode="json")
+    for option in changes:
+        setting = f"model.{option}={json.dumps(OTHER[option])}"
+        with pytest.raises(UsageError):
+            change_options(baseline, stored, [setting])
+    assert change_options(baseline, stored, []) == stored
+
+
+@pytest.mark.parametrize(
+    ("name", "option", "value"),
+    [
+        *(
+            ("mlp", "target", "change"),
+            ("mlp", "activation", "tanh"),
+            ("lstm", "target", "change"),
+        ),
+        *(("gns", "target", "velocity"), ("gns", "sum_messages", "false")),
+    ],
+)
+def test_weights_keep_their_meaning(name: str, option: str, value: str) -> None:
+    """A trained model refuses options that its weights were made for, though they would
+    fit.
+    """
+    baseline = find(name)
+    setting = f"model.{option}={value}"
+    stored = baseline.model.Options().model_dump(mode="json")
+    with pytest.raises(UsageError):
+        change_options(baseline, stored, [setting])
+    assert change_options(baseline, {**stored, option: value}, [setting])
+
+
+def test_layers(entry: CatalogueEntry, tmp_path: Path) -> None:
+    """Settings win over the recipe, and the recipe over the defaults of the file, which
+    may be one's own.
+
+    A star stands for every split. Of baselines that share a recipe, one has what is
+    said of it by name.
+    """
+    plain = recipe_for(entry, "cavity", "tiny")
+    assert plain.training.steps == 7
+    assert plain.training.epochs is None
+    assert plain.training.batch == 4
+    long = recipe_for(
+        entry, "cavity", "tiny", variant="long", settings=["training.batch=9"], seed=5
+    )
+    assert plain.model["start"] == 0.5
+    assert long.model["start"] == 2.0
+    assert long.training.batch == 9
+    assert long.training.seed == 5
+    assert long.training.schedule.factor == 0.5
+    assert long.training.schedule.every == 10
+    starred = recipe_for(entry, "fluid", "mini")
+    assert starred.name == "fluid/mini"
+    assert starred.training.learning_rate == 0.01
+    for name, steps in (("drift", 8), ("gns", 9)):
+        recipe = recipe_for(replace(entry, name=name), "fluid", "full")
+        assert recipe.model["start"] == 1.0
+        assert recipe.training.steps == steps
+        assert recipe.training.batch == 4
+    own = tmp_path / "own.yaml"
+    own.write_text("{format: 1, recipes: {fluid/tiny: {training: {steps: 3}}}}")
+    assert recipe_for(entry, "fluid", "tiny", variant=str(own)).training.steps == 3
+
+
+def test_trainings_of_before_an_option_go_on() -> None:
+    """A record says an option that came later only where it is not what was done
+    before.
+    """
+    entry = find("neuralmpm")
+    before = recipe_for(entry, "fluid", "tiny").as_json()
+    assert not {"strain", "mixture", "pushforward", "recovery", "average"} & set(
+        before["model"]
+    )
+    assert not {"ema", "compile"} & set(before["training"])
+    changes = ["model.strain=true", "training.ema=0.9", "training.compile=true"]
+    after = recipe_for(entry, "fluid", "tiny", settings=changes).as_json()
+    before["model"] |= {"strain": True}
+    before["training"] |= {"ema": 0.9, "compile": True}
+    assert after == before
+
+
+def test_committed_trainings_lack_no_option() -> None:
+    """What the records of committed weights do not say is what is done without it, so
+    that they can go on.
+    """
+    paths = Path(__file__).parents[2].glob("leaderboard/weights/*/*/*.json")
+    held = {
+        path: json.loads(path.read_text(encoding="utf-8")).get("recipe")
+        for path in sorted(paths)
+    }
+    for path, recipe in {
+        recipe["baseline"]: (p, recipe) for p, recipe in held.items() if recipe
+    }.values():
+        settings = list_settings(recipe)
+        now = recipe_for(
+            find(recipe["baseline"]), *path.parts[-3:-1], settings=settings
+        ).as_json()
+        lacking = {
+            part: now[part].keys() - recipe[part].keys()
+            for part in ("model", "training")
+        }
+        assert lacking == {"model": set(), "training": set()}, path
+
+
+@pytest.mark.parametrize(
+    ("name", "given"),
+    [
+        (
+            "gns",
+            ("model.loss_norm=l1", "model.loss.vorticity=0.5", "training.steps=70"),
+        ),
+        ("supergat", ("model.sum_messages=false", "training.epochs=2")),
+        (
+            "neuralmpm",
+            (
+                "model.pushforward=2",
+                "training.ema=0.9",
+                "training.windows=[train, extra]",
+            ),
+        ),
+        ("neuralmpm", ("training.schedule.floor=0.1", "training.validate_every=0")),
+        ("neuralmpm", ()),
+    ],
+)
+def test_settings_lead_back_to_the_recipe(name: str, given: tuple[str, ...]) -> None:
+    """What a training changed, read off its record, makes its recipe again; seeds and
+    looks are no change.
+    """
+    entry = find(name)
+    recipe = recipe_for(
+        entry, "cavity", "mini", settings=[*given, "training.log_every=3"], seed=5
+    )
+    record = json.loads(json.dumps(recipe.as_json()))
+    told = list_settings(record)
+    assert {one.partition("=")[0] for one in given} <= {
+        one.partition("=")[0] for one in told
+    }
+    assert (
+        recipe_for(
+            entry, "cavity", "mini", settings=[*told, "training.log_every=3"], seed=5
+        )
+        == recipe
+    )
+    assert (
+        list_settings(
+            recipe_for(
+                entry, "cavity", "mini", settings=["training.log_every=3"]
+            ).as_json()
+        )
+        == ()
+    )
+
+
+def test_nothing_is_told_of_a_recipe_that_is_not_ours(tmp_path: Path) -> None:
+    """Strangers' records: no such recipe or baseline, options that do not fit, a path
+    for a name.
+    """
+    own = tmp_path / "own.yaml"
+    own.write_text("format: 1\nrecipes: {cavity/mini: {training: {steps: 1}}}\n")
+    good = recipe_for(
+        find("gns"), "cavity", "mini", settings=["training.steps=7"]
+    ).as_json()
+    assert list_settings(good) == ("training.steps=7",)
+    for change in (
+        *({"name": f"cavity/mini-{path}"} for path in (own, tmp_path / "absent.yaml")),
+        *(
+            {"name": "cavity/none"},
+            {"name": 3},
+            {"baseline": "other"},
+            {"baseline": ["gns"]},
+        ),
+        {"training": [1]},
+    ):
+        assert list_settings({**good, **change}) == (), change
+    assert list_settings({**good, "model": None}) == ("training.steps=7",)
+    for odd in (
+        "x" * 1000,
+        "a\n\x1b[31m\ud800",
+        "2026-99-99",
+        "\u00e4",
+        [[0] * 1000],
+        {"steps": {"a": "b"}},
+    ):
+        (told,) = list_settings(
+            {**good, "training": {**good["training"], "steps": odd, "unknown": 1}}
+        ) or ("",)
+        assert len(told) < 250
+        assert told.isprintable()
+        assert told.isascii()
+    assert list_settings(None) == list_settings([good]) == ()
+
+
+def test_steps_and_epochs_replace_each_other(entry: CatalogueEntry) -> None:
+    """A later layer that counts epochs drops the steps below it; in one layer both are
+    refused.
+    """
+    for settings in (["training.epochs=2"], ["training.steps=5", "training.epochs=2"]):
+        changed = recipe_for(entry, "cavity", "tiny", settings=settings).training
+        assert changed.steps is None
+        assert changed.epochs == 2
+    # 2 epochs x 41 windows / (4 windows x 2 processes) = 10.25
+    assert changed.total_steps(41, processes=2) == 11
+    with pytest.raises(ValueError, match="steps or epochs"):
+        TrainingOptions(steps=1, epochs=1)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("training.learning_rat=1", "did you mean 'learning_rate'"),
+        ("training.schedule.evry=1", "did you mean 'every'"),
+        ("training.schedule=cosin", "schedule"),
+        ("model.strat=1", "did you mean 'start'"),
+        ("modle.start=1", "model.KEY=VALUE"),
+        ("model.start", "model.KEY=VALUE"),
+        ("training.batch=[1", "no YAML"),
+        ("training.batch=0", "greater than 0"),
+        ("training.windows=[test]", "never on test"),
+        ("training.windows=[train, valid]", "not on valid"),
+        ("training.learning_rate=.inf", "finite"),
+        ("training.precision=off", "'bf16'"),
+        ("training.opening_share=true", "opening_share"),
+        ("training.schedule.factor=yes", "schedule.factor"),
+        ("training.steps=on", "training.steps"),
+        ("training.clip=no", "training.clip"),
+        ("model.start=true", "model.start"),
+    ],
+)
+def test_mistakes_in_settings(
+    entry: CatalogueEntry, setting: str, message: str
+) -> None:
+    """A wrong setting is a usage error that names key and remedy."""
+    with pytest.raises(UsageError, match=message):
+        recipe_for(entry, "cavity", "tiny", settings=[setting])
+
+
+def test_no_such_recipe(entry: CatalogueEntry) -> None:
+    """A split or variant without a recipe is a usage error that names the nearest."""
+    bare = replace(entry, recipes=None)
+    assert recipe_for(bare, "cavity", "tiny").name == "cavity/tiny"
+    for asked, split, size, variant, words in (
+        (entry, "cavity", "tiny", "lon", "did you mean 'long'"),
+        (entry, "curl-noise", "full", None, "cavity/tiny"),
+        (
+            entry,
+            "curl-noise",
+            "mini",
+            "long",
+            "leave --recipe out",
+        ),  # of any split one has no variant
+        (entry, "cavity", "huge", "long", "cavity/tiny"),
+        (
+            find("neuralmpm"),
+            "multimaterial",
+            "tiny",
+            "conserving",
+            "--size mini or full has it",
+        ),
+        (bare, "cavity", "tiny", "long", "no recipe"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            recipe_for(asked, split, size, variant=variant)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{format: 2, recipes: {}}", "format"),
+        ("{format: 1, receipts: {}}", "did you mean 'recipes'"),
+        ("{format: 1, recipes: {a/b: {modell: {}}}}", "did you mean 'model'"),
+        (
+            "{format: 1, recipes: {a/b: {baselines: {gns: {trainin: {}}}}}}",
+            "did you mean 'training'",
+        ),
+        (
+            "{format: 1, recipes: {cavity/tiny: {baselines: {gnss: {}}}}}",
+            "did you mean 'gns'",
+        ),
+        ("[1, 2]", "dictionary"),
+        ("{format: 1, a: &x 1, b: *x}", "aliases"),
+    ],
+)
+def test_mistakes_in_files(
+    entry: CatalogueEntry, tmp_path: Path, text: str, message: str
+) -> None:
+    """A file that is none of recipes is unreadable, and the message says where."""
+    path = tmp_path / "wrong.yaml"
+    path.write_text(text)
+    with pytest.raises(UnreadableFileError, match=message):
+        recipe_for(entry, "cavity", "tiny", variant=str(path))
+
+
+def test_schedules_equal_torch() -> None:
+    """Cosine and exponential rates are those of torch's own schedulers."""
+    weight = torch.nn.Parameter(torch.zeros(1))
+    optimizer = torch.optim.SGD([weight], lr=1.0)
+    cosine = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, T_max=50, eta_min=0.01
+    )
+    ours = Schedule(kind="cosine", floor=0.01)
+    decay = Schedule(kind="exponential", factor=0.1, every=20)
+    for step in range(50):
+        assert math.isclose(
+            ours.factor_at(step, steps=50),
+            optimizer.param_groups[0]["lr"],
+            rel_tol=1e-9,
+        )
+        assert math.isclose(
+            decay.factor_at(step, steps=50), 0.1 ** (step / 20), rel_tol=1e-12
+        )
+        optimizer.step()
+        cosine.step()
+    # it rises in equal parts: with 3 warm-up steps 1/4, 2/4, 3/4, then 1
+    assert [Schedule().factor_at(step, steps=10, warmup=3) for step in range(5)] == [
+        0.25,
+        0.5,
+        0.75,
+        1.0,
+        1.0,
+    ]
+
+
+class Kinds(Settings):
+    """Options of many kinds, as packages may have them."""
+
+    number: float = 0.0
+    either: bool | int | None = None
+    word: Literal["auto", True] = "auto"
+    several: tuple[int, ...] = ()
+    flags: tuple[bool, ...] = ()
+    named: dict[str, float] | None = None
+    anything: Any = None
+
+
+def test_yes_and_no_where_they_are_meant() -> None:
+    """Options that may be yes or no, or anything, keep it; pydantic would make numbers
+    of it elsewhere.
+
+    Inside of lists and mappings too.
+    """
+    for given in (
+        {
+            "number": 1.0,
+            "either": True,
+            "word": True,
+            "flags": [True, False],
+            "anything": [True],
+        },
+        {"either": 1, "several": [1, 2], "named": {"a": 1.0}, "anything": False},
+    ):
+        found = Kinds.model_validate(given).model_dump(mode="json", include=set(given))
+        assert json.dumps(found, sort_keys=True) == json.dumps(given, sort_keys=True)
+    for value in (True, False):
+        for name, wrong in (
+            ("number", value),
+            ("several", [3, value]),
+            ("named", {"a": value}),
+        ):
+            with pytest.raises(ValidationError) as caught:
+                Kinds.model_validate({name: wrong})
+            assert [error["loc"] for error in caught.value.errors()] == [(name,)]
+
+
+def test_other_packages_add_baselines(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A class of another package is found by its name, its recipes beside its module;
+    ours stay.
+    """
+    install(monkeypatch, drift=Drift, gns=Drift)
+    monkeypatch.setattr(Drift, "recipes", "drift.yaml", raising=False)
+    monkeypatch.chdir(tmp_path)  # from whatever folder the command is given
+    with pytest.warns(UserWarning, match="its name is taken"):
+        found = find("drift")
+    assert found.model is Drift
+    assert found.recipes == Path(inspect.getfile(Drift)).with_name("drift.yaml")
+    with pytest.warns(UserWarning, match="its name is taken"):
+        assert find("gns").model.method == "GNS"
+
+
+def test_a_baseline_is_whole_and_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What lacks methods or is no baseline cannot be loaded and only warns beside
+    others, as odd names do.
+    """
+    install(monkeypatch, half=Baseline, broken=Settings, **{"Bad Name/x": Drift})
+    with pytest.warns(UserWarning, match="adds no baseline") as told:
+        found = load_all()
+    words = " ".join(str(warning.message) for warning in told)
+    assert all(
+        f"'{name}'" in words and name not in found
+        for name in ("half", "broken", "Bad Name/x")
+    )
+    assert "mlp" in found
+    for name, reason in (
+        ("half", "history, forward, start, advance"),
+        ("broken", "cannot be loaded"),
+    ):
+        with (
+            pytest.warns(UserWarning, match="Bad Name/x"),
+            pytest.raises(UsageError, match=reason),
+        ):
+            find(name)
+
+
+def test_the_page_of_the_baselines_is_complete() -> None:
+    """docs/baselines.md names every baseline and every option of a training."""
+    page = (Path(__file__).parents[2] / "docs/baselines.md").read_text()
+    for word in (*list_names(), *TrainingOptions.model_fields):
+        assert f"`{word}`" in page, word

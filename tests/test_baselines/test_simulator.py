@@ -1,0 +1,424 @@
+"""Graph networks as simulators: oracles, symmetries, starts, walls, precision."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from simple_models import (
+    RADIUS,
+    SMALL,
+    batch,
+    info,
+    jittered,
+    network,
+    oracle,
+    rolled,
+    swirl,
+)
+from torch import Tensor
+
+from lagbench.baselines.augmentation import mirror_batch
+from lagbench.baselines.operators.gns import GNS
+from lagbench.baselines.simulator import GraphNetwork, ParticleState
+from lagbench.errors import UsageError
+
+TARGETS = pytest.mark.parametrize("target", ["acceleration", "velocity"])
+
+
+def seeded(seed: int = 0) -> torch.Generator:
+    """Return a seeded source of randomness."""
+    return torch.Generator().manual_seed(seed)
+
+
+@TARGETS
+def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
+    """With the true accelerations or velocities, 90 frames end at the truth.
+
+    They differ by the rounding of float32 only.
+    """
+    frames = swirl(0, 96)
+    truth = batch(frames)
+    exact = torch.from_numpy(frames).transpose(0, 1)
+    path = rolled(oracle(exact, target), truth.part(slice(6)), 90)
+
+    displacement = truth.position[:, 95] - truth.position[:, 5]
+    assert float(displacement.norm(dim=1).max()) > 0.2
+    # The initial velocities are differences of float32 positions: 6e-8 a frame, which
+    # accelerations do not mend.
+    tolerance = 1e-6
+    if target == "acceleration":
+        tolerance = 90 * 6e-8
+    error = (path - truth.position[:, 6:]).abs().max()
+    assert float(error) < tolerance
+
+
+def test_untrained_models_of_accelerations_keep_velocities() -> None:
+    window = batch(swirl(0, 6))
+    time = torch.arange(1.0, 4.0)[:, None]
+    velocity = window.position[:, -1] - window.position[:, -2]
+    straight = window.position[:, -1:] + time * velocity[:, None]
+    path = rolled(network(), window, 3)
+    torch.testing.assert_close(path, straight, rtol=0.0, atol=3e-7)
+
+
+def test_untrained_models_of_velocities_stand_still() -> None:
+    """They predict the mean velocity of the training data, which is 0 here."""
+    window = batch(swirl(0, 6))
+    still = window.position[:, -1:].expand(-1, 3, -1)
+    path = rolled(network(target="velocity"), window, 3)
+    assert torch.equal(path, still)
+
+
+@TARGETS
+def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
+    """One vector moves all particles, and so the rollout; it is exact in binary."""
+    rng = np.random.default_rng(0)
+    start = np.round(jittered(0, 8, 0.3, 0.5) * 2**16) / 2**16
+    noise = rng.normal(0.0, 1e-3, (6, *start.shape))
+    steps = np.round(noise * 2**16) / 2**16
+    frames = start + steps.cumsum(axis=0)
+    shift = np.array([0.25, 0.125])
+
+    model = network(awake=True, target=target)
+    window = batch(frames)
+    path = rolled(model, window, 4)
+    shifted_path = rolled(model, batch(frames + shift), 4)
+    first_step = path[:, 0] - window.position[:, -1]
+    assert float(first_step.abs().max()) > 1e-4
+    expected = path + torch.from_numpy(shift).float()
+    torch.testing.assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
+
+
+def mirror_model(model: Any, axis: int) -> Any:
+    """Return the model whose weights see the world mirrored along an axis.
+
+    Every input that changes sign has its column negated, the two walls across have
+    their columns swapped, and the output along the axis is negated.
+    """
+    mirrored = network(
+        awake=True,
+        target=model.options.target.value,
+        wall_velocity=True,
+    )
+    mirrored.load_state_dict(model.state_dict())
+    low = 2 * axis
+    high = 2 * axis + 1
+    with torch.no_grad():
+        node_weight = mirrored.network.node_encoder[0].weight
+        node_weight[:, axis:10:2] *= -1.0
+
+        distance = node_weight[:, 10:14]
+        distance[:, [low, high]] = distance[:, [high, low]]
+
+        wall_velocity = node_weight[:, 30:].reshape(-1, 4, 2)
+        wall_velocity[..., axis] *= -1.0
+        wall_velocity[:, [low, high]] = wall_velocity[:, [high, low]]
+        node_weight[:, 30:] = wall_velocity.flatten(1)
+
+        edge_weight = mirrored.network.edge_encoder[0].weight
+        edge_weight[:, axis] *= -1.0
+        decoder = mirrored.network.decoder[-1]
+        decoder.weight[axis] *= -1.0
+        decoder.bias[axis] *= -1.0
+    return mirrored
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@TARGETS
+def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
+    """Walls, their motion and the weights mirrored: the rollout is the mirror image."""
+    rng = np.random.default_rng(0)
+    windows = []
+    for seed in (0, 1):
+        steps = rng.normal(0.0, 2e-3, (6, 256, 2))
+        windows.append(jittered(seed) + steps.cumsum(axis=0))
+    window = batch(*windows, walls=True)
+    window.wall_velocity[1] *= -0.5
+    matrix = torch.eye(2).repeat(2, 1, 1)
+    matrix[:, axis, axis] = -1.0
+    image = mirror_batch(window, matrix, info().bounds)
+
+    model = network(awake=True, target=target, wall_velocity=True)
+    expected = rolled(model, window, 3)
+    expected[..., axis] = 1.0 - expected[..., axis]
+    path = rolled(mirror_model(model, axis), image, 3)
+    torch.testing.assert_close(path, expected, rtol=0.0, atol=1e-6)
+
+    # The weights matter: the model itself does not give the mirror image.
+    unmirrored_path = rolled(model, image, 3)
+    assert float((unmirrored_path - expected).abs().max()) > 1e-5
+
+
+def test_windows_side_by_side_do_not_see_each_other() -> None:
+    """Two windows in one batch roll out as they do alone."""
+    model = network(awake=True)
+    windows = [swirl(0, 6), swirl(1, 6)]
+    together = rolled(model, batch(*windows), 3)
+    alone = [rolled(model, batch(window), 3) for window in windows]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-6)
+
+
+def test_two_frames_are_enough_to_start_from() -> None:
+    """The first velocity repeats in place of those before the window."""
+    window = batch(swirl(0, 8))
+    model = network()
+    first_velocity = window.position[:, 1] - window.position[:, 0]
+
+    from_two = model.start(window.part(slice(2)))
+    repeated = first_velocity[:, None].expand(-1, 5, -1)
+    assert torch.equal(from_two.velocity, repeated)
+    assert torch.equal(from_two.position, window.position[:, 1])
+
+    from_four = model.start(window.part(slice(4)))
+    assert torch.equal(from_four.velocity[:, :3], repeated[:, :3])
+    assert torch.equal(from_four.velocity[:, 2:], window.position[:, :4].diff(dim=1))
+
+    with pytest.raises(UsageError):
+        model.start(window.part(slice(1)))
+
+
+def test_a_start_takes_the_last_frames_of_a_long_window() -> None:
+    window = batch(swirl(0, 8))
+    model = network()
+    from_eight = model.start(window)
+    from_six = model.start(window.part(slice(2, 8)))
+    assert torch.equal(from_eight.velocity, from_six.velocity)
+    assert torch.equal(from_eight.velocity, window.position[:, 2:].diff(dim=1))
+
+
+def test_a_model_of_one_velocity_sees_two_frames() -> None:
+    window = batch(swirl(0, 8))
+    model = network(awake=True, velocities=1)
+    assert model.history == 2
+    assert model.features.count == 22
+    from_two = rolled(model, window.part(slice(6, 8)), 2)
+    assert torch.equal(rolled(model, window, 2), from_two)
+
+
+def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
+    """The oldest velocity leaves and the new one comes last."""
+    window = batch(swirl(0, 7))
+    model = network()
+    state = model.start(window.part(slice(6)))
+    next_start = model.start(window.part(slice(1, 7)))
+    moved = state.move(next_start.position, next_start.velocity[:, -1])
+    for field in fields(ParticleState):
+        value = getattr(moved, field.name)
+        expected = getattr(next_start, field.name)
+        if expected is None:
+            assert value is None
+        else:
+            assert torch.equal(value, expected)
+
+
+def test_wall_velocities_become_velocities_per_frame() -> None:
+    """A frame is half a second here; each particle has the walls of its window."""
+    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    window.wall_velocity[1] *= 3.0
+    wall_velocity = network(wall_velocity=True).start(window).wall_velocity
+    expected = torch.arange(1.0, 9.0).reshape(4, 2) / 200
+    torch.testing.assert_close(wall_velocity[0, 0], expected)
+    torch.testing.assert_close(wall_velocity[1], 3.0 * wall_velocity[0])
+
+
+def test_models_without_wall_velocity_have_none() -> None:
+    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    assert network().start(window).wall_velocity is None
+    with pytest.raises(UsageError) as caught:
+        network(wall_velocity=True, changes={"moving_walls": False})
+    assert caught.value.where == "model.wall_velocity"
+
+
+def test_a_predicted_frame_moves_with_its_own_wall_velocity() -> None:
+    """After the last known wall velocity that one stays."""
+    window = batch(swirl(0, 8), walls=True)
+    window.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
+    state = network(wall_velocity=True).start(window.part(slice(6)))
+    speeds = []
+    for _ in range(3):
+        speeds.append(float(state.wall_velocity[0, 0, 0, 0]))
+        state = state.move(state.position, state.velocity[:, -1])
+    assert speeds == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
+
+
+def flight_to_the_right_wall() -> Any:
+    """Return a window of one particle that is at the wall, x = 0.9375, in 2 frames."""
+    time = np.arange(6)
+    x = 0.93 - 0.004 * (5 - time)
+    y = 0.5 + 0.001 * time
+    return batch(np.stack([x, y], axis=-1)[:, None])
+
+
+def test_a_particle_that_flies_out_stops_at_the_wall() -> None:
+    """Its velocity says so."""
+    model = network()
+    x = []
+    state = model.start(flight_to_the_right_wall())
+    for _ in range(3):
+        with torch.no_grad():
+            state, position = model.advance(state)
+        x.append(float(position[0, 0]))
+    assert x == pytest.approx([0.934, 0.9375, 0.9375], abs=1e-6)
+    x_velocity, y_velocity = state.velocity[0, -1].tolist()
+    assert x_velocity == pytest.approx(0.0, abs=1e-7)
+    assert y_velocity == pytest.approx(0.001, abs=1e-6)
+
+
+def test_without_clamp_a_particle_flies_out() -> None:
+    path = rolled(network(clamp=False), flight_to_the_right_wall(), 3)
+    assert float(path[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
+
+
+@TARGETS
+def test_no_rollout_leaves_the_box(target: str) -> None:
+    """Whatever a network says: of 256 particles over 30 frames none is outside."""
+    model = network(awake=True, target=target)
+    torch.nn.init.normal_(model.network.decoder[-1].bias, std=50.0)
+    path = rolled(model, batch(swirl(0, 6)), 30)
+    low, high = torch.tensor(info().bounds).T
+    is_inside = (path >= low) & (path <= high)
+    is_stopped = (path == low) | (path == high)
+    assert bool(is_inside.all())
+    assert bool(is_stopped.any())
+
+
+class RecordingNetwork(GraphNetwork):
+    """A graph network that records its inputs and predicts zeros."""
+
+    operator = GNS
+    method = "recording"
+
+    def predict(
+        self, state: ParticleState, *_: object
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Record the state."""
+        self.states = [*getattr(self, "states", []), state]
+        return torch.zeros_like(state.position), {}
+
+
+def test_noise_stays_in_the_box() -> None:
+    """Noise moves particles that rest at a wall to its inner side only."""
+    y = 0.3 + 0.05 * np.arange(8)
+    resting = np.stack([np.full(8, 0.9375), y], axis=-1)
+    window = batch(np.repeat(resting[None], 7, axis=0))
+    model = RecordingNetwork.build(SMALL | {"noise_std": 1e-3}, info())
+    model(window, seeded())
+    x = model.states[0].position[:, 0]
+    assert float(x.max()) == 0.9375
+    assert float(x.min()) < 0.9375
+
+
+def test_a_wall_passes_gradients_on() -> None:
+    """A prediction that a wall stops learns to stop before it, where the truth does."""
+    x = np.append(0.9275 + 0.002 * np.arange(6), 0.936)
+    y = np.full(7, 0.5)
+    arriving = np.stack([x, y], axis=-1)[:, None]
+    model = network()
+    loss = model(batch(arriving))["acceleration"]
+    (gradient,) = torch.autograd.grad(loss, model.network.decoder[-1].bias)
+
+    path = rolled(model, batch(arriving[:6]), 1)
+    assert float(path[0, 0, 0]) == 0.9375
+    # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are
+    # multiplied by.
+    assert float(gradient[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
+
+
+def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
+    """A change of the wall velocity in an older frame changes nothing."""
+    frames = np.repeat(jittered(0)[None], 7, axis=0)
+    window = batch(frames, walls=True)
+    model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
+
+    def step_with(wall_velocity: Tensor) -> Tensor:
+        forced = replace(window, wall_velocity=wall_velocity)
+        with torch.no_grad():
+            state, _ = model.step(model.start(forced.part(slice(6))))
+        return state.position
+
+    def reverse_walls_at(frame: int) -> Tensor:
+        wall_velocity = window.wall_velocity.clone()
+        wall_velocity[:, frame] *= -3.0
+        return wall_velocity
+
+    position = step_with(window.wall_velocity)
+    assert torch.equal(step_with(reverse_walls_at(5)), position)
+
+    difference = step_with(reverse_walls_at(6)) - position
+    is_changed = difference.abs().amax(dim=1) > 0
+    low, high = torch.tensor(info().bounds).T
+    last = window.position[:, 5]
+    wall_distance = torch.minimum(last - low, high - last).amin(dim=1)
+    assert bool(is_changed[wall_distance < 0.9 * RADIUS].all())
+    # One layer: a particle hears of the walls of its neighbours at most.
+    assert not bool(is_changed[wall_distance > 2.0 * RADIUS].any())
+
+
+def test_forgetful_windows_start_from_their_last_frames() -> None:
+    """Every number of frames comes up, except all of them."""
+    window = batch(*(swirl(seed, 7) for seed in range(24)))
+    model = RecordingNetwork.build(SMALL | {"forgetful": 1.0}, info())
+    model(window, seeded())
+    velocity = model.states[0].velocity
+
+    velocity_by_frame_count = {}
+    for frame_count in range(2, 7):
+        short = window.part(slice(6 - frame_count, 6))
+        velocity_by_frame_count[frame_count] = model.start(short).velocity
+    frame_counts = set()
+    for sample in range(24):
+        members = window.sample == sample
+        matches = []
+        for frame_count, start_velocity in velocity_by_frame_count.items():
+            if torch.equal(velocity[members], start_velocity[members]):
+                matches.append(frame_count)
+        assert len(matches) == 1
+        frame_counts.update(matches)
+    assert frame_counts == {2, 3, 4, 5}
+
+    # In validation there is no generator, and windows forget nothing.
+    model(window)
+    assert torch.equal(model.states[1].velocity, velocity_by_frame_count[6])
+
+
+def test_half_precision_moves_particles_in_full() -> None:
+    """Under bf16 autocast positions stay float32."""
+    window = batch(swirl(0, 6))
+    model = network(awake=True)
+    exact = rolled(model, window, 1)
+    with torch.autocast("cpu", torch.bfloat16):
+        half = rolled(model, window, 1)
+    assert half.dtype == torch.float32
+    displacement = (exact[:, 0] - window.position[:, -1]).abs().max()
+    difference = float((half - exact).abs().max())
+    assert 0.0 < difference < 0.02 * float(displacement)
+
+
+def test_half_precision_changes_the_loss_by_rounding_only() -> None:
+    window = batch(swirl(0, 7))
+    model = network(awake=True, noise_std=1e-3, symmetry="square")
+    with torch.no_grad():
+        exact = model(window, seeded())
+        with torch.autocast("cpu", torch.bfloat16):
+            half = model(window, seeded())
+    for name, value in exact.items():
+        assert half[name].dtype == torch.float32
+        torch.testing.assert_close(half[name], value, rtol=0.02, atol=0.0)
+
+
+def test_scales_are_no_weights() -> None:
+    """Weights stored in half precision bring back a model with the scales in full."""
+    model = network(awake=True)
+    stored = {}
+    for name, value in model.state_dict().items():
+        stored[name] = value.bfloat16()
+    loaded = network()
+    loaded.load_state_dict(stored)
+    for name in ("position", "velocity", "acceleration"):
+        deviation = getattr(model, name).std
+        assert torch.equal(getattr(loaded, name).std, deviation)
+    assert float(loaded.velocity.std[0]) == pytest.approx(0.004, rel=1e-7)

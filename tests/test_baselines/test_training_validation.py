@@ -1,0 +1,211 @@
+"""Validation while a model is trained: the scorer's digits, how often, and what a
+training then says.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import netCDF4
+import numpy as np
+import pytest
+import torch
+from simple_models import Drift, trainer
+
+from lagbench.baselines.checkpoint import load, restore
+from lagbench.baselines.dataset_info import read_dataset_info
+from lagbench.baselines.predict import predict
+from lagbench.baselines.recipe import TrainingOptions
+from lagbench.baselines.rollout import Validation
+from lagbench.baselines.train import TrainingResult
+from lagbench.data.registry import Registry
+from lagbench.errors import DataError
+from lagbench.make.generate import GenerationResult
+from lagbench.scoring.score import score
+from lagbench.scoring.task import load_scored_task
+
+Run = Callable[..., TrainingResult]
+
+
+@pytest.fixture
+def run(
+    generated: GenerationResult,
+    unmeasured: Registry,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Run:
+    """Train on tiny curl-noise data."""
+    return trainer(generated.root, unmeasured, tmp_path, monkeypatch, drift=Drift)
+
+
+def validated_on_test(
+    weights: Path, registry: Registry, root: Path, split: str
+) -> float:
+    """Return what validation says of stored weights when the test subset stands in for
+    valid.
+    """
+    task = load_scored_task(registry.size(split, "tiny"), root)
+    frames = {}
+    for scenario in task.scenarios:
+        with task.opened(scenario) as opened:
+            frames[scenario] = len(opened.scenario.moving_frames)
+    torch.set_num_threads(1)
+    return Validation(task=task, frames=frames).measure(restore(load(weights)))
+
+
+def scored(weights: Path, registry: Registry, root: Path, name: str) -> float:
+    """Return what the score card says of the predictions of stored weights."""
+    predict(
+        weights,
+        weights.with_name("predictions.nc"),
+        root=root,
+        registry=registry,
+        threads=1,
+    )
+    card = score(
+        weights.with_name("predictions.nc"), root=root, registry=registry, write=False
+    )
+    return card.scores["submission"][name].mean
+
+
+@pytest.mark.parametrize("baseline", ["gns", "mlp"])
+def test_digits_of_the_scorer_in_a_full_box(
+    run: Run, generated: GenerationResult, unmeasured: Registry, baseline: str
+) -> None:
+    """On the same scenarios validation and score card have the same vorticity NRMSE, to
+    the digit.
+    """
+    result = run(baseline, "steps=2")
+    assert result.metric == "vorticity_nrmse"
+    there = (result.weights, unmeasured, generated.root)
+    assert validated_on_test(*there, "curl-noise") == scored(*there, "vorticity_nrmse")
+
+
+def test_digits_of_the_scorer_on_the_free_surface(
+    run: Run, unmeasured: Registry, tiny_split: Callable[..., GenerationResult]
+) -> None:
+    """The same for the distance of clouds, although rollouts end where the truth
+    rests.
+    """
+    root = tiny_split("fluid").root
+    result = run("neuralmpm", "steps=2", root=root, split="fluid")
+    assert result.metric == "cloud_distance"
+    there = (result.weights, unmeasured, root)
+    assert validated_on_test(*there, "fluid") == scored(*there, "cloud_distance")
+
+
+def test_all_of_valid_and_no_other(run: Run, copied: Callable[[], Path]) -> None:
+    """Every scenario of valid counts, the test subset is not needed, and a lost
+    scenario is told.
+    """
+    root = copied()
+    for file in (root / "curl-noise/tiny/v2/test").glob("*.nc"):
+        file.unlink()
+    assert run("drift", "steps=1", root=root).best_value is not None
+    files = sorted((root / "curl-noise/tiny/v2/valid").glob("*.nc"))
+    with netCDF4.Dataset(files[-1]) as data:
+        assert np.isfinite(data["position"][:]).all()
+    files[-1].unlink()
+    with pytest.raises(DataError) as caught:
+        run("drift", "steps=1", root=root, fresh=True)
+    assert caught.value.where.endswith("root/curl-noise/tiny/v2/valid")
+
+
+def test_how_often() -> None:
+    """Validations share a training evenly, the last step among them, and take at most
+    15 % of it.
+
+    What a recipe names in `validate_every` wins; 0 means never.
+    """
+    options = TrainingOptions()
+    for steps, trained, rolled, expected in (
+        (5000, 64, 720, 8),  # NeuralMPM: four windows of 16 frames a step
+        (6500, 1, 720, 2),  # GNS: 0.15 * 1.5 * 6500 / 720 = 2.03
+        (6300, 1, 720, 1),
+        (10, 1, 720, 1),
+    ):
+        count = options.count_validations(steps, trained=trained, rolled=rolled)
+        at = [
+            s
+            for s in range(1, steps + 1)
+            if options.is_validated(s, steps=steps, validations=count)
+        ]
+        assert len(at) == count == expected
+        assert at[-1] == steps
+        assert at[count // 2 - 1] == steps // 2 or count == 1
+    options = TrainingOptions(validate_every=4)
+    never = TrainingOptions(validate_every=0)
+    assert [
+        s for s in range(1, 11) if options.is_validated(s, steps=10, validations=1)
+    ] == [4, 8, 10]
+    assert not any(never.is_validated(s, steps=10, validations=8) for s in range(1, 11))
+
+
+def test_what_a_training_says(run: Run) -> None:
+    """Record, weights and result tell windows, epochs, times, machine, and the best
+    validation.
+    """
+    settings = ("steps=8", "batch=3", "validate_every=2", "model.start=1.0")
+    result = run("drift", *settings, "learning_rate=0.5")
+    record = json.loads((result.folder / "training.json").read_text())
+    stored = load(result.weights).training
+    assert record["budget"] == stored["budget"]
+    budget = record["budget"]
+    # 48 windows in train: a step sees three
+    assert budget["windows"] == 24
+    assert budget["epochs"] == 0.5
+    assert budget["steps"] == 8
+    assert result.windows_seen == 24
+    assert result.epochs == 0.5
+    assert result.threads == 1
+    told = [[entry["step"], entry["vorticity_nrmse"]] for entry in record["validation"]]
+    assert budget["validations"] == told
+    assert [step for step, _ in told] == [2, 4, 6, 8]
+    assert (budget["best_step"], budget["best"]) == tuple(
+        min(told, key=lambda one: one[1])
+    )
+    assert stored["step"] == result.best_step == budget["best_step"] < 8
+    assert budget["gpu_hours"] == 0.0
+    assert result.gpu_seconds == 0.0
+    spent = 3600 * (budget["cpu_hours"] + budget["validation_hours"])
+    assert 0 < spent == pytest.approx(record["cpu_seconds"], rel=1e-4)
+
+
+def test_long_records_are_thinned(run: Run) -> None:
+    """Of 22 validations a budget tells at most 20, the last one among them."""
+    result = run("drift", "steps=22", "validate_every=1", "validation_frames=2")
+    told = json.loads((result.folder / "training.json").read_text())["budget"][
+        "validations"
+    ]
+    assert len(told) <= 20
+    assert told[-1][0] == 22
+
+
+def test_fewer_frames_for_tests(
+    run: Run, generated: GenerationResult, unmeasured: Registry
+) -> None:
+    """`validation_frames` shortens the rollouts, and the metric is that of the shorter
+    task.
+    """
+    settings = ("steps=1", "validation_frames=4")
+    result = run("drift", *settings)
+    task = load_scored_task(
+        unmeasured.size("curl-noise", "tiny"), generated.root, subset="valid"
+    )
+    short = replace(task, config=replace(task.config, horizon=4))
+    model = Drift.build(
+        {},
+        read_dataset_info(
+            "curl-noise", "tiny", root=generated.root, registry=unmeasured
+        ),
+    )
+    model.load_state_dict(dict(load(result.checkpoint).weights))
+    whole = dict.fromkeys(task.scenarios, 20)
+    assert (
+        Validation(task=short, frames=dict.fromkeys(task.scenarios, 4)).measure(model)
+        == result.best_value
+    )
+    assert Validation(task=task, frames=whole).measure(model) != result.best_value
