@@ -224,9 +224,9 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
 
 def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
     """Refuse wall particles where no wall can move, or where they have no room."""
-    if not is_closed:
+    if not is_closed or size.box.is_periodic:
         raise UsageError(
-            "the box has no walls that could move",
+            "the box has no walls that could move on every side",
             where="--wall-particles",
             got=size.split,
         )

@@ -3,9 +3,9 @@
 usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
            [--root FOLDER] [--workers 2] [--predictor analog ...] [--costs]
 
-All splits and sizes whose data are there are measured, or those named. With
---predictor only these references are measured anew, from the start; the others, and
-all costs, stay as they are. Without it each measured scenario is saved under the root folder: an
+All splits and sizes whose data are there are measured, or those named. With --predictor
+only these references are measured anew, from the start; the others, and all costs, stay
+as they are. Without it each measured scenario is saved under the root folder: an
 interrupted run continues where it stopped. Last a frame of each reference and of the
 solver itself (``lagbench bench solver``) is timed on one core; with --costs nothing
 else is done. Shipped scores are checked by ``lagbench leaderboard check --root
@@ -61,8 +61,8 @@ def measure_and_ship(
     """
     where = f"{size.split} {size.name}"
     if names is not None:
-        known = {reference.name for reference in references_of(size)}
-        if known.isdisjoint(names):
+        names_here = {reference.name for reference in references_of(size)}
+        if names_here.isdisjoint(names):
             raise UsageError(
                 "the data set has no such reference", where=where, got=names
             )

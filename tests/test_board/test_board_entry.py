@@ -351,10 +351,10 @@ def test_mistakes_of_a_file_are_told_together(tmp_path: Path) -> None:
     path.write_text(
         yaml.safe_dump(plain(licenze="MIT", code="javascript:x", parameters=-1))
     )
-    with pytest.raises(ChecksFailedError) as error:
+    with pytest.raises(ChecksFailedError) as caught:
         read_entry(path)
-    assert error.value.where.endswith("entry.yaml")
-    assert all(key in str(error.value) for key in ("licenze", "code", "parameters"))
+    assert caught.value.where.endswith("entry.yaml")
+    assert all(key in str(caught.value) for key in ("licenze", "code", "parameters"))
 
 
 def objects(value: Any) -> Iterator[dict[str, Any]]:

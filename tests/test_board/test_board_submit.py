@@ -231,9 +231,9 @@ def test_a_cost_of_predictions_that_no_entry_can_hold(
     path = own.predict(
         nearer, "odd", **{"device": "a laptop", "seconds_per_frame": 0.25, **labels}
     )
-    with pytest.raises(ChecksFailedError) as told:
+    with pytest.raises(ChecksFailedError) as caught:
         own.submit(path)
-    assert f"{key}: " in str(told.value.got)
+    assert f"{key}: " in str(caught.value.got)
 
 
 def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
@@ -244,9 +244,9 @@ def test_mistakes_are_told_together(own: BoardBench, predictions: Path) -> None:
     mended = {"name": "Fine", "urls": (), "method": "fine"}
     alone = []
     for key, value in keys.items():
-        with pytest.raises(UsageError) as told:
+        with pytest.raises(UsageError) as caught:
             own.submit(predictions, **{**mended, key: value})
-        alone.append(told.value.what)
+        alone.append(caught.value.what)
     with pytest.raises(UsageError) as together:
         own.submit(predictions, **keys)
     assert all(what in str(together.value) for what in alone)
@@ -391,9 +391,9 @@ def test_no_board_is_begun_by_mistake(
     meta = Meta(authors=("A. Author",), command="make", date=DAY)
     board = tmp_path / "site"
     where = own.where | {"board": board}
-    with pytest.raises(UsageError) as error:
+    with pytest.raises(UsageError) as caught:
         submitting.submit([predictions], meta, **where)
-    assert "--new-board" in str(error.value.fix)
+    assert "--new-board" in str(caught.value.fix)
     assert not board.exists()
     where["new_board"] = True
     assert submitting.submit([predictions], meta, **where).board == board
@@ -401,10 +401,10 @@ def test_no_board_is_begun_by_mistake(
     (board / ".git").mkdir(parents=True)
     for name in ("README.md", "index.html"):
         (board / name).write_text("mine")
-    with pytest.raises(UsageError) as error:
+    with pytest.raises(UsageError) as caught:
         submitting.submit([predictions], meta, **where)
-    assert error.value.where == str(board)
-    assert error.value.got == "'index.html'"
+    assert caught.value.where == str(board)
+    assert caught.value.got == "'index.html'"
     assert sorted(path.name for path in board.iterdir()) == [
         ".git",
         "README.md",

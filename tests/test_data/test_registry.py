@@ -21,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lagbench.data import registry
+from lagbench.data.box import Box
 from lagbench.data.limits import NEEDED, SUBSETS, Limit
 from lagbench.data.registry import Registry, default_path, load
 from lagbench.data.yamlfile import read_yaml
@@ -175,6 +176,14 @@ def test_unknown_names_offer_the_nearest() -> None:
     assert caught.value.where == "multimaterial full"
 
 
+def test_a_box_has_walls_unless_axes_are_periodic(tmp_path: Path) -> None:
+    assert load().size("cavity", "full").box.walls == ("left", "right", "bottom", "top")
+    path = edited(tmp_path, cavity(periodic=["y"], bounds=[[0.1, 0.9], [0.0, 1.0]]))
+    size = load(path).size("cavity", "full")
+    assert size.box == Box.from_bounds([(0.1, 0.9), (0.0, 1.0)], [False, True])
+    assert size.field_grid.box == size.box
+
+
 def test_a_registry_of_ones_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,6 +242,8 @@ def refused(path: Path, parts: tuple[str, ...], call: Callable[[], object]) -> N
         (cavity("subsets", tset="90"), ("cavity", "did you mean 'test'?")),
         (cavity("subsets", extra="0"), ("cavity", "stands in two subsets")),
         (cavity(frames={600: "0-58"}), ("cavity", "name every scenario once")),
+        (cavity(periodic=["q"]), ("cavity", "periodic", "got q")),
+        (cavity(periodic=["x", "x"]), ("cavity", "periodic", "got x, x")),
         (within("cavity", version="1.0"), ("cavity.version", "match pattern")),
         (
             lambda splits: splits["cavity"]["sizes"].update(

@@ -776,6 +776,26 @@ def test_jumps_of_nearly_a_box_are_refused_unless_the_box_is_periodic(
     assert locate(str(tmp_path / "told")).size.box == size.box
 
 
+def test_a_periodic_split_is_scored_by_the_shortest_way(tmp_path: Path) -> None:
+    """Straight flight across the boundary is what constant velocity predicts."""
+    made = adopt(
+        save_runs(tmp_path / "in", drifting_runs(3)),
+        output=tmp_path / "mine",
+        bounds=((0.0, 1.0), (0.0, 1.0)),
+        periodic=["x", "y"],
+        input_frames=3,
+        **BASIC,
+    )
+    target = tmp_path / "predictions.nc"
+    lagbench.template(str(made.folder), output=target)
+    card = lagbench.score(target, root=tmp_path, output_dir=tmp_path, workers=1)
+    straight = card.scores["constant-velocity"]["position_rmse"]
+    assert np.max(straight.per_frame) < 1e-5
+    at_rest = card.scores["persistence"]["position_rmse"].per_frame[0]  # [length]
+    drift = 0.02 * np.arange(1, len(at_rest) + 1)
+    np.testing.assert_allclose(at_rest, drift / np.sqrt(2.0), rtol=0.01)
+
+
 def test_a_periodic_axis_needs_a_name_and_bounds(tmp_path: Path) -> None:
     paths = save_runs(tmp_path / "in", drifting_runs(3))
     for options in (

@@ -117,7 +117,7 @@ def test_average_and_end_over_horizons() -> None:
         scenario.config.predicted_frames,
     )
     scores = {
-        name: found.mean for name, found in aggregate(metrics, {7: pieces}).items()
+        name: actual.mean for name, actual in aggregate(metrics, {7: pieces}).items()
     }
     # z-score of x: k; of u: 0.3 / 0.01 = 30; L = (k^2 + 30^2) / 4 for k = 1..6
     expected = [(k**2 + 900) / 4 for k in range(1, 7)]

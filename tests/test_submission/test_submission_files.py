@@ -282,10 +282,10 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
-    with pytest.raises(WorkFailedError) as told:
+    with pytest.raises(WorkFailedError) as caught:
         write(bench.valid / "p.nc", RIGHT, **options(bench))
-    assert told.value.where.endswith("valid.nc/p.nc")
-    assert "--output" in str(told.value.fix)
+    assert caught.value.where.endswith("valid.nc/p.nc")
+    assert "--output" in str(caught.value.fix)
 
 
 @pytest.mark.parametrize("size", [0, 5_000])
@@ -297,9 +297,9 @@ def test_a_full_disk_is_said(
     lack.
     """
     values = RIGHT if whole else {TESTS[0]: RIGHT[TESTS[0]]}
-    with largest_file(size), pytest.raises(WorkFailedError) as told:
+    with largest_file(size), pytest.raises(WorkFailedError) as caught:
         write(tmp_path / "p.nc", values, **options(bench))
-    assert "--output" in str(told.value.fix)
+    assert "--output" in str(caught.value.fix)
     assert not list(tmp_path.iterdir())
 
 
