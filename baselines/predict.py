@@ -332,15 +332,15 @@ class _TimedRollouts:
         """Yield the rollout of every scenario."""
         input_frames = slice(0, self._info.input_frames)
         for number, group in enumerate(self._groups):
-            given = scenario_batch(group, input_frames).to(self._machine)
+            given_frames = scenario_batch(group, input_frames).to(self._machine)
             if number == 0:
-                roll_out(self._model, given, 1)  # to warm up
+                roll_out(self._model, given_frames, 1)  # to warm up
             started = self._read_clock()
-            rollouts = roll_out(self._model, given, self._info.horizon)
+            rollouts = roll_out(self._model, given_frames, self._info.horizon)
             self.seconds += self._read_clock() - started
             for rollout in rollouts:
                 self._count_frames(rollout)
-            self._time_searches(given, rollouts)
+            self._time_searches(given_frames, rollouts)
             yield from rollouts
 
     def _count_frames(self, rollout: Rollout) -> None:

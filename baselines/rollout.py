@@ -276,9 +276,9 @@ class Validation:
         """Return rollouts of scenarios side by side."""
         paths = [self.task.truth.path(scenario) for scenario in scenarios]
         input_frames = slice(0, self.task.config.input_frames)
-        given = scenario_batch(paths, input_frames).to(device)
+        given_frames = scenario_batch(paths, input_frames).to(device)
         horizon = max(self.frames[scenario] for scenario in scenarios)
-        return roll_out(model, given, horizon)
+        return roll_out(model, given_frames, horizon)
 
     def _compare(self, rollout: Rollout) -> Tally:
         """Return the tally of a rollout against the truth, rounded as in a file."""

@@ -289,8 +289,8 @@ def test_npz_in_memory(tmp_path: Path) -> None:
     )
     size = sum(frames.nbytes for frames in trajectories)
     print(
-        f"\nNPZ in memory: {windows_per_second:.0f} windows/s, after {loading:.1f} s for "
-        f"{size / 1e6:.0f} MB"
+        f"\nNPZ in memory: {windows_per_second:.0f} windows/s, after {loading:.1f} s "
+        f"to load {size / 1e6:.0f} MB"
     )
 
 

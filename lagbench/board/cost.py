@@ -157,7 +157,10 @@ def draw(
     solver_times = [point.seconds for point in solvers]
     solver_errors = [point.error for point in solvers]
     plot.line(solver_times, solver_errors, "classical-front")
-    plot.spots([_spot_of(point, ranking, is_best=point in front) for point in points])
+    spots = []
+    for point in points:
+        spots.append(_spot_of(point, ranking, is_best=point in front))
+    plot.spots(spots)
 
     description = f"{len(points)} methods by processor time and {words(ranking)}"
     if solver:

@@ -148,7 +148,9 @@ def find_materials(
             unknown_numbers.append(number)
     if unknown_numbers:
         meanings = MEANINGS[form]
-        known = [f"{number} ({name})" for number, name in sorted(name_of.items())]
+        meanings_in_file = [
+            f"{number} ({name})" for number, name in sorted(name_of.items())
+        ]
         unknown = []
         for n in unknown_numbers:
             unknown.append(f"{n} ({meanings.get(n, 'unknown')})")
@@ -156,7 +158,7 @@ def find_materials(
         raise UnreadableFileError(
             "particles of a kind that no material is known for",
             where=where,
-            expected=", ".join(known),
+            expected=", ".join(meanings_in_file),
             got=", ".join(unknown),
             fix=f"say what they stand for: --kinds {first}=jelly, or leave them "
             f"out: {first}=drop",

@@ -589,7 +589,8 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         paths = {}
         for i in train_ids:
             paths[f"scenario {i}"] = setup.path(i)
-        moments = setup.read_files(file_moments, paths, paths.values())
+        read_moments = partial(file_moments, box=setup.size.box)
+        moments = setup.read_files(read_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     keeper.keep(manifest)
 

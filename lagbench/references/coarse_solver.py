@@ -139,10 +139,12 @@ def spread_subset(
     """
     rank = np.empty(len(position), np.intp)
     for kind in np.unique(material):
-        own = np.flatnonzero(material == kind)
-        columns = math.isqrt(math.ceil(count * len(own) / len(position)))
-        place = np.argsort(np.argsort(position[own, 0], kind="stable"), kind="stable")
-        rank[own] = place * columns // len(own)
+        members = np.flatnonzero(material == kind)
+        columns = math.isqrt(math.ceil(count * len(members) / len(position)))
+        place = np.argsort(
+            np.argsort(position[members, 0], kind="stable"), kind="stable"
+        )
+        rank[members] = place * columns // len(members)
     order = np.lexsort((position[:, 1], rank, material))
     draws = np.random.Generator(np.random.PCG64(0)).random(count)
     groups = np.array_split(order, count)

@@ -51,8 +51,6 @@ CURVES = (
 )
 """Metrics of which reports and boards draw curves."""
 
-KNOTS = 100  # most frames of a curve
-
 DIGITS = 5
 FRAME_DIGITS = 4
 CURVE_DIGITS = 3

@@ -505,23 +505,23 @@ def fill_gaps(sums: Floats, weight: Floats) -> Floats:
 
     Gaps close from their edges, layer by layer. Without any weight all values are 0.
     """
-    known = weight > 1e-9
-    values = np.where(known, sums / np.where(known, weight, 1.0), 0.0)
-    if not known.any():
+    has_value = weight > 1e-9
+    values = np.where(has_value, sums / np.where(has_value, weight, 1.0), 0.0)
+    if not has_value.any():
         return values
-    while not known.all():
+    while not has_value.all():
         total = np.zeros(values.shape)
         count = np.zeros(values.shape)
-        padded_values = np.pad(values * known, 1)
-        padded_known = np.pad(known.astype(np.float64), 1)
+        padded_values = np.pad(values * has_value, 1)
+        padded_has_value = np.pad(has_value.astype(np.float64), 1)
         for axis in range(values.ndim):
             for step in (-1, +1):
                 beside = _neighbour(values.ndim, axis, step)
                 total += padded_values[beside]
-                count += padded_known[beside]
-        closing = ~known & (count > 0)
+                count += padded_has_value[beside]
+        closing = ~has_value & (count > 0)
         values[closing] = total[closing] / count[closing]
-        known |= closing
+        has_value |= closing
     return values
 
 

@@ -282,13 +282,15 @@ def _select_metrics(extras: Collection[str]) -> tuple[Metric, ...]:
     """Return the metrics to measure; refuse an extra that brings none."""
     if isinstance(extras, str):
         extras = (extras,)
-    known = {metric.extra for metric in available().values() if metric.extra}
+    extras_with_metrics = {
+        metric.extra for metric in available().values() if metric.extra
+    }
     for extra in extras:
-        if extra not in known:
+        if extra not in extras_with_metrics:
             raise UsageError(
                 f"no extra {extra!r} with metrics",
                 where="--extras",
-                fix=suggest_name(extra, known),
+                fix=suggest_name(extra, extras_with_metrics),
             )
     return select(extras=extras)
 
