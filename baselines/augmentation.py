@@ -212,9 +212,9 @@ def velocity_towards_path(
 ) -> Tensor:
     """Return the velocity that leads back to the true path, shape [particle, 2].
 
-    The gap is divided by ``frames``: formed anew each frame, it closes by 1/frames of
-    the rest. At most three deviations of accelerations are returned: particles that are
-    farther off are not worth a larger one.
+    It is ``gap / frames``. The gap is measured anew in each frame, so each frame closes
+    1/frames of what is left of it. However far off a particle is, the velocity is no
+    longer than three standard deviations of an acceleration, acting for one frame.
 
     Args:
         gap: true less reached positions [length], shape [particle, 2].

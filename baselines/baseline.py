@@ -24,8 +24,9 @@ from pydantic import (
 )
 from torch import Tensor, nn
 
+from lagbench.data.box import Box, parse_periodic
 from lagbench.errors import UsageError
-from lagbench.tensors import Batch
+from lagbench.tensors import Batch, TensorBox
 
 __all__ = [
     "Baseline",
@@ -94,6 +95,7 @@ class Baseline(nn.Module):
         method: name of the model on the board.
         any_size: whether weights of one size can be run at another, with other
             particles and other distances.
+        any_box: whether the model knows periodic boxes as well as walls.
 
     Args:
         options: the model's options.
@@ -103,11 +105,20 @@ class Baseline(nn.Module):
     Options: ClassVar[type[Options]] = Options
     method: ClassVar[str]
     any_size: ClassVar[bool] = False
+    any_box: ClassVar[bool] = False
 
     def __init__(self, options: Any, info: DatasetInfo) -> None:  # noqa: ANN401 (each has its own)
         super().__init__()
+        if info.periodic and not self.any_box:
+            raise UsageError(
+                f"{self.method} knows boxes with walls only",
+                where=f"the box of {info.split} {info.size}",
+                expected="walls along every axis",
+                got=f"periodic along {', '.join(info.periodic)}",
+            )
         self.options = options
         self.info = info
+        self.box = TensorBox(info.box)
 
     @classmethod
     def build(cls, options: Mapping[str, object], info: DatasetInfo) -> Self:
@@ -201,16 +212,27 @@ def count_parameters(model: Baseline) -> int:
     return sum(tensor.numel() for tensor in tensors)
 
 
-def last_velocities(position: Tensor, count: int) -> Tensor:
+def last_velocities(
+    position: Tensor, count: int, box: TensorBox | None = None
+) -> Tensor:
     """Return the last velocities of given frames, oldest first.
 
-    They have shape [particle, count, 2] and the unit length/frame. Where the frames are
-    few, the first velocity repeats.
+    They have shape [particle, count, axis] and the unit length/frame. Where the frames
+    are few, the first velocity repeats.
+
+    Args:
+        position: given frames [length], shape [particle, frame, axis].
+        count: number of velocities.
+        box: box that holds the particles; None for one with walls only.
 
     Raises:
         UsageError: there are fewer than two frames.
     """
-    velocity = position[:, -count - 1 :].diff(dim=1)
+    frames = position[:, -count - 1 :]
+    if box is None:
+        velocity = frames.diff(dim=1)
+    else:
+        velocity = box.displacement(frames[:, :-1], frames[:, 1:])
     if not velocity.shape[1]:
         raise UsageError(
             "too few frames to start from",
@@ -265,6 +287,13 @@ class DatasetInfo:
     # [length/frame], acceleration_mean, acceleration_std [length/frame^2], one (x, y)
     # pair each
     statistics: Mapping[str, Pair]
+    periodic: tuple[str, ...] = ()  # names of the axes that have no walls
+
+    @property
+    def box(self) -> Box:
+        """The box that holds the particles."""
+        periodic = parse_periodic(self.periodic, len(self.bounds))
+        return Box.from_bounds(self.bounds, periodic)
 
 
 def rescale(trained: DatasetInfo, target: DatasetInfo) -> DatasetInfo:

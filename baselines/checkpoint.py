@@ -104,10 +104,14 @@ def save(path: Path, checkpoint: Checkpoint) -> None:
     Raises:
         WorkFailedError: the disk is full, or nobody may write there.
     """
+    facts = asdict(checkpoint.info)
+    if not checkpoint.info.periodic:
+        # Without the key the bytes of a box with walls are those of older versions.
+        del facts["periodic"]
     about = {
         "baseline": checkpoint.baseline,
         "options": dict(checkpoint.options),
-        "facts": asdict(checkpoint.info),
+        "facts": facts,
         "training": dict(checkpoint.training),
     }
     weights = {}
@@ -394,7 +398,7 @@ def _check_other_size(
             fix=f"train it there: {command}",
         )
     target = read_dataset_info(trained.split, size, root=root, registry=registry)
-    same_box = target.bounds == trained.bounds
+    same_box = target.box == trained.box
     same_interval = target.frame_interval == trained.frame_interval
     if not same_box or not same_interval:
         raise UsageError(

@@ -61,6 +61,7 @@ def read_dataset_info(
         dataset_sha256=dataset_sha256,
         particles=tier.particles,
         bounds=tier.bounds,
+        periodic=tier.periodic,
         radius=task.radius,
         input_frames=task.input_frames,
         horizon=task.horizon,

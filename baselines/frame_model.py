@@ -22,6 +22,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from lagbench.errors import DataError
+from lagbench.tensors import TensorBox
 
 from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
@@ -38,6 +39,7 @@ class FrameState(nn.Module):
 
     def __init__(self, info: DatasetInfo) -> None:
         super().__init__()
+        self.box = TensorBox(info.box)
         statistics = info.statistics
         mean = (*statistics["position_mean"], *statistics["velocity_mean"])
         std = (*statistics["position_std"], *statistics["velocity_std"])
@@ -57,7 +59,9 @@ class FrameState(nn.Module):
             raise DataError(
                 "a velocity needs two frames", expected="2 or more", got=frame_count
             )
-        velocity = position[..., 1:, :, :] - position[..., :-1, :, :]
+        velocity = self.box.displacement(
+            position[..., :-1, :, :], position[..., 1:, :, :]
+        )
         velocity = torch.cat([velocity[..., :1, :, :], velocity], dim=-3)
         state = torch.cat([position, velocity], dim=-1)
         return (state - self.mean.to(state.dtype)) / self.std.to(state.dtype)

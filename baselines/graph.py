@@ -29,6 +29,7 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from lagbench.errors import UsageError
+from lagbench.tensors import TensorBox
 
 Bounds = tuple[tuple[float, float], tuple[float, float]]
 
@@ -277,15 +278,30 @@ def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
     return (distance / reach).clamp(-1.0, 1.0)
 
 
-def edge_features(position: Tensor, edge_index: Tensor, radius: float) -> Tensor:
+def edge_features(
+    position: Tensor,
+    edge_index: Tensor,
+    radius: float,
+    box: TensorBox | None = None,
+) -> Tensor:
     """Return displacement (x, y) and distance of each edge over the radius, [edge, 3].
 
-    The displacement is the sender's position less the receiver's.
+    The displacement is the way from receiver to sender.
+
+    Args:
+        position: positions [length], shape [particle, axis].
+        edge_index: senders and receivers, int64, shape [2, edge].
+        radius: connectivity radius [length].
+        box: box that holds the particles; None for one with walls only.
     """
     sender, receiver = edge_index
     sender_position = position.index_select(0, sender)
     receiver_position = position.index_select(0, receiver)
-    displacement = (sender_position - receiver_position) / radius
+    if box is None:
+        way = sender_position - receiver_position
+    else:
+        way = box.displacement(receiver_position, sender_position)
+    displacement = way / radius
     # The gradient of a norm is NaN at 0, where two particles coincide; that of this
     # root is 0.
     square = (displacement**2).sum(dim=-1, keepdim=True)

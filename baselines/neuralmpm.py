@@ -154,8 +154,10 @@ class NeuralMPM(Baseline):
             state, frames = self.call(state, average=False)
             for position, velocity in frames:
                 true_position = batch.position[:, next_frame - 1]
-                true_velocity = batch.position[:, next_frame] - true_position
-                gap = true_position - reached.detach()
+                true_velocity = self.box.displacement(
+                    true_position, batch.position[:, next_frame]
+                )
+                gap = self.box.displacement(reached.detach(), true_position)
                 target = true_velocity + velocity_towards_path(
                     gap, self.options.recovery, acceleration_std=self.change
                 )
@@ -185,11 +187,11 @@ class NeuralMPM(Baseline):
         training, nothing is mirror-averaged, whatever the options say.
         """
         position = given.position[:, -self.history :]
-        position = position.clamp(self.grid.low, self.grid.high)
+        position = self.box.inside(position)
         layer = self.encoder.layers(given.material, given.sample)
         state = GridState(
             position=position[:, -1],
-            velocity=last_velocities(position, self.options.velocities),
+            velocity=last_velocities(position, self.options.velocities, self.box),
             sample=given.sample,
             layer=layer,
             walls=self._coming_walls(given),
@@ -254,7 +256,8 @@ class NeuralMPM(Baseline):
     ) -> tuple[GridState, list[Frame]]:
         """Return the state after a bundle of frames, and those frames.
 
-        ``average`` is that of :meth:`start`.
+        With ``average=False``, as in training, nothing is mirror-averaged, whatever the
+        options say.
         """
         stencil = self.grid.stencil(state.position, state.layer)
         fields, grid_velocity = self.encoder.encode(state, stencil)
@@ -327,12 +330,10 @@ class NeuralMPM(Baseline):
             )
             if self.projection is not None and state.projection is not None:
                 corrected = self.projection(state.projection, position + velocity)
-                velocity = corrected - position
-            velocity = velocity.clamp(
-                self.grid.low - position, self.grid.high - position
-            )
+                velocity = self.box.displacement(position, corrected)
+            velocity = self.box.stop_at_walls(position, velocity)
             # The sum may round to a number beyond the wall.
-            position = (position + velocity).clamp(self.grid.low, self.grid.high)
+            position = self.box.inside(position + velocity)
             grid_velocity = grid_velocity + acceleration
             frames.append((position, velocity))
         return frames

@@ -15,6 +15,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from lagbench.data.box import Box
+from lagbench.tensors import TensorBox
+
 from .graph import Bounds, wall_distance
 from .torch_grid import number_nine_nodes, spline_slopes, spline_weights
 
@@ -49,6 +52,7 @@ class ParticleGrid(nn.Module):
     def __init__(self, bounds: Bounds, cells: int, *, multiple: int = 1) -> None:
         super().__init__()
         self.bounds = bounds
+        self.box = TensorBox(Box.from_bounds(bounds))
         self.spacing = max(high - low for low, high in bounds) / cells
         axis_x = self._node_places(bounds[0], multiple)
         axis_y = self._node_places(bounds[1], multiple)

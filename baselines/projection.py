@@ -66,7 +66,7 @@ class ShapeMatching:
 
         Each body is in a layer of its own. Clusters reach one and a half cells.
         """
-        position = position.clamp(grid.low, grid.high)
+        position = grid.box.inside(position)
         stencil = grid.stencil(position, layer)
 
         # A cluster whose arms do not add up to 0 turns a little in every frame:
@@ -166,7 +166,7 @@ class DensityProjection:
         """
         inverse_share = 1.0 / grid.share_inside().clamp(min=LEAST_SHARE_INSIDE)
         unscaled = cls(grid, inverse_share, sample, position.new_ones(windows))
-        stencil = grid.stencil(position.clamp(grid.low, grid.high), sample)
+        stencil = grid.stencil(grid.box.inside(position), sample)
         density, _ = unscaled.relative_density(stencil)
         greatest = position.new_zeros(windows).scatter_reduce(
             0, sample, density, "amax"
@@ -191,7 +191,7 @@ class DensityProjection:
             push: k [1]; about 1 removes the excess within a few steps.
             limit: l [1], shape [particle].
         """
-        position = position.clamp(self.grid.low, self.grid.high)
+        position = self.grid.box.inside(position)
         stencil = self.grid.stencil(position, self.sample)
         density, mass = self.relative_density(stencil)
         pressure = push * (density - limit).clamp(0.0, LARGEST_EXCESS)

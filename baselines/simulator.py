@@ -398,7 +398,9 @@ class GraphNetwork(Baseline):
     ) -> dict[str, Tensor]:
         """Return the terms of one step to a frame of the batch."""
         target_position = batch.position[:, frame]
-        target_velocity = target_position - batch.position[:, frame - 1]
+        target_velocity = self.box.displacement(
+            batch.position[:, frame - 1], target_position
+        )
         predicted_velocity = following.velocity[:, -1]
         # Both accelerations start from the state's velocity.
         last_velocity = state.velocity[:, -1]
@@ -464,7 +466,7 @@ class GraphNetwork(Baseline):
             walls = per_second * self.info.frame_interval
         return ParticleState(
             position=given.position[:, -1],
-            velocity=last_velocities(given.position, self.options.velocities),
+            velocity=last_velocities(given.position, self.options.velocities, self.box),
             material=given.material,
             sample=given.sample,
             wall_velocity=walls,
@@ -488,7 +490,8 @@ class GraphNetwork(Baseline):
 
         position = state.position + velocity
         inside = self._keep_inside(position)
-        velocity = velocity + (inside - position).detach()
+        correction = self.box.displacement(position, inside)
+        velocity = velocity + correction.detach()
         return state.move(inside, velocity), losses
 
     def find_edges(self, state: ParticleState) -> Tensor:
@@ -515,7 +518,7 @@ class GraphNetwork(Baseline):
             next_frame = state.wall_velocity[:, 0]
             walls = next_frame[state.sample]
         node = self.features(state.position, state.velocity, state.material, walls)
-        edge = edge_features(state.position, edge_index, self.radius)
+        edge = edge_features(state.position, edge_index, self.radius, self.box)
         output: tuple[Tensor, Losses] = self.network(node, edge_index, edge, generator)
         return output
 
@@ -526,8 +529,7 @@ class GraphNetwork(Baseline):
         """
         if not self.options.clamp:
             return position
-        low, high = position.new_tensor(self.info.bounds).T
-        clamped = position.detach().clamp(low, high)
+        clamped = self.box.inside(position.detach())
         return clamped + (position - position.detach())
 
 

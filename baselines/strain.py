@@ -55,7 +55,7 @@ class RestShape:
         Bodies that do not mix have layers of their own. ``is_solid``, bool, shape
         [particle], names the particles that show a strain; all of them by default.
         """
-        position = position.clamp(grid.low, grid.high)
+        position = grid.box.inside(position)
         stencil = grid.stencil(position, layer)
         weight_sum = grid.spread(stencil, torch.ones_like(position[:, :1]), layers)
         offset = stencil.weight[:, :, None] * grid.offsets(stencil, position)
@@ -75,7 +75,7 @@ class RestShape:
 
         ``position`` is x, the positions now [length], shape [particle, 2].
         """
-        displacement = position - self.position
+        displacement = self.grid.box.displacement(self.position, position)
         mean_offset = _relative_means(
             self.grid, self.stencil, self.weight_sum, displacement
         )

@@ -38,7 +38,7 @@ from lagbench.board.entry import (
 from lagbench.board.entry_file import entry_bytes
 from lagbench.board.folder import Folder, score_paths
 from lagbench.board.ranking import combine, summarise, write_references
-from lagbench.cli.output import spell_bytes
+from lagbench.cli.output import format_bytes
 from lagbench.data.checksums import file_sha256
 from lagbench.data.grid import Grid, Placement
 from lagbench.data.registry import Size, load
@@ -80,15 +80,21 @@ def main() -> int:
     parser.add_argument(
         "--output", type=Path, help="folder to make; a temporary one by default"
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        return _measured(given.output or Path(scratch) / "board", given.entries)
+        return _measure(options.output or Path(scratch) / "board", options.entries)
 
 
-def _measured(target: Path, entries: int) -> int:
-    splits = [name for name, split in load().splits.items() if SIZE in split.sizes]
+def _measure(target: Path, entries: int) -> int:
+    registry = load()
+    splits = []
+    for name, split in registry.splits.items():
+        if SIZE in split.sizes:
+            splits.append(name)
     for number in range(entries):
-        make_entry(load().size(splits[number % len(splits)], SIZE), target, number)
+        size = registry.size(splits[number % len(splits)], SIZE)
+        make_entry(size, target, number)
+
     wall = time.perf_counter()
     cpu = time.process_time()
     result = build(target)
@@ -101,7 +107,7 @@ def _measured(target: Path, entries: int) -> int:
     print(f"entries      {result.rows} on {result.tabs} tabs")
     print(f"score files  {len(files)}, at most {max(files)} bytes")
     print(
-        f"page         {spell_bytes(result.bytes)} ({result.bytes} bytes; limit "
+        f"page         {format_bytes(result.bytes)} ({result.bytes} bytes; limit "
         f"{MOST_BYTES})"
     )
     print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s")
@@ -115,31 +121,57 @@ def make_entry(size: Size, target: Path, number: int) -> None:
     """Write a made-up entry, its score files and the references beside it."""
     rng = np.random.Generator(np.random.PCG64(number))
     place = (size.split, size.name, f"model-{number}")
-    seeds: list[int | None] = [None] if number % 5 else list(range(SEEDS))
-    cards = [
-        made_up(size, place[2], number * SEEDS + i, 10.0 ** rng.uniform(-1.5, 0.3))
-        for i in range(len(seeds))
-    ]
-    paths = [target / path for path in score_paths(place, seeds)]
+    seeds: list[int | None] = [None]
+    if number % 5 == 0:
+        seeds = list(range(SEEDS))
+    flags: tuple[EntryFlag, ...] = ()
     if number % 7 == 0:
         flags = (EntryFlag(name="physics", reasons=("made up",)),)
-    else:
-        flags = ()
-    for card, path in zip(cards, paths, strict=True):
+
+    cards = []
+    for i in range(len(seeds)):
+        quality = 10.0 ** rng.uniform(-1.5, 0.3)
+        cards.append(make_card(size, place[2], number * SEEDS + i, quality))
+
+    files = []
+    predictions = []
+    tallies = []
+    paths = score_paths(place, seeds)
+    for seed, card, inner_path in zip(seeds, cards, paths, strict=True):
+        path = target / inner_path
         path.parent.mkdir(parents=True, exist_ok=True)
         write_statistics(card, path)
-    write_references(cards[0], Folder(target))
-    files = tuple(
-        ScoredFile(
+        tallies.append(read_score_file(path).scores.tallies)
+        scored_file = ScoredFile(
             sha256=file_sha256(path),
             predictions_sha256=card.predictions_sha256,
             flags=flags,
         )
-        for card, path in zip(cards, paths, strict=True)
-    )
+        files.append(scored_file)
+        prediction = Prediction(
+            seed=seed,
+            sha256=card.predictions_sha256,
+            url="https://example.org/x.nc",
+            bytes=1_000_000,
+        )
+        predictions.append(prediction)
+    write_references(cards[0], Folder(target))
+
+    status = Status.ACTIVE
+    successor = None
+    reason = ""
+    if number % 13 == 12:
+        status = Status.SUPERSEDED
+        successor = f"model-{number % 4}"
+        reason = "made up"
+    elif number % 11 == 10:
+        status = Status.WITHDRAWN
+        reason = "made up"
+
+    solver_seconds = None
+    if number % 3:
+        solver_seconds = 0.05
     header = cards[0].header
-    superseded = number % 13 == 12
-    withdrawn = number % 11 == 10
     entry = Entry(
         format=2,
         split=size.split,
@@ -159,65 +191,49 @@ def make_entry(size: Size, target: Path, number: int) -> None:
         cost=EntryCost(
             seconds_per_frame=float(f"{10.0 ** rng.uniform(-3, 0):.4g}"),
             device="a machine",
-            solver_seconds_per_frame=0.05 if number % 3 else None,
+            solver_seconds_per_frame=solver_seconds,
         ),
-        status=Status.SUPERSEDED
-        if superseded
-        else Status.WITHDRAWN
-        if withdrawn
-        else Status.ACTIVE,
-        superseded_by=f"model-{number % 4}" if superseded else None,
-        reason="made up" if superseded or withdrawn else "",
+        status=status,
+        superseded_by=successor,
+        reason=reason,
         dataset=DataSet(version=header.dataset_version, sha256=header.dataset_sha256),
-        predictions=tuple(
-            Prediction(
-                seed=seed,
-                sha256=card.predictions_sha256,
-                url="https://example.org/x.nc",
-                bytes=1_000_000,
-            )
-            for seed, card in zip(seeds, cards, strict=True)
-        ),
+        predictions=tuple(predictions),
         score=ScoreBlock(
             lagbench="0.0.0",
             dataset_sha256=header.dataset_sha256,
             ranking_metric=cards[0].ranking,
-            files=files,
-            metrics=summarise(
-                combine([read_score_file(path).scores.tallies for path in paths])
-            ),
+            files=tuple(files),
+            metrics=summarise(combine(tallies)),
         ),
     )
     (target / entry.yaml_path).parent.mkdir(parents=True, exist_ok=True)
     (target / entry.yaml_path).write_bytes(entry_bytes(entry))
 
 
-def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
-    """Return a score card of nobody's predictions: errors that grow, pictures of
-    noise.
-    """
+def make_card(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
+    """Return a score card without predictions: errors grow, pictures are noise."""
     rng = np.random.Generator(np.random.PCG64(seed))
-    rows = {SUBMISSION: quality}
-    rows |= {name: 3.0 + i for i, name in enumerate(REFERENCES)}
+    qualities = {SUBMISSION: quality}
+    for i, name in enumerate(REFERENCES):
+        qualities[name] = 3.0 + i
+
     task = size.task
     frames = tuple(frames_to_predict(size))
     ranking = ranking_metric(size)
-    tallies = {
-        row: {
-            i: _tally(
-                frames,
-                value,
-                np.random.Generator(np.random.PCG64([i, int(1e6 * value)])),
-            )
-            for i in size.subsets["test"]
-        }
-        for row, value in rows.items()
-    }
+    tallies = {}
+    scores = {}
+    for row, row_quality in qualities.items():
+        tallies[row] = _tallies(size, row_quality)
+        scores[row] = aggregate([METRICS[ranking]], tallies[row])
+
+    sha256 = "0" * 64
+    if size.measured:
+        sha256 = size.measured.dataset_sha256
     header = Header(
         split=size.split,
         size=size.name,
         dataset_version=size.version,
-        dataset_sha256=size.measured.dataset_sha256 if size.measured else "0" * 64,
+        dataset_sha256=sha256,
         method=method,
         scenarios=size.subsets["test"],
         frames=frames,
@@ -230,7 +246,6 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         diverged_at={},
     )
     grid = Grid(task.score_grid.cells, Placement(task.score_grid.placement))
-    scores = {row: aggregate([METRICS[ranking]], held) for row, held in tallies.items()}
     naive_scores = {}
     for row, row_scores in scores.items():
         if row in NAIVE:
@@ -259,46 +274,57 @@ def made_up(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
     )
 
 
+def _tallies(size: Size, quality: float) -> dict[int, Tally]:
+    """Return statistics by scenario."""
+    frames = tuple(frames_to_predict(size))
+    tallies = {}
+    for scenario in size.subsets["test"]:
+        rng = np.random.Generator(np.random.PCG64([scenario, int(1e6 * quality)]))
+        tallies[scenario] = _tally(frames, quality, rng)
+    return tallies
+
+
 def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) -> Tally:
     """Return statistics that grow with the frames; correlations fall."""
-    metrics = [
-        m for m in METRICS.values() if m.statistic is not None and m.extra is None
-    ]
-    share = np.linspace(0.01, 1.0, len(frames))
-    total = (
-        1e-3
-        * quality
-        * 10.0 ** rng.uniform(-0.1, 0.1, (len(metrics), len(frames)))
-        * share
-    )
-    falling = np.array([metric.direction is Direction.HIGHER for metric in metrics])
-    total[falling] = 1.0 / (1.0 + quality * share)
+    names = []
+    is_falling = []
+    for metric in METRICS.values():
+        if metric.statistic is not None and metric.extra is None:
+            names.append(metric.name)
+            is_falling.append(metric.direction is Direction.HIGHER)
+
+    share = np.linspace(0.01, 1.0, len(frames))  # of the error at the last frame
+    scatter = 10.0 ** rng.uniform(-0.1, 0.1, (len(names), len(frames)))
+    total = 1e-3 * quality * scatter * share
+    total[is_falling] = 1.0 / (1.0 + quality * share)
     ones = np.ones(total.shape, np.int64)
-    return round_statistics(
-        Tally(tuple(metric.name for metric in metrics), frames, total, ones, 0 * ones)
-    )
+    return round_statistics(Tally(tuple(names), frames, total, ones, 0 * ones))
 
 
 def _preview(size: Size, nodes: int, rng: np.random.Generator) -> Preview:
     frames = tuple(frames_to_predict(size))
     maps = reported_frames(size)
-    shown = [
-        frames[i]
-        for i in np.linspace(0, len(frames) - 1, min(FRAMES, len(frames))).astype(int)
-    ]
+    frame_count = min(FRAMES, len(frames))
+    indices = np.linspace(0, len(frames) - 1, frame_count).astype(int)
+    shown = [frames[i] for i in indices]
+
+    # both sides start from the truth, shape [side, ...]
     truth = np.random.Generator(np.random.PCG64(size.particles))
-    vorticity = (
-        0.1 * truth.normal(size=(1, len(maps), nodes, nodes)) * np.ones((2, 1, 1, 1))
-    )
+    true_vorticity = 0.1 * truth.normal(size=(1, len(maps), nodes, nodes))
+    vorticity = true_vorticity * np.ones((2, 1, 1, 1))
     vorticity[1] += 0.02 * rng.normal(size=vorticity[1].shape)
-    film = truth.random((1, 1, PARTICLES, 2)) * np.ones((2, len(shown), 1, 1))
+
+    true_position = truth.random((1, 1, PARTICLES, 2))
+    film = true_position * np.ones((2, frame_count, 1, 1))
     film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0)
+
     shares = rng.random((2, len(maps), BINS))
+    histogram = shares / shares.sum(axis=-1, keepdims=True)
     return Preview(
         scenario=min(size.subsets["test"]),
         map_frames=maps,
         vorticity=vorticity.astype(np.float32),
-        histogram=(shares / shares.sum(axis=-1, keepdims=True)).astype(np.float32),
+        histogram=histogram.astype(np.float32),
         histogram_range=np.array([[-0.3, 0.3]] * len(maps), np.float32),
         film_frames=tuple(shown),
         particles=tuple(range(PARTICLES)),

@@ -252,35 +252,35 @@ def main() -> int:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--substeps", type=int, default=2000)
     parser.add_argument("--repeats", type=int, default=3)
-    given = parser.parse_args()
+    options = parser.parse_args()
     ti.init(
         arch=ti.cpu,
-        cpu_max_num_threads=given.threads,
+        cpu_max_num_threads=options.threads,
         offline_cache=True,
         log_level=ti.ERROR,
     )
     experiment = plan(
-        Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps
+        Case.CAVITY, reynolds=100.0, grid=options.grid, substeps=options.substeps
     )
     box = Conventional(solver_parameters(experiment), initial_state(experiment))
     box.substep()
     ti.sync()
     wall = []
     processor = []
-    for _ in range(given.repeats):
+    for _ in range(options.repeats):
         start = time.perf_counter(), time.process_time()
-        for _ in range(given.substeps):
+        for _ in range(options.substeps):
             box.substep()
         ti.sync()
         wall.append(time.perf_counter() - start[0])
         processor.append(time.process_time() - start[1])
-    work = experiment.particles * given.substeps
-    found = {
-        "per_core": work / min(wall) / given.threads,
+    work = experiment.particles * options.substeps
+    speed = {
+        "per_core": work / min(wall) / options.threads,
         "per_processor_second": work / min(processor),
         "energy": float(0.5 * np.mean(np.sum(box.v.to_numpy() ** 2, axis=-1))),
     }
-    print(json.dumps(found))
+    print(json.dumps(speed))
     return 0
 
 

@@ -32,13 +32,13 @@ def main() -> int:
     parser.add_argument("--split", nargs="+", default=list(load().splits))
     parser.add_argument("--size", nargs="+", default=["tiny", "mini", "full"])
     parser.add_argument("--workers", type=int)
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(HEADER)
-    for size in given.size:
-        for split in given.split:
+    for size in options.size:
+        for split in options.split:
             before = _cpu_seconds()
             result = generate(
-                split, size, root=given.root, workers=given.workers, force=True
+                split, size, root=options.root, workers=options.workers, force=True
             )
             print(_row(result, _cpu_seconds() - before), flush=True)
     return 0
@@ -58,12 +58,11 @@ def _row(result: GenerationResult, cpu: float) -> str:
 
 def _cpu_seconds() -> float:
     """Return the CPU time of this process and of its children that have ended."""
-    return sum(
-        usage.ru_utime + usage.ru_stime
-        for usage in map(
-            resource.getrusage, (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-        )
-    )
+    seconds = 0.0
+    for processes in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
+        usage = resource.getrusage(processes)
+        seconds += usage.ru_utime + usage.ru_stime
+    return seconds
 
 
 if __name__ == "__main__":

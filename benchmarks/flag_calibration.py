@@ -90,9 +90,9 @@ class CalibrationScenario:
         return np.stack(frames)
 
     def follow_field(self, first: int, count: int) -> Floats:
-        """Return ``count`` frames carried by the last given velocity field.
+        """Return ``count`` frames of particles carried by a velocity field that stays.
 
-        The field is that on the grid before absolute frame ``first``.
+        It is the field on the grid of the last motion before absolute frame ``first``.
         """
         position, displacement = self.last_motion(first)
         grid = self.scenario.config.grid

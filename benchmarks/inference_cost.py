@@ -105,12 +105,12 @@ def measure_milliseconds(name: str, q: int) -> float:
         options["cells"] *= q
     torch.manual_seed(0)
     model = entry.model.build(options, info)
-    given = make_given_frames(info)
-    roll_out(model, given, FRAMES)
+    given_frames = make_given_frames(info)
+    roll_out(model, given_frames, FRAMES)
     milliseconds = []
     for _ in range(REPEATS):
         start = time.process_time()
-        roll_out(model, given, FRAMES)
+        roll_out(model, given_frames, FRAMES)
         seconds = time.process_time() - start
         milliseconds.append(1e3 * seconds / FRAMES)
     return statistics.median(milliseconds)

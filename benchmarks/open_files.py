@@ -9,6 +9,7 @@ as many as lagbench keeps, in turns in one process, and their ratio.
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from lagbench.store import windows
 from lagbench.torch import WindowDataset, WindowSampler
 
 FEW = 32
-KEPT = windows.OPEN_FILES
+MANY = windows.OPEN_FILES
 
 
 def spent(root: Path | None, split: str, size: str, *, files: int, count: int) -> float:
@@ -42,32 +43,30 @@ def main() -> int:
     parser.add_argument("--size", default="full")
     parser.add_argument("--windows", type=int, default=2000)
     parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args()
-    took: dict[int, list[float]] = {FEW: [], KEPT: []}
-    scenarios = len(load().size(given.split, given.size).subsets["train"])
+    options = parser.parse_args()
+    scenarios = len(load().size(options.split, options.size).subsets["train"])
     if scenarios <= FEW:
         parser.error(
-            f"{given.split} {given.size} trains on {scenarios} scenarios: name a "
+            f"{options.split} {options.size} trains on {scenarios} scenarios: name a "
             f"split with more"
         )
-    for _ in range(given.rounds):
-        for files, times in took.items():
-            times.append(
-                spent(
-                    given.root,
-                    given.split,
-                    given.size,
-                    files=files,
-                    count=given.windows,
-                )
+    seconds = {FEW: math.inf, MANY: math.inf}  # least of the rounds, by open files
+    for _ in range(options.rounds):
+        for files, least in seconds.items():
+            spent_seconds = spent(
+                options.root,
+                options.split,
+                options.size,
+                files=files,
+                count=options.windows,
             )
-    few, kept = (min(took[files]) for files in (FEW, KEPT))
-    print(
-        f"{given.windows} windows of {given.split} {given.size}, the first of an epoch"
-    )
-    print(f"{FEW:4d} files open  {few:6.2f} s")
-    print(f"{KEPT:4d} files open  {kept:6.2f} s")
-    print(f"ratio {few / kept:.2f}")
+            seconds[files] = min(least, spent_seconds)
+
+    data_set = f"{options.split} {options.size}"
+    print(f"{options.windows} windows of {data_set}, the first of an epoch")
+    for files, least in seconds.items():
+        print(f"{files:4d} files open  {least:6.2f} s")
+    print(f"ratio {seconds[FEW] / seconds[MANY]:.2f}")
     return 0
 
 

@@ -70,10 +70,10 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
         attribute_std=(0.3, 0.3, SPEED, SPEED),
         radius=0.03,
     )
-    given = np.stack([position - 2 * velocity, position - velocity])
+    given_positions = np.stack([position - 2 * velocity, position - velocity])
     scenario = Scenario(
         config=config,
-        given=given,
+        given=given_positions,
         material=np.zeros(len(position), np.int8),
         particle_mass=1.0 / len(position),
         area=1.0 if config.is_full_box else 0.12,

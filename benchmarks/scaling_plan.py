@@ -76,13 +76,16 @@ class Whole:
     worker: int  # peak memory of the largest worker [bytes]
 
 
+MeasuredRow = tuple[ThesisRow, Parts, Sequence[Whole]]
+
+
 def registry_of(row: ThesisRow, frames: int) -> Registry:
     """Return our splits with a size ``q`` of fluid that has the numbers of a row."""
-    known = load()
-    fluid = known.split("fluid")
+    registry = load()
+    fluid = registry.split("fluid")
     interval = row.substeps * _COURANT / (row.grid * _MODULUS**0.5)
     full = fluid.sizes["full"]
-    changed = {
+    size_parameters = {
         **full.parameters,
         "particles": row.particles,
         "grid": row.grid,
@@ -94,19 +97,19 @@ def registry_of(row: ThesisRow, frames: int) -> Registry:
     subsets = {"train": (0,), "valid": (1,), "test": (2,)}
     size = full.model_copy(
         update={
-            "parameters": changed,
+            "parameters": size_parameters,
             "subsets": subsets,
             "frames": frames,
             "task": task,
         }
     )
     values = {"area_min": _AREA, "area_max": _AREA, "frame_rate": 1.0 / interval}
-    parameters = {
-        name: parameter.model_copy(update={"value": values.get(name, parameter.value)})
-        for name, parameter in fluid.parameters.items()
-    }
+    parameters = {}
+    for name, parameter in fluid.parameters.items():
+        value = values.get(name, parameter.value)
+        parameters[name] = parameter.model_copy(update={"value": value})
     split = fluid.model_copy(update={"parameters": parameters, "sizes": {"q": size}})
-    return Registry({**known.splits, "fluid": split}, {})
+    return Registry({**registry.splits, "fluid": split}, {})
 
 
 def timed(function: Callable[[], object]) -> float:
@@ -116,32 +119,40 @@ def timed(function: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
+def best_of_three(function: Callable[[], object]) -> float:
+    """Return the shortest processor time of three calls [s]."""
+    return min(timed(function), timed(function), timed(function))
+
+
 def measure_parts(row: ThesisRow, frames: int, root: Path) -> Parts:
     """Time the parts of a generation in this process."""
     size = registry_of(row, frames).size("fluid", "q")
     job = SimulationJob(size=size, scenarios=(0,), root=root)
-    drawing = min(timed(lambda: draw_initial_state(size, 0)) for _ in range(3))
+    draw_seconds = best_of_three(lambda: draw_initial_state(size, 0))
+
     batch = ScenarioBatch(job, lambda _: None)
     batch.solver.advance(1)
-    solving = (
-        min(timed(lambda: batch.solver.advance(row.substeps)) for _ in range(3))
-        / row.substeps
-    )
+    solver_seconds = best_of_three(lambda: batch.solver.advance(row.substeps))
+
     position = batch.solver.position()[0]
     velocity = batch.solver.velocity()[0]
     with scenario_writer(job, 0, batch.states[0]) as writer:
-        writing = (
-            timed(lambda: [writer.append(position, velocity) for _ in range(frames)])
-            / frames
-        )
+
+        def write_frames() -> None:
+            for _ in range(frames):
+                writer.append(position, velocity)
+
+        write_seconds = timed(write_frames)
+
     path = writer.path
+    rows_written = frames * row.particles
     return Parts(
-        draw=drawing / row.particles,
-        substep=solving / row.particles,
-        write=writing / row.particles,
-        check=timed(lambda: check_scenario(path)) / frames / row.particles,
-        statistics=timed(lambda: file_moments(path)) / frames / row.particles,
-        bytes=path.stat().st_size / frames / row.particles,
+        draw=draw_seconds / row.particles,
+        substep=solver_seconds / row.substeps / row.particles,
+        write=write_seconds / rows_written,
+        check=timed(lambda: check_scenario(path)) / rows_written,
+        statistics=timed(lambda: file_moments(path)) / rows_written,
+        bytes=path.stat().st_size / rows_written,
     )
 
 
@@ -168,50 +179,58 @@ def measure_whole(row: ThesisRow, frames: int, root: Path) -> Whole:
 def apart(row: ThesisRow, frames: int, what: str) -> Any:  # noqa: ANN401 (plain values)
     """Measure in a process of its own, whose peak memory is nobody else's."""
     command = [sys.executable, __file__, "--one", f"{row.q},{frames},{what}"]
-    return json.loads(
-        subprocess.run(command, capture_output=True, check=True, text=True).stdout
-    )
+    process = subprocess.run(command, capture_output=True, check=True, text=True)
+    return json.loads(process.stdout)
+
+
+def row_of(q: int) -> ThesisRow:
+    """Return the row of a quality factor."""
+    return next(row for row in THESIS if row.q == q)
 
 
 def one(text: str) -> int:
     """Measure one thing and print it as JSON."""
     q, frames, what = text.split(",")
-    row = next(row for row in THESIS if row.q == int(q))
+    row = row_of(int(q))
     with tempfile.TemporaryDirectory() as folder:
         if what == "parts":
             measure = measure_parts
         else:
             measure = measure_whole
-        print(json.dumps(asdict(measure(row, int(frames), Path(folder)))))
+        costs = measure(row, int(frames), Path(folder))
+        print(json.dumps(asdict(costs)))
     return 0
 
 
-def parts_table(found: Sequence[tuple[ThesisRow, Parts]]) -> list[str]:
+def parts_table(measured: Sequence[MeasuredRow]) -> list[str]:
     """Return the costs per particle."""
     lines = [
-        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] | hash it "
-        "again [ns] "
-        "| statistics [ns] | bytes of a frame |",
+        "| q | particles | draw [ns] | substep [ns] | write a frame [ns] "
+        "| hash it again [ns] | statistics [ns] | bytes of a frame |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for row, p in found:
+    for row, parts, _ in measured:
         times = " | ".join(
-            f"{1e9 * t:.3g}"
-            for t in (p.draw, p.substep, p.write, p.check, p.statistics)
+            [
+                f"{1e9 * parts.draw:.3g}",
+                f"{1e9 * parts.substep:.3g}",
+                f"{1e9 * parts.write:.3g}",
+                f"{1e9 * parts.check:.3g}",
+                f"{1e9 * parts.statistics:.3g}",
+            ]
         )
-        lines.append(f"| {row.q} | {row.particles:,} | {times} | {p.bytes:.3g} |")
+        lines.append(f"| {row.q} | {row.particles:,} | {times} | {parts.bytes:.3g} |")
     return lines
 
 
-def whole_table(found: Sequence[tuple[ThesisRow, Parts, Sequence[Whole]]]) -> list[str]:
-    """Return what whole generations took, beside the sum of the parts."""
+def whole_table(measured: Sequence[MeasuredRow]) -> list[str]:
+    """Return the costs of whole generations, beside the sum of the parts."""
     lines = [
-        "| q | frames | core seconds | sum of the parts | one frame [MB] | parent, "
-        "peak [MB] "
-        "| worker, peak [MB] |",
+        "| q | frames | core seconds | sum of the parts | one frame [MB] "
+        "| parent, peak [MB] | worker, peak [MB] |",
         "|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for row, parts, runs in found:
+    for row, parts, runs in measured:
         for run in runs:
             lines.append(
                 f"| {row.q} | {run.frames} | {run.seconds:.1f} | "
@@ -259,15 +278,15 @@ def plan_table(row: ThesisRow, p: Parts, memory: int) -> list[str]:
     ]
 
 
-def extrapolated(
-    found: Sequence[tuple[ThesisRow, Parts, Sequence[Whole]]], particles: int
-) -> int:
-    """Return a worker's peak memory at a number of particles, by the line through two
-    rows [bytes].
+def extrapolate_memory(measured: Sequence[MeasuredRow], particles: int) -> int:
+    """Return a worker's peak memory at a number of particles [bytes].
+
+    It lies on the line through the first and the last row.
     """
-    (small, _, few), (large, _, many) = found[0], found[-1]
-    low = few[-1].worker
-    high = many[-1].worker
+    small, _, small_runs = measured[0]
+    large, _, large_runs = measured[-1]
+    low = small_runs[-1].worker
+    high = large_runs[-1].worker
     if small is large:
         return round(high * particles / large.particles)
     slope = (high - low) / (large.particles - small.particles)
@@ -282,29 +301,32 @@ def main() -> int:
     parser.add_argument("--rows", default="2,4", help="values of q, such as 2,4")
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
     parser.add_argument("--one", help=argparse.SUPPRESS)
-    given = parser.parse_args()
-    if given.one:
-        return one(given.one)
-    rows = [row for row in THESIS if str(row.q) in given.rows.split(",")]
-    found = [
-        (
-            row,
-            Parts(**apart(row, FRAMES[0], "parts")),
-            [Whole(**apart(row, frames, "whole")) for frames in FRAMES],
-        )
-        for row in rows
-    ]
-    million = next(row for row in THESIS if row.q == 8)
+    options = parser.parse_args()
+    if options.one:
+        return one(options.one)
+
+    measured = []
+    for row in THESIS:
+        if str(row.q) in options.rows.split(","):
+            parts = Parts(**apart(row, FRAMES[0], "parts"))
+            runs = []
+            for frames in FRAMES:
+                runs.append(Whole(**apart(row, frames, "whole")))
+            measured.append((row, parts, runs))
+
+    million = row_of(8)
+    _, largest_parts, _ = measured[-1]
+    memory = extrapolate_memory(measured, million.particles)
     lines = [
-        *parts_table([(row, parts) for row, parts, _ in found]),
+        *parts_table(measured),
         "",
-        *whole_table(found),
+        *whole_table(measured),
         "",
-        *plan_table(million, found[-1][1], extrapolated(found, million.particles)),
+        *plan_table(million, largest_parts, memory),
     ]
     text = "\n".join(lines) + "\n"
-    given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / "scaling_plan.md").write_text(text, encoding="utf-8")
+    options.output.mkdir(parents=True, exist_ok=True)
+    (options.output / "scaling_plan.md").write_text(text, encoding="utf-8")
     print(text)
     return 0
 

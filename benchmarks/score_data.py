@@ -72,6 +72,7 @@ def make_score_data(
             subset="test",
         )
         positions = _flow(scenario, frames, size.particles)
+        # Positions take the place of velocities, whose values do not matter here.
         flow = ((position, position) for position in positions)
         mass = 1e-4 * BOX[1] ** 2 / size.particles
         hashes[scenario] = write_scenario(

@@ -60,23 +60,23 @@ print(json.dumps({
 
 def score(tree: Path, data: Path) -> dict[str, float]:
     """Return what a tree's scorer takes for the data that it made."""
-    found: dict[str, float] = json.loads(
-        on_one_core(tree, "-c", SCORE, str(data), OMP_NUM_THREADS="1")
-    )
-    return found
+    printed = on_one_core(tree, "-c", SCORE, str(data), OMP_NUM_THREADS="1")
+    costs: dict[str, float] = json.loads(printed)
+    return costs
 
 
 def declare(tree: Path) -> None:
-    """Write the entry points that a tree declares, which an installation of another
-    tree would hide.
+    """Write the entry points that a tree declares.
+
+    An installation of another tree would hide them.
     """
-    groups = tomllib.loads((tree / "pyproject.toml").read_text())["project"][
-        "entry-points"
-    ]
-    lines = [
-        f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in named.items())
-        for group, named in groups.items()
-    ]
+    project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
+    lines = []
+    for group, entry_points in project["entry-points"].items():
+        lines.append(f"[{group}]")
+        for name, target in entry_points.items():
+            lines.append(f"{name} = {target}")
+        lines.append("")
     folder = tree / "lagbench.egg-info"
     folder.mkdir()
     (folder / "PKG-INFO").write_text(
@@ -92,25 +92,24 @@ def main() -> int:
     )
     parser.add_argument("--against", required=True, metavar="REV")
     parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder, checked_out(given.against) as other:
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder, checked_out(options.against) as other:
         declare(other)
         best: dict[Path, dict[str, float]] = {}
-        made = {other: Path(folder) / "theirs", HERE: Path(folder) / "ours"}
-        for tree, data in made.items():
+        data_folders = {other: Path(folder) / "theirs", HERE: Path(folder) / "ours"}
+        for tree, data in data_folders.items():
             data.mkdir()
             on_one_core(tree, "-c", MAKE, str(data), OMP_NUM_THREADS="1")
-        for tree, data in made.items():
+        for tree, data in data_folders.items():
             score(tree, data)
-        for _ in range(given.rounds):
-            for tree, data in made.items():
-                found = score(tree, data)
-                best[tree] = min(
-                    best.get(tree, found), found, key=lambda one: one["cpu"]
-                )
+        for _ in range(options.rounds):
+            for tree, data in data_folders.items():
+                costs = score(tree, data)
+                if tree not in best or costs["cpu"] < best[tree]["cpu"]:
+                    best[tree] = costs
     print(f"{hardware()['processor']}, one core, cavity full, all metrics but Sinkhorn")
     print(
-        f"| per scenario of 90 frames | {given.against} | this tree | ratio "
+        f"| per scenario of 90 frames | {options.against} | this tree | ratio "
         f"|\n|---|---|---|---|"
     )
     shown: tuple[tuple[str, str, Callable[[float], str]], ...] = (

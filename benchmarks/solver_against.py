@@ -62,22 +62,14 @@ def rate(tree: Path, case: str, size: str) -> float:
     """Return the particle-substeps per second of processor time that a tree reaches."""
     command = ["benchmarks/whole_frame.py"]
     if case != "kernels":
-        command = [
-            "-m",
-            "lagbench",
-            "bench",
-            "solver",
-            "--split",
-            case,
-            "--size",
-            size,
-            "--json",
-        ]
+        command = ["-m", "lagbench", "bench", "solver", "--json"]
+        command += ["--split", case, "--size", size]
     printed = on_one_core(tree, *command)
-    found: dict[str, Any] = json.loads(printed[printed.index("{") :])
+    speed: dict[str, Any] = json.loads(printed[printed.index("{") :])
     if case == "kernels":
-        return float(found["per_processor_second"])
-    return float(found["particles"] * found["substeps"] / found["seconds_per_frame"])
+        return float(speed["per_processor_second"])
+    particle_substeps = speed["particles"] * speed["substeps"]  # of one frame
+    return float(particle_substeps / speed["seconds_per_frame"])
 
 
 def main() -> int:
@@ -88,18 +80,18 @@ def main() -> int:
     parser.add_argument("--against", required=True, metavar="REV")
     parser.add_argument("--size", default="mini")
     parser.add_argument("--rounds", type=int, default=3)
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(
-        f"{hardware()['processor']}, size {given.size}; M particle-substeps/s of "
+        f"{hardware()['processor']}, size {options.size}; M particle-substeps/s of "
         f"processor time"
     )
-    print(f"| case | {given.against} | this tree | ratio |\n|---|---|---|---|")
-    with checked_out(given.against) as other:
+    print(f"| case | {options.against} | this tree | ratio |\n|---|---|---|---|")
+    with checked_out(options.against) as other:
         for case in ("kernels", *SPLITS):
             best = dict.fromkeys((other, HERE), 0.0)
-            for _ in range(given.rounds):
+            for _ in range(options.rounds):
                 for tree, so_far in best.items():
-                    best[tree] = max(so_far, rate(tree, case, given.size))
+                    best[tree] = max(so_far, rate(tree, case, options.size))
             theirs = best[other] / 1e6
             ours = best[HERE] / 1e6
             print(

@@ -32,11 +32,9 @@ FIXED = 20
 """Substeps in a run that measures the time of one substep."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ThesisRow:
-    """One row of Table 3.1 as the thesis prints it (times on its GPU, in
-    milliseconds).
-    """
+    """One row of Table 3.1 as the thesis prints it; times on its GPU [ms]."""
 
     q: int
     particles: int
@@ -46,26 +44,16 @@ class ThesisRow:
     frame_ms: float
 
 
-THESIS = tuple(
-    ThesisRow(
-        q=q,
-        particles=n,
-        grid=grid,
-        substeps=substeps,
-        substep_ms=substep,
-        frame_ms=frame,
-    )
-    for q, n, grid, substeps, substep, frame in (
-        (1, 16_384, 128, 20, 0.06, 1.17),
-        (2, 65_536, 256, 20, 0.14, 5.33),
-        (3, 147_456, 384, 40, 0.51, 41.46),
-        (4, 262_144, 512, 40, 0.73, 73.66),
-        (5, 589_824, 768, 80, 0.85, 136.09),
-        (6, 819_024, 896, 80, 1.14, 180.05),
-        (7, 1_024_576, 1024, 120, 1.60, 238.69),
-        (8, 1_048_576, 1024, 160, 2.25, 361.89),
-        (9, 1_324_104, 1152, 180, 3.08, 562.43),
-    )
+THESIS = (
+    ThesisRow(1, 16_384, 128, 20, 0.06, 1.17),
+    ThesisRow(2, 65_536, 256, 20, 0.14, 5.33),
+    ThesisRow(3, 147_456, 384, 40, 0.51, 41.46),
+    ThesisRow(4, 262_144, 512, 40, 0.73, 73.66),
+    ThesisRow(5, 589_824, 768, 80, 0.85, 136.09),
+    ThesisRow(6, 819_024, 896, 80, 1.14, 180.05),
+    ThesisRow(7, 1_024_576, 1024, 120, 1.60, 238.69),
+    ThesisRow(8, 1_048_576, 1024, 160, 2.25, 361.89),
+    ThesisRow(9, 1_324_104, 1152, 180, 3.08, 562.43),
 )
 
 
@@ -167,8 +155,11 @@ def exponents(
     sizes: Sequence[ThesisRow], substep_ms: Sequence[float], frame_ms: Sequence[float]
 ) -> Exponents:
     """Fit straight lines to the logarithms (Eq. 3.1)."""
-    squares = [row.q**2 for row in sizes]
-    particles = [row.particles for row in sizes]
+    squares = []
+    particles = []
+    for row in sizes:
+        squares.append(row.q**2)
+        particles.append(row.particles)
     return Exponents(
         frame_q2=_slope(squares, frame_ms),
         frame_particles=_slope(particles, frame_ms),
@@ -184,24 +175,28 @@ def _slope(x: Sequence[float], y: Sequence[float]) -> float:
 
 def of_thesis(rows: Sequence[ThesisRow] = THESIS) -> Exponents:
     """Return the exponents of the thesis's own times."""
-    return exponents(
-        rows, [row.substep_ms for row in rows], [row.frame_ms for row in rows]
-    )
+    substep_ms = []
+    frame_ms = []
+    for row in rows:
+        substep_ms.append(row.substep_ms)
+        frame_ms.append(row.frame_ms)
+    return exponents(rows, substep_ms, frame_ms)
 
 
-def of_measured(found: Sequence[Measurement]) -> Exponents:
+def of_measured(measurements: Sequence[Measurement]) -> Exponents:
     """Return the exponents of our times."""
-    return exponents(
-        [m.row for m in found],
-        [m.substep_ms for m in found],
-        [m.frame_ms for m in found],
-    )
+    rows = []
+    substep_ms = []
+    frame_ms = []
+    for measurement in measurements:
+        rows.append(measurement.row)
+        substep_ms.append(measurement.substep_ms)
+        frame_ms.append(measurement.frame_ms)
+    return exponents(rows, substep_ms, frame_ms)
 
 
-def markdown(found: Sequence[Measurement], device: str) -> str:
-    """Return Table 3.1 with our times beside the thesis's, and the exponents below
-    it.
-    """
+def markdown(measurements: Sequence[Measurement], device: str) -> str:
+    """Return Table 3.1 with our times beside the thesis's, and the exponents."""
     lines = [
         f"Times in milliseconds; ours on {device}, the thesis's on its GPU.",
         "",
@@ -209,7 +204,7 @@ def markdown(found: Sequence[Measurement], device: str) -> str:
         "| thesis t/substep | thesis t/frame | thesis / ours |",
         "|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|",
     ]
-    for m in found:
+    for m in measurements:
         r = m.row
         lines.append(
             f"| {r.q} | {r.q**2} | {r.particles:,} | {r.grid} x {r.grid} | "
@@ -223,33 +218,38 @@ def markdown(found: Sequence[Measurement], device: str) -> str:
         "| exponent of | ours | thesis, same rows | thesis, all rows |",
         "|---|--:|--:|--:|",
     ]
-    sets = (of_measured(found), of_thesis([m.row for m in found]), of_thesis())
+    same_rows = of_thesis([measurement.row for measurement in measurements])
+    columns = (of_measured(measurements), same_rows, of_thesis())
     for name, words in (
         ("frame_q2", "t/frame against q^2"),
         ("frame_particles", "t/frame against particles"),
         ("substep_particles", "t/substep against particles"),
     ):
-        lines.append(
-            f"| {words} | " + " | ".join(f"{getattr(e, name):.2f}" for e in sets) + " |"
-        )
+        cells = " | ".join(f"{getattr(column, name):.2f}" for column in columns)
+        lines.append(f"| {words} | {cells} |")
     return "\n".join(lines) + "\n"
 
 
-def draw(found: Sequence[Measurement], device: str, path: Path) -> None:
-    """Draw Fig. 3.1: (a) log-log with fitted lines, (b) linear with second-degree
-    fits.
-    """
+def draw(measurements: Sequence[Measurement], device: str, path: Path) -> None:
+    """Draw Fig. 3.1: (a) log-log with lines, (b) linear with second-degree fits."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
+    our_points = []
+    for measurement in measurements:
+        our_points.append((measurement.row.q**2, measurement.frame_ms))
+    thesis_points = []
+    for row in THESIS:
+        thesis_points.append((row.q**2, row.frame_ms))
     series = (
-        (f"ours, {device}", "C0", [(m.row.q**2, m.frame_ms) for m in found]),
-        ("thesis, GPU", "C3", [(row.q**2, row.frame_ms) for row in THESIS]),
+        (f"ours, {device}", "C0", our_points),
+        ("thesis, GPU", "C3", thesis_points),
     )
     for name, colour, points in series:
         x, y = np.array(points, dtype=float).T
         slope, offset = np.polyfit(np.log10(x), np.log10(y), 1)
+        parabola = np.polyfit(x, y, 2)
         line = np.linspace(x.min(), x.max(), 200)
         left.loglog(x, y, "o", color=colour)
         left.loglog(
@@ -259,9 +259,7 @@ def draw(found: Sequence[Measurement], device: str, path: Path) -> None:
             label=f"{name}: slope {slope:.2f}",
         )
         right.plot(x, y, "o", color=colour)
-        right.plot(
-            line, np.polyval(np.polyfit(x, y, 2), line), color=colour, label=name
-        )
+        right.plot(line, np.polyval(parabola, line), color=colour, label=name)
     for axes, title in ((left, "(a) log-log"), (right, "(b) second-degree fit")):
         axes.set(xlabel="q^2", ylabel="t/frame [ms]", title=title)
         axes.grid(alpha=0.3)
@@ -283,18 +281,20 @@ def main() -> int:
     )
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--output", type=Path, default=Path("docs/figures"))
-    given = parser.parse_args()
-    first, _, last = given.rows.partition("-")
-    rows = [row for row in THESIS if int(first) <= row.q <= int(last or first)]
-    found = [measure(row, device=given.device, repeats=given.repeats) for row in rows]
-    table = markdown(found, given.device.value)
-    given.output.mkdir(parents=True, exist_ok=True)
-    (given.output / f"table_3_1_{given.device.value}.md").write_text(
-        table, encoding="utf-8"
-    )
-    draw(
-        found, given.device.value, given.output / f"table_3_1_{given.device.value}.png"
-    )
+    options = parser.parse_args()
+    first, _, last = options.rows.partition("-")
+    measurements = []
+    for row in THESIS:
+        if int(first) <= row.q <= int(last or first):
+            measurement = measure(row, device=options.device, repeats=options.repeats)
+            measurements.append(measurement)
+
+    device = options.device.value
+    table = markdown(measurements, device)
+    options.output.mkdir(parents=True, exist_ok=True)
+    name = f"table_3_1_{device}"
+    (options.output / f"{name}.md").write_text(table, encoding="utf-8")
+    draw(measurements, device, options.output / f"{name}.png")
     print(table)
     return 0
 

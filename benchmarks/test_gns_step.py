@@ -32,30 +32,28 @@ MINI = ("--particles", "2048", "--latent", "32", "--layers", "5", "--steps", "8"
 GAIN = 1.3
 """Least gain of compiled layers, the geometric mean over the operators."""
 
-Found = dict[str, Any]
+StepCost = dict[str, Any]
 
 
-def measure(*options: str) -> Found:
-    """Run the script in a process of its own and return what it prints."""
-    found: Found = measured_apart(
-        "-W", "ignore", str(Path(__file__).with_name("gns_step.py")), *options
-    )
-    return found
+def measure(*options: str) -> StepCost:
+    """Run the script in a process of its own and return its costs."""
+    script = str(Path(__file__).with_name("gns_step.py"))
+    cost: StepCost = measured_apart("-W", "ignore", script, *options)
+    return cost
 
 
 def best_of(
     benchmark: BenchmarkFixture, sides: Mapping[str, tuple[str, ...]]
-) -> dict[str, Found]:
+) -> dict[str, StepCost]:
     """Run the sides in turns and keep each one's fastest step and smallest peak."""
-    best: dict[str, Found] = {}
+    best: dict[str, StepCost] = {}
 
     def one_round() -> None:
         for name, options in sides.items():
-            found = measure(*options)
-            best[name] = {
-                key: min(value, best.get(name, found)[key])
-                for key, value in found.items()
-            }
+            cost = measure(*options)
+            least = best.setdefault(name, cost)
+            for key, value in cost.items():
+                least[key] = min(least[key], value)
 
     best_seconds(benchmark, one_round, rounds=ROUNDS)
     benchmark.extra_info.update(best)
@@ -68,14 +66,16 @@ def test_full_step(benchmark: BenchmarkFixture) -> None:
     """
     best = best_of(benchmark, SIDES)
     print(f"\nGNS, 8192 particles, {best['float32']['edges']} edges, one core")
-    for name, found in best.items():
+    for name, cost in best.items():
         base = best[name.partition(",")[0]]["processor_seconds"]
         print(
-            f"{name:32s} {found['processor_seconds']:6.2f} s "
-            f"{found['peak_bytes'] / 1e9:5.2f} GB"
-            f"  {found['processor_seconds'] / base:5.2f}x ours"
+            f"{name:32s} {cost['processor_seconds']:6.2f} s "
+            f"{cost['peak_bytes'] / 1e9:5.2f} GB"
+            f"  {cost['processor_seconds'] / base:5.2f}x ours"
         )
-    seconds = {precision: best[precision]["processor_seconds"] for precision in SECONDS}
+    seconds = {}
+    for precision in SECONDS:
+        seconds[precision] = best[precision]["processor_seconds"]
     print(
         f"bfloat16 is {seconds['float32'] / seconds['bfloat16']:.1f}x faster "
         f"than float32"
@@ -94,22 +94,20 @@ def test_operators_at_mini(benchmark: BenchmarkFixture) -> None:
         "bfloat16": ("--precision", "bfloat16"),
         "compiled": ("--compiled",),
     }
-    sides = {
-        f"{operator} {kind}": ("--operator", operator, *options, *MINI)
-        for operator in OPERATORS
-        for kind, options in kinds.items()
-    }
-    best = best_of(benchmark, sides)
-    gains = []
-    print(
-        f"\n{'operator':14s} "
-        + " ".join(f"{kind:>9s}" for kind in kinds)
-        + "  gain parameters"
-    )
+    sides = {}
     for operator in OPERATORS:
-        seconds = {
-            kind: best[f"{operator} {kind}"]["processor_seconds"] for kind in kinds
-        }
+        for kind, options in kinds.items():
+            name = f"{operator} {kind}"
+            sides[name] = ("--operator", operator, *options, *MINI)
+    best = best_of(benchmark, sides)
+
+    gains = []
+    heads = " ".join(f"{kind:>9s}" for kind in kinds)
+    print(f"\n{'operator':14s} {heads}  gain parameters")
+    for operator in OPERATORS:
+        seconds = {}
+        for kind in kinds:
+            seconds[kind] = best[f"{operator} {kind}"]["processor_seconds"]
         gains.append(seconds["float32"] / seconds["compiled"])
         times = " ".join(f"{value:9.3f}" for value in seconds.values())
         print(

@@ -49,8 +49,8 @@ def cpu_seconds():
 def peak_kib():
     # getrusage's maximum of this process is that of its parent before exec
     status = Path("/proc/self/status").read_text()
-    own = int(status.split("VmHWM:")[1].split()[0])
-    return max(own, getrusage(RUSAGE_CHILDREN).ru_maxrss)
+    peak = int(status.split("VmHWM:")[1].split()[0])
+    return max(peak, getrusage(RUSAGE_CHILDREN).ru_maxrss)
 
 folder = Path(sys.argv[1])
 registry = load(folder / "datasets.yaml")

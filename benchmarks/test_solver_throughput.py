@@ -41,19 +41,18 @@ def measure(script: str, cores: int) -> dict[str, Any]:
 def test_throughput_per_core(benchmark: BenchmarkFixture) -> None:
     """On one core, at least 4 times the conventional code by processor time."""
     sides = {"ours, 1 core": ("whole_frame.py", 1)}
-    sides |= {
-        f"conventional, {n} core(s)": ("conventional.py", n)
-        for n in (1, 2)
-        if n <= len(CORES)
-    }
-    best = {name: {"per_core": 0.0, "per_processor_second": 0.0} for name in sides}
+    for count in (1, 2):
+        if count <= len(CORES):
+            sides[f"conventional, {count} core(s)"] = ("conventional.py", count)
+    best = {}
+    for name in sides:
+        best[name] = {"per_core": 0.0, "per_processor_second": 0.0}
 
     def one_round() -> None:
         for name, (script, cores) in sides.items():
-            found = measure(script, cores)
-            best[name] = {
-                key: max(rate, found[key]) for key, rate in best[name].items()
-            }
+            rates = measure(script, cores)
+            for key, rate in best[name].items():
+                best[name][key] = max(rate, rates[key])
 
     best_seconds(benchmark, one_round, rounds=ROUNDS)
     ours = best["ours, 1 core"]

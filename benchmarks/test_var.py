@@ -50,18 +50,18 @@ def test_var_of_a_thousand_dimensions(
         "lagbench": lambda: solve(LaggedRows([states], lags=1)).coefficients,
         "statsmodels": lambda: StatsmodelsVAR(double).fit(1, trend="c").params,
     }
-    found = {}
+    coefficients = {}
     best = dict.fromkeys(sides, np.inf)
 
     def one_round() -> None:
         for name, fit in sides.items():
             start = time.perf_counter()
-            found[name] = fit()
+            coefficients[name] = fit()
             best[name] = min(best[name], time.perf_counter() - start)
 
     best_seconds(benchmark, one_round, rounds=ROUNDS)
-    difference = np.linalg.norm(found["lagbench"] - found["statsmodels"])
-    relative = difference / np.linalg.norm(found["statsmodels"])
+    difference = np.linalg.norm(coefficients["lagbench"] - coefficients["statsmodels"])
+    relative = difference / np.linalg.norm(coefficients["statsmodels"])
     ratio = best["statsmodels"] / best["lagbench"]
     benchmark.extra_info.update(best, ratio=ratio, relative_difference=float(relative))
     print(

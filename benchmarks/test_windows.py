@@ -94,16 +94,16 @@ def _rotation(scenario: int) -> Iterator[Frames]:
 
 def write_ours(root: Path, scenarios: int) -> None:
     """Write the train subset as lagbench does, and the registry that describes it."""
-    held = read_yaml(default_path())
-    size = held["splits"]["cavity"]["sizes"]["full"]
+    registry_content = read_yaml(default_path())
+    size = registry_content["splits"]["cavity"]["sizes"]["full"]
     size["subsets"] = {
         "train": f"0-{scenarios - 1}",
         "valid": f"{scenarios}",
         "test": f"{scenarios + 1}",
     }
-    held["measured"] = {}
+    registry_content["measured"] = {}
     path = root / "datasets.yaml"
-    path.write_text(yaml.safe_dump(held))
+    path.write_text(yaml.safe_dump(registry_content))
     registry = load(path)
     version = registry.split("cavity").version
     still = np.zeros((PARTICLES, 2), np.float32)
@@ -252,10 +252,9 @@ def test_memory_is_flat(root: Path, tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
     write_ours(few, FEW)
-    peaks = [
-        float(measured_apart("-c", CHILD, str(folder), str(count)))
-        for folder, count in ((few, 4100), (root, 7000))
-    ]
+    peaks = []
+    for folder, count in ((few, 4100), (root, 7000)):
+        peaks.append(float(measured_apart("-c", CHILD, str(folder), str(count))))
     print(
         f"\npeak memory, {FEW} scenarios: {peaks[0] / 1e6:.0f} MB; {SCENARIOS}: "
         f"{peaks[1] / 1e6:.0f} MB"
@@ -269,8 +268,8 @@ def test_npz_in_memory(tmp_path: Path) -> None:
     """
     write_gns_npz(tmp_path / "train.npz", OTHERS)
     start = time.process_time()
-    with np.load(tmp_path / "train.npz") as held:
-        trajectories = [held[name] for name in held.files]
+    with np.load(tmp_path / "train.npz") as arrays:
+        trajectories = [arrays[name] for name in arrays.files]
     loading = time.process_time() - start
     per = FRAMES - HISTORY
 
@@ -285,12 +284,12 @@ def test_npz_in_memory(tmp_path: Path) -> None:
             frames[stop].copy(),
         )
 
-    found = rate(
+    windows_per_second = rate(
         read, np.random.default_rng(SEED).integers(OTHERS * per, size=1000), 1000
     )
     size = sum(frames.nbytes for frames in trajectories)
     print(
-        f"\nNPZ in memory: {found:.0f} windows/s, after {loading:.1f} s to load "
+        f"\nNPZ in memory: {windows_per_second:.0f} windows/s, after {loading:.1f} s for "
         f"{size / 1e6:.0f} MB"
     )
 
@@ -309,7 +308,7 @@ def test_hdf5_of_trajectories(tmp_path: Path) -> None:
             )
             return position, group["particle_type"][:]
 
-        found = rate(
+        windows_per_second = rate(
             read, np.random.default_rng(SEED).integers(OTHERS * per, size=200), 200
         )
-    print(f"\nHDF5 of trajectories: {found:.0f} windows/s")
+    print(f"\nHDF5 of trajectories: {windows_per_second:.0f} windows/s")

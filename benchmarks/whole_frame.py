@@ -33,9 +33,9 @@ def main() -> int:
     parser.add_argument("--grid", type=int, default=40)
     parser.add_argument("--substeps", type=int, default=2000)
     parser.add_argument("--repeats", type=int, default=3)
-    given = parser.parse_args()
+    options = parser.parse_args()
     experiment = plan(
-        Case.CAVITY, reynolds=100.0, grid=given.grid, substeps=given.substeps
+        Case.CAVITY, reynolds=100.0, grid=options.grid, substeps=options.substeps
     )
     running = solver.build(
         solver_parameters(experiment), device=solver.Device.CPU, threads=1
@@ -44,18 +44,18 @@ def main() -> int:
     running.advance(1)
     wall = []
     processor = []
-    for _ in range(given.repeats):
+    for _ in range(options.repeats):
         start = time.perf_counter(), time.process_time()
-        running.advance(given.substeps)
+        running.advance(options.substeps)
         wall.append(time.perf_counter() - start[0])
         processor.append(time.process_time() - start[1])
-    work = experiment.particles * given.substeps
-    found = {
+    work = experiment.particles * options.substeps
+    speed = {
         "per_core": work / min(wall),
         "per_processor_second": work / min(processor),
         "energy": float(0.5 * np.mean(np.sum(running.velocity()[0] ** 2, axis=-1))),
     }
-    print(json.dumps(found))
+    print(json.dumps(speed))
     return 0
 
 

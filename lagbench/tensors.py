@@ -1,4 +1,4 @@
-"""Windows of consecutive frames as tensors: one window, and several side by side."""
+"""Windows of consecutive frames as tensors, and the box that holds their particles."""
 
 from __future__ import annotations
 
@@ -6,10 +6,77 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
+import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from lagbench.data.box import Box
 from lagbench.errors import UsageError
+
+
+class TensorBox(nn.Module):
+    """A :class:`~lagbench.data.box.Box` for tensors on any device.
+
+    It has no weights: its buffers do not enter checkpoints.
+    """
+
+    lower_walls: Tensor
+    upper_walls: Tensor
+    start: Tensor
+    period: Tensor
+
+    def __init__(self, box: Box) -> None:
+        super().__init__()
+        self.box = box
+        period = np.where(box.periodic, box.lengths, np.inf)
+        for name, values in (
+            ("lower_walls", box.lower_walls),
+            ("upper_walls", box.upper_walls),
+            ("start", box.low),
+            ("period", period),
+        ):
+            buffer = torch.tensor(values, dtype=torch.float32)
+            self.register_buffer(name, buffer, persistent=False)
+
+    def displacement(self, start: Tensor, end: Tensor) -> Tensor:
+        """Return the shortest way from one point to another (minimum image).
+
+        Along an axis with walls this is ``end - start``.
+
+        Args:
+            start: points [length], shape [..., axis].
+            end: points [length], shape [..., axis].
+        """
+        way = end - start
+        if not self.box.is_periodic:
+            return way
+        # Along an axis with walls the quotient is 0; 0 times infinity is no number.
+        count = torch.round(way.detach() / self.period)
+        return way - torch.where(count == 0.0, 0.0, count * self.period)
+
+    def inside(self, position: Tensor) -> Tensor:
+        """Return positions inside: those beyond a wall are put on it, others wrapped.
+
+        Args:
+            position: points [length], shape [..., axis].
+        """
+        clamped = position.clamp(self.lower_walls, self.upper_walls)
+        if not self.box.is_periodic:
+            return clamped
+        count = torch.floor((clamped.detach() - self.start) / self.period)
+        wrapped = clamped - torch.where(count == 0.0, 0.0, count * self.period)
+        # The difference can round up to the upper end, which is the lower one.
+        is_at_end = wrapped >= self.start + self.period
+        return torch.where(is_at_end, self.start, wrapped)
+
+    def stop_at_walls(self, position: Tensor, velocity: Tensor) -> Tensor:
+        """Return velocities that lead no particle past a wall [length/frame].
+
+        Args:
+            position: points in the box [length], shape [..., axis].
+            velocity: ways to the next frame [length/frame], shape [..., axis].
+        """
+        return velocity.clamp(self.lower_walls - position, self.upper_walls - position)
 
 
 class TensorWindow(NamedTuple):

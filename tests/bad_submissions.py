@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from faulty import FAULTS
+from fault_registry import FAULTS
 from submission_data import make_bench
 
 __all__ = ["FAULTS", "main"]

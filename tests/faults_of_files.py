@@ -12,7 +12,7 @@ from pathlib import Path
 
 import h5py
 import netCDF4
-from faulty import DIMS, FAULTS, SHAPE, Fault, fault, replace
+from fault_registry import DIMS, FAULTS, SHAPE, Fault, fault, replace
 from submission_data import Bench
 
 

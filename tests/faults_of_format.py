@@ -6,7 +6,16 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from faulty import DIMS, SHAPE, attribute, fault, positions, replace, simple, store
+from fault_registry import (
+    DIMS,
+    SHAPE,
+    attribute,
+    fault,
+    positions,
+    replace,
+    simple,
+    store,
+)
 from submission_data import PARTICLES, Bench
 
 attribute("no_format_number", "lagbench_format", None, says="missing")

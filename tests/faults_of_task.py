@@ -7,7 +7,7 @@ from typing import Any
 
 import h5py
 import numpy as np
-from faulty import (
+from fault_registry import (
     DIMS,
     FAULTS,
     Fault,

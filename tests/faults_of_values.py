@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import netCDF4
 import numpy as np
-from faulty import DIMS, SHAPE, built, fault, positions, replace, simple, store
+from fault_registry import DIMS, SHAPE, built, fault, positions, replace, simple, store
 from numpy.typing import ArrayLike, NDArray
 from submission_data import PARTICLES, Bench
 

@@ -127,7 +127,10 @@ def _lost_own_lines_only(
         return False
 
     lost_names = before.keys() - now.keys()
-    remaining = {name: line for name, line in before.items() if name in now}
+    remaining = {}
+    for name, line in before.items():
+        if name in now:
+            remaining[name] = line
     is_own = all(Path(str(name)).stem in own_methods for name in lost_names)
     return now == remaining and bool(lost_names) and is_own
 
@@ -141,14 +144,18 @@ def _describe_change(folder: Folder, start: str, entry: Path) -> str:
     if not isinstance(before, dict) or not isinstance(now, dict):
         return "another content"
 
-    names = [key for key in {**before, **now} if before.get(key) != now.get(key)]
+    names = []
+    for key in {**before, **now}:
+        if before.get(key) != now.get(key):
+            names.append(key)
     clauses = []
     for key in STATUS_KEYS:
         if key in names:
             clauses.append(f"{key} {before.get(key)!a:.60} -> {now.get(key)!a:.60}")
-    other_keys = [
-        ascii(str(name))[1:-1][:40] for name in names if name not in STATUS_KEYS
-    ]
+    other_keys = []
+    for name in names:
+        if name not in STATUS_KEYS:
+            other_keys.append(ascii(str(name))[1:-1][:40])
     if other_keys:
         clauses.append(f"other {', '.join(other_keys[:MOST_KEYS])}")
     return "; ".join(clauses) or "another wording"

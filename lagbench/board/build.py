@@ -188,7 +188,10 @@ def collect(
     for tab in tabs:
         for row in tab.lines:
             shown.update(row.values)
-    metrics = {name: metric for name, metric in METRICS.items() if name in shown}
+    metrics = {}
+    for name, metric in METRICS.items():
+        if name in shown:
+            metrics[name] = metric
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
 
 
@@ -205,9 +208,9 @@ def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod 
     size = _size_of(entry, registry, where=board.path / path)
     current = is_current(entry.dataset, size)
     try:
-        stored = [
-            read_score_file(board.path / path, size) for path in entry.score_paths
-        ]
+        stored = []
+        for score_path in entry.score_paths:
+            stored.append(read_score_file(board.path / score_path, size))
     except UnreadableFileError:
         if current:
             raise
@@ -215,7 +218,10 @@ def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod 
 
     scores = combine([seed.scores.tallies for seed in stored])
     needed = (stored[0].scores.ranking, TRUE_ENERGY, PREDICTED_ENERGY)
-    missing = [name for name in needed if name not in scores]
+    missing = []
+    for name in needed:
+        if name not in scores:
+            missing.append(name)
     if missing:
         raise UnreadableFileError(
             "a score file lacks metrics that every one has",
@@ -281,6 +287,9 @@ def _make_tab(
         if any(name in row.curves for row in rows):
             curves.append(name)
     scenarios = tuple(sorted(size.subsets["test"]))
+    reference_rows = []
+    for reference in references:
+        reference_rows.append(_make_reference(reference, size, ranking))
     return Tab(
         size=size,
         title=title,
@@ -294,7 +303,7 @@ def _make_tab(
         energy=make_curve(reference_entry.scores[TRUE_ENERGY].score),
         truth=_make_pictures(reference_entry.preview, TRUTH),
         rows=tuple(rows),
-        references=tuple(_make_reference(r, size, ranking) for r in references),
+        references=tuple(reference_rows),
         solver_seconds=solver_seconds(size),
     )
 
@@ -497,7 +506,9 @@ def make_curve(score: Score) -> Curve:
     if len(measured):
         first = int(measured[0]) % step
     sampled = range(first, len(score.frames), step)
-    chosen = [sampled[i] for i in spaced(len(sampled), CURVE_FRAMES)]
+    chosen = []
+    for i in spaced(len(sampled), CURVE_FRAMES):
+        chosen.append(sampled[i])
 
     values = score.per_frame[:, chosen]  # shape [scenario, frame]
     with warnings.catch_warnings():
@@ -589,12 +600,13 @@ def build(
     if not _is_file(schema) or schema.read_bytes() != new_schema:
         stale[schema] = new_schema
     if stale and check:
+        descriptions = []
+        for path, data in stale.items():
+            descriptions.append(f"{path.name} of {len(data)} bytes")
         raise ChecksFailedError(
             "the page is not what the submissions give",
             where=", ".join(str(path) for path in stale),
-            expected=", ".join(
-                f"{path.name} of {len(data)} bytes" for path, data in stale.items()
-            ),
+            expected=", ".join(descriptions),
             got="another content, or no file",
             fix=f"lagbench leaderboard build --board {board}",
         )

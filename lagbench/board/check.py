@@ -136,13 +136,16 @@ def check_board(
             build(folder.path, check=True, registry=described)
         except LagbenchError as error:
             issues.append(issue_from_error("page", error, error.where))
+    recorded_paths = []
+    for entry in recorded:
+        recorded_paths.append(entry.yaml_path.as_posix())
     return CheckResult(
         folder=folder.path,
         entries=len(folder.entries()),
         findings=tuple(issues),
         page_checked=is_page_checked,
         confirmed=tuple(rescoring.confirmations),
-        recorded=tuple(entry.yaml_path.as_posix() for entry in recorded),
+        recorded=tuple(recorded_paths),
         partly=partly,
         floors=measured,
     )
@@ -151,7 +154,10 @@ def check_board(
 def _find_unreadable(folder: Folder) -> Mapping[Path, str]:
     """Return the score files that a child process cannot read, and why."""
     paths = (*folder.score_files(), *folder.reference_files())
-    return find_unreadable([folder.path / path for path in paths])
+    whole_paths = []
+    for path in paths:
+        whole_paths.append(folder.path / path)
+    return find_unreadable(whole_paths)
 
 
 def _issues_of_measured(

@@ -16,7 +16,7 @@ from .model import BoardRow, ReferenceRow, Tab, Value
 
 TableRow = BoardRow | ReferenceRow
 
-MAIN_METRICS = 5
+MAIN_METRICS = 4
 """Metrics of the first table, the ranking one among them; with more it would be wider
 than a screen.
 """
@@ -387,9 +387,13 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
     """Return the keys of each preset that has something to show, main first, all
     last.
     """
+    metric_count = MAIN_METRICS
+    if AGAINST_CLASSICAL.key in columns:
+        # main fits into 1280 pixels
+        metric_count -= 1
     main = (
         "against_classical",
-        *tab.columns[:MAIN_METRICS],
+        *tab.columns[:metric_count],
         "kind",
         "speed_up",
         "budget",
@@ -401,7 +405,11 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
         if columns.keys().isdisjoint(keys):
             continue
         shown_keys = {"skill", tab.ranking, *keys}
-        presets[name] = tuple(key for key in columns if key in shown_keys)
+        shown_columns = []
+        for key in columns:
+            if key in shown_keys:
+                shown_columns.append(key)
+        presets[name] = tuple(shown_columns)
     return presets
 
 
@@ -430,7 +438,9 @@ def loss_of(row: TableRow, column: Column) -> float:
     value = value_of(row, column)
     metric = metric_value(row, column.key)
     if column.direction is Direction.TARGET and metric is not None:
-        losses = [column.loss(scenario_mean) for scenario_mean in metric.per_scenario]
+        losses = []
+        for scenario_mean in metric.per_scenario:
+            losses.append(column.loss(scenario_mean))
         return mean(np.array(losses))
     if isinstance(value, str):
         return math.nan

@@ -97,7 +97,11 @@ def points_of(tab: Tab) -> list[CostPoint]:
                 kind=str(reference.kind),
             )
             points.append(point)
-    return [point for point in points if point.is_drawable]
+    drawable_points = []
+    for point in points:
+        if point.is_drawable:
+            drawable_points.append(point)
+    return drawable_points
 
 
 def _seconds_here(cost: EntryCost, solver_seconds_here: float | None) -> float:
@@ -129,8 +133,11 @@ def draw(
         ranking: name of the ranking metric.
         title: title of the figure.
     """
-    times = [point.seconds for point in points]
-    errors = [point.error for point in points]
+    times = []
+    errors = []
+    for point in points:
+        times.append(point.seconds)
+        errors.append(point.error)
     if solver:
         times.append(solver)
     plot = Plot(
@@ -233,7 +240,9 @@ def picture(board: Board, size: Size) -> str:
         points = _shipped_points(size, ranking)
     else:
         ranking = tab.ranking
-        points = [replace(point, href=None) for point in points_of(tab)]
+        points = []
+        for point in points_of(tab):
+            points.append(replace(point, href=None))
     if not points:
         raise DataError(
             "nothing to draw: neither entries nor reference predictors with a cost",

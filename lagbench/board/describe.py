@@ -163,7 +163,9 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
     if extended is not None:
         meta = _fill_from_entry(meta, extended)
     header = headers[0]
-    keys: dict[str, Any] = {name: getattr(meta, name) for name in About.model_fields}
+    keys: dict[str, Any] = {}
+    for name in About.model_fields:
+        keys[name] = getattr(meta, name)
     keys["name"] = meta.name or header.method[:LONGEST_LABEL]
     keys["date"] = _date_of(meta)
     keys["training"] = meta.training or (header.training or "")[:LONGEST_TEXT]
@@ -175,7 +177,9 @@ def _describe(headers: Sequence[Header], meta: Meta, extended: Entry | None) -> 
 
 
 def _fill_from_entry(meta: Meta, entry: Entry) -> Meta:
-    keys = {name: getattr(entry, name) for name in DESCRIBED_KEYS}
+    keys = {}
+    for name in DESCRIBED_KEYS:
+        keys[name] = getattr(entry, name)
     for name in meta.model_fields_set:
         keys[name] = getattr(meta, name)
     return meta.model_copy(update=keys)

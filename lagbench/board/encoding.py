@@ -47,10 +47,10 @@ class Scale:
     def levels_of(self, values: NDArray[np.float64]) -> NDArray[np.int16]:
         """Return the nearest levels; MISSING for what is not finite."""
         is_known = np.isfinite(values)
-        known = np.where(is_known, values, 0.0)
+        numbers = np.where(is_known, values, 0.0)
         if self.is_logarithmic:
-            known = np.log(np.maximum(known, math.exp(self.zero)))
-        levels = np.rint((known - self.zero) / self.step)
+            numbers = np.log(np.maximum(numbers, math.exp(self.zero)))
+        levels = np.rint((numbers - self.zero) / self.step)
         return np.where(is_known, levels, MISSING).astype(np.int16)
 
 
@@ -68,14 +68,14 @@ def scale_for(
     A logarithmic one needs values >= 0; zeros and very small values become the least
     value of its range.
     """
-    known = values[np.isfinite(values)]
-    if not known.size:
+    finite_values = values[np.isfinite(values)]
+    if not finite_values.size:
         return WHOLE_NUMBERS
-    low = float(known.min())
-    high = float(known.max())
+    low = float(finite_values.min())
+    high = float(finite_values.max())
     is_logarithmic = prefer_logarithmic and low >= 0.0 and high > SMALLEST_TOP
     if is_logarithmic:
-        low = math.log(known[known > SMALLEST_SHARE * high].min())
+        low = math.log(finite_values[finite_values > SMALLEST_SHARE * high].min())
         high = math.log(high)
     step = (high - low) / levels
     if step == 0.0:

@@ -162,7 +162,10 @@ class EntryBudget(Budget):
 
         None unless each seed has a budget.
         """
-        budgets = [budget for budget in seeds if budget is not None]
+        budgets = []
+        for budget in seeds:
+            if budget is not None:
+                budgets.append(budget)
         if len(budgets) < len(seeds):
             return None
 

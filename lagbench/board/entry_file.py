@@ -99,8 +99,14 @@ def examine(
     for item in errors:
         for depth in range(1, len(item["loc"])):
             containers.add(item["loc"][:depth])
-    innermost = [item for item in errors if item["loc"] not in containers]
-    return None, tuple(_issue_from(kind, item) for item in innermost[:MOST_ISSUES])
+    innermost = []
+    for item in errors:
+        if item["loc"] not in containers:
+            innermost.append(item)
+    issues = []
+    for item in innermost[:MOST_ISSUES]:
+        issues.append(_issue_from(kind, item))
+    return None, tuple(issues)
 
 
 def format_issues(issues: Sequence[SchemaIssue]) -> str:
@@ -192,7 +198,10 @@ def _join_description_lines(value: object) -> None:
 def entry_bytes(entry: Entry) -> bytes:
     """Return the bytes of an entry's YAML file; equal entries give equal bytes."""
     values = entry.model_dump(mode="python", exclude_defaults=True)
-    ordered = {key: values[key] for key in Entry.KEY_ORDER if key in values}
+    ordered = {}
+    for key in Entry.KEY_ORDER:
+        if key in values:
+            ordered[key] = values[key]
     return yaml_bytes(ordered)
 
 

@@ -67,7 +67,10 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
         names = [method]
     else:
         names = [f"{method}_{seed}" for seed in seeds]
-    return tuple(Path(SCORES, split, size, f"{name}.nc") for name in names)
+    paths = []
+    for name in names:
+        paths.append(Path(SCORES, split, size, f"{name}.nc"))
+    return tuple(paths)
 
 
 def weights_path(place: Place, seed: int | None) -> Path:
@@ -130,7 +133,9 @@ class Folder:
     def data_sets(self) -> tuple[tuple[str, str], ...]:
         """Return the (split, size) that have entries."""
         self.require()
-        data_sets = {(path.parts[1], path.parts[2]): None for path in self.entries()}
+        data_sets: dict[tuple[str, str], None] = {}
+        for path in self.entries():
+            data_sets[(path.parts[1], path.parts[2])] = None
         return tuple(data_sets)
 
     def score_files(self) -> tuple[Path, ...]:
@@ -142,7 +147,11 @@ class Folder:
         paths = self._fit_files(REFERENCES)
         if not split:
             return paths
-        return tuple(path for path in paths if path.parts[1:3] == (split, size))
+        matching_paths = []
+        for path in paths:
+            if path.parts[1:3] == (split, size):
+                matching_paths.append(path)
+        return tuple(matching_paths)
 
     def weight_files(self) -> tuple[Path, ...]:
         """Return weights and the logs of their trainings, ordered by name."""
@@ -212,7 +221,11 @@ class Folder:
                 )
 
     def _fit_files(self, top: str) -> tuple[Path, ...]:
-        return tuple(p for p in self._files(top) if self.reason_unfit(p) is None)
+        fit_paths = []
+        for path in self._files(top):
+            if self.reason_unfit(path) is None:
+                fit_paths.append(path)
+        return tuple(fit_paths)
 
     def _files(self, top: str) -> list[Path]:
         """Return everything under a subfolder that is no folder.
@@ -224,7 +237,10 @@ class Folder:
         paths: list[Path] = []
         for folder, folder_names, file_names in os.walk(self.path / top):
             here = Path(folder)
-            links = [name for name in folder_names if (here / name).is_symlink()]
+            links = []
+            for name in folder_names:
+                if (here / name).is_symlink():
+                    links.append(name)
             for name in (*links, *file_names):
                 if name != PLACEHOLDER:
                     paths.append((here / name).relative_to(self.path))

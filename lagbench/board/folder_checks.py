@@ -372,7 +372,9 @@ class FolderChecks:
 
     def _check_names(self) -> None:
         """Check that no two names of active entries look alike."""
-        reference_keys = {confusable_key(name): name for name in REFERENCES}
+        reference_keys = {}
+        for name in REFERENCES:
+            reference_keys[confusable_key(name)] = name
         entries_by_key: dict[tuple[str, str, str], Entry] = {}
         for entry in self.entries:
             if entry.status is not Status.ACTIVE:

@@ -37,7 +37,10 @@ def fingerprint_of(tallies: Mapping[int, Tally]) -> str:
     """
     digest = hashlib.sha256()
     for scenario, tally in sorted(tallies.items()):
-        names = [name for name in STATISTICS if name in tally.names]
+        names = []
+        for name in STATISTICS:
+            if name in tally.names:
+                names.append(name)
         rows = [tally.names.index(name) for name in names]
         totals = tally.total[rows].astype(np.float32)
         digest.update(f"{scenario} {names} {tally.frames}".encode())

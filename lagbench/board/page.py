@@ -83,12 +83,20 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     theme = _read_part("theme.js")
     script = _script()
     style = _style_sheet()
-    views = [make_table(tab, board.metrics) for tab in board.tabs]
+    views = []
+    for tab in board.tabs:
+        views.append(make_table(tab, board.metrics))
     data, arrays = page_data(views)
 
-    link_tags = [tag("a", label, href=address) for label, address in links.items()]
+    link_tags = []
+    for label, address in links.items():
+        link_tags.append(tag("a", label, href=address))
     sections = [draw_overview(board)]
-    sections += [draw_section(view, board.metrics) for view in views]
+    for view in views:
+        sections.append(draw_section(view, board.metrics))
+    foot = []
+    for line in FOOT:
+        foot.append(tag("p", line))
     parts = {
         "policy": _policy(scripts=(theme, script), style=style),
         "style": style,
@@ -100,7 +108,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
         "navigation": draw_navigation(board),
         "sections": join(sections, "\n"),
         "empty": draw_empty(board),
-        "foot": join([tag("p", line) for line in FOOT]),
+        "foot": join(foot),
         "data": encode(data),
         "arrays": encode(arrays),
     }
@@ -291,7 +299,9 @@ def draw_overview(board: Board) -> Markup:
     for tab in board.tabs:
         link = tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}")
         headings.append(tag("th", link, scope="col"))
-    lines = [_overview_line(method, board) for method in _order_methods(board)]
+    lines = []
+    for method in _order_methods(board):
+        lines.append(_overview_line(method, board))
     caption = (
         "Skill on every data set (0: the best naive baseline, 1: perfect) where it is "
         "known, and rank; bold leads. Methods stand in the order of their mean skill, "
@@ -388,6 +398,9 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         aria_label="Scores",
         tabindex=0,
     )
+    notes = []
+    for note in _notes(tab):
+        notes.append(tag("p", note))
     return tag(
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
@@ -395,7 +408,7 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         tag("ul", *_tiles(view, metrics), class_="tiles"),
         _tools(view),
         table,
-        tag("div", *(tag("p", note) for note in _notes(tab)), class_="notes"),
+        tag("div", *notes, class_="notes"),
         tag("div", cost_figure(tab), class_="figures"),
         id=tab.id,
         class_="tab",

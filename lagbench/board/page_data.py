@@ -47,7 +47,9 @@ Plain = dict[str, Any]
 def page_data(views: Sequence[TableView]) -> tuple[bytes, bytes]:
     """Return the data of all tabs as JSON, and the arrays that it refers to."""
     arrays = ArrayStore()
-    tabs = [_TabWriter(view, arrays).tab() for view in views]
+    tabs = []
+    for view in views:
+        tabs.append(_TabWriter(view, arrays).tab())
     data = {"colours": COLOURS, "tabs": tabs}
     encoded = json.dumps(data, ensure_ascii=True, allow_nan=False)
     return encoded.encode(), arrays.to_bytes()
@@ -73,6 +75,9 @@ class _TabWriter:
                 references.append(self._reference(line, line.row))
             else:
                 rows.append(self._row(line, line.row))
+        curves = []
+        for name in tab.curves:
+            curves.append({"key": name, "label": words(name)})
         return {
             "id": tab.id,
             "split": tab.size.split,
@@ -83,7 +88,7 @@ class _TabWriter:
             "ranking": tab.ranking,
             "columns": list(self._columns()),
             "presets": self._view.presets,
-            "curves": [{"key": name, "label": words(name)} for name in tab.curves],
+            "curves": curves,
             "energy": self._curve(tab.energy),
             "truth": self._pictures(tab.truth),
             "references": references,
@@ -120,12 +125,15 @@ class _TabWriter:
         residuals = []
         for i in spaced(len(row.residuals), MAP_FRAMES):
             residuals.append(self._histogram(row.residuals[i]))
+        flags = []
+        for chip in line.chips:
+            flags.append([chip.kind, chip.label, chip.meaning])
         return {
             **self._line(line),
             "status": status,
             "active": row.active,
             "rank": row.rank,
-            "flags": [[c.kind, c.label, c.meaning] for c in line.chips],
+            "flags": flags,
             "byline": line.byline,
             "links": list(line.links),
             "search": _search_text(line, entry),
@@ -145,23 +153,27 @@ class _TabWriter:
         """Return the cells of a line, each kind in the order of the columns."""
         values = []
         losses = []
+        texts = []
+        notes = []
         for key, cell in line.cells.items():
             values.append(plain_number(cell.value))
             loss = target_loss(cell, self._view.columns[key])
             losses.append(None if loss is None else plain_number(loss))
-        cells = line.cells.values()
+            texts.append(cell.text)
+            notes.append(cell.note)
         ranking_cell = line.cells[self._tab.ranking]
-        interval = []
+        interval: list[float | str | None] = []
         if ranking_cell.interval is not None:
-            interval = [plain_number(bound) for bound in ranking_cell.interval]
+            for bound in ranking_cell.interval:
+                interval.append(plain_number(bound))
         return {
             "id": line.id,
             "name": line.name,
             "place": line.place,
             "values": values,
             "losses": losses,
-            "texts": [cell.text for cell in cells],
-            "notes": [cell.note for cell in cells],
+            "texts": texts,
+            "notes": notes,
             "interval": interval,
         }
 
@@ -170,7 +182,10 @@ class _TabWriter:
         spread = {}
         for name in self._tab.columns:
             if name in values:
-                spread[name] = [plain_number(x) for x in values[name].per_scenario]
+                means = []
+                for scenario_mean in values[name].per_scenario:
+                    means.append(plain_number(scenario_mean))
+                spread[name] = means
         return spread
 
     def _at_marked_frames(self, values: Mapping[str, Value]) -> Plain:
@@ -179,8 +194,10 @@ class _TabWriter:
             if name not in values or not values[name].at:
                 continue
             by_frame = values[name].at
-            numbers = [by_frame.get(frame, math.nan) for frame in self._tab.marked]
-            at[name] = [plain_number(number) for number in numbers]
+            numbers = []
+            for frame in self._tab.marked:
+                numbers.append(plain_number(by_frame.get(frame, math.nan)))
+            at[name] = numbers
         return at
 
     def _curves(self, curves: Mapping[str, Curve]) -> Plain:
@@ -210,13 +227,25 @@ class _TabWriter:
         frames = spaced(len(pictures.film_frames), FILM_FRAMES)
         particles = spaced(len(pictures.material), FILM_PARTICLES)
         film = pictures.film[frames][:, particles]  # shape [frame, particle, 2]
+        map_frames = []
+        for i in maps:
+            map_frames.append(pictures.map_frames[i])
+        maps_of_vorticity = []
+        for field in fields:
+            maps_of_vorticity.append(self._arrays.add(field))
+        histograms = []
+        for i in maps:
+            histograms.append(self._histogram(pictures.histograms[i]))
+        film_frames = []
+        for i in frames:
+            film_frames.append(pictures.film_frames[i])
         return {
             "scenario": pictures.scenario,
-            "mapFrames": [pictures.map_frames[i] for i in maps],
+            "mapFrames": map_frames,
             "nodes": fields.shape[-1],
-            "maps": [self._arrays.add(field) for field in fields],
-            "histograms": [self._histogram(pictures.histograms[i]) for i in maps],
-            "filmFrames": [pictures.film_frames[i] for i in frames],
+            "maps": maps_of_vorticity,
+            "histograms": histograms,
+            "filmFrames": film_frames,
             "material": pictures.material[particles].tolist(),
             "film": self._arrays.add(film.reshape(len(frames), -1), levels=FILM_LEVELS),
         }

@@ -87,16 +87,22 @@ def publish(
         moves |= _stage_weights(draft, entry, staging)
         moves |= _stage_texts(entry, folder, staging)
         removed = _find_files_to_remove(entry, previous, moves, folder)
+        parents = []
+        for path in removed:
+            parents.append(path.relative_to(folder.path).parent)
         folder.require_unlinked(
             [
                 *moves,
-                *(path.relative_to(folder.path).parent for path in removed),
+                *parents,
                 Path(REFERENCES, entry.split, entry.size),
             ]
         )
         refuse_folders(removed)
         references = write_references(cards[0], folder)
-        move_together([(copy, folder.path / path) for path, copy in moves.items()])
+        copies_and_places = []
+        for path, copy in moves.items():
+            copies_and_places.append((copy, folder.path / path))
+        move_together(copies_and_places)
     for path in removed:
         path.unlink()
 
@@ -137,7 +143,9 @@ def _stage_scores(
         Path of each copy, by its place in the leaderboard's folder.
     """
     seeds = [prediction.seed for prediction in predictions]
-    staged = {path: staging / path.name for path in score_paths(draft.place, seeds)}
+    staged = {}
+    for path in score_paths(draft.place, seeds):
+        staged[path] = staging / path.name
     copies = list(staged.values())
     kept_paths = _kept_score_paths(draft)
     for kept_path, copy in zip(kept_paths, copies, strict=False):
@@ -240,9 +248,11 @@ def _moves_of_scores(
 ) -> dict[Path, Path]:
     """Return the score files to move; those that lie there already are the same."""
     kept_paths = _kept_score_paths(draft)
-    return {
-        path: copy for path, copy in staged_scores.items() if path not in kept_paths
-    }
+    new_scores = {}
+    for path, copy in staged_scores.items():
+        if path not in kept_paths:
+            new_scores[path] = copy
+    return new_scores
 
 
 def _stage_weights(draft: Draft, entry: Entry, staging: Path) -> dict[Path, Path]:
@@ -280,19 +290,23 @@ def _find_files_to_remove(
         log = path.with_suffix(".json")
         if path.suffix == ".pt" and log not in moves:
             stale_paths.add(log)
-    whole_paths = [folder.path / path for path in sorted(stale_paths)]
-    return tuple(path for path in whole_paths if os.path.lexists(path))
+    whole_paths = []
+    for path in sorted(stale_paths):
+        whole_path = folder.path / path
+        if os.path.lexists(whole_path):
+            whole_paths.append(whole_path)
+    return tuple(whole_paths)
 
 
 def _find_kept_weights(
     entry: Entry, moves: Mapping[Path, Path], folder: Folder
 ) -> tuple[Path, ...]:
-    kept = []
+    kept_paths = []
     for prediction in entry.predictions:
         weights = prediction.weights
         if weights is not None and Path(weights.path) not in moves:
-            kept.append(folder.path / weights.path)
-    return tuple(kept)
+            kept_paths.append(folder.path / weights.path)
+    return tuple(kept_paths)
 
 
 def _result_of(

@@ -68,7 +68,10 @@ def combine(seeds: Sequence[Mapping[int, Tally]]) -> dict[str, CombinedScore]:
     statistics = set(_statistics_of(seeds[0]))
     for tallies in seeds[1:]:
         statistics.intersection_update(_statistics_of(tallies))
-    metrics = [m for m in METRICS.values() if statistics.issuperset(m.of)]
+    metrics = []
+    for metric in METRICS.values():
+        if statistics.issuperset(metric.of):
+            metrics.append(metric)
 
     scores = [aggregate(metrics, tallies) for tallies in seeds]
     combined = {}
@@ -137,7 +140,11 @@ def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
     """
     shipped_scores = shipped(size)
     if shipped_scores:
-        return tuple(r for r in shipped_scores.values() if r.name in KNOWN)
+        known_references = []
+        for reference in shipped_scores.values():
+            if reference.name in KNOWN:
+                known_references.append(reference)
+        return tuple(known_references)
 
     references = []
     for path in folder.reference_files(size.split, size.name):
@@ -148,10 +155,13 @@ def read_references(folder: Folder, size: Size) -> tuple[ReferenceScores, ...]:
             continue
         read_score_file(file, size)  # refuses scores that do not fit the task
         combined = combine([stored.tallies])
+        scores = {}
+        for name, combined_score in combined.items():
+            scores[name] = combined_score.score
         references.append(
             ReferenceScores(
                 name=path.stem,
-                scores={name: each.score for name, each in combined.items()},
+                scores=scores,
                 seconds_per_frame=math.nan,
                 correlation=np.empty(0),
             )

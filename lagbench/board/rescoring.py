@@ -257,7 +257,10 @@ def compare_tallies(
 
 
 def _frames_of(tallies: Mapping[int, Tally]) -> dict[int, tuple[int, ...]]:
-    return {scenario: tuple(tally.frames) for scenario, tally in tallies.items()}
+    frames = {}
+    for scenario, tally in tallies.items():
+        frames[scenario] = tuple(tally.frames)
+    return frames
 
 
 def relative_difference(first: Tally, second: Tally, name: str) -> float:

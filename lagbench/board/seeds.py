@@ -30,7 +30,10 @@ def seeds_of(headers: Sequence[Header]) -> tuple[int | None, ...]:
         UsageError: the files do not belong together, or their seeds do not differ.
     """
     for name in SHARED_LABELS:
-        _require_equal(name, [str(getattr(header, name)) for header in headers])
+        labels = []
+        for header in headers:
+            labels.append(str(getattr(header, name)))
+        _require_equal(name, labels)
     provenances = [header.provenance for header in headers]
     _require_equal("training", _shared_trainings(provenances))
 

@@ -32,11 +32,11 @@ def choose_data_sets(
     if chosen or (split is None and size is None):
         return tuple(chosen)
 
-    wanted = " ".join(name for name in (split, size) if name)
+    request = " ".join(name for name in (split, size) if name)
     fix: str | None = "submit something: lagbench submit"
     if known:
-        fix = suggest_name(wanted, [" ".join(data_set) for data_set in known])
-    raise UsageError("no entries there", where=f"leaderboard {wanted}", fix=fix)
+        fix = suggest_name(request, [" ".join(data_set) for data_set in known])
+    raise UsageError("no entries there", where=f"leaderboard {request}", fix=fix)
 
 
 def tables(
@@ -61,13 +61,21 @@ def tables(
             )
     for tab in board.tabs:
         names = _columns_of(tab, metrics, wide=wide)
-        ranked_rows = [row for row in tab.rows if row.rank is not None]
-        other_rows = [row for row in tab.rows if row.rank is None]
+        ranked_rows = []
+        other_rows = []
+        for row in tab.rows:
+            if row.rank is not None:
+                ranked_rows.append(row)
+            else:
+                other_rows.append(row)
         rows: list[TableRow] = [*ranked_rows, *tab.references, *other_rows]
+        cells = []
+        for table_row in rows:
+            cells.append(_format_row(table_row, names))
         yield Table(
             _title_of(tab),
             ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
-            tuple(_format_row(row, names) for row in rows),
+            tuple(cells),
             keys=2,
         )
 
@@ -102,7 +110,9 @@ def _plain_tab(tab: Tab) -> dict[str, Any]:
     references = []
     for reference in tab.references:
         values = reference.values
-        metrics = {name: _plain_value(value) for name, value in values.items()}
+        metrics = {}
+        for name, value in values.items():
+            metrics[name] = _plain_value(value)
         references.append(
             {"id": reference.name, "kind": str(reference.kind), "metrics": metrics}
         )
@@ -130,6 +140,9 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
     against_classical = None
     if row.against_classical is not None:
         against_classical = _plain_value(row.against_classical)
+    metrics = {}
+    for name, value in row.values.items():
+        metrics[name] = _plain_value(value)
     return {
         "id": row.id,
         "rank": row.rank,
@@ -148,7 +161,7 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "skill": skill,
         "against_classical": against_classical,
         "classical_solver": row.solver,
-        "metrics": {name: _plain_value(value) for name, value in row.values.items()},
+        "metrics": metrics,
     }
 
 

@@ -43,7 +43,9 @@ def draw_table(view: TableView) -> Markup:
     ]
     for key, column in view.columns.items():
         headings.append(_column_heading(column, is_hidden=key not in view.main))
-    lines = [_draw_line(view, line) for line in view.lines]
+    lines = []
+    for line in view.lines:
+        lines.append(_draw_line(view, line))
     return tag(
         "table",
         tag("caption", caption, class_="unseen"),
@@ -141,7 +143,9 @@ def _entry_heading(tab: Tab, line: Line) -> Markup:
     parts += [_draw_chip(chip) for chip in line.chips]
     parts.append(tag("span", line.byline, class_="sub", title=line.byline))
     if line.links:
-        links = [_draw_link(label, target) for label, target in line.links]
+        links = []
+        for label, target in line.links:
+            links.append(_draw_link(label, target))
         parts.append(tag("span", *links, class_="links"))
     return tag("th", *parts, scope="row", class_="method")
 

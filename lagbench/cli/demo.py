@@ -39,7 +39,7 @@ from lagbench.work.progress import Progress
 
 from .model_options import TRAINING_LIBRARIES, require_libraries
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption
-from .output import format_seconds, print_line, print_result, print_table
+from .output import format_seconds, print_result, print_table
 from .progress import progress_bar
 from .solver_bench import SolverBench, bench_apart
 
@@ -129,20 +129,11 @@ def demo_command(
         "model_left_out": model_left_out,
         "seconds": seconds,
     }
-    done = f"{len(splits)} data sets, verified and drawn"
-    duration = format_seconds(seconds)
-    if model is None:
-        lines = iter(
-            [
-                f"{done}, in {duration}",
-                f"no model, no leaderboard: {model_left_out}",
-            ]
-        )
-    else:
-        lines = _describe_model(model, done, duration)
-    print_result(value, lines, as_json=as_json, quiet=quiet)
-    print_line(
-        "next: lagbench generate --split cavity --size mini", quiet=as_json or quiet
+    print_result(
+        value,
+        _describe(len(splits), model, model_left_out=model_left_out, seconds=seconds),
+        as_json=as_json,
+        quiet=quiet,
     )
 
 
@@ -310,8 +301,29 @@ def _print_splits(splits: Mapping[str, DemoResult]) -> None:
     print_table("", ("split", "hash", "data set", "picture"), rows)
 
 
-def _describe_model(model: ModelResult, done: str, duration: str) -> Iterator[str]:
-    """Print the table of scores, then yield the lines below it."""
+def _describe(
+    split_count: int,
+    model: ModelResult | None,
+    *,
+    model_left_out: str | None,
+    seconds: float,
+) -> Iterator[str]:
+    """Print the table of scores, if there is a model, then yield the lines below it."""
+    work = f"{split_count} data sets, verified and drawn"
+    duration = format_seconds(seconds)
+    if model is None:
+        yield f"{work}, in {duration}"
+        yield f"no model, no leaderboard: {model_left_out}"
+    else:
+        _print_scores(model)
+        yield (
+            f"{work}; a model trained, predicted, scored and submitted; in {duration}"
+        )
+        yield f"leaderboard page: {model.page.page}"
+    yield "next: lagbench generate --split cavity --size mini"
+
+
+def _print_scores(model: ModelResult) -> None:
     training = model.training
     card = model.card
     metrics = tuple(dict.fromkeys((card.ranking, *METRICS)))
@@ -327,8 +339,6 @@ def _describe_model(model: ModelResult, done: str, duration: str) -> Iterator[st
         f"{training.size}, test scenarios"
     )
     print_table(title, ("method", *metrics), rows)
-    yield (f"{done}; a model trained, predicted, scored and submitted; in {duration}")
-    yield f"leaderboard page: {model.page.page}"
 
 
 def _format_mean(mean: float) -> str:

@@ -20,6 +20,8 @@ from lagbench.errors import DataError, UsageError
 from lagbench.scoring.references import measured_sizes
 
 from .options import (
+    DEFAULT_BOARD,
+    BoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
@@ -39,7 +41,6 @@ from .output import (
     print_tables,
 )
 from .progress import progress_bar
-from .submit import DEFAULT_BOARD, BoardOption
 
 
 def build_command(

@@ -39,6 +39,10 @@ IntervalOption = Annotated[
 BoundsOption = Annotated[
     str | None, option("--bounds X0,X1,Y0,Y1", "Positions of the walls.")
 ]
+PeriodicOption = Annotated[
+    str | None,
+    option("--periodic AXES", "Axes of the box without walls, as in x,y; or none."),
+]
 RescaleFlag = Annotated[
     bool,
     option("--rescale", "Scale the bounds into the unit box, by a power of two."),
@@ -86,6 +90,7 @@ def import_command(
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
     bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
     rescale: RescaleFlag = False,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
@@ -130,6 +135,7 @@ def adopt_command(
         int | None, option("--test N", "Trajectories of test; a tenth by default.")
     ] = None,
     bounds: BoundsOption = None,
+    periodic: PeriodicOption = None,
     rescale: RescaleFlag = False,
     input_frames: InputFramesOption = None,
     horizon: HorizonOption = None,
@@ -167,6 +173,8 @@ def _data_options(parameters: Mapping[str, Any]) -> Any:  # noqa: ANN401 (a Data
         del options["rescale"]
     if "bounds" in options:
         options["bounds"] = _parse_bounds(options["bounds"])
+    if "periodic" in options:
+        options["periodic"] = _parse_axes(options["periodic"])
     if "frames_of_interest" in options:
         options["frames_of_interest"] = parse_ids(
             options["frames_of_interest"], where="--frames-of-interest", noun="frame"
@@ -188,6 +196,13 @@ def _parse_bounds(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
             got=text,
         ) from None
     return (left, right), (bottom, top)
+
+
+def _parse_axes(text: str) -> tuple[str, ...]:
+    """Return the names of axes; "none" stands for no axis."""
+    if text == "none":
+        return ()
+    return tuple(text.split(","))
 
 
 def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -> None:

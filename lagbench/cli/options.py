@@ -76,6 +76,8 @@ SchedulerOption = Annotated[
     str | None,
     option("--scheduler ADDRESS", "Dask scheduler, as in tcp://host:8786."),
 ]
+DEFAULT_BOARD = Path("leaderboard")
+BoardOption = Annotated[Path, option("--board FOLDER", "Folder of the leaderboard.")]
 JsonFlag = Annotated[bool, option("--json", "Print one JSON object on stdout.")]
 QuietFlag = Annotated[bool, option("--quiet -q", "Print errors only.")]
 

@@ -169,8 +169,11 @@ def print_table(
     Only the last column wraps. Columns of numbers are set flush right.
     """
     cells = [[str(cell) for cell in row] for row in rows]
+    table_title = None
+    if title:
+        table_title = Text(title)
     table = DrawnTable(
-        title=Text(title) if title else None,
+        title=table_title,
         box=SIMPLE_HEAD,
         title_justify="left",
         pad_edge=False,

@@ -13,12 +13,17 @@ from lagbench.board.folder import VERIFIED
 from lagbench.board.publish import SubmitResult
 from lagbench.board.submit import submit
 
-from .options import JsonFlag, QuietFlag, RootOption, WorkersOption, option
+from .options import (
+    DEFAULT_BOARD,
+    BoardOption,
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    WorkersOption,
+    option,
+)
 from .output import print_errors, print_result, print_warning
 from .progress import progress_bar
-
-DEFAULT_BOARD = Path("leaderboard")
-BoardOption = Annotated[Path, option("--board FOLDER", "Folder of the leaderboard.")]
 
 
 def submit_command(

@@ -170,10 +170,14 @@ class Box:
             if is_periodic:
                 low = self.low[axis]
                 high = self.high[axis]
+                column = points[..., axis]
                 with np.errstate(invalid="ignore"):  # infinity becomes NaN
-                    column = low + np.mod(points[..., axis] - low, high - low)
+                    moved = low + np.mod(column - low, high - low)
                 # The sum can round up to the upper end, which is the lower one.
-                wrapped[..., axis] = np.where(column >= high, low, column)
+                moved = np.where(moved >= high, low, moved)
+                # Components that lie inside keep their bits.
+                is_inside = (column >= low) & (column < high)
+                wrapped[..., axis] = np.where(is_inside, column, moved)
         return wrapped
 
     def inside(self, position: ArrayLike) -> Floats:
@@ -183,6 +187,17 @@ class Box:
             position: points [length], shape [..., axis].
         """
         return self.wrap(np.clip(position, self.lower_walls, self.upper_walls))
+
+    def has_whole_cells(self, cells: int) -> bool:
+        """Tell whether every periodic axis is three or more whole cells long.
+
+        Args:
+            cells: cells across a length of 1.
+        """
+        periods = self.lengths[np.asarray(self.periodic)] * cells
+        count = np.rint(periods)
+        is_whole = np.abs(periods - count) <= 1e-9 * count
+        return bool((is_whole & (count >= 3)).all())
 
     def unwrap(self, position: ArrayLike) -> Floats:
         """Return the points of one body as one piece: the images nearest to the first.

@@ -240,7 +240,9 @@ def file_sha256(path: Path) -> str:
 
 def subset_hash(hashes: Mapping[int, str]) -> str:
     """Return the SHA-256 of the lines ``{id:04d} {content hash}``, by id."""
-    lines = [f"{scenario:04d} {hashes[scenario]}\n" for scenario in sorted(hashes)]
+    lines = []
+    for scenario in sorted(hashes):
+        lines.append(f"{scenario:04d} {hashes[scenario]}\n")
     text = "".join(lines)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
 
@@ -251,7 +253,10 @@ def dataset_hash(split: str, size: str, major: int, subsets: Mapping[str, str]) 
     Raises:
         DataError: the hash of one of the three is missing.
     """
-    missing = [subset for subset in HASHED_SUBSETS if subset not in subsets]
+    missing = []
+    for subset in HASHED_SUBSETS:
+        if subset not in subsets:
+            missing.append(subset)
     if missing:
         raise DataError(
             "the data set hash needs every subset",

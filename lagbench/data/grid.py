@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import UsageError
 
-from .box import AXES, UNIT_SQUARE, Box
+from .box import UNIT_SQUARE, Box
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -77,22 +77,14 @@ class Grid:
                 got=self.cells,
             )
         object.__setattr__(self, "placement", Placement(self.placement))
-        for axis, is_periodic in enumerate(self.box.periodic):
-            if is_periodic:
-                self._check_period(axis)
-
-    def _check_period(self, axis: int) -> None:
-        """Refuse a period that is no whole number of cells, or of fewer than three."""
-        periods = float(self.box.lengths[axis]) * self.cells
-        if round(periods) >= 3 and abs(periods - round(periods)) <= 1e-9 * periods:
-            return
-        raise UsageError(
-            "a periodic axis is no whole number of cells long",
-            where=f"axis {AXES[axis]}",
-            expected="a length of 3 or more whole cells",
-            got=f"{periods:.9g} cells",
-            fix="another number of cells",
-        )
+        if not self.box.has_whole_cells(self.cells):
+            raise UsageError(
+                "a periodic axis is no whole number of cells long",
+                where="cells",
+                expected="3 or more whole cells along every periodic axis",
+                got=f"{self.cells} cells across a length of 1, box {self.box.bounds}",
+                fix="another number of cells",
+            )
 
     @property
     def dimension(self) -> int:

@@ -374,7 +374,9 @@ def locate_new(
 def _only_size(location: SplitLocation) -> str:
     """Return the only size of a split, or the only one with data."""
     split, root, registry = location
-    sizes = [registry.size(split, name) for name in registry.split(split).sizes]
+    sizes = []
+    for name in registry.split(split).sizes:
+        sizes.append(registry.size(split, name))
     sizes_with_data = []
     for size in sizes:
         folder = dataset_folder(root, split, size.name, size.major)

@@ -139,7 +139,10 @@ class Manifest(_ManifestModel):
 
         Nine digits; empty where a test scenario has no perturbed run.
         """
-        errors = [entry.twin_floor for entry in self.files if entry.subset == "test"]
+        errors = []
+        for entry in self.files:
+            if entry.subset == "test":
+                errors.append(entry.twin_floor)
         if not all(errors):
             return ()
         means = []
@@ -214,9 +217,10 @@ def build_manifest(
         has_same_train = old.subset_sha256.get("train") == subset_hashes.get("train")
         if has_same_train:
             statistics = old.statistics
-    rows = {}
+    rows: dict[str, tuple[float, ...]] = {}
     if "train" in subset_hashes:
-        rows = {name: tuple(row) for name, row in (statistics or {}).items()}
+        for name, row in (statistics or {}).items():
+            rows[name] = tuple(row)
 
     identity: Literal["bitwise", "tolerance"] = "bitwise"
     for entry in entries.values():
@@ -242,7 +246,7 @@ def _collect_entries(
     files: Iterable[FileEntry],
     subsets: Mapping[str, Sequence[int]],
 ) -> dict[int, FileEntry]:
-    """Return old and new entries by id; old ones count in their own subset only."""
+    """Return entries by id; old ones only if their subset still lists them."""
     entries = {}
     if old is not None:
         for entry in old.files:

@@ -136,9 +136,9 @@ class ScenarioFile:
                 expected = expected_attributes(name, dims)
             differing = list_differing_attributes(expected, attributes)
             if differing:
-                values = [
-                    f"{key} = {attributes.get(key, 'missing')}" for key in differing
-                ]
+                values = []
+                for key in differing:
+                    values.append(f"{key} = {attributes.get(key, 'missing')}")
                 raise DataError(
                     "attributes of a variable are not those of the format",
                     where=f"{self.path}, variable {name!r}",

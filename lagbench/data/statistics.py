@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from lagbench.errors import DataError
 
+from .box import UNIT_SQUARE, Box
 from .checksums import round_digits
 from .scenario import ScenarioFile, read_scenario
 
@@ -43,11 +44,14 @@ class Moments:
     squares: tuple[float, ...]  # sum of their squares
 
 
-def scenario_moments(frames: Iterable[NDArray[np.float32]]) -> dict[str, Moments]:
+def scenario_moments(
+    frames: Iterable[NDArray[np.float32]], box: Box = UNIT_SQUARE
+) -> dict[str, Moments]:
     """Return the moments of one scenario.
 
     Args:
         frames: positions of every frame in order, each of shape [particle, space].
+        box: box that holds the particles: a velocity is the way that a particle went.
     """
     recent: list[NDArray[np.float64]] = []
     counts = dict.fromkeys(QUANTITIES, 0)
@@ -55,8 +59,13 @@ def scenario_moments(frames: Iterable[NDArray[np.float32]]) -> dict[str, Moments
     squares: dict[str, list[NDArray[np.float64]]] = {name: [] for name in QUANTITIES}
     for position in frames:
         differences = [np.ascontiguousarray(position.T, dtype=np.float64)]
-        for earlier in recent:
-            differences.append(differences[-1] - earlier)
+        for order, earlier in enumerate(recent):
+            later = differences[-1]
+            if order == 0:
+                change = box.displacement(earlier.T, later.T).T
+            else:
+                change = later - earlier
+            differences.append(change)
         recent = differences[: len(QUANTITIES) - 1]
         for name, values in zip(QUANTITIES, differences, strict=False):
             counts[name] += values.shape[1]
@@ -107,21 +116,26 @@ def statistics(scenarios: Iterable[dict[str, Moments]]) -> dict[str, tuple[float
     return result
 
 
-def file_statistics(paths: Sequence[Path]) -> dict[str, tuple[float, ...]]:
+def file_statistics(
+    paths: Sequence[Path], box: Box = UNIT_SQUARE
+) -> dict[str, tuple[float, ...]]:
     """Return the statistics of scenario files, read one frame at a time."""
     if not paths:
         raise DataError(
             "no scenario files", expected="at least one file for statistics"
         )
-    return statistics([file_moments(path) for path in paths])
+    return statistics([file_moments(path, box=box) for path in paths])
 
 
 def file_moments(
-    path: Path, report: Callable[[int], None] = lambda _: None
+    path: Path,
+    report: Callable[[int], None] = lambda _: None,
+    *,
+    box: Box = UNIT_SQUARE,
 ) -> dict[str, Moments]:
     """Return the moments of one scenario file, read one frame at a time."""
     with read_scenario(path) as file:
-        moments = scenario_moments(_read_frames(file))
+        moments = scenario_moments(_read_frames(file), box)
     report(1)
     return moments
 

@@ -259,7 +259,7 @@ class ScenarioWriter:
         if error is not None:
             self._stack.__exit__(kind, error, trace)
             return
-        with self._stack:
+        with self._stack:  # its exit closes and renames the file
             digests = self._hasher.digests()
             self.content_sha256 = self._hasher.hexdigest()
             for name, digest in digests.items():

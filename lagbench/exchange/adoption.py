@@ -10,12 +10,11 @@ from typing import Any, Unpack
 
 import h5py
 import numpy as np
-from numpy.typing import NDArray
 
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.structure import Structure, check_structure
-from lagbench.errors import DataError, UnreadableFileError, UsageError
+from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.work.progress import Progress
 
 from . import gns_npz
@@ -75,7 +74,8 @@ def adopt(
         UsageError: no radius or frame interval, too few trajectories or one named
             twice, a folder that is there, a task that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
-        DataError: positions are not plane, not finite, or outside the unit box.
+        DataError: positions are not plane, not finite, or outside the unit box, or
+            particles jump by more than half the box along an axis with walls.
         WorkFailedError: the disk is full or not writable.
     """
     options = check_options(options)
@@ -202,8 +202,8 @@ def import_split(
         UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
             pickle of more than arrays, or particles of a kind that no material is
             known for.
-        DataError: positions are not plane, not finite, outside the unit box, or cross a
-            periodic one.
+        DataError: positions are not plane, not finite, or outside the unit box, or
+            particles jump by more than half the box along an axis with walls.
         WorkFailedError: the disk is full or not writable.
     """
     options = check_options(options)
@@ -276,6 +276,7 @@ def _merge_options(metadata: SourceMetadata, options: DataOptions) -> dict[str, 
     merged |= keys.model_dump(
         exclude={"origin", "placement", "wall_particle_type"}, exclude_none=True
     )
+    merged["periodic"] = metadata.periodic_axes
     merged["full_box"] = keys.placement == "cell_centres"
     merged |= options
     if "frame_interval" not in merged:
@@ -331,38 +332,11 @@ def _parse_group(
     origin = np.asarray(metadata.lagbench.origin, np.float32)
 
     def read() -> Iterator[Frame]:
-        before: NDArray[np.floating] | None = None
         for number in range(shape[0]):
             with hdf5_errors(path, f"{position.name}, frame {number}"):
                 frame = position[number][is_kept]
             if origin.any():
                 frame = frame + origin
-            if before is not None:
-                where = f"{name}, frame {number}"
-                _refuse_crossings(before, frame, metadata=metadata, where=where)
-            before = frame
             yield frame, None
 
     return Trajectory(name=name, frames=shape[0], material=material, read=read)
-
-
-def _refuse_crossings(
-    before: NDArray[np.floating],
-    after: NDArray[np.floating],
-    *,
-    metadata: SourceMetadata,
-    where: str,
-) -> None:
-    """Refuse a step through a periodic boundary: half the box or more."""
-    for axis, ((low, high), is_periodic) in enumerate(
-        zip(metadata.bounds, metadata.periodic, strict=True)
-    ):
-        steps = np.abs(after[:, axis] - before[:, axis])
-        if is_periodic and (steps > (high - low) / 2.0).any():
-            raise DataError(
-                "particles cross a periodic boundary",
-                where=where,
-                expected="positions that move on: velocities are their differences",
-                got="a jump of more than half the box",
-                fix="lagbench has no periodic boxes: leave such data out",
-            )

@@ -277,7 +277,11 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
                 with archive.open(member) as stream:
                     _check_header(name, stream, member.file_size)
     with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in ARRAYS if name in file}
+        arrays = {}
+        for name in ARRAYS:
+            if name in file:
+                arrays[name] = file[name]
+        return arrays
 
 
 def _read_netcdf(path: Path) -> dict[str, Any]:

@@ -239,11 +239,10 @@ class DownloadJob:
         Returns why something still is missing.
         """
         place = f"{self.size.split} {self.size.name}"
-        unknown = [
-            scenario
-            for scenario in self.missing
-            if scenario not in self._recorded_hashes
-        ]
+        unknown = []
+        for scenario in self.missing:
+            if scenario not in self._recorded_hashes:
+                unknown.append(scenario)
         if unknown:
             return DataError(
                 "datasets.yaml has no hash to check downloads against",
@@ -276,10 +275,10 @@ class DownloadJob:
         check_disk(self.root, sum(map(self.size.file_bytes, self.missing)))
         claims = self._read_claims(url)
         requests = self._list_requests(url, claims or {})
-        byte_count = sum(
-            item.length or self.size.file_bytes(scenario)
-            for scenario, item in requests.items()
-        )
+        lengths = []
+        for scenario, item in requests.items():
+            lengths.append(item.length or self.size.file_bytes(scenario))
+        byte_count = sum(lengths)
         self._meter.begin("downloading", total=byte_count, scenarios=len(requests))
         try:
             if claims is None:
@@ -291,9 +290,11 @@ class DownloadJob:
                     requests.pop(scenario, None)
             return self._fetch_files(url, requests, claims)
         finally:
-            self.missing = [
-                scenario for scenario in self.missing if scenario not in self.downloaded
-            ]
+            still_missing = []
+            for scenario in self.missing:
+                if scenario not in self.downloaded:
+                    still_missing.append(scenario)
+            self.missing = still_missing
 
     def _read_claims(self, url: str) -> dict[int, FileEntry] | None:
         """Return what a store's manifest says of its files; None without one.
@@ -396,11 +397,11 @@ class DownloadJob:
     def write_manifest(self) -> Manifest:
         """Write the manifest of what is there now; return it."""
         record_entry_hashes(self.size.folder(self.root), self._entries)
-        kept_entries = tuple(
-            entry
-            for entry in self._old_manifest.files
-            if entry.scenario not in self.missing
-        )
+        old_entries = []
+        for entry in self._old_manifest.files:
+            if entry.scenario not in self.missing:
+                old_entries.append(entry)
+        kept_entries = tuple(old_entries)
         old_manifest = self._old_manifest.model_copy(update={"files": kept_entries})
         manifest = merge_entries(self.size, old_manifest, self._entries)
         if self.size.measured and "train" in manifest.subset_sha256:

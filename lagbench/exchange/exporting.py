@@ -40,7 +40,7 @@ from .metadata import (
     round_down,
     write_metadata,
 )
-from .trajectory import Box, Run
+from .trajectory import Bounds, Run
 
 FORCE = "force.py"
 """Name of the program beside the data that LagrangeBench would run."""
@@ -120,14 +120,16 @@ def export(
         )
     entry, folder, splits = locate(split, size, root=root, registry=registry)
     target = Path(output)
-    file_of = {subset: target / f"{subset}{ENDINGS[form]}" for subset in HASHED_SUBSETS}
+    file_of = {}
+    for subset in HASHED_SUBSETS:
+        file_of[subset] = target / f"{subset}{ENDINGS[form]}"
     _check_target(target, list(file_of.values()), force=force)
 
     frames_of = _frames_by_subset(entry, folder)
     statistics, dataset_sha256 = _recorded_statistics(entry, folder)
     spacing, is_closed = _inspect_scenario(next(iter(frames_of["train"])), entry)
     if from_walls is None:
-        is_measured_from_walls = is_closed
+        is_measured_from_walls = is_closed or entry.box.is_periodic
     else:
         is_measured_from_walls = from_walls
     walls = None
@@ -207,7 +209,10 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
             where=str(folder / FORCE),
             fix="name another folder: --output",
         )
-    existing = [path.name for path in (*files, folder / NAME) if path.exists()]
+    existing = []
+    for path in (*files, folder / NAME):
+        if path.exists():
+            existing.append(path.name)
     if existing and not force:
         raise UsageError(
             "files of that name are there",
@@ -218,10 +223,10 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
 
 
 def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
-    """Refuse wall particles where there are no walls, or no room for them."""
-    if not is_closed:
+    """Refuse wall particles where no wall can move, or where they have no room."""
+    if not is_closed or size.box.is_periodic:
         raise UsageError(
-            "the box has no walls that could move",
+            "the box has no walls that could move on every side",
             where="--wall-particles",
             got=size.split,
         )
@@ -254,7 +259,7 @@ class WallParticles:
     They go along with the wall, and what leaves at one end comes in at the other.
     """
 
-    def __init__(self, bounds: Box, spacing: float) -> None:
+    def __init__(self, bounds: Bounds, spacing: float) -> None:
         self.thickness = WALL_LAYERS * spacing
         self._bounds = np.array(bounds)
         low, high = self._bounds.T

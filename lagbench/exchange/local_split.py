@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
+from lagbench.data.box import AXES, UNIT_SQUARE, Box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
 from lagbench.data.layout import ScenarioKey, expand_path, scenario_path
@@ -43,7 +44,7 @@ from lagbench.work.progress import Meter, Progress
 from .trajectory import (
     FEWEST_CELLS,
     MOST_CELLS,
-    Box,
+    Bounds,
     Description,
     Trajectory,
     estimate_spacing,
@@ -59,6 +60,15 @@ HEAD = (
     "# A local split of lagbench, written by `lagbench {}`; "
     'its hashes stand under "measured".\n'
 )
+
+CROSSING = 0.5
+"""Step beyond which a particle crossed a periodic boundary, over the box's length."""
+
+CROSSING_MEDIAN = 0.1
+"""Median step of particles that follow a flow, over the box's length, at most."""
+
+FEWEST_CROSSINGS = 3
+"""Particles that must cross at once before data count as periodic."""
 
 SPACINGS_PER_CELL = 2.5
 """Spacings of particles across a cell of the score grid; our splits have 1.8 to 2.6."""
@@ -291,7 +301,7 @@ class SplitBuilder:
         description = self.description
         raw_position, _ = next(trajectory.read())
         raw_position = np.asarray(raw_position)
-        position = description.transform.transform_positions(raw_position)
+        position = self._transform_positions(raw_position)
         self._check_positions(position, where=f"{trajectory.name}, frame 0")
         spacing = description.spacing
         if not spacing:
@@ -319,17 +329,54 @@ class SplitBuilder:
         before: NDArray[np.float32] | None = None
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
-            position = description.transform.transform_positions(raw_position)
+            position = self._transform_positions(raw_position)
             self._check_positions(position, where=where)
+            if before is not None:
+                step = self._box.displacement(before, position.astype(np.float64))
+                self._check_steps(step, where=where)
             if raw_velocity is not None:
                 yield position, self._transform_velocities(raw_velocity, where=where)
             elif before is not None:
-                step = position.astype(np.float64) - before
                 velocity = (step * description.rate).astype(np.float32)
                 if number == 1:
                     yield before, velocity
                 yield position, velocity
             before = position
+
+    @property
+    def _box(self) -> Box:
+        """The stated box in the unit box, else the unit box itself."""
+        return self.description.box or UNIT_SQUARE
+
+    def _transform_positions(
+        self, raw_position: NDArray[np.floating]
+    ) -> NDArray[np.float32]:
+        """Return positions in the unit box, wrapped along periodic axes."""
+        position = self.description.transform.transform_positions(raw_position)
+        return self._box.wrap(position).astype(np.float32, copy=False)
+
+    def _check_steps(self, step: NDArray[np.float64], *, where: str) -> None:
+        """Refuse steps through a periodic boundary that nobody stated.
+
+        There a few particles move nearly the length of the box, and most hardly move.
+        """
+        lengths = self.high - self.low  # [length], shape [axis]
+        if self.description.box is not None:
+            lengths = self.description.box.lengths
+        share = np.abs(step) / np.where(lengths > 0.0, lengths, np.inf)
+        for axis, name in enumerate(AXES[: step.shape[1]]):
+            crossing_count = int(np.count_nonzero(share[:, axis] > CROSSING))
+            moves_little = np.median(share[:, axis]) < CROSSING_MEDIAN
+            if crossing_count < FEWEST_CROSSINGS or not moves_little:
+                continue
+            axes = ",".join([*self.description.periodic, name])
+            raise DataError(
+                "particles jump by more than half the box",
+                where=f"{where}, along {name}",
+                expected="steps much shorter than the box, as of most particles",
+                got=f"{crossing_count} of {len(step)} particles jump",
+                fix=f"if the box is periodic: --periodic {axes} with --bounds",
+            )
 
     def _transform_velocities(
         self, raw_velocity: NDArray[np.floating], *, where: str
@@ -411,11 +458,13 @@ class SplitBuilder:
             subsets=ids,
             environment=describe_machine(DEVICE),
             recorded=short_hashes,
-            statistics=file_statistics(train_paths),
+            statistics=file_statistics(train_paths, self._box),
         )
         write_manifest(self.root, manifest)
 
-        statistics = {key: list(row) for key, row in manifest.statistics.items()}
+        statistics = {}
+        for quantity, row in manifest.statistics.items():
+            statistics[quantity] = list(row)
         measured: dict[str, object] = {
             "dataset_sha256": manifest.dataset_sha256,
             "subset_sha256": manifest.subset_sha256,
@@ -443,6 +492,7 @@ class SplitBuilder:
             "subsets": {name: format_ids(scenarios) for name, scenarios in ids.items()},
             "frames": self._describe_frames(),
             "bounds": self._bounds(),
+            **self._describe_periodic(),
             "parameters": {},
             "task": task,
         }
@@ -512,7 +562,11 @@ class SplitBuilder:
         ]
 
     def _test_entries(self) -> list[FileEntry]:
-        return [entry for entry in self.entries if entry.subset == "test"]
+        test_entries = []
+        for entry in self.entries:
+            if entry.subset == "test":
+                test_entries.append(entry)
+        return test_entries
 
     def _particle_count(self) -> int:
         """Return the particles of a test scenario; the most of any if they differ."""
@@ -526,10 +580,16 @@ class SplitBuilder:
         description = self.description
         left, bottom = self.low
         right, top = self.high
-        sides: Box = ((left, right), (bottom, top))
+        sides: Bounds = ((left, right), (bottom, top))
         if description.bounds:
             sides = description.transform.transform_box(description.bounds)
         return [[float(low), float(high)] for low, high in sides]
+
+    def _describe_periodic(self) -> dict[str, object]:
+        """Return the key of the periodic axes; none where there are only walls."""
+        if not self.description.periodic:
+            return {}
+        return {"periodic": list(self.description.periodic)}
 
     def _describe_frames(self) -> int | dict[int, str]:
         """Return the number of frames; by scenario ids where it differs."""
@@ -596,7 +656,19 @@ class SplitBuilder:
         cells = round(1.0 / (SPACINGS_PER_CELL * self.spacing))
         cells = min(MOST_CELLS, max(FEWEST_CELLS, cells))
         clouds = partial(self._read_clouds, frames)
-        return fitting_cells(clouds, placement, near=cells) or cells
+        box = self._box
+        suitable_cells = fitting_cells(clouds, placement, near=cells, box=box)
+        if suitable_cells is not None:
+            return suitable_cells
+        if box.has_whole_cells(cells):
+            return cells
+        raise UsageError(
+            "no score grid has whole cells along the periodic axes",
+            where="--periodic and --bounds",
+            expected="a box whose periods are whole numbers of one cell",
+            got=box.bounds,
+            fix="other bounds, or --cells",
+        )
 
     def _read_clouds(self, frames: tuple[int, int]) -> Iterator[Cloud]:
         """Yield the particles of some frames of every test scenario."""

@@ -14,6 +14,7 @@ leave its particles out.
 from __future__ import annotations
 
 import enum
+import itertools
 import json
 import math
 import re
@@ -35,6 +36,7 @@ from pydantic import (
 
 from lagbench.atomic import write_atomically
 from lagbench.data import MATERIALS
+from lagbench.data.box import AXES
 from lagbench.data.registry import Size
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 
@@ -135,14 +137,21 @@ def find_materials(
     for name, number in NUMBERS[form].items():
         name_of[number] = name
     name_of.update(user_kinds)
-    code_of = {number: _material_code(name) for number, name in name_of.items()}
+    code_of = {}
+    for number, name in name_of.items():
+        code_of[number] = _material_code(name)
 
     stored_numbers = np.unique(numbers).tolist()
-    unknown_numbers = [number for number in stored_numbers if number not in code_of]
+    unknown_numbers = []
+    for number in stored_numbers:
+        if number not in code_of:
+            unknown_numbers.append(number)
     if unknown_numbers:
         meanings = MEANINGS[form]
         known = [f"{number} ({name})" for number, name in sorted(name_of.items())]
-        unknown = [f"{n} ({meanings.get(n, 'unknown')})" for n in unknown_numbers]
+        unknown = []
+        for n in unknown_numbers:
+            unknown.append(f"{n} ({meanings.get(n, 'unknown')})")
         first = unknown_numbers[0]
         raise UnreadableFileError(
             "particles of a kind that no material is known for",
@@ -250,6 +259,11 @@ class SourceMetadata(BaseModel):
     periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")
     lagbench: LagbenchKeys  # what our own exports add
 
+    @property
+    def periodic_axes(self) -> tuple[str, ...]:
+        """Names of the periodic axes."""
+        return tuple(itertools.compress(AXES, self.periodic))
+
 
 def round_down(value: float) -> float:
     """Return the largest multiple of 2^-20 below a value.
@@ -347,7 +361,7 @@ def _lagrangebench_metadata(
     for subset in ("train", "test"):
         metadata[f"num_trajs_{subset}"] = len(shapes[subset])
     metadata["num_particles_max"] = most_particles
-    metadata["periodic_boundary_conditions"] = [False, False]
+    metadata["periodic_boundary_conditions"] = list(size.box.periodic)
 
     # Its cell lists start at 0 and are as long as the bounds are apart: particles
     # beyond the difference would lose their neighbours.
@@ -357,7 +371,11 @@ def _lagrangebench_metadata(
             bounds.append([0.0, high + info.wall_thickness - origin])
         metadata["bounds"] = bounds
     elif not info.from_walls:
-        metadata["bounds"] = [[0.0, 1.0], [0.0, 1.0]]
+        bounds = []
+        for side, is_periodic in zip(size.bounds, size.box.periodic, strict=True):
+            # A period is as long as the box, room between walls may be longer.
+            bounds.append(list(side) if is_periodic else [0.0, 1.0])
+        metadata["bounds"] = bounds
     return metadata
 
 

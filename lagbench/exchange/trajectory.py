@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import IO, Annotated, Any
 
@@ -16,6 +17,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_confi
 # pydantic reads the TypedDict of Python 3.12 and later only
 from typing_extensions import TypedDict
 
+from lagbench.data.box import Box, parse_periodic
 from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
@@ -35,7 +37,7 @@ The number of frames, a function that returns the positions of one of them, and 
 of each particle.
 """
 
-Box = tuple[tuple[float, float], tuple[float, float]]
+Bounds = tuple[tuple[float, float], tuple[float, float]]
 """Low and high walls along x and y."""
 
 COMPONENTS = 2
@@ -91,7 +93,7 @@ class BoxTransform:
     corner: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def fit(cls, bounds: Box) -> BoxTransform:
+    def fit(cls, bounds: Bounds) -> BoxTransform:
         """Return the transform of the least scale by which a box fits.
 
         The corner is 0 where that is enough.
@@ -113,7 +115,7 @@ class BoxTransform:
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
             return position.astype(np.float32, copy=False)
 
-    def transform_box(self, bounds: Box) -> Box:
+    def transform_box(self, bounds: Bounds) -> Bounds:
         """Return a box of the source in the unit box."""
         sides = []
         for (low, high), corner in zip(bounds, self.corner, strict=True):
@@ -143,7 +145,8 @@ class DataOptions(TypedDict, total=False):
     licence: str
     radius: float
     frame_interval: float
-    bounds: Box
+    bounds: Bounds
+    periodic: Sequence[str]
     rescale: bool
     density: float
     spacing: float
@@ -213,7 +216,8 @@ class Description:
     radius: float  # connectivity radius
     frame_interval: float  # time between frames [s]
     # box that holds the particles; None where the positions say
-    bounds: Box | None = None
+    bounds: Bounds | None = None
+    periodic: Sequence[str] = ()  # names of the axes without walls; needs bounds
     rescale: bool = False  # whether to fit the bounds into the unit box
     density: float = 1.0  # rest density [mass/length^2]
     # distance of neighbouring particles at first; None to estimate it
@@ -235,6 +239,7 @@ class Description:
         self._check_quantities()
         self._check_counts()
         self._check_bounds()
+        self._check_periodic()
         if self.rescale:
             if self.bounds is None:
                 raise UsageError(
@@ -298,6 +303,31 @@ class Description:
                 raise UsageError(
                     "bounds run from low to high", where="--bounds", got=self.bounds
                 )
+
+    def _check_periodic(self) -> None:
+        if self.periodic and self.bounds is None:
+            raise UsageError(
+                "a periodic axis needs bounds: they are its period",
+                where="--periodic",
+                fix="add --bounds",
+            )
+        try:
+            parse_periodic(self.periodic, COMPONENTS)
+        except UsageError as error:
+            raise UsageError(
+                error.what,
+                where="--periodic",
+                expected=error.expected,
+                got=error.got,
+            ) from None
+
+    @cached_property
+    def box(self) -> Box | None:
+        """The box that holds the particles, in the unit box; None where unknown."""
+        if self.bounds is None:
+            return None
+        sides = self.transform.transform_box(self.bounds)
+        return Box.from_bounds(sides, parse_periodic(self.periodic, COMPONENTS))
 
     @property
     def rate(self) -> float:

@@ -192,7 +192,10 @@ class Film:
         height = TOP + SIDE + BOTTOM
         self.size = (width, height)
         self._background = self._draw_background()
-        self._letters = {letter: _draw_letter(letter) for letter in LETTERS}
+        letters = {}
+        for letter in LETTERS:
+            letters[letter] = _draw_letter(letter)
+        self._letters = letters
 
     def frame(self, number: int) -> NDArray[np.uint8]:
         """Return one frame as RGB bytes, shape [row, column, 3]."""

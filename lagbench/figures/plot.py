@@ -297,7 +297,10 @@ def _first_of_each_kind(files: Sequence[Path], splits: Registry) -> dict[str, Pa
     def file_name(kind: str) -> str:
         return paths[kind].name
 
-    return {kind: paths[kind] for kind in sorted(paths, key=file_name)}
+    paths_by_name = {}
+    for kind in sorted(paths, key=file_name):
+        paths_by_name[kind] = paths[kind]
+    return paths_by_name
 
 
 def _arrange_over_time(

@@ -36,7 +36,9 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     are code and stay as they are.
     """
     lines = [_format_line(map(escape, head))]
-    rules = [_format_rule(rows, column) for column in range(len(head))]
+    rules = []
+    for column in range(len(head)):
+        rules.append(_format_rule(rows, column))
     lines.append(_format_line(rules))
     for row in rows:
         lines.append(_format_line(map(_format_cell, row)))

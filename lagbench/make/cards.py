@@ -82,7 +82,9 @@ def write_cards(root: Path, size: Size, split: Split, manifest: Manifest) -> lis
     texts: dict[Path, bytes] = {}
     for name, text in card_texts(size, split, manifest).items():
         texts[folder / name] = text
-    pictures = [folder / name for name in _picture_names(manifest)]
+    pictures = []
+    for name in _picture_names(manifest):
+        pictures.append(folder / name)
 
     if not _is_current(texts, pictures):
         if pictures:
@@ -185,7 +187,9 @@ def _summary_table(size: Size, manifest: Manifest) -> str:
     if most > fewest:
         frame_range = f"{fewest} to {most}"
 
-    sides = [f"[{low:.9g}, {high:.9g}]" for low, high in size.bounds]
+    sides = []
+    for low, high in size.bounds:
+        sides.append(f"[{low:.9g}, {high:.9g}]")
     rows = [
         ("version", manifest.version),
         ("complete", manifest.complete),
@@ -252,7 +256,10 @@ def _task_table(size: Size, manifest: Manifest) -> str:
         ("score grid", f"{grid.cells} cells a side, {placement}"),
         ("radius for graph models", f"{task.radius:g}"),
     ]
-    limits = [entry.twin_floor for entry in manifest.files if entry.twin_floor]
+    limits = []
+    for entry in manifest.files:
+        if entry.twin_floor:
+            limits.append(entry.twin_floor)
     if limits:
         first = sum(limit[0] for limit in limits) / len(limits)
         last = sum(limit[-1] for limit in limits) / len(limits)

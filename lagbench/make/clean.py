@@ -118,7 +118,10 @@ def _remove_empty_folders(folder: Path, home: Path) -> None:
     """Remove folders that hold nothing any more, up to the root folder; links stay."""
     # another process may have been faster
     with suppress(OSError):
-        children = [child for child in folder.iterdir() if child.is_dir()]
+        children = []
+        for child in folder.iterdir():
+            if child.is_dir():
+                children.append(child)
         for place in (*children, folder, *folder.parents):
             if home in place.parents and not place.is_symlink():
                 # a folder that holds something stays

@@ -358,10 +358,10 @@ def _scan_folder(
     force: bool,
     gathered: Collection[int] | None = None,
 ) -> _Scan:
-    """Inspect the files of a folder.
+    """Find the files that are right, and which wanted ids must be simulated.
 
-    With ``gathered``, the ids that would be there, nothing is written and the hashes of
-    the manifest are trusted.
+    Nothing is written. ``gathered`` is given in a dry run: the ids that gathering would
+    bring. They count as right, and hashes of the manifest are trusted.
     """
     size = setup.size
     old = read_or_empty(size, setup.root)
@@ -385,12 +385,15 @@ def _scan_folder(
     results = setup.read_files(run_inspection, inspections, paths)
 
     hashed = []
-    bad_ids = set(suspects)
+    bad_ids = set(suspects)  # until an inspection proves a file right
     for result in results:
         if result.entry:
             hashed.append(result.entry)
             bad_ids.discard(result.scenario)
-    old_entries = [entry for entry in old.files if entry.scenario not in bad_ids]
+    old_entries = []
+    for entry in old.files:
+        if entry.scenario not in bad_ids:
+            old_entries.append(entry)
     base = old.model_copy(update={"files": tuple(old_entries)})
 
     kept_ids = []
@@ -418,7 +421,9 @@ def _suspects(
     """Return the ids to inspect: those chosen, and those whose file came, went, or has
     another length than the manifest says; what the store holds is right.
     """
-    stated_lengths = {entry.scenario: entry.bytes for entry in old.files}
+    stated_lengths = {}
+    for entry in old.files:
+        stated_lengths[entry.scenario] = entry.bytes
     suspects = []
     for scenario in setup.size.scenarios:
         if scenario in stored:
@@ -581,7 +586,9 @@ def _complete_statistics(setup: _Setup, keeper: _ManifestKeeper) -> None:
         train_ids = setup.size.subsets["train"]
         keeper.fetch(train_ids)
         setup.meter.begin("statistics", total=len(train_ids), scenarios=len(train_ids))
-        paths = {f"scenario {i}": setup.path(i) for i in train_ids}
+        paths = {}
+        for i in train_ids:
+            paths[f"scenario {i}"] = setup.path(i)
         moments = setup.read_files(file_moments, paths, paths.values())
         manifest = manifest.model_copy(update={"statistics": statistics(moments)})
     keeper.keep(manifest)

@@ -372,7 +372,10 @@ def _check_header(
 
     if expected != stated:
         names = expected.keys() | stated.keys()
-        different = [n for n in sorted(names) if expected.get(n) != stated.get(n)]
+        different = []
+        for name in sorted(names):
+            if expected.get(name) != stated.get(name):
+                different.append(name)
         raise DataError(
             "a file was simulated with other parameters",
             where=f"{path}, attributes {', '.join(different)}",

@@ -72,9 +72,14 @@ def select(
         return tuple(sorted(selectable))
 
     ids = _scenario_ids(scenarios)
-    unknown = [scenario for scenario in ids if scenario not in selectable]
+    unknown = []
+    for scenario in ids:
+        if scenario not in selectable:
+            unknown.append(scenario)
     if unknown or not ids:
-        choices = [f"{name} {format_ids(size.subsets[name])}" for name in names]
+        choices = []
+        for name in names:
+            choices.append(f"{name} {format_ids(size.subsets[name])}")
         missing = format_ids(unknown) or "at all"
         raise UsageError(
             f"no scenario {missing} in {', '.join(names)}",

@@ -178,7 +178,10 @@ def verify(
     subset_digests = _subset_digests(tier, hashes)
     data_set_digest = _data_set_digest(tier, subset_digests)
     reports = _subset_reports(folder, tier, inspections, subset_digests)
-    tolerated = [i for i, inspection in inspections.items() if inspection.tolerated]
+    tolerated = []
+    for i, inspection in inspections.items():
+        if inspection.tolerated:
+            tolerated.append(i)
     verdict = hash_verdict(tier, data_set_digest, tolerated=bool(tolerated))
 
     problems = [*_file_problems(inspections), *_regeneration_problems(regenerated)]
@@ -353,7 +356,10 @@ def _subset_reports(
     extra = extra_files(root, size)
     reports = []
     for name, members in size.subsets.items():
-        subset_inspections = [inspections[i] for i in members if i in inspections]
+        subset_inspections = []
+        for i in members:
+            if i in inspections:
+                subset_inspections.append(inspections[i])
         if not subset_inspections:
             continue
         is_tolerated = any(inspection.tolerated for inspection in subset_inspections)
@@ -373,7 +379,11 @@ def _subset_reports(
 def _ids_in_state(
     inspections: Sequence[ScenarioInspection], state: DataSetState
 ) -> tuple[int, ...]:
-    return tuple(i.scenario for i in inspections if i.state is state)
+    scenarios = []
+    for inspection in inspections:
+        if inspection.state is state:
+            scenarios.append(inspection.scenario)
+    return tuple(scenarios)
 
 
 def _file_problems(inspections: Inspections) -> list[str]:

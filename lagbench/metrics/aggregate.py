@@ -118,7 +118,11 @@ class Tally:
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields; another process forms the cached rows again."""
-        return {name: value for name, value in self.__dict__.items() if name != "_rows"}
+        state = {}
+        for name, value in self.__dict__.items():
+            if name != "_rows":
+                state[name] = value
+        return state
 
     def series(self, name: str) -> Floats:
         """Return a statistic per frame, NaN without a value, [frame], read-only."""
@@ -168,8 +172,13 @@ def tally(
     pairs: Iterable[FramePair], metrics: Sequence[Metric], frames: Sequence[int]
 ) -> Tally:
     """Measure consecutive frame pairs, one in memory at a time."""
-    names = [metric.name for metric in metrics if metric.statistic is not None]
-    values = {pair.frame: measure(pair, metrics) for pair in pairs}
+    names = []
+    for metric in metrics:
+        if metric.statistic is not None:
+            names.append(metric.name)
+    values = {}
+    for pair in pairs:
+        values[pair.frame] = measure(pair, metrics)
     return Tally.of(names, frames, values)
 
 
@@ -228,10 +237,10 @@ class Resampling:
     def freedom(self) -> float:
         """Degrees of freedom behind the error, after Satterthwaite."""
         variances = self._variances
-        squares = math.fsum(
-            variance**2 / (len(part) - 1)
-            for variance, part in zip(variances, self.parts.values(), strict=True)
-        )
+        terms = []
+        for variance, part in zip(variances, self.parts.values(), strict=True):
+            terms.append(variance**2 / (len(part) - 1))
+        squares = math.fsum(terms)
         if squares:
             return math.fsum(variances) ** 2 / squares
         return math.inf
@@ -307,7 +316,9 @@ def resample(values: ArrayLike, minus: ArrayLike | None = None) -> Resampling | 
         methods.append(np.atleast_2d(np.asarray(minus, np.float64)))
     _check_losses(methods)
 
-    has_value = [~np.isnan(method).all(axis=0) for method in methods]
+    has_value = []
+    for method in methods:
+        has_value.append(~np.isnan(method).all(axis=0))
     defined = np.all(has_value, axis=0)  # shape [scenario]
     if np.count_nonzero(defined) < 2:
         return None

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.grid import Grid, Placement, fields
 
 from .metric import MINIMUM_NODES
@@ -42,7 +43,11 @@ def covered_nodes(cloud: Cloud, grid: Grid) -> int:
 
 
 def fitting_cells(
-    clouds: Callable[[], Iterable[Cloud]], placement: Placement, *, near: int
+    clouds: Callable[[], Iterable[Cloud]],
+    placement: Placement,
+    *,
+    near: int,
+    box: Box = UNIT_SQUARE,
 ) -> int | None:
     """Return the number of cells nearest to ``near`` at which each cloud fits.
 
@@ -54,7 +59,9 @@ def fitting_cells(
         {near, *CELLS}, key=lambda cells: (abs(cells - near), cells)
     )
     for cells in candidates:
-        grid = Grid(cells, placement)
+        if not box.has_whole_cells(cells):
+            continue
+        grid = Grid(cells, placement, box)
         if all(covered_nodes(cloud, grid) >= MINIMUM_NODES for cloud in clouds()):
             return cells
     return None

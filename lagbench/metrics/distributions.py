@@ -189,14 +189,15 @@ def energy_spectrum(velocity: Floats, periodic: Sequence[bool] | None = None) ->
     return energy[1 : min(limits)]
 
 
-def _transform_by_cosines(field: Floats, axis: int) -> Floats:
+def _transform_by_cosines(field: NDArray[Any], axis: int) -> NDArray[Any]:
     """Return the modes of a field along an axis of nodes, of the field's shape."""
     cosines = _cosines(field.shape[axis])
     nodes = "xyz"[: field.ndim - 1]
     modes = nodes.replace(nodes[axis], "k")
     # einsum, not BLAS: the bits must not depend on the number of threads
     subscripts = f"k{nodes[axis]},{nodes}c->{modes}c"
-    return np.asarray(np.einsum(subscripts, cosines, field))
+    modes_of_field: NDArray[Any] = np.einsum(subscripts, cosines, field)
+    return modes_of_field
 
 
 def _at_slow_frames_of_full_box(pair: FramePair) -> bool:

@@ -132,7 +132,10 @@ def holm(p_values: Sequence[float]) -> list[float]:
     >>> holm([0.01, 0.04, 0.03])
     [0.03, 0.06, 0.06]
     """
-    claimed = [i for i, p in enumerate(p_values) if not math.isnan(p)]
+    claimed = []
+    for i, p_value in enumerate(p_values):
+        if not math.isnan(p_value):
+            claimed.append(i)
     claimed.sort(key=lambda i: (p_values[i], i))
 
     corrected = [math.nan] * len(p_values)

@@ -106,9 +106,10 @@ def available() -> dict[str, Metric]:
                     fix="rename one, or uninstall its package",
                 )
 
-    statistics = {
-        name for name, metric in metrics.items() if metric.statistic is not None
-    }
+    statistics = set()
+    for name, metric in metrics.items():
+        if metric.statistic is not None:
+            statistics.add(name)
     for metric in metrics.values():
         missing = sorted(set(metric.of) - statistics)
         if missing:
@@ -178,15 +179,18 @@ def select(
     """
     table = available() if known is None else known
     if names is None:
-        names = [
-            metric.name
-            for metric in table.values()
-            if metric.extra is None or metric.extra in extras
-        ]
+        names = []
+        for metric in table.values():
+            if metric.extra is None or metric.extra in extras:
+                names.append(metric.name)
 
     needed: set[str] = set()
     for name in names:
         if name not in table:
             raise UsageError(f"no metric {name!r}", fix=suggest_name(name, table))
         needed.update((name, *table[name].of))
-    return tuple(metric for name, metric in table.items() if name in needed)
+    chosen_metrics = []
+    for name, metric in table.items():
+        if name in needed:
+            chosen_metrics.append(metric)
+    return tuple(chosen_metrics)

@@ -267,9 +267,9 @@ def choose(size: Size, root: Path) -> Choice:
             starts[scenario] = given_in(file, size, root)
     means = {}
     for choice in CHOICES:
-        errors = [
-            cloud_error(given, choice, scenario) for scenario, given in starts.items()
-        ]
+        errors = []
+        for scenario, given in starts.items():
+            errors.append(cloud_error(given, choice, scenario))
         means[choice] = float(np.mean(errors))
     return min(CHOICES, key=lambda choice: means[choice])
 

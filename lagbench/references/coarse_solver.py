@@ -208,8 +208,8 @@ def _describe(name: str, times: int, share: str) -> ReferencePredictor:
         title=f"Coarse solver, {share} of the cells",
         kind=Kind.CLASSICAL,
         definition=f"The solver itself on a grid with {share} of the cells along each"
-        " axis, with its time step: it knows the equations, the materials and what"
-        " drives the flow.",
+        " axis, with the longer time step of that grid: it knows the equations, the"
+        " materials and what drives the flow.",
         applies=has_grid,
         predict=predict_scenario,
     )

@@ -146,10 +146,9 @@ class StaggeredGrid:
                 axis] [length/s]; rows of periodic axes are not read.
             force: acceleration f of the whole fluid [length/s^2], shape [axis].
         """
-        padded = [
-            self._with_ghosts(values, component, wall_velocity)
-            for component, values in enumerate(velocity)
-        ]
+        padded = []
+        for component, values in enumerate(velocity):
+            padded.append(self._with_ghosts(values, component, wall_velocity))
         result = []
         for component, ghosted in enumerate(padded):
             rate = viscosity * self._laplacian(ghosted)

@@ -49,6 +49,8 @@ def references_of(size: Size) -> tuple[ReferencePredictor, ...]:
 
     A split of the user's own has those of its kind of box.
     """
-    return tuple(
-        predictor for predictor in REFERENCES.values() if predictor.applies(size)
-    )
+    predictors = []
+    for predictor in REFERENCES.values():
+        if predictor.applies(size):
+            predictors.append(predictor)
+    return tuple(predictors)

@@ -204,25 +204,28 @@ def _build_library(
     size: Size, root: Path, kinds: tuple[int, ...]
 ) -> StateLibrary | None:
     scenarios = []
-    numbers = []
+    mirror_numbers = []
     frames = []
     features = []
     for scenario in long_enough(size):
         motion = read_train_scenario(size.path(root, scenario))
         if tuple(np.unique(motion.material).tolist()) != kinds:
             continue
-        last = int(LAST_STATE * len(motion.position))
+        end = int(LAST_STATE * len(motion.position))  # LAST_STATE is a share
         for number, mirror in enumerate(mirrors_of(size)):
             image = mirror.positions(motion.position.astype(np.float64))
-            for frame in range(1, last, STATE_STRIDE):
+            for frame in range(1, end, STATE_STRIDE):
                 velocity = size.box.displacement(image[frame - 1], image[frame])
                 state = describe_state(image[frame], velocity, motion.material)
                 scenarios.append(scenario)
-                numbers.append(number)
+                mirror_numbers.append(number)
                 frames.append(frame)
                 features.append(state)
     if not features:
         return None
     return StateLibrary(
-        np.array(scenarios), np.array(numbers), np.array(frames), np.array(features)
+        np.array(scenarios),
+        np.array(mirror_numbers),
+        np.array(frames),
+        np.array(features),
     )

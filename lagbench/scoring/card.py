@@ -136,7 +136,10 @@ class ScoreCard:
                 content[name] = label
 
         diverged_at = sorted(self.header.diverged_at.items())
-        content["diverged_at"] = {str(i): frame for i, frame in diverged_at}
+        diverged = {}
+        for i, frame in diverged_at:
+            diverged[str(i)] = frame
+        content["diverged_at"] = diverged
         content["task"] = {
             "input_frames": self.config.input_frames,
             "horizon": self.config.horizon,
@@ -146,21 +149,33 @@ class ScoreCard:
         content["ranking_metric"] = self.ranking
         content["skill"] = _skill_as_json(self.skill)
         content["against_classical"] = _classical_as_json(self.against_classical)
-        content["metrics"] = {
-            score.metric.name: _metric_as_json(score.metric)
-            for score in self.submission.values()
-        }
-        content["rows"] = {row: self._row_as_json(row) for row in self.scores}
-        content["against"] = {
-            row: _comparison_as_json(self.against(row))
-            for row in self.scores
-            if row != SUBMISSION
-        }
-        content["flags"] = {flag.name: _flag_as_json(flag) for flag in self.flags}
-        content["warnings"] = [
-            {"check": warning.check, "what": warning.what, "got": warning.got}
-            for warning in self.warnings
-        ]
+
+        metrics = {}
+        for score in self.submission.values():
+            metrics[score.metric.name] = _metric_as_json(score.metric)
+        content["metrics"] = metrics
+
+        rows = {}
+        for row in self.scores:
+            rows[row] = self._row_as_json(row)
+        content["rows"] = rows
+
+        comparisons = {}
+        for row in self.scores:
+            if row != SUBMISSION:
+                comparisons[row] = _comparison_as_json(self.against(row))
+        content["against"] = comparisons
+
+        flags = {}
+        for flag in self.flags:
+            flags[flag.name] = _flag_as_json(flag)
+        content["flags"] = flags
+        warnings = []
+        for warning in self.warnings:
+            warnings.append(
+                {"check": warning.check, "what": warning.what, "got": warning.got}
+            )
+        content["warnings"] = warnings
         return content
 
     def _row_as_json(self, row: str) -> dict[str, Any]:
@@ -169,10 +184,10 @@ class ScoreCard:
         for name, score in self.scores[row].items():
             scores[name] = _score_as_json(score)
             if score.metric.per_frame:
-                scores[name]["at"] = {
-                    str(frame): _frame_as_json(score, frame, row)
-                    for frame in self.reported_frames
-                }
+                at = {}
+                for frame in self.reported_frames:
+                    at[str(frame)] = _frame_as_json(score, frame, row)
+                scores[name]["at"] = at
         return scores
 
 
@@ -267,10 +282,13 @@ def _comparison_as_json(comparison: Comparison) -> dict[str, Any]:
 
 
 def _flag_as_json(flag: Flag) -> dict[str, Any]:
+    evidence = {}
+    for name, value in flag.evidence.items():
+        evidence[name] = digits(value)
     return {
         "raised": flag.raised,
         "reasons": list(flag.reasons),
-        "evidence": {name: digits(value) for name, value in flag.evidence.items()},
+        "evidence": evidence,
     }
 
 

@@ -247,9 +247,9 @@ def compare(
     for name in judging:
         if name in chosen and name != one.ranking:
             order.append(name)
-    comparisons = {
-        name: _compare_metric(one.scores[name], two.scores[name]) for name in order
-    }
+    comparisons = {}
+    for name in order:
+        comparisons[name] = _compare_metric(one.scores[name], two.scores[name])
 
     first_name, second_name = _names(one, two, is_reference=is_reference)
     has_one_name = one.identity["method"] == two.identity["method"]
@@ -439,7 +439,11 @@ def _numbered_files(path: Path) -> list[Path]:
         return []
     numbered = re.compile(rf"{re.escape(path.stem)}_[0-9]+")
     files = sorted(path.parent.glob("*.nc"))
-    return [file for file in files if numbered.fullmatch(file.stem)]
+    numbered_files = []
+    for file in files:
+        if numbered.fullmatch(file.stem):
+            numbered_files.append(file)
+    return numbered_files
 
 
 def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
@@ -537,7 +541,11 @@ def _judging_metrics(one: Contestant, two: Contestant) -> list[str]:
         raise _incomplete(one.name, expected, None)
     if one.ranking not in two.scores:
         raise _incomplete(two.name, expected, None)
-    return [name for name in judging if name in two.scores]
+    common = []
+    for name in judging:
+        if name in two.scores:
+            common.append(name)
+    return common
 
 
 def _incomplete(where: str, expected: str, got: str | None) -> UnreadableFileError:

@@ -85,12 +85,15 @@ class Tracer:
         self._true = deque(last_inputs, maxlen=longest)
         self._predicted: deque[Floats] = deque(maxlen=longest)
         self._error: Floats | None = None
+        shifted = {}
+        for shift in SHIFTS:
+            shifted[shift] = np.full(frame_count, np.nan)
         self._trace = Trace(
             error=np.full(frame_count, np.nan),
             overlap=np.full(frame_count, np.nan),
             motion=np.full(frame_count, np.nan),
             predicted_motion=np.full(frame_count, np.nan),
-            shifted={shift: np.full(frame_count, np.nan) for shift in SHIFTS},
+            shifted=shifted,
             occupancy=np.full(frame_count, np.nan),
             outside=np.full(frame_count, np.nan),
         )
@@ -210,7 +213,9 @@ def judge_copying(traces: Sequence[Trace]) -> Flag:
     One such scenario is enough. A constant offset beyond a frame's motion, or a share
     of the truth mixed into a rollout, is not seen.
     """
-    scenarios = [analyse_error(trace) for trace in traces]
+    scenarios = []
+    for trace in traces:
+        scenarios.append(analyse_error(trace))
     exact = sum(scenario.exact for scenario in scenarios)
     best = min(scenarios, key=lambda scenario: scenario.shift_gain)
     is_independent = any(s.autocorrelation < AUTOCORRELATION for s in scenarios)

@@ -1,14 +1,15 @@
 """Measure the reference predictors of data sets and write the scores that are shipped.
 
 usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
-           [--root FOLDER] [--workers 2] [--floor analog ...] [--solver]
+           [--root FOLDER] [--workers 2] [--predictor analog ...] [--costs]
 
-All splits and sizes whose data are there are measured, or those named. With --floor
+All splits and sizes whose data are there are measured, or those named. With --predictor
 only these references are measured anew, from the start; the others, and all costs, stay
 as they are. Without it each measured scenario is saved under the root folder: an
-interrupted run continues where it stopped. Last the solver itself is timed (``lagbench
-bench solver``); with --solver nothing else is done. Shipped scores are checked by
-``lagbench leaderboard check --root FOLDER``.
+interrupted run continues where it stopped. Last a frame of each reference and of the
+solver itself (``lagbench bench solver``) is timed on one core; with --costs nothing
+else is done. Shipped scores are checked by ``lagbench leaderboard check --root
+FOLDER``.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedErro
 from lagbench.references.shipped import (
     FOLDER,
     shipped_path,
+    write_costs,
     write_shipped,
-    write_solver_seconds,
 )
 from lagbench.references.table import REFERENCES, references_of
 
-from .references import measure, measured_sizes, saved_folder
+from .references import measure, measured_sizes, saved_folder, time_references
 from .task import load_scored_task
 
 
@@ -60,8 +61,8 @@ def measure_and_ship(
     """
     where = f"{size.split} {size.name}"
     if names is not None:
-        known = {reference.name for reference in references_of(size)}
-        if known.isdisjoint(names):
+        names_here = {reference.name for reference in references_of(size)}
+        if names_here.isdisjoint(names):
             raise UsageError(
                 "the data set has no such reference", where=where, got=names
             )
@@ -85,8 +86,8 @@ def measure_and_ship(
     return path
 
 
-def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
-    """Time the solver in a process of its own and write the cost of a frame.
+def time_all(size: Size, root: Path, *, folder: Path = FOLDER) -> Path:
+    """Time a frame of each reference and of the solver; write what they cost.
 
     Raises:
         WorkFailedError: the solver fails.
@@ -98,8 +99,9 @@ def time_solver(size: Size, *, folder: Path = FOLDER) -> Path:
         raise WorkFailedError(
             "the solver could not be timed", got=process.stderr.strip()[-300:]
         )
-    seconds = json.loads(process.stdout)["seconds_per_frame"]
-    return write_solver_seconds(size, seconds, folder)
+    solver = json.loads(process.stdout)["seconds_per_frame"]
+    seconds = time_references(size, root)
+    return write_costs(size, seconds, solver=solver, folder=folder)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -112,19 +114,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     part = parser.add_mutually_exclusive_group()
-    part.add_argument("--floor", nargs="+", choices=sorted(REFERENCES))
-    part.add_argument("--solver", action="store_true")
+    part.add_argument("--predictor", nargs="+", choices=sorted(REFERENCES))
+    part.add_argument("--costs", action="store_true")
     options = parser.parse_args(arguments)
 
     root = resolve_root(options.root)
     try:
         for size in measured_sizes(root, split=options.split, name=options.size):
-            if not options.solver:
+            if not options.costs:
                 measure_and_ship(
-                    size, root, workers=options.workers, names=options.floor
+                    size, root, workers=options.workers, names=options.predictor
                 )
-            if not options.floor:
-                time_solver(size)
+            if not options.predictor:
+                time_all(size, root)
             path = shipped_path(size)
             length = path.stat().st_size
             sys.stdout.write(f"{size.split} {size.name}: {path.name}, {length} bytes\n")

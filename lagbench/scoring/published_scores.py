@@ -116,13 +116,18 @@ def parse_scores(content: Mapping[str, Any]) -> PublishedScores:
     metrics = available()
     rows = {}
     for row, scores in checked.rows.items():
-        rows[row] = {
-            name: _make_score(metrics[name], checked.task.scenarios, score)
-            for name, score in scores.items()
-            if name in metrics
-        }
+        row_scores = {}
+        for name, score in scores.items():
+            if name in metrics:
+                row_scores[name] = _make_score(
+                    metrics[name], checked.task.scenarios, score
+                )
+        rows[row] = row_scores
+    identity = {}
+    for name in IDENTITY:
+        identity[name] = getattr(checked, name)
     return PublishedScores(
-        identity={name: getattr(checked, name) for name in IDENTITY},
+        identity=identity,
         predictions_sha256=checked.predictions_sha256,
         ranking=checked.ranking_metric,
         scores=rows,
@@ -136,7 +141,9 @@ def _make_score(metric: Metric, ids: list[int], content: _ScoreContent) -> Score
             raise ValueError(
                 f"{metric.name}: {len(numbers)} values of {len(ids)} scenarios"
             )
-    values = [math.nan if value is None else value for value in content.values]
+    values = []
+    for value in content.values:
+        values.append(math.nan if value is None else value)
     return Score(
         metric=metric,
         scenarios=tuple(ids),

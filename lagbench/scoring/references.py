@@ -31,6 +31,9 @@ from lagbench.work.run import run_all
 from .scenario import measure_rows, predict_reference
 from .task import ScoredTask, load_scored_task
 
+TIMED_SCENARIOS = 2
+"""Test scenarios on which the references are timed."""
+
 TOLERANCE = 1e-4
 """Relative difference of equal values: libraries round differently."""
 
@@ -49,7 +52,11 @@ def _with_data(size: Size, root: Path) -> list[ReferencePredictor]:
     references = references_of(size)
     if _has_files(size, root, "train"):
         return list(references)
-    return [reference for reference in references if not reference.reads_train]
+    usable_references = []
+    for reference in references:
+        if not reference.reads_train:
+            usable_references.append(reference)
+    return usable_references
 
 
 def _has_files(size: Size, root: Path, subset: str) -> bool:
@@ -81,10 +88,15 @@ def measured_sizes(
     sizes = []
     for one_split in splits:
         names = [name] if name else list(registry.split(one_split).sizes)
-        sizes += [registry.size(one_split, one_name) for one_name in names]
+        for one_name in names:
+            sizes.append(registry.size(one_split, one_name))
     if split and name:
         return sizes
-    return [size for size in sizes if _has_files(size, root, "test")]
+    sizes_with_data = []
+    for size in sizes:
+        if _has_files(size, root, "test"):
+            sizes_with_data.append(size)
+    return sizes_with_data
 
 
 def remeasure(
@@ -97,7 +109,10 @@ def remeasure(
     """
     names = tuple(reference.name for reference in _with_data(size, root))
     expected = shipped(size) or {}
-    comparable = {name: expected[name] for name in expected if name in names}
+    comparable = {}
+    for name in expected:
+        if name in names:
+            comparable[name] = expected[name]
     measured = measure(size, root, names=names, progress=progress)
     return names, differences(comparable, measured)
 
@@ -145,11 +160,30 @@ def measure_scenario(job: ReferenceJob, report: Report) -> ReferenceTallies:
             report=report,
         )
 
-    medians = {name: float(np.median(seconds[name])) for name in seconds}
+    medians = {}
+    for name in seconds:
+        medians[name] = float(np.median(seconds[name]))
     result = ReferenceTallies(job.scenario, tallies, medians)
     if job.saved is not None:
         _save(result, job.saved)
     return result
+
+
+def time_references(size: Size, root: Path) -> dict[str, float]:
+    """Return the processor time of a frame by name of the reference [s].
+
+    The median over the frames of the first test scenarios, one core, no scoring.
+    """
+    task = load_scored_task(size, root)
+    seconds: dict[str, list[float]] = {}
+    for scenario in task.scenarios[:TIMED_SCENARIOS]:
+        with task.opened(scenario) as truth:
+            given = given_in(truth.file, size, root)
+        for reference in references_of(size):
+            times = seconds.setdefault(reference.name, [])
+            for _ in _time_frames(predict_reference(reference, given), times):
+                pass
+    return {name: float(np.median(times)) for name, times in seconds.items()}
 
 
 def _time_frames(
@@ -231,11 +265,11 @@ def measure(
     """
     task = load_scored_task(size, root)
     metrics = select()
-    references = tuple(
-        reference.name
-        for reference in references_of(size)
-        if names is None or reference.name in names
-    )
+    names_to_measure = []
+    for reference in references_of(size):
+        if names is None or reference.name in names:
+            names_to_measure.append(reference.name)
+    references = tuple(names_to_measure)
     folder = saved_folder(size, root)
     jobs = {}
     for scenario in task.scenarios:
@@ -260,10 +294,13 @@ def measure(
 
     measured = {}
     for name in references:
-        scores = aggregate(
-            metrics, {result.scenario: result.tallies[name] for result in results}
-        )
-        seconds = [result.seconds_per_frame[name] for result in results]
+        tallies = {}
+        for result in results:
+            tallies[result.scenario] = result.tallies[name]
+        scores = aggregate(metrics, tallies)
+        seconds = []
+        for result in results:
+            seconds.append(result.seconds_per_frame[name])
         measured[name] = ReferenceScores(
             name=name,
             scores=scores,

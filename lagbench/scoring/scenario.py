@@ -213,7 +213,9 @@ def measure_rows(
     frames = scenario.config.predicted_frames
     tracer = Tracer(scenario)
     first = next(iter(rows))
-    measured: dict[str, dict[int, dict[str, float]]] = {name: {} for name in rows}
+    measured: dict[str, dict[int, dict[str, float]]] = {}
+    for name in rows:
+        measured[name] = {}
 
     for frame, true, *predicted in zip(frames, truth, *rows.values(), strict=True):
         for name, snapshot in zip(rows, predicted, strict=True):
@@ -225,7 +227,10 @@ def measure_rows(
                     recorder.add(pair)
         report(1)
 
-    names = [metric.name for metric in metrics if metric.statistic is not None]
+    names = []
+    for metric in metrics:
+        if metric.statistic is not None:
+            names.append(metric.name)
     tallies = {}
     for name, values in measured.items():
         tallies[name] = round_statistics(Tally.of(names, frames, values))

@@ -145,7 +145,10 @@ def score(
     # aggregation
     tallies = {}
     for row in outcomes[0].tallies:
-        tallies[row] = {outcome.scenario: outcome.tallies[row] for outcome in outcomes}
+        tallies_of_row = {}
+        for outcome in outcomes:
+            tallies_of_row[outcome.scenario] = outcome.tallies[row]
+        tallies[row] = tallies_of_row
     scores: dict[str, Mapping[str, Score]] = {}
     for row, row_tallies in tallies.items():
         scores[row] = aggregate(metrics, row_tallies)
@@ -153,11 +156,10 @@ def score(
         scores[name] = reference.scores
 
     ranking = ranking_metric(size)
-    counting = {
-        row: row_scores[ranking]
-        for row, row_scores in scores.items()
-        if row in NAIVE and ranking in row_scores
-    }
+    counting = {}
+    for row, row_scores in scores.items():
+        if row in NAIVE and ranking in row_scores:
+            counting[row] = row_scores[ranking]
     card = ScoreCard(
         header=header,
         predictions_sha256=sha256,
@@ -247,7 +249,10 @@ def _warn_of_few_nodes(
 
     Where it ranks, of any such scenario; else only if all scenarios are such.
     """
-    without = [i for i, tally in tallies.items() if not _has_nodes(tally)]
+    without = []
+    for i, tally in tallies.items():
+        if not _has_nodes(tally):
+            without.append(i)
     if not without:
         return
     if ranking_metric(task.size) == OF_NODES or len(without) == len(tallies):

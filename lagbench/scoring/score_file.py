@@ -77,7 +77,9 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
 
 
 def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
-    tallies = [card.tallies[SUBMISSION][i] for i in card.scenarios]
+    tallies = []
+    for i in card.scenarios:
+        tallies.append(card.tallies[SUBMISSION][i])
     names = tallies[0].names
     frames = tallies[0].frames
 

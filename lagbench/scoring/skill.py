@@ -66,8 +66,13 @@ class AgainstClassical:
 
 def best_reference(references: Mapping[str, Score]) -> str | None:
     """Return the name of the reference with the least mean, None if none is above 0."""
-    means = {name: score.mean for name, score in references.items()}
-    positive = [name for name, mean in means.items() if mean > 0.0]
+    means = {}
+    for name, score in references.items():
+        means[name] = score.mean
+    positive = []
+    for name, mean in means.items():
+        if mean > 0.0:
+            positive.append(name)
     if positive:
         return min(positive, key=lambda name: means[name])
     return None

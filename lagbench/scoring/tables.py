@@ -53,13 +53,25 @@ def card_tables(
     """
     if every:
         names = list(card.submission)
-        frame_names = [n for n in names if card.submission[n].metric.per_frame]
+        frame_names = []
+        for name in names:
+            if card.submission[name].metric.per_frame:
+                frame_names.append(name)
     else:
         chosen = dict.fromkeys((card.ranking, *CHOSEN))
-        names = [name for name in chosen if name in card.submission]
-        frame_names = [name for name in SHOWN_AT_FRAMES if name in card.submission]
+        names = []
+        for name in chosen:
+            if name in card.submission:
+                names.append(name)
+        frame_names = []
+        for name in SHOWN_AT_FRAMES:
+            if name in card.submission:
+                frame_names.append(name)
 
-    references = [row for row in card.scores if row != SUBMISSION]
+    references = []
+    for row in card.scores:
+        if row != SUBMISSION:
+            references.append(row)
     if not floors and card.skill:
         references = [card.skill.reference]
     elif not floors:
@@ -79,7 +91,9 @@ def _over_horizon(
     if card.skill is not None:
         skill_cell = _with_interval(card.skill.value, card.skill.interval)
         best = card.skill.reference
-    zeros = ["0" if row == best else "" for row in references]
+    zeros = []
+    for row in references:
+        zeros.append("0" if row == best else "")
     rows = [("skill ↑", skill_cell, *zeros)]
     if card.against_classical is not None:
         against = card.against_classical
@@ -91,7 +105,9 @@ def _over_horizon(
         cell = _with_interval(score.mean, score.interval)
         if any(score.undefined):
             cell += " †"
-        means = [_mean_cell(card, row, name) for row in references]
+        means = []
+        for row in references:
+            means.append(_mean_cell(card, row, name))
         rows.append((_label(score.metric), cell, *means))
 
     header = card.header
@@ -113,14 +129,19 @@ def _at_frames(card: ScoreCard, names: Collection[str]) -> Table:
     rows: list[tuple[str, ...]] = []
     for name in names:
         score = card.submission[name]
-        rows.append((name, *[_number(mean(score.at(frame))) for frame in frames]))
+        cells = []
+        for frame in frames:
+            cells.append(_number(mean(score.at(frame))))
+        rows.append((name, *cells))
     title = f"{card.header.method} at frames, mean over scenarios"
     return Table(title, ("metric", *map(str, frames)), tuple(rows))
 
 
 def _per_scenario(card: ScoreCard, shown: Sequence[str]) -> Table:
     """Return the table of the ranking metric by scenario."""
-    columns = [card.scores[row][card.ranking].values.tolist() for row in shown]
+    columns = []
+    for row in shown:
+        columns.append(card.scores[row][card.ranking].values.tolist())
     rows: list[tuple[str, ...]] = []
     for i, *values in zip(card.scenarios, *columns, strict=True):
         rows.append((str(i), *map(_number, values)))

@@ -140,7 +140,10 @@ def scenario_files(size: Size, root: Path, subsets: Sequence[str]) -> dict[int, 
             paths[scenario] = size.path(root, scenario)
     update_working_copy(size, root, paths)
 
-    missing = [scenario for scenario, path in paths.items() if not path.is_file()]
+    missing = []
+    for scenario, path in paths.items():
+        if not path.is_file():
+            missing.append(scenario)
     if missing:
         incomplete_subsets = []
         for subset in subsets:

@@ -164,10 +164,9 @@ def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:
             frame_bytes = value_bytes * file.sizes["particle"] * file.sizes["space"]
             frames_per_chunk = max(1, CHUNK_BYTES // frame_bytes)
             scenario = file.chunk(frame=frames_per_chunk, particle=-1, space=-1)
-            attributes = {
-                name: scenario.attrs[name]
-                for name in ("split", "size", "scenario", "version")
-            }
+            attributes = {}
+            for name in ("split", "size", "scenario", "version"):
+                attributes[name] = scenario.attrs[name]
         except Exception as error:  # HDF5 on damaged bytes raises nearly any type
             reason = f"{type(error).__name__}: {error}"
             raise damage_error(path, reason, fix=fix) from error

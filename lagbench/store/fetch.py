@@ -84,11 +84,11 @@ def fetch_scenarios(
     *,
     connections: int = CONNECTIONS,
 ) -> Generator[tuple[int, NotInStoreError | None], None, None]:
-    """Fetch scenarios side by side; yield each when its file has its name.
+    """Fetch scenarios side by side; yield each once its file is checked and renamed.
 
-    Hold the lock of the data set, and close the iterator: that stops the transfers.
-    After a broken connection temporary files stay, to go on from; after wrong data none
-    does.
+    The caller must hold the lock of the data set. Closing the iterator stops the
+    transfers. After a broken connection the temporary files stay, and the next attempt
+    goes on from them; after wrong data no temporary file stays.
 
     Args:
         requests: files to fetch, by scenario id.

@@ -385,7 +385,11 @@ def _file_system(url: str) -> tuple[Any, str]:
             got=scheme,
         )
     # Another endpoint or other credentials are another system, also within one process.
-    settings = sorted(item for item in os.environ.items() if item[0].startswith("AWS_"))
+    settings = []
+    for item in os.environ.items():
+        if item[0].startswith("AWS_"):
+            settings.append(item)
+    settings = sorted(settings)
     key = (scheme, *settings)
     if key not in _systems:
         system, _ = fsspec.core.url_to_fs(

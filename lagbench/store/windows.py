@@ -110,7 +110,10 @@ class FrameStore:
         for first, last in _consecutive_runs(missing):
             values.update(self._read(scenario, first, last))
 
-        frames = [values[frame] for frame in range(start, stop) if frame in values]
+        frames = []
+        for frame in range(start, stop):
+            if frame in values:
+                frames.append(values[frame])
         for frame, positions in sorted(values.items()):
             self._cache(scenario, frame, positions)
         while self.cached_bytes > self.cache_bytes:

@@ -188,7 +188,10 @@ def scan_positions(
 def check_finite(scans: list[ScenarioScan], issues: IssueCollector) -> None:
     """Report values that are NaN, infinite or were never written."""
     issues.complete("finite")
-    bad_scans = [scan for scan in scans if scan.first_bad is not None]
+    bad_scans = []
+    for scan in scans:
+        if scan.first_bad is not None:
+            bad_scans.append(scan)
     if not bad_scans:
         return
     bad_values = sum(scan.bad_values for scan in bad_scans)
@@ -241,7 +244,10 @@ def check_frozen(
 def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) -> None:
     """Flag positions outside the box; refuse those beyond ten boxes."""
     issues.complete("in_domain")
-    outside_scans = [scan for scan in scans if scan.first_outside is not None]
+    outside_scans = []
+    for scan in scans:
+        if scan.first_outside is not None:
+            outside_scans.append(scan)
     if not outside_scans:
         return
     farthest = max(scan.farthest for scan in outside_scans)

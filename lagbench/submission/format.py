@@ -481,7 +481,9 @@ def check_dims(info: FileInfo, issues: IssueCollector) -> bool:
     issues.complete("dims")
     where = "variable 'position'"
     if array.dims != DIMS:
-        names = [quote(name) if name else "one without a name" for name in array.dims]
+        names = []
+        for name in array.dims:
+            names.append(quote(name) if name else "one without a name")
         issues.error(
             "dims",
             "the dimensions are others",
@@ -550,9 +552,9 @@ def check_dtype(info: FileInfo, issues: IssueCollector) -> bool:
             fix="store positions as float32: positions.astype('float32')",
         )
     if info.packing:
-        packing = [
-            f"{name} = {describe_value(value)}" for name, value in info.packing.items()
-        ]
+        packing = []
+        for name, value in info.packing.items():
+            packing.append(f"{name} = {describe_value(value)}")
         issues.error(
             "dtype",
             "the values are packed, and are not unpacked here",

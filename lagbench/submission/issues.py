@@ -259,9 +259,10 @@ class IssueCollector:
 
     def first_failed(self, *checks: str) -> str | None:
         """Return the first of some checks that has an error; None where none has."""
-        failed_checks = {
-            issue.check for issue in self._issues if issue.severity is Severity.ERROR
-        }
+        failed_checks = set()
+        for issue in self._issues:
+            if issue.severity is Severity.ERROR:
+                failed_checks.add(issue.check)
         for check in checks:
             if check in failed_checks:
                 return check

@@ -50,9 +50,9 @@ class Predictions:
         self.header: Header = header_of(info)
         self._position = position
         self._stack = stack
-        self._row = {
-            scenario: row for row, scenario in enumerate(self.header.scenarios)
-        }
+        self._row = {}
+        for row, scenario in enumerate(self.header.scenarios):
+            self._row[scenario] = row
 
     def __enter__(self) -> Self:
         """Return the predictions themselves."""
@@ -138,7 +138,9 @@ class Predictions:
         """
         header = self.header
         scenarios = sorted(header.scenarios)
-        identity: dict[str, Any] = {name: getattr(header, name) for name in REQUIRED}
+        identity: dict[str, Any] = {}
+        for name in REQUIRED:
+            identity[name] = getattr(header, name)
         identity["scenarios"] = scenarios
         identity["frames"] = list(header.frames)
         hasher = ContentHasher(identity)

@@ -122,7 +122,10 @@ def check_scenarios(info: FileInfo, size: Size, issues: IssueCollector) -> None:
     expected = size.subsets["test"]
     missing = sorted(set(expected) - set(stored))
     unknown = sorted(set(stored) - set(expected))
-    duplicate = [scenario for scenario, count in Counter(stored).items() if count > 1]
+    duplicate = []
+    for scenario, count in Counter(stored).items():
+        if count > 1:
+            duplicate.append(scenario)
     for kind, scenarios, fix in (
         ("missing", missing, "predict every test scenario"),
         ("unknown", unknown, "store the ids of the test scenarios, and no others"),

@@ -55,9 +55,10 @@ class Truth:
             DataError: scenarios are missing.
         """
         scenarios = self.size.subsets[self.subset]
-        missing = [
-            scenario for scenario in scenarios if not self.path(scenario).is_file()
-        ]
+        missing = []
+        for scenario in scenarios:
+            if not self.path(scenario).is_file():
+                missing.append(scenario)
         if missing:
             raise DataError(
                 f"{len(missing)} of {len(scenarios)} {self.subset} scenarios are not "

@@ -370,11 +370,15 @@ def _without_truth(result: ValidationResult, error: DataError) -> ValidationResu
     """
     collector = IssueCollector()
     collector.add_exception("dataset", error)
-    issues = [issue for issue in result.findings if issue.check not in TRUTH_CHECKS]
+    issues = []
+    for issue in result.findings:
+        if issue.check not in TRUTH_CHECKS:
+            issues.append(issue)
     issues += collector.result(result.path).findings
-    passed = [
-        check for check in result.passed if check not in ("dataset", *TRUTH_CHECKS)
-    ]
+    passed = []
+    for check in result.passed:
+        if check not in ("dataset", *TRUTH_CHECKS):
+            passed.append(check)
     skipped = dict(result.skipped)
     for check in TRUTH_CHECKS:
         skipped[check] = f"{error.what}: {error.where}"

@@ -497,7 +497,10 @@ def _by_scenario(
 def _require_test_scenarios(
     name: str, values: Mapping[int, object], scenarios: list[int]
 ) -> None:
-    unknown = [scenario for scenario in values if scenario not in scenarios]
+    unknown = []
+    for scenario in values:
+        if scenario not in scenarios:
+            unknown.append(scenario)
     if unknown:
         raise UsageError(
             "no such test scenario",

@@ -74,7 +74,7 @@ class OpenRollouts:
         return np.asarray(frames[0], np.float64)
 
     def snapshot(self, name: str | None, frame: int) -> Snapshot:
-        """Return a frame as metrics see it; that of the truth is formed once."""
+        """Return a frame as metrics see it; None is the truth, made once per frame."""
         if name is None and frame in self._true_snapshots:
             return self._true_snapshots[frame]
         snapshot = self.scenario.snapshot(

@@ -110,8 +110,8 @@ def test_from_a_name_to_scores_in_words(lagbench: Command) -> None:
         "next: lagbench predict runs/curl-noise/tiny/gns-0/weights.pt" in trained.stdout
     )
     assert "hint: tiny is for tests" in trained.stdout
-    assert "it was over before" in lagbench(*train).stdout
-    assert "it was over before" not in trained.stdout
+    assert "was over before" in lagbench(*train).stdout
+    assert "was over before" not in trained.stdout
     predict = (
         "predict",
         "runs/curl-noise/tiny/gns-0/weights.pt",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -26,16 +26,25 @@ from lagbench.baselines.operators.supergat import (
 from lagbench.baselines.operators.transformer import Transformer
 
 Array = NDArray[np.float64]
+Weights = dict[str, Array]
+Neighbours = list[tuple[int, Array]]
+"""Sender and edge of each neighbour of a node."""
+
 LATENT = 6
 HIDDEN = 5
 
 
-def small(seed: int = 0) -> Graph:
+def seeded(seed: int) -> torch.Generator:
+    """Return a seeded source of randomness."""
+    return torch.Generator().manual_seed(seed)
+
+
+def small_graph() -> Graph:
     """Return 9 nodes, one of them alone, and 24 edges."""
-    return graph(9, 24, node=2 * LATENT, edge=LATENT, seed=seed)
+    return graph(9, 24, node=2 * LATENT, edge=LATENT)
 
 
-def built(operator: type[Operator], *, scale: float = 1.0) -> Operator:
+def build_random(operator: type[Operator], *, scale: float = 1.0) -> Operator:
     """Return an operator in float64 whose every weight, biases too, is random."""
     torch.manual_seed(1)
     layer = operator(2 * LATENT, LATENT, HIDDEN).double()
@@ -44,284 +53,297 @@ def built(operator: type[Operator], *, scale: float = 1.0) -> Operator:
     return layer
 
 
-def updated(layer: Operator, inputs: Graph) -> Array:
+def compute_update(layer: Operator, inputs: Graph) -> Array:
     """Return what each node gathers."""
     node, edge_index, edge = inputs
-    return layer(node.double(), edge_index, edge.double())[0].detach().numpy()
+    update, _ = layer(node.double(), edge_index, edge.double())
+    return update.detach().numpy()
 
 
-def weights(layer: Operator) -> dict[str, Array]:
+def read_weights(layer: Operator) -> Weights:
     """Return the layer's weights by name."""
-    return {name: value.detach().numpy() for name, value in layer.named_parameters()}
+    weights = {}
+    for name, value in layer.named_parameters():
+        weights[name] = value.detach().numpy()
+    return weights
 
 
-def softmax(logits: list[float]) -> Array:
+def softmax(logits: Sequence[float]) -> Array:
     """Return exponentials over their sum."""
     powers = np.exp(np.array(logits) - max(logits))
     return powers / powers.sum()
 
 
+def sigmoid(x: Array | float) -> Array:
+    """Return the logistic function."""
+    return 1 / (1 + np.exp(-np.asarray(x)))
+
+
 def leaky(x: Array | float) -> Array:
     """Return LeakyReLU with PyG's slope."""
-    return np.where(np.asarray(x) > 0, x, 0.2 * np.asarray(x))
+    values = np.asarray(x)
+    return np.where(values > 0, values, 0.2 * values)
 
 
-def neighbours(inputs: Graph, receiver: int, *, loop: bool) -> list[tuple[int, Array]]:
-    """Return senders and edges of a node; a loop's edge is the mean of the others, 0
-    without any.
+def neighbours(inputs: Graph, receiver: int, *, loop: bool) -> Neighbours:
+    """Return senders and edges of a node.
+
+    A loop's edge is the mean of the others, and 0 without any.
     """
     senders, receivers = inputs.edge_index.numpy()
     edges = inputs.edge.double().numpy()
-    found = [(int(senders[k]), edges[k]) for k in np.flatnonzero(receivers == receiver)]
-    mean = (
-        np.mean([edge for _, edge in found], axis=0)
-        if found
-        else np.zeros(edges.shape[1])
-    )
-    return [*found, (receiver, mean)] if loop else found
+    near = []
+    for number in np.flatnonzero(receivers == receiver):
+        near.append((int(senders[number]), edges[number]))
+    if loop:
+        mean = np.zeros(edges.shape[1])
+        if near:
+            mean = np.mean([edge for _, edge in near], axis=0)
+        near.append((receiver, mean))
+    return near
 
 
-def gat(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
+def weighted_sum(attention: Array, value: Array, near: Neighbours) -> Array:
+    """Return the sum of the neighbours' values times their attention."""
+    total = np.zeros(value.shape[1])
+    for share, (sender, _) in zip(attention, near, strict=True):
+        total += share * value[sender]
+    return total
+
+
+def gat(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Velickovic et al. (2018), Eqs. 3 and 4, with the edge as a third part."""
     z = x @ w["conv.lin.weight"].T
-    source, target, edge = (
-        w[f"conv.att_{name}"].ravel() for name in ("src", "dst", "edge")
-    )
-    of_edge = w["conv.lin_edge.weight"]
-    a = softmax(
-        [
-            float(leaky(z[j] @ source + z[i] @ target + (of_edge @ e) @ edge))
-            for j, e in near
-        ]
-    )
-    return (
-        np.sum([a_j * z[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0)
-        + w["conv.bias"]
-    )
+    source = w["conv.att_src"].ravel()
+    target = w["conv.att_dst"].ravel()
+    of_edge = w["conv.att_edge"].ravel()
+    logits = []
+    for j, e in near:
+        edge = w["conv.lin_edge.weight"] @ e
+        logits.append(float(leaky(z[j] @ source + z[i] @ target + edge @ of_edge)))
+    return weighted_sum(softmax(logits), z, near) + w["conv.bias"]
 
 
-def gatv2(
-    w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]
-) -> Array:
+def gatv2(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Brody et al. (2022), Eq. 7."""
     left = x @ w["conv.lin_l.weight"].T + w["conv.lin_l.bias"]
     right = x @ w["conv.lin_r.weight"].T + w["conv.lin_r.bias"]
-    of_edge = w["conv.lin_edge.weight"]
-    a = softmax(
-        [
-            float(leaky(left[j] + right[i] + of_edge @ e) @ w["conv.att"].ravel())
-            for j, e in near
-        ]
-    )
-    return (
-        np.sum([a_j * left[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0)
-        + w["conv.bias"]
-    )
+    attention = w["conv.att"].ravel()
+    logits = []
+    for j, e in near:
+        edge = w["conv.lin_edge.weight"] @ e
+        logits.append(float(leaky(left[j] + right[i] + edge) @ attention))
+    return weighted_sum(softmax(logits), left, near) + w["conv.bias"]
 
 
 SCALE = START * np.sqrt(LATENT)
-"""What SuperGAT's inputs are divided by and its values multiplied by."""
+"""SuperGAT divides its inputs and multiplies its values by this."""
 
 
-def supergat_mx(
-    w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]
-) -> Array:
-    """Return Eqs. 5.26 and 5.27 of the thesis, MX, of scaled inputs; edges have no part
-    in it.
+def supergat_mx(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
+    """Return Eqs. 5.26 and 5.27 of the thesis, MX, of scaled inputs.
+
+    Edges have no part in it.
     """
     z = x / SCALE @ w["conv.lin.weight"].T
     left = w["conv.att_l"].ravel()
     right = w["conv.att_r"].ravel()
-    gate = [1 / (1 + np.exp(-z[i] @ z[j])) for j, _ in near]
-    e = [
-        float(leaky((z[j] @ left + z[i] @ right) * g))
-        for g, (j, _) in zip(gate, near, strict=True)
-    ]
-    heard = np.sum(
-        [a * z[j] for a, (j, _) in zip(softmax(e), near, strict=True)], axis=0
-    )
-    return SCALE * (heard + w["conv.bias"])
+    logits = []
+    for j, _ in near:
+        gate = sigmoid(z[i] @ z[j])
+        logits.append(float(leaky((z[j] @ left + z[i] @ right) * gate)))
+    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
 
 
-def supergat_sd(
-    w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]
-) -> Array:
+def supergat_sd(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Eqs. 5.26 and 5.27 of the thesis, SD, of scaled inputs."""
     z = x / SCALE @ w["conv.lin.weight"].T
-    a = softmax([float(leaky(z[i] @ z[j] / np.sqrt(LATENT))) for j, _ in near])
-    heard = np.sum([a_j * z[j] for a_j, (j, _) in zip(a, near, strict=True)], axis=0)
-    return SCALE * (heard + w["conv.bias"])
+    logits = []
+    for j, _ in near:
+        logits.append(float(leaky(z[i] @ z[j] / np.sqrt(LATENT))))
+    return SCALE * (weighted_sum(softmax(logits), z, near) + w["conv.bias"])
 
 
-def transformer(
-    w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]
-) -> Array:
+def transformer(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return Shi et al. (2021), Eqs. 3 and 4, with a linear skip connection."""
-    key, query, value, skip = (
-        x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
-        for name in ("key", "query", "value", "skip")
-    )
-    told = [(j, w["conv.lin_edge.weight"] @ e) for j, e in near]
-    a = (
-        softmax([query[i] @ (key[j] + e) / np.sqrt(LATENT) for j, e in told])
-        if near
-        else []
-    )
-    return skip[i] + np.sum(
-        [a_j * (value[j] + e) for a_j, (j, e) in zip(a, told, strict=True)], axis=0
-    )
+
+    def project(name: str) -> Array:
+        rows: Array = x @ w[f"conv.lin_{name}.weight"].T + w[f"conv.lin_{name}.bias"]
+        return rows
+
+    total = project("skip")[i]
+    if not near:
+        return total
+    key = project("key")
+    query = project("query")
+    value = project("value")
+    edges = [w["conv.lin_edge.weight"] @ e for _, e in near]
+    logits = []
+    for (j, _), edge in zip(near, edges, strict=True):
+        logits.append(query[i] @ (key[j] + edge) / np.sqrt(LATENT))
+    for share, (j, _), edge in zip(softmax(logits), near, edges, strict=True):
+        total = total + share * (value[j] + edge)
+    return total
 
 
-def gns(w: dict[str, Array], x: Array, i: int, near: list[tuple[int, Array]]) -> Array:
+def gns(w: Weights, x: Array, i: int, near: Neighbours) -> Array:
     """Return the sum of Sanchez-Gonzalez et al. (2020)."""
-    return np.sum([np.zeros(LATENT), *(e for _, e in near)], axis=0)
+    total = np.zeros(LATENT)
+    for _, edge in near:
+        total += edge
+    return total
 
 
-Equation = Callable[[dict[str, Array], Array, int, list[tuple[int, Array]]], Array]
-EQUATIONS: list[tuple[type[Operator], Equation, bool]] = [
-    (GNS, gns, False),
-    (GAT, gat, True),
-    (GATv2, gatv2, True),
-    (SuperGAT, supergat_mx, True),
-    (SuperGATDot, supergat_sd, True),
-    (Transformer, transformer, False),
-]
+Equation = Callable[[Weights, Array, int, Neighbours], Array]
 
 
-@pytest.mark.parametrize(("operator", "equation", "loop"), EQUATIONS)
-def test_equation(operator: type[Operator], equation: Equation, loop: bool) -> None:
-    """What a node gathers is the published equation, summed over neighbours one by
-    one.
-    """
-    inputs = small()
-    layer = built(operator, scale=0.4)
+@pytest.mark.parametrize(
+    ("operator", "equation", "loop"),
+    [
+        (GNS, gns, False),
+        (GAT, gat, True),
+        (GATv2, gatv2, True),
+        (SuperGAT, supergat_mx, True),
+        (SuperGATDot, supergat_sd, True),
+        (Transformer, transformer, False),
+    ],
+)
+def test_an_operator_is_its_published_equation(
+    operator: type[Operator], equation: Equation, loop: bool
+) -> None:
+    """The equation sums over neighbours one by one."""
+    inputs = small_graph()
+    layer = build_random(operator, scale=0.4)
     x = inputs.node.double().numpy()
-    w = weights(layer)
-    expected = [
-        equation(w, x, i, neighbours(inputs, i, loop=loop)) for i in range(len(x))
-    ]
-    np.testing.assert_allclose(updated(layer, inputs), expected, rtol=1e-9, atol=1e-9)
+    weights = read_weights(layer)
+    expected = []
+    for receiver in range(len(x)):
+        near = neighbours(inputs, receiver, loop=loop)
+        expected.append(equation(weights, x, receiver, near))
+    update = compute_update(layer, inputs)
+    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_pointnet_is_that_of_pyg() -> None:
     """With relative positions as edges, PointNet is PyG's PointNetConv."""
-    inputs = small()
-    layer = built(PointNet)
+    inputs = small_graph()
+    layer = build_random(PointNet)
     assert isinstance(layer, PointNet)
     position = torch.randn(len(inputs.node), LATENT, dtype=torch.float64)
-    sender, receiver = inputs.edge_index
-    local = torch.nn.Sequential(
-        torch.nn.Linear(3 * LATENT, HIDDEN).double(), *copy.deepcopy(layer.local)
-    )
+
+    first = torch.nn.Linear(3 * LATENT, HIDDEN).double()
     with torch.no_grad():
-        local[0].weight[:] = torch.cat(
-            [layer.of_node.weight, layer.of_edge.weight], dim=1
-        )
-        local[0].bias[:] = layer.of_node.bias
+        first.weight[:] = torch.cat([layer.of_node.weight, layer.of_edge.weight], dim=1)
+        first.bias[:] = layer.of_node.bias
     with torch.random.fork_rng():
-        theirs = PointNetConv()  # Its constructor would reset the weights.
-    theirs.local_nn = local
+        convolution = PointNetConv()  # Its constructor would reset the weights.
+    convolution.local_nn = torch.nn.Sequential(first, *copy.deepcopy(layer.local))
+
+    sender, receiver = inputs.edge_index
     x = inputs.node.double()
-    ours = layer(x, inputs.edge_index, position[sender] - position[receiver])[0]
-    torch.testing.assert_close(
-        ours, theirs(x, position, inputs.edge_index), rtol=1e-12, atol=1e-12
-    )
+    edge = position[sender] - position[receiver]
+    update, _ = layer(x, inputs.edge_index, edge)
+    expected = convolution(x, position, inputs.edge_index)
+    torch.testing.assert_close(update, expected, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("operator", OPERATORS)
-def test_order_and_lack_of_edges(operator: type[Operator]) -> None:
-    """Particles in another order get the same updates in that order; the order of edges
-    is nothing.
+def test_the_order_of_nodes_and_edges_means_nothing(operator: type[Operator]) -> None:
+    """Nodes in another order get the same updates in that order."""
+    inputs = small_graph()
+    layer = build_random(operator).eval()
+    node_order = torch.randperm(len(inputs.node), generator=seeded(3))
+    edge_order = torch.randperm(len(inputs.edge), generator=seeded(4))
+    new_number = torch.argsort(node_order)
+    shuffled = Graph(
+        inputs.node[node_order],
+        new_number[inputs.edge_index][:, edge_order],
+        inputs.edge[edge_order],
+    )
+    update = compute_update(layer, shuffled)
+    expected = compute_update(layer, inputs)[node_order]
+    np.testing.assert_allclose(update, expected, rtol=1e-9, atol=1e-9)
 
-    Without any edge updates and gradients are finite.
-    """
-    inputs = small()
-    layer = built(operator).eval()
-    order = torch.randperm(len(inputs.node), generator=torch.Generator().manual_seed(3))
-    edges = torch.randperm(len(inputs.edge), generator=torch.Generator().manual_seed(4))
-    place = torch.argsort(order)
-    mixed = Graph(
-        inputs.node[order], place[inputs.edge_index][:, edges], inputs.edge[edges]
-    )
-    np.testing.assert_allclose(
-        updated(layer, mixed), updated(layer, inputs)[order], rtol=1e-9, atol=1e-9
-    )
 
-    layer = built(operator)
-    alone = Graph(
-        torch.randn(3, 2 * LATENT),
-        torch.empty(2, 0, dtype=torch.int64),
-        torch.empty(0, LATENT),
-    )
-    alone.edge.requires_grad_()  # a plain sum has no weights
-    update, losses = layer(alone.node.double(), alone.edge_index, alone.edge.double())
-    total = update.sum() + sum(losses.values())
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_without_edges_updates_and_gradients_are_finite(
+    operator: type[Operator],
+) -> None:
+    layer = build_random(operator)
+    node = torch.randn(3, 2 * LATENT).double()
+    edge_index = torch.empty(2, 0, dtype=torch.int64)
+    edge = torch.empty(0, LATENT).double()
+    edge.requires_grad_()  # a plain sum has no weights
+    update, losses = layer(node, edge_index, edge)
     assert update.isfinite().all()
+    total = update.sum() + sum(losses.values())
     total.backward()
-    assert all(p.grad is None or p.grad.isfinite().all() for p in layer.parameters())
+    for parameter in layer.parameters():
+        if parameter.grad is not None:
+            assert parameter.grad.isfinite().all()
 
 
-def test_unlinked_pairs() -> None:
-    """Pairs are neither edges nor loops, every other pair comes up, and the same seed
-    gives the same.
-    """
-    inputs = small()
-    pairs = draw_unlinked_pairs(
-        inputs.edge_index, 9, 20_000, torch.Generator().manual_seed(5)
-    )
+def test_unlinked_pairs_are_neither_edges_nor_loops() -> None:
+    """Every other pair comes up, and the same seed gives the same pairs."""
+    edge_index = small_graph().edge_index
+    pairs = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
     drawn = set(map(tuple, pairs.t().tolist()))
-    linked = set(map(tuple, inputs.edge_index.t().tolist()))
-    every = {(j, i) for j in range(9) for i in range(9) if i != j}
-    assert drawn == every - linked  # 72 - 24 = 48 pairs in 20,000 draws of 81
-    again = draw_unlinked_pairs(
-        inputs.edge_index, 9, 20_000, torch.Generator().manual_seed(5)
-    )
+    linked = set(map(tuple, edge_index.t().tolist()))
+    every_pair = {(j, i) for j in range(9) for i in range(9) if i != j}
+    assert drawn == every_pair - linked  # 72 - 24 = 48 pairs in 20,000 draws of 81
+    again = draw_unlinked_pairs(edge_index, 9, 20_000, seeded(5))
     assert torch.equal(pairs, again)
 
 
-def test_link_loss() -> None:
-    """The link loss is the cross entropy of edges, loops and unlinked pairs (Eq. 5.28),
-    by hand.
-    """
-    inputs = small()
-    layer = built(SuperGAT, scale=0.4)
-    _, losses = layer(
-        inputs.node.double(),
-        inputs.edge_index,
-        inputs.edge,
-        generator=torch.Generator().manual_seed(2),
-    )
-    pairs = draw_unlinked_pairs(
-        inputs.edge_index, 9, 12, torch.Generator().manual_seed(2)
-    ).numpy()
-    z = inputs.node.double().numpy() / SCALE @ weights(layer)["conv.lin.weight"].T
-    links = np.concatenate(
-        [inputs.edge_index.numpy(), np.tile(np.arange(9), (2, 1))], axis=1
-    )
-    likely = 1 / (1 + np.exp(-np.sum(z[links[0]] * z[links[1]], axis=1)))
-    unlikely = 1 / (1 + np.exp(-np.sum(z[pairs[0]] * z[pairs[1]], axis=1)))
-    expected = -np.mean(np.concatenate([np.log(likely), np.log(1 - unlikely)]))
+def test_the_link_loss_is_equation_5_28() -> None:
+    """It is the cross entropy of edges, loops and unlinked pairs."""
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+    node = inputs.node.double()
+    _, losses = layer(node, inputs.edge_index, inputs.edge, generator=seeded(2))
+
+    z = node.numpy() / SCALE @ read_weights(layer)["conv.lin.weight"].T
+
+    def link_probability(pairs: NDArray[np.int64]) -> Array:
+        sender, receiver = pairs
+        return sigmoid(np.sum(z[sender] * z[receiver], axis=1))
+
+    loops = np.tile(np.arange(9), (2, 1))
+    linked = np.concatenate([inputs.edge_index.numpy(), loops], axis=1)
+    unlinked = draw_unlinked_pairs(inputs.edge_index, 9, 12, seeded(2)).numpy()
+    of_linked = np.log(link_probability(linked))
+    of_unlinked = np.log(1 - link_probability(unlinked))
+    expected = -np.mean(np.concatenate([of_linked, of_unlinked]))
     assert losses["link"].item() == pytest.approx(expected, rel=1e-9)
-    assert not layer.eval()(inputs.node.double(), inputs.edge_index, inputs.edge)[1]
 
 
-def test_link_loss_starts_low_and_decreases() -> None:
-    """At the widths of a recipe it starts near 1, not 1000; SuperGAT learns who are
-    neighbours.
-    """
+def test_there_is_no_link_loss_in_evaluation() -> None:
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4).eval()
+    _, losses = layer(inputs.node.double(), inputs.edge_index, inputs.edge)
+    assert not losses
+
+
+def test_the_link_loss_starts_low() -> None:
+    """At the widths of a recipe it starts near 1, not 1000."""
     torch.manual_seed(0)
     wide = graph(300, 2400, node=256, edge=128)
     wide.node[:, 128:] *= 8.0  # sums of about 8 normalised messages
-    assert 0.3 < SuperGAT(256, 128, 128)(*wide)[1]["link"].item() < 3.0
+    _, losses = SuperGAT(256, 128, 128)(*wide)
+    assert 0.3 < losses["link"].item() < 3.0
+
+
+def test_supergat_learns_who_are_neighbours() -> None:
     torch.manual_seed(0)
     inputs = graph(40, 200, node=32, edge=16)
     layer = SuperGAT(32, 16, 16)
     inputs.node.mul_(8.0)  # sums of about 8 normalised messages
-    source = torch.Generator().manual_seed(0)
+    generator = seeded(0)
     optimizer = torch.optim.Adam(layer.parameters(), lr=1e-2)
     course = []
     for _ in range(60):
-        loss = layer(*inputs, generator=source)[1]["link"]
+        _, losses = layer(*inputs, generator=generator)
+        loss = losses["link"]
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -329,35 +351,38 @@ def test_link_loss_starts_low_and_decreases() -> None:
     assert np.mean(course[-5:]) < 0.75 * np.mean(course[:5])
 
 
-def test_draws_leave_global_sources_alone() -> None:
-    """Training SuperGAT draws from the given generator only, the same for the same
-    seed.
-
-    The layer can be copied afterwards: no graph of gradients hangs on it.
-    """
-    (node, edge_index, edge), layer = small(), built(SuperGAT, scale=0.4)
-
-    def states() -> tuple[object, ...]:
-        return (
-            random.getstate(),
-            torch.get_rng_state().tolist(),
-            np.random.get_state()[1].tolist(),  # noqa: NPY002
-        )
-
-    before = states()
-    losses = [
-        layer(
-            node.double(),
-            edge_index,
-            edge,
-            generator=torch.Generator().manual_seed(seed),
-        )[1]["link"].item()
-        for seed in (0, 0, 1)
-    ]
-    assert states() == before
-    assert losses[0] == losses[1] != losses[2]
-    copied = copy.deepcopy(layer)
-    assert all(
-        torch.equal(a, b)
-        for a, b in zip(layer.parameters(), copied.parameters(), strict=True)
+def global_random_states() -> tuple[object, ...]:
+    """Return the states of the global generators of Python, torch and NumPy."""
+    return (
+        random.getstate(),
+        torch.get_rng_state().tolist(),
+        np.random.get_state()[1].tolist(),  # noqa: NPY002
     )
+
+
+def test_draws_leave_global_sources_alone() -> None:
+    """SuperGAT draws from its generator only, the same for the same seed."""
+    node, edge_index, edge = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+
+    def link_loss(seed: int) -> float:
+        _, losses = layer(node.double(), edge_index, edge, generator=seeded(seed))
+        return losses["link"].item()
+
+    before = global_random_states()
+    loss = link_loss(0)
+    assert link_loss(0) == loss
+    assert link_loss(1) != loss
+    assert global_random_states() == before
+
+
+def test_supergat_can_be_copied_after_training() -> None:
+    """No graph of gradients hangs on it."""
+    inputs = small_graph()
+    layer = build_random(SuperGAT, scale=0.4)
+    layer(inputs.node.double(), inputs.edge_index, inputs.edge, generator=seeded(0))
+    copied = copy.deepcopy(layer)
+    for parameter, copied_parameter in zip(
+        layer.parameters(), copied.parameters(), strict=True
+    ):
+        assert torch.equal(parameter, copied_parameter)

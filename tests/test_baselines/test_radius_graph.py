@@ -1,6 +1,4 @@
-"""The radius graph is that of brute force, on CPU and by the torch operations that a
-GPU runs.
-"""
+"""The radius graph against brute force, by NumPy and by the operations of a GPU."""
 
 from __future__ import annotations
 
@@ -24,61 +22,69 @@ Floats = NDArray[np.float32]
 Search = Callable[..., Tensor]
 
 
-def by_torch(
+def search_by_torch(
     position: Tensor, radius: float, sample: Tensor | None, *, self_edges: bool
 ) -> Tensor:
     """Search by the operations that a GPU runs."""
-    window = torch.zeros(len(position), dtype=torch.int64) if sample is None else sample
-    edges = (
-        edge_numbers(torch, position.double(), window, radius, self_edges).sort().values
-    )
-    return torch.stack([edges & 0xFFFFFFFF, edges >> 32])
+    if sample is None:
+        sample = torch.zeros(len(position), dtype=torch.int64)
+    numbers = edge_numbers(torch, position.double(), sample, radius, self_edges)
+    numbers = numbers.sort().values
+    sender = numbers & 0xFFFFFFFF
+    receiver = numbers >> 32
+    return torch.stack([sender, receiver])
 
 
 BOTH = pytest.mark.parametrize(
-    "search", [radius_graph, by_torch], ids=["numpy", "torch"]
+    "search", [radius_graph, search_by_torch], ids=["numpy", "torch"]
 )
 
 
 def brute_force(
     x: Floats, radius: float, sample: Any = None, self_edges: bool = False
 ) -> NDArray[np.int64]:
-    """Compare every pair; [sender, receiver], sorted by receiver, then sender."""
+    """Compare every pair; return [sender, receiver] by receiver, then by sender."""
     with np.errstate(invalid="ignore", over="ignore"):
-        d = x[:, None].astype(np.float64) - x.astype(np.float64)
-        near = d[..., 0] * d[..., 0] + d[..., 1] * d[..., 1] <= radius * radius
+        difference = x[:, None].astype(np.float64) - x.astype(np.float64)
+        dx = difference[..., 0]
+        dy = difference[..., 1]
+        is_near = dx * dx + dy * dy <= radius * radius
     if sample is not None:
-        near &= sample[:, None] == sample
+        is_near &= sample[:, None] == sample
     if not self_edges:
-        np.fill_diagonal(near, val=False)
-    return np.stack(np.nonzero(near))[::-1]
+        np.fill_diagonal(is_near, val=False)
+    receiver, sender = np.nonzero(is_near)
+    return np.stack([sender, receiver])
 
 
-def check(
+def compare_with_brute_force(
     search: Search,
     x: Floats,
     radius: float,
     sample: Any = None,
     self_edges: bool = False,
 ) -> int:
-    """Compare a search with brute force, order included; return the number of edges."""
-    windows = None if sample is None else torch.from_numpy(sample)
-    found = search(torch.from_numpy(x), radius, windows, self_edges=self_edges)
-    assert found.dtype == torch.int64
-    np.testing.assert_array_equal(
-        found.numpy(), brute_force(x, radius, sample, self_edges)
-    )
-    return found.shape[1]
+    """Compare all edges in their order, and return the number of edges."""
+    sample_tensor = None
+    if sample is not None:
+        sample_tensor = torch.from_numpy(sample)
+    edges = search(torch.from_numpy(x), radius, sample_tensor, self_edges=self_edges)
+    assert edges.dtype == torch.int64
+    expected = brute_force(x, radius, sample, self_edges)
+    np.testing.assert_array_equal(edges.numpy(), expected)
+    return edges.shape[1]
+
+
+def uniform(count: int, seed: int) -> Floats:
+    """Return random particles in the unit square."""
+    return np.random.default_rng(seed).random((count, 2), dtype=np.float32)
 
 
 def lattice(side: int, spacing: float) -> Floats:
     """Return side x side particles, shape [particle, 2]."""
     axis = np.arange(side) * spacing
-    return (
-        np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
-        .reshape(-1, 2)
-        .astype(np.float32)
-    )
+    points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+    return points.reshape(-1, 2).astype(np.float32)
 
 
 @BOTH
@@ -86,77 +92,90 @@ def lattice(side: int, spacing: float) -> Floats:
 @pytest.mark.parametrize("self_edges", [False, True])
 def test_random_particles(search: Search, radius: float, self_edges: bool) -> None:
     """Uniform particles, from hardly any edge to all pairs."""
-    x = np.random.default_rng(1).random((400, 2), dtype=np.float32)
-    assert check(search, x, radius, self_edges=self_edges) > 400 * self_edges
+    x = uniform(400, seed=1)
+    edge_count = compare_with_brute_force(search, x, radius, self_edges=self_edges)
+    assert edge_count > 400 * self_edges
 
 
 @BOTH
 def test_clustered_particles(search: Search) -> None:
-    """Dense clumps, some particles in the very same place, and lone particles far
-    off.
-    """
+    """Dense clumps, particles in the very same place, and lone particles far off."""
     rng = np.random.default_rng(2)
     centres = rng.random((6, 1, 2))
-    clumps = (centres + 0.01 * rng.normal(size=(6, 60, 2))).reshape(-1, 2)
-    x = np.concatenate([clumps, clumps[:20], rng.uniform(-50.0, 50.0, (30, 2))]).astype(
-        np.float32
-    )
-    assert check(search, x, 0.015) > 6 * 60
+    clumps = centres + 0.01 * rng.normal(size=(6, 60, 2))
+    clumps = clumps.reshape(-1, 2)
+    far_off = rng.uniform(-50.0, 50.0, (30, 2))
+    x = np.concatenate([clumps, clumps[:20], far_off]).astype(np.float32)
+    assert compare_with_brute_force(search, x, 0.015) > 6 * 60
 
 
 @BOTH
-def test_pairs_exactly_at_the_radius(search: Search) -> None:
-    """On a lattice of 1/8 and radius 1/8 the four direct neighbours count, at
-    equality.
-    """
+def test_pairs_exactly_at_the_radius_are_edges(search: Search) -> None:
+    """On a lattice of 1/8 with radius 1/8 the four direct neighbours count."""
+    x = lattice(9, 0.125)
+    below = np.nextafter(0.125, 0.0)
     # 9 x 9 particles: 2 * 9 * 8 = 144 pairs, both ways
-    assert check(search, lattice(9, 0.125), 0.125) == 288
-    assert check(search, lattice(9, 0.125), np.nextafter(0.125, 0.0)) == 0
-    # offsets (3, 4) and (0, 5) of a lattice of 1/64 are both at distance 5/64
-    x = (np.array([[0, 0], [3, 4], [4, -3], [0, 5], [-5, 0], [4, 4]]) / 64).astype(
-        np.float32
+    assert compare_with_brute_force(search, x, 0.125) == 288
+    assert compare_with_brute_force(search, x, below) == 0
+
+
+@BOTH
+def test_diagonal_pairs_exactly_at_the_radius_are_edges(search: Search) -> None:
+    """Offsets (3, 4) and (0, 5) of a lattice of 1/64 are both at distance 5/64."""
+    nodes = np.array(
+        [
+            [0, 0],
+            [3, 4],
+            [4, -3],
+            [0, 5],
+            [-5, 0],
+            [4, 4],
+        ]
     )
-    to_origin = brute_force(x, 5 / 64)
-    assert ((to_origin == 0).any(axis=0)).sum() == 2 * 4
-    check(search, x, 5 / 64)
+    x = (nodes / 64).astype(np.float32)
+    edges = brute_force(x, 5 / 64)
+    is_at_origin = (edges == 0).any(axis=0)
+    assert is_at_origin.sum() == 2 * 4
+    compare_with_brute_force(search, x, 5 / 64)
 
 
 @BOTH
 @pytest.mark.parametrize("spacing", [0.1, 0.015, 1 / 3])
 def test_radius_that_float32_cannot_hold(search: Search, spacing: float) -> None:
-    """Where rounding decides which neighbours are within the radius, it decides as in
-    brute force.
-    """
-    x = lattice(12, spacing)
-    edges = check(search, x, spacing)
-    assert 0 < edges < 2 * 2 * 12 * 11  # some of the 264 pairs fall outside
+    """Rounding decides which neighbours are within the radius, as in brute force."""
+    edge_count = compare_with_brute_force(search, lattice(12, spacing), spacing)
+    assert 0 < edge_count < 2 * 2 * 12 * 11  # some of the 264 pairs fall outside
 
 
 @BOTH
 @pytest.mark.parametrize("radius", [0.1, 0.7, 5.0])
 def test_windows_are_never_connected(search: Search, radius: float) -> None:
-    """The same particles in three windows, one of them empty, have thrice the edges of
-    one.
+    """The same particles in three windows have thrice the edges of one.
+
+    A fourth window is empty.
     """
-    x = np.random.default_rng(3).random((80, 2), dtype=np.float32)
-    alone = check(search, x, radius)
+    x = uniform(80, seed=3)
+    alone = compare_with_brute_force(search, x, radius)
+    three_windows = np.tile(x, (3, 1))
     sample = np.repeat([0, 1, 3], 80)
-    assert check(search, np.tile(x, (3, 1)), radius, sample) == 3 * alone
+    together = compare_with_brute_force(search, three_windows, radius, sample)
+    assert together == 3 * alone
 
 
 @BOTH
-def test_few_and_diverged_particles(search: Search) -> None:
-    """Nothing has no edges, one particle only the edge to itself.
+def test_few_particles(search: Search) -> None:
+    """No particle has no edges, one particle only the edge to itself."""
+    none = np.zeros((0, 2), np.float32)
+    one = np.ones((1, 2), np.float32)
+    assert compare_with_brute_force(search, none, 0.1, self_edges=True) == 0
+    assert compare_with_brute_force(search, one, 0.1) == 0
+    assert compare_with_brute_force(search, one, 0.1, self_edges=True) == 1
 
-    Particles that are no number or immensely far have no wrong edge; all others keep
-    theirs.
-    """
-    nothing = np.zeros((0, 2), np.float32)
-    assert check(search, nothing, 0.1, self_edges=True) == 0
-    assert check(search, np.ones((1, 2), np.float32), 0.1) == 0
-    assert check(search, np.ones((1, 2), np.float32), 0.1, self_edges=True) == 1
 
-    x = np.random.default_rng(4).random((60, 2), dtype=np.float32)
+@BOTH
+def test_diverged_particles_have_no_wrong_edge(search: Search) -> None:
+    """They are no number or immensely far; all other particles keep their edges."""
+    x = uniform(60, seed=4)
     x[5] = np.nan
     x[6] = np.inf
     x[7, 0] = -np.inf
@@ -165,14 +184,17 @@ def test_few_and_diverged_particles(search: Search) -> None:
     x[10] = [-3e38, 2.0]
     x[11] = [5e4, 5e4]
     x[12] = [5e4, 5e4 + 0.0625]
-    assert check(search, x, 0.1, self_edges=True) > 60
-    assert check(search, np.full((3, 2), np.nan, np.float32), 0.1) == 0
+    assert compare_with_brute_force(search, x, 0.1, self_edges=True) > 60
+    all_lost = np.full((3, 2), np.nan, np.float32)
+    assert compare_with_brute_force(search, all_lost, 0.1) == 0
 
 
 @BOTH
 @given(
     cells=arrays(
-        np.int8, st.tuples(st.integers(0, 25), st.just(2)), elements=st.integers(-6, 6)
+        np.int8,
+        st.tuples(st.integers(0, 25), st.just(2)),
+        elements=st.integers(-6, 6),
     ),
     steps=st.integers(1, 7),
 )
@@ -181,31 +203,32 @@ def test_any_lattice_points(
     search: Search, cells: NDArray[np.int8], steps: int
 ) -> None:
     """Points of a lattice, many together, and radii that are multiples of its step."""
-    check(search, (cells / 16).astype(np.float32), steps / 16)
+    x = (cells / 16).astype(np.float32)
+    compare_with_brute_force(search, x, steps / 16)
 
 
 def test_scipy_agrees() -> None:
     """SciPy's tree finds the same pairs among 5000 particles."""
-    x = np.random.default_rng(5).random((5000, 2), dtype=np.float32)
-    pairs = cKDTree(x.astype(np.float64)).query_pairs(0.015, output_type="ndarray")
+    x = uniform(5000, seed=5)
+    tree = cKDTree(x.astype(np.float64))
+    pairs = tree.query_pairs(0.015, output_type="ndarray")
     edges = radius_graph(torch.from_numpy(x), 0.015).numpy()
-    once = edges[:, edges[0] < edges[1]].T
-    np.testing.assert_array_equal(np.unique(once, axis=0), np.unique(pairs, axis=0))
     assert edges.shape[1] == 2 * len(pairs)
+    sender, receiver = edges
+    once = edges[:, sender < receiver].T
+    np.testing.assert_array_equal(np.unique(once, axis=0), np.unique(pairs, axis=0))
 
 
-def test_it_has_no_gradient_and_any_precision() -> None:
-    """Positions that require gradients, in float64 or bfloat16, are searched as they
-    are stored.
-    """
-    x = torch.rand(
-        50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
-    )
-    assert torch.equal(
-        radius_graph(x.clone().requires_grad_(), 0.2), radius_graph(x, 0.2)
-    )
+def test_positions_may_have_gradients_and_any_precision() -> None:
+    """The search takes positions as they are stored."""
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(50, 2, dtype=torch.float64, generator=generator)
+    edges = radius_graph(x, 0.2)
+    with_gradient = x.clone().requires_grad_()
+    assert torch.equal(radius_graph(with_gradient, 0.2), edges)
     coarse = x.bfloat16()
-    assert torch.equal(radius_graph(coarse, 0.2), radius_graph(coarse.float(), 0.2))
+    coarse_edges = radius_graph(coarse, 0.2)
+    assert torch.equal(coarse_edges, radius_graph(coarse.float(), 0.2))
 
 
 @pytest.mark.parametrize(
@@ -214,7 +237,7 @@ def test_it_has_no_gradient_and_any_precision() -> None:
         (torch.zeros(4, 3), 0.1, None, "wrong shape"),
         (torch.zeros(4, 2), 0.0, None, "no length"),
         (torch.zeros(4, 2), float("nan"), None, "no length"),
-        (torch.zeros(4, 2), 0.1, torch.zeros(3, dtype=torch.int64), "do not fit"),
+        (torch.zeros(4, 2), 0.1, torch.tensor([0, 0, 0]), "do not fit"),
         (torch.zeros(3, 2), 0.1, torch.tensor([0, 1, 0]), "do not fit"),
     ],
 )
@@ -226,45 +249,56 @@ def test_what_does_not_fit_is_refused(
         radius_graph(position, radius, sample)
 
 
-@pytest.mark.parametrize("most", [1, 3, 7, 60])
-def test_the_nearest_neighbours_are_heard(most: int) -> None:
-    """Of the edges of brute force each receiver keeps the shortest; where all are kept,
-    it is the same graph.
-
-    Twins at one place, windows, particles that are nowhere and loops as without a
-    limit.
-    """
-    rng = np.random.default_rng(1)
-    x = rng.random((120, 2), np.float32)
+def heap_of_twelve() -> Floats:
+    """Return 120 particles, twelve of them in one place and one of them nowhere."""
+    x = np.random.default_rng(1).random((120, 2), np.float32)
     x[40:52] = x[40]
-    x[100] = np.nan  # a heap of twelve
+    x[100] = np.nan
+    return x
+
+
+@pytest.mark.parametrize("most", [1, 3, 7, 60])
+def test_each_receiver_keeps_its_shortest_edges(most: int) -> None:
+    """With a limit that all edges meet it is the graph of brute force."""
+    x = heap_of_twelve()
     sample = np.repeat([0, 1], 60)
     radius = 0.25
     senders, receivers = brute_force(x, radius, sample)
-    length = np.sum(
-        (x[senders].astype(float) - x[receivers].astype(float)) ** 2, axis=1
-    )
-    found = radius_graph(
-        torch.from_numpy(x), radius, torch.from_numpy(sample), most=most
-    ).numpy()
-    pairs = {(s, r): d for s, r, d in zip(senders, receivers, length, strict=True)}
-    assert len(set(map(tuple, found.T))) == found.shape[1]
-    assert np.array_equal(
-        np.lexsort(found), np.arange(found.shape[1])
-    )  # by receiver, then sender
+    difference = x[senders].astype(float) - x[receivers].astype(float)
+    lengths = np.sum(difference**2, axis=1)
+    length_of_pair = {}
+    for sender, receiver, length in zip(senders, receivers, lengths, strict=True):
+        length_of_pair[sender, receiver] = length
+
+    position = torch.from_numpy(x)
+    edges = radius_graph(position, radius, torch.from_numpy(sample), most=most).numpy()
+    edge_count = edges.shape[1]
+    assert len(set(map(tuple, edges.T))) == edge_count
+    # The order is by receiver, then by sender.
+    np.testing.assert_array_equal(np.lexsort(edges), np.arange(edge_count))
     for receiver in range(len(x)):
-        heard = sorted(pairs[s, receiver] for s in found[0, found[1] == receiver])
-        assert heard == sorted(length[receivers == receiver])[:most]
-    looped = radius_graph(
-        torch.from_numpy(x), radius, self_edges=True, most=most
-    ).numpy()
-    assert set(looped[0, looped[0] == looped[1]]) == set(range(120)) - {100}
+        edge_senders = edges[0, edges[1] == receiver]
+        edge_lengths = sorted(length_of_pair[s, receiver] for s in edge_senders)
+        all_lengths = sorted(lengths[receivers == receiver])
+        assert edge_lengths == all_lengths[:most]
+
+
+@pytest.mark.parametrize("most", [1, 3, 7, 60])
+def test_each_particle_keeps_its_self_edge(most: int) -> None:
+    """The particle that is nowhere has none."""
+    position = torch.from_numpy(heap_of_twelve())
+    edges = radius_graph(position, 0.25, self_edges=True, most=most).numpy()
+    sender, receiver = edges
+    self_edges = sender[sender == receiver]
+    assert set(self_edges) == set(range(120)) - {100}
 
 
 def test_a_heap_takes_bounded_memory() -> None:
-    """Ten thousand particles at one place have the edges that are asked for, not a
-    hundred million.
+    """Ten thousand particles in one place have as many edges as the limit allows.
+
+    Without a limit they would have a hundred million.
     """
-    found = radius_graph(torch.full((10_000, 2), 0.5), 0.01, most=4)
-    assert found.shape == (2, 40_000)
-    assert torch.equal(found[1].bincount(), torch.full((10_000,), 4))
+    edges = radius_graph(torch.full((10_000, 2), 0.5), 0.01, most=4)
+    assert edges.shape == (2, 40_000)
+    edges_per_receiver = edges[1].bincount()
+    assert torch.equal(edges_per_receiver, torch.full((10_000,), 4))

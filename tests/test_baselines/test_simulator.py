@@ -19,346 +19,406 @@ from simple_models import (
     rolled,
     swirl,
 )
+from torch import Tensor
 
 from lagbench.baselines.augmentation import mirror_batch
 from lagbench.baselines.operators.gns import GNS
 from lagbench.baselines.simulator import GraphNetwork, ParticleState
 from lagbench.errors import UsageError
 
+TARGETS = pytest.mark.parametrize("target", ["acceleration", "velocity"])
 
-@pytest.mark.parametrize("target", ["acceleration", "velocity"])
+
+def seeded(seed: int = 0) -> torch.Generator:
+    """Return a seeded source of randomness."""
+    return torch.Generator().manual_seed(seed)
+
+
+@TARGETS
 def test_an_oracle_makes_no_error_over_a_rollout(target: str) -> None:
-    """Fed the true accelerations or velocities, 90 frames end within float32 rounding
-    of the truth.
+    """With the true accelerations or velocities, 90 frames end at the truth.
+
+    They differ by the rounding of float32 only.
     """
-    truth = batch(swirl(0, 96))
-    exact = torch.from_numpy(swirl(0, 96)).transpose(0, 1)
-    found = rolled(oracle(exact, target), truth.part(slice(6)), 90)
-    moved = float((truth.position[:, 95] - truth.position[:, 5]).norm(dim=1).max())
-    assert moved > 0.2
-    # The given velocities are differences of float32 positions: 6e-8 a frame if nothing
-    # mends it.
-    allowed = 90 * 6e-8 if target == "acceleration" else 1e-6
-    assert float((found - truth.position[:, 6:]).abs().max()) < allowed
+    frames = swirl(0, 96)
+    truth = batch(frames)
+    exact = torch.from_numpy(frames).transpose(0, 1)
+    path = rolled(oracle(exact, target), truth.part(slice(6)), 90)
+
+    displacement = truth.position[:, 95] - truth.position[:, 5]
+    assert float(displacement.norm(dim=1).max()) > 0.2
+    # The initial velocities are differences of float32 positions: 6e-8 a frame, which
+    # accelerations do not mend.
+    tolerance = 1e-6
+    if target == "acceleration":
+        tolerance = 90 * 6e-8
+    error = (path - truth.position[:, 6:]).abs().max()
+    assert float(error) < tolerance
 
 
-def test_untrained_models_keep_velocities_or_stand_still() -> None:
-    """Target acceleration gives constant velocity; target velocity the train mean, here
-    0.
-    """
-    given = batch(swirl(0, 6))
-    steps = torch.arange(1.0, 4.0)[:, None]
-    last = given.position[:, -1] - given.position[:, -2]
-    straight = given.position[:, -1:] + steps * last[:, None]
-    torch.testing.assert_close(
-        rolled(network(), given, 3), straight, rtol=0.0, atol=3e-7
-    )
-    still = given.position[:, -1:].expand(-1, 3, -1)
-    assert torch.equal(rolled(network(target="velocity"), given, 3), still)
+def test_untrained_models_of_accelerations_keep_velocities() -> None:
+    window = batch(swirl(0, 6))
+    time = torch.arange(1.0, 4.0)[:, None]
+    velocity = window.position[:, -1] - window.position[:, -2]
+    straight = window.position[:, -1:] + time * velocity[:, None]
+    path = rolled(network(), window, 3)
+    torch.testing.assert_close(path, straight, rtol=0.0, atol=3e-7)
 
 
-@pytest.mark.parametrize("target", ["acceleration", "velocity"])
+def test_untrained_models_of_velocities_stand_still() -> None:
+    """They predict the mean velocity of the training data, which is 0 here."""
+    window = batch(swirl(0, 6))
+    still = window.position[:, -1:].expand(-1, 3, -1)
+    path = rolled(network(target="velocity"), window, 3)
+    assert torch.equal(path, still)
+
+
+@TARGETS
 def test_a_shift_away_from_walls_shifts_the_rollout(target: str) -> None:
-    """All particles moved by one vector: so is what follows (the shift is exact in
-    binary).
-    """
+    """One vector moves all particles, and so the rollout; it is exact in binary."""
     rng = np.random.default_rng(0)
     start = np.round(jittered(0, 8, 0.3, 0.5) * 2**16) / 2**16
-    drift = np.round(rng.normal(0.0, 1e-3, (6, *start.shape)) * 2**16) / 2**16
-    frames = start + drift.cumsum(axis=0)
+    noise = rng.normal(0.0, 1e-3, (6, *start.shape))
+    steps = np.round(noise * 2**16) / 2**16
+    frames = start + steps.cumsum(axis=0)
     shift = np.array([0.25, 0.125])
+
     model = network(awake=True, target=target)
-    here, there = (
-        rolled(model, batch(window), 4) for window in (frames, frames + shift)
-    )
-    assert float((here[:, 0] - batch(frames).position[:, -1]).abs().max()) > 1e-4
-    torch.testing.assert_close(
-        there, here + torch.from_numpy(shift).float(), rtol=0.0, atol=2e-6
-    )
+    window = batch(frames)
+    path = rolled(model, window, 4)
+    shifted_path = rolled(model, batch(frames + shift), 4)
+    first_step = path[:, 0] - window.position[:, -1]
+    assert float(first_step.abs().max()) > 1e-4
+    expected = path + torch.from_numpy(shift).float()
+    torch.testing.assert_close(shifted_path, expected, rtol=0.0, atol=2e-6)
 
 
-def mirrored(model: Any, axis: int) -> Any:
+def mirror_model(model: Any, axis: int) -> Any:
     """Return the model whose weights see the world mirrored along an axis.
 
     Every input that changes sign has its column negated, the two walls across have
     their columns swapped, and the output along the axis is negated.
     """
-    twin = network(awake=True, target=model.options.target.value, wall_velocity=True)
-    twin.load_state_dict(model.state_dict())
+    mirrored = network(
+        awake=True,
+        target=model.options.target.value,
+        wall_velocity=True,
+    )
+    mirrored.load_state_dict(model.state_dict())
+    low = 2 * axis
+    high = 2 * axis + 1
     with torch.no_grad():
-        first = twin.network.node_encoder[0].weight
-        first[:, axis:10:2] *= -1.0
-        low = 10 + 2 * axis
-        high = 11 + 2 * axis
-        first[:, [low, high]] = first[:, [high, low]]
-        walls = first[:, 30:].reshape(-1, 4, 2)
-        walls[..., axis] *= -1.0
-        walls[:, [2 * axis, 2 * axis + 1]] = walls[:, [2 * axis + 1, 2 * axis]]
-        first[:, 30:] = walls.flatten(1)
-        twin.network.edge_encoder[0].weight[:, axis] *= -1.0
-        twin.network.decoder[-1].weight[axis] *= -1.0
-        twin.network.decoder[-1].bias[axis] *= -1.0
-    return twin
+        node_weight = mirrored.network.node_encoder[0].weight
+        node_weight[:, axis:10:2] *= -1.0
+
+        distance = node_weight[:, 10:14]
+        distance[:, [low, high]] = distance[:, [high, low]]
+
+        wall_velocity = node_weight[:, 30:].reshape(-1, 4, 2)
+        wall_velocity[..., axis] *= -1.0
+        wall_velocity[:, [low, high]] = wall_velocity[:, [high, low]]
+        node_weight[:, 30:] = wall_velocity.flatten(1)
+
+        edge_weight = mirrored.network.edge_encoder[0].weight
+        edge_weight[:, axis] *= -1.0
+        decoder = mirrored.network.decoder[-1]
+        decoder.weight[axis] *= -1.0
+        decoder.bias[axis] *= -1.0
+    return mirrored
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-@pytest.mark.parametrize("target", ["acceleration", "velocity"])
+@TARGETS
 def test_a_mirrored_model_in_a_mirrored_world(target: str, axis: int) -> None:
     """Walls, their motion and the weights mirrored: the rollout is the mirror image."""
     rng = np.random.default_rng(0)
-    windows = [
-        jittered(seed) + rng.normal(0.0, 2e-3, (6, 256, 2)).cumsum(axis=0)
-        for seed in (0, 1)
-    ]
-    given = batch(*windows, walls=True)
-    given.wall_velocity[1] *= -0.5
+    windows = []
+    for seed in (0, 1):
+        steps = rng.normal(0.0, 2e-3, (6, 256, 2))
+        windows.append(jittered(seed) + steps.cumsum(axis=0))
+    window = batch(*windows, walls=True)
+    window.wall_velocity[1] *= -0.5
     matrix = torch.eye(2).repeat(2, 1, 1)
     matrix[:, axis, axis] = -1.0
-    turned = mirror_batch(given, matrix, info().bounds)
+    image = mirror_batch(window, matrix, info().bounds)
+
     model = network(awake=True, target=target, wall_velocity=True)
-    here, there, plain = (
-        rolled(m, w, 3)
-        for m, w in ((model, given), (mirrored(model, axis), turned), (model, turned))
-    )
-    for found in (there, plain):
-        found[..., axis] = 1.0 - found[..., axis]
-    torch.testing.assert_close(there, here, rtol=0.0, atol=1e-6)
-    assert float((plain - here).abs().max()) > 1e-5  # the weights matter
+    expected = rolled(model, window, 3)
+    expected[..., axis] = 1.0 - expected[..., axis]
+    path = rolled(mirror_model(model, axis), image, 3)
+    torch.testing.assert_close(path, expected, rtol=0.0, atol=1e-6)
+
+    # The weights matter: the model itself does not give the mirror image.
+    unmirrored_path = rolled(model, image, 3)
+    assert float((unmirrored_path - expected).abs().max()) > 1e-5
 
 
 def test_windows_side_by_side_do_not_see_each_other() -> None:
     """Two windows in one batch roll out as they do alone."""
     model = network(awake=True)
-    windows = [swirl(seed, 6) for seed in (0, 1)]
-    alone = torch.cat([rolled(model, batch(window), 3) for window in windows])
-    torch.testing.assert_close(
-        rolled(model, batch(*windows), 3), alone, rtol=0.0, atol=1e-6
-    )
+    windows = [swirl(0, 6), swirl(1, 6)]
+    together = rolled(model, batch(*windows), 3)
+    alone = [rolled(model, batch(window), 3) for window in windows]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-6)
 
 
 def test_two_frames_are_enough_to_start_from() -> None:
-    """The first velocity repeats before what is given; more than six frames count by
-    their last six.
-    """
-    given = batch(swirl(0, 8))
+    """The first velocity repeats in place of those before the window."""
+    window = batch(swirl(0, 8))
     model = network()
-    short = model.start(given.part(slice(2)))
-    first = given.position[:, 1] - given.position[:, 0]
-    assert torch.equal(short.velocity, first[:, None].expand(-1, 5, -1))
-    assert torch.equal(short.position, given.position[:, 1])
-    middle = model.start(given.part(slice(4)))
-    assert torch.equal(middle.velocity[:, :3], first[:, None].expand(-1, 3, -1))
-    assert torch.equal(middle.velocity[:, 2:], given.position[:, :4].diff(dim=1))
-    long = model.start(given)
-    six = model.start(given.part(slice(2, 8)))
-    assert torch.equal(long.velocity, six.velocity)
-    assert torch.equal(long.velocity, given.position[:, 2:].diff(dim=1))
-    with pytest.raises(UsageError, match="2 or more"):
-        model.start(given.part(slice(1)))
-    model = network(awake=True, velocities=1)  # sees two frames and starts from two
+    first_velocity = window.position[:, 1] - window.position[:, 0]
+
+    from_two = model.start(window.part(slice(2)))
+    repeated = first_velocity[:, None].expand(-1, 5, -1)
+    assert torch.equal(from_two.velocity, repeated)
+    assert torch.equal(from_two.position, window.position[:, 1])
+
+    from_four = model.start(window.part(slice(4)))
+    assert torch.equal(from_four.velocity[:, :3], repeated[:, :3])
+    assert torch.equal(from_four.velocity[:, 2:], window.position[:, :4].diff(dim=1))
+
+    with pytest.raises(UsageError):
+        model.start(window.part(slice(1)))
+
+
+def test_a_start_takes_the_last_frames_of_a_long_window() -> None:
+    window = batch(swirl(0, 8))
+    model = network()
+    from_eight = model.start(window)
+    from_six = model.start(window.part(slice(2, 8)))
+    assert torch.equal(from_eight.velocity, from_six.velocity)
+    assert torch.equal(from_eight.velocity, window.position[:, 2:].diff(dim=1))
+
+
+def test_a_model_of_one_velocity_sees_two_frames() -> None:
+    window = batch(swirl(0, 8))
+    model = network(awake=True, velocities=1)
     assert model.history == 2
     assert model.features.count == 22
-    assert torch.equal(
-        rolled(model, given, 2), rolled(model, given.part(slice(6, 8)), 2)
-    )
+    from_two = rolled(model, window.part(slice(6, 8)), 2)
+    assert torch.equal(rolled(model, window, 2), from_two)
 
 
 def test_a_state_moved_by_the_truth_is_the_next_start() -> None:
-    """The oldest velocity leaves, the new one comes last: the start of the window one
-    frame on.
-    """
-    given = batch(swirl(0, 7))
+    """The oldest velocity leaves and the new one comes last."""
+    window = batch(swirl(0, 7))
     model = network()
-    following = model.start(given.part(slice(1, 7)))
-    moved = model.start(given.part(slice(6))).move(
-        following.position, following.velocity[:, -1]
-    )
+    state = model.start(window.part(slice(6)))
+    next_start = model.start(window.part(slice(1, 7)))
+    moved = state.move(next_start.position, next_start.velocity[:, -1])
     for field in fields(ParticleState):
-        one = getattr(moved, field.name)
-        other = getattr(following, field.name)
-        assert one is other is None or torch.equal(one, other)
+        value = getattr(moved, field.name)
+        expected = getattr(next_start, field.name)
+        if expected is None:
+            assert value is None
+        else:
+            assert torch.equal(value, expected)
 
 
-def test_walls_move_per_frame() -> None:
-    """Wall velocities per second become per frame (half a second here), each particle
-    its window's.
+def test_wall_velocities_become_velocities_per_frame() -> None:
+    """A frame is half a second here; each particle has the walls of its window."""
+    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    window.wall_velocity[1] *= 3.0
+    wall_velocity = network(wall_velocity=True).start(window).wall_velocity
+    expected = torch.arange(1.0, 9.0).reshape(4, 2) / 200
+    torch.testing.assert_close(wall_velocity[0, 0], expected)
+    torch.testing.assert_close(wall_velocity[1], 3.0 * wall_velocity[0])
 
-    A predicted frame moves with its own wall velocity; after the last known one that
-    stays.
-    """
-    given = batch(swirl(0, 6), swirl(1, 6), walls=True)
-    given.wall_velocity[1] *= 3.0
-    state = network(wall_velocity=True).start(given)
-    torch.testing.assert_close(
-        state.wall_velocity[0, 0], torch.arange(1.0, 9.0).reshape(4, 2) / 200
-    )
-    torch.testing.assert_close(state.wall_velocity[1], 3.0 * state.wall_velocity[0])
-    assert network().start(given).wall_velocity is None
+
+def test_models_without_wall_velocity_have_none() -> None:
+    window = batch(swirl(0, 6), swirl(1, 6), walls=True)
+    assert network().start(window).wall_velocity is None
     with pytest.raises(UsageError) as caught:
         network(wall_velocity=True, changes={"moving_walls": False})
     assert caught.value.where == "model.wall_velocity"
-    whole = batch(swirl(0, 8), walls=True)
-    whole.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
-    state = network(wall_velocity=True).start(whole.part(slice(6)))
-    seen = []
+
+
+def test_a_predicted_frame_moves_with_its_own_wall_velocity() -> None:
+    """After the last known wall velocity that one stays."""
+    window = batch(swirl(0, 8), walls=True)
+    window.wall_velocity.mul_(torch.arange(8.0)[:, None, None])
+    state = network(wall_velocity=True).start(window.part(slice(6)))
+    speeds = []
     for _ in range(3):
-        seen.append(float(state.wall_velocity[0, 0, 0, 0]))
+        speeds.append(float(state.wall_velocity[0, 0, 0, 0]))
         state = state.move(state.position, state.velocity[:, -1])
-    assert seen == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
+    assert speeds == pytest.approx([6 * 0.005, 7 * 0.005, 7 * 0.005])
 
 
-def test_particles_stay_in_the_box_unless_told_otherwise() -> None:
-    """A particle that flies out stops at the wall and its velocity says so; without
-    clamp it flies on.
-    """
-    flight = batch(
-        np.array([[[0.93 - 0.004 * (5 - f), 0.5 + 0.001 * f]] for f in range(6)])
-    )
-    assert float(rolled(network(clamp=False), flight, 3)[0, -1, 0]) == pytest.approx(
-        0.942, abs=1e-6
-    )
-    kept = network()
-    places = []
-    state = kept.start(flight)
+def flight_to_the_right_wall() -> Any:
+    """Return a window of one particle that is at the wall, x = 0.9375, in 2 frames."""
+    time = np.arange(6)
+    x = 0.93 - 0.004 * (5 - time)
+    y = 0.5 + 0.001 * time
+    return batch(np.stack([x, y], axis=-1)[:, None])
+
+
+def test_a_particle_that_flies_out_stops_at_the_wall() -> None:
+    """Its velocity says so."""
+    model = network()
+    x = []
+    state = model.start(flight_to_the_right_wall())
     for _ in range(3):
         with torch.no_grad():
-            state, position = kept.advance(state)
-        places.append(float(position[0, 0]))
-    assert places == pytest.approx([0.934, 0.9375, 0.9375], abs=1e-6)
-    assert float(state.velocity[0, -1, 0]) == pytest.approx(0.0, abs=1e-7)
-    assert float(state.velocity[0, -1, 1]) == pytest.approx(0.001, abs=1e-6)
+            state, position = model.advance(state)
+        x.append(float(position[0, 0]))
+    assert x == pytest.approx([0.934, 0.9375, 0.9375], abs=1e-6)
+    x_velocity, y_velocity = state.velocity[0, -1].tolist()
+    assert x_velocity == pytest.approx(0.0, abs=1e-7)
+    assert y_velocity == pytest.approx(0.001, abs=1e-6)
 
 
-@pytest.mark.parametrize("target", ["acceleration", "velocity"])
+def test_without_clamp_a_particle_flies_out() -> None:
+    path = rolled(network(clamp=False), flight_to_the_right_wall(), 3)
+    assert float(path[0, -1, 0]) == pytest.approx(0.942, abs=1e-6)
+
+
+@TARGETS
 def test_no_rollout_leaves_the_box(target: str) -> None:
     """Whatever a network says: of 256 particles over 30 frames none is outside."""
     model = network(awake=True, target=target)
     torch.nn.init.normal_(model.network.decoder[-1].bias, std=50.0)
-    found = rolled(model, batch(swirl(0, 6)), 30)
+    path = rolled(model, batch(swirl(0, 6)), 30)
     low, high = torch.tensor(info().bounds).T
-    assert bool(((found >= low) & (found <= high)).all())
-    assert bool(((found == low) | (found == high)).any())  # some did try
+    is_inside = (path >= low) & (path <= high)
+    is_stopped = (path == low) | (path == high)
+    assert bool(is_inside.all())
+    assert bool(is_stopped.any())
 
 
-class Watched(GraphNetwork):
-    """A graph network that keeps what it is shown, and says nothing."""
+class RecordingNetwork(GraphNetwork):
+    """A graph network that records its inputs and predicts zeros."""
 
     operator = GNS
-    method = "watched"
+    method = "recording"
 
     def predict(
         self, state: ParticleState, *_: object
-    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-        """Keep the state."""
-        self.seen = [*getattr(self, "seen", []), state]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Record the state."""
+        self.states = [*getattr(self, "states", []), state]
         return torch.zeros_like(state.position), {}
 
 
 def test_noise_stays_in_the_box() -> None:
-    """Particles that rest at a wall are disturbed to its inner side only."""
-    resting = np.repeat([[[0.9375, 0.3 + 0.05 * i] for i in range(8)]], 7, axis=0)
-    model = Watched.build(SMALL | {"noise_std": 1e-3}, info())
-    model(batch(resting), torch.Generator().manual_seed(0))
-    x = model.seen[0].position[:, 0]
-    assert float(x.min()) < float(x.max()) == 0.9375
+    """Noise moves particles that rest at a wall to its inner side only."""
+    y = 0.3 + 0.05 * np.arange(8)
+    resting = np.stack([np.full(8, 0.9375), y], axis=-1)
+    window = batch(np.repeat(resting[None], 7, axis=0))
+    model = RecordingNetwork.build(SMALL | {"noise_std": 1e-3}, info())
+    model(window, seeded())
+    x = model.states[0].position[:, 0]
+    assert float(x.max()) == 0.9375
+    assert float(x.min()) < 0.9375
 
 
 def test_a_wall_passes_gradients_on() -> None:
     """A prediction that a wall stops learns to stop before it, where the truth does."""
-    arriving = np.array(
-        [[[0.9275 + 0.002 * f, 0.5]] for f in range(6)] + [[[0.936, 0.5]]]
-    )
+    x = np.append(0.9275 + 0.002 * np.arange(6), 0.936)
+    y = np.full(7, 0.5)
+    arriving = np.stack([x, y], axis=-1)[:, None]
     model = network()
-    (slope,) = torch.autograd.grad(
-        model(batch(arriving))["acceleration"], model.network.decoder[-1].bias
-    )
-    assert float(rolled(model, batch(arriving[:6]), 1)[0, 0, 0]) == 0.9375
+    loss = model(batch(arriving))["acceleration"]
+    (gradient,) = torch.autograd.grad(loss, model.network.decoder[-1].bias)
+
+    path = rolled(model, batch(arriving[:6]), 1)
+    assert float(path[0, 0, 0]) == 0.9375
     # The stopped position is 0.0015 off: 2 e / std^2, times the std that outputs are
     # multiplied by.
-    assert float(slope[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
+    assert float(gradient[0]) == pytest.approx(2 * 0.0015 / 0.0002, rel=1e-3)
 
 
 def test_forcing_of_the_next_frame_moves_particles_near_walls() -> None:
-    """Another wall velocity in the coming frame changes the step near walls, in an
-    older frame nothing.
-    """
-    window = batch(np.repeat(jittered(0)[None], 7, axis=0), walls=True)
+    """A change of the wall velocity in an older frame changes nothing."""
+    frames = np.repeat(jittered(0)[None], 7, axis=0)
+    window = batch(frames, walls=True)
     model = network(awake=True, layers=1, wall_velocity=True, wall_reach=1.0)
-    found = []
-    for frame in (None, 5, 6):
-        walls = window.wall_velocity.clone()
-        if frame is not None:
-            walls[:, frame] *= -3.0
+
+    def step_with(wall_velocity: Tensor) -> Tensor:
+        forced = replace(window, wall_velocity=wall_velocity)
         with torch.no_grad():
-            state, _ = model.step(
-                model.start(replace(window, wall_velocity=walls).part(slice(6)))
-            )
-        found.append(state.position)
-    assert torch.equal(found[0], found[1])
-    changed = (found[0] - found[2]).abs().amax(dim=1) > 0
+            state, _ = model.step(model.start(forced.part(slice(6))))
+        return state.position
+
+    def reverse_walls_at(frame: int) -> Tensor:
+        wall_velocity = window.wall_velocity.clone()
+        wall_velocity[:, frame] *= -3.0
+        return wall_velocity
+
+    position = step_with(window.wall_velocity)
+    assert torch.equal(step_with(reverse_walls_at(5)), position)
+
+    difference = step_with(reverse_walls_at(6)) - position
+    is_changed = difference.abs().amax(dim=1) > 0
     low, high = torch.tensor(info().bounds).T
-    place = window.position[:, 5]
-    near = torch.minimum(place - low, high - place).amin(dim=1)
-    assert bool(changed[near < 0.9 * RADIUS].all())
-    assert not bool(
-        changed[near > 2.0 * RADIUS].any()
-    )  # one layer: a neighbour's wall at most
+    last = window.position[:, 5]
+    wall_distance = torch.minimum(last - low, high - last).amin(dim=1)
+    assert bool(is_changed[wall_distance < 0.9 * RADIUS].all())
+    # One layer: a particle hears of the walls of its neighbours at most.
+    assert not bool(is_changed[wall_distance > 2.0 * RADIUS].any())
 
 
-def test_forgetful_windows_know_what_a_rollout_knows_at_its_start() -> None:
-    """A forgetful window starts as from its last few frames do; every number comes up,
-    but all of them.
-    """
+def test_forgetful_windows_start_from_their_last_frames() -> None:
+    """Every number of frames comes up, except all of them."""
     window = batch(*(swirl(seed, 7) for seed in range(24)))
-    model = Watched.build(SMALL | {"forgetful": 1.0}, info())
-    model(window, torch.Generator().manual_seed(0))
-    starts = [
-        model.start(window.part(slice(6 - known, 6))).velocity for known in range(2, 7)
-    ]
-    numbers = set()
+    model = RecordingNetwork.build(SMALL | {"forgetful": 1.0}, info())
+    model(window, seeded())
+    velocity = model.states[0].velocity
+
+    velocity_by_frame_count = {}
+    for frame_count in range(2, 7):
+        short = window.part(slice(6 - frame_count, 6))
+        velocity_by_frame_count[frame_count] = model.start(short).velocity
+    frame_counts = set()
     for sample in range(24):
-        mine = window.sample == sample
-        (number,) = (
-            i
-            for i, start in enumerate(starts)
-            if torch.equal(model.seen[0].velocity[mine], start[mine])
-        )
-        numbers.add(number)
-    assert numbers == set(range(4))
-    model(window)  # without a generator, as in validation, nothing is forgotten
-    assert torch.equal(model.seen[1].velocity, starts[-1])
+        members = window.sample == sample
+        matches = []
+        for frame_count, start_velocity in velocity_by_frame_count.items():
+            if torch.equal(velocity[members], start_velocity[members]):
+                matches.append(frame_count)
+        assert len(matches) == 1
+        frame_counts.update(matches)
+    assert frame_counts == {2, 3, 4, 5}
+
+    # In validation there is no generator, and windows forget nothing.
+    model(window)
+    assert torch.equal(model.states[1].velocity, velocity_by_frame_count[6])
 
 
 def test_half_precision_moves_particles_in_full() -> None:
-    """Under bf16 autocast positions stay float32; a step and the loss differ by bf16's
-    rounding only.
-    """
-    given = batch(swirl(0, 6))
+    """Under bf16 autocast positions stay float32."""
+    window = batch(swirl(0, 6))
     model = network(awake=True)
-    exact = rolled(model, given, 1)
+    exact = rolled(model, window, 1)
     with torch.autocast("cpu", torch.bfloat16):
-        half = rolled(model, given, 1)
+        half = rolled(model, window, 1)
     assert half.dtype == torch.float32
-    change = (exact[:, 0] - given.position[:, -1]).abs().max()
-    assert 0.0 < float((half - exact).abs().max()) < 0.02 * float(change)
+    displacement = (exact[:, 0] - window.position[:, -1]).abs().max()
+    difference = float((half - exact).abs().max())
+    assert 0.0 < difference < 0.02 * float(displacement)
+
+
+def test_half_precision_changes_the_loss_by_rounding_only() -> None:
     window = batch(swirl(0, 7))
-    disturbed = network(awake=True, noise_std=1e-3, symmetry="square")
+    model = network(awake=True, noise_std=1e-3, symmetry="square")
     with torch.no_grad():
-        full = disturbed(window, torch.Generator().manual_seed(0))
+        exact = model(window, seeded())
         with torch.autocast("cpu", torch.bfloat16):
-            mixed = disturbed(window, torch.Generator().manual_seed(0))
-    for name, value in full.items():
-        assert mixed[name].dtype == torch.float32
-        torch.testing.assert_close(mixed[name], value, rtol=0.02, atol=0.0)
+            half = model(window, seeded())
+    for name, value in exact.items():
+        assert half[name].dtype == torch.float32
+        torch.testing.assert_close(half[name], value, rtol=0.02, atol=0.0)
 
 
 def test_scales_are_no_weights() -> None:
     """Weights stored in half precision bring back a model with the scales in full."""
     model = network(awake=True)
-    twin = network()
-    twin.load_state_dict(
-        {name: value.bfloat16() for name, value in model.state_dict().items()}
-    )
-    for scale in ("position", "velocity", "acceleration"):
-        assert torch.equal(getattr(twin, scale).std, getattr(model, scale).std)
-    assert float(twin.velocity.std[0]) == pytest.approx(0.004, rel=1e-7)
+    stored = {}
+    for name, value in model.state_dict().items():
+        stored[name] = value.bfloat16()
+    loaded = network()
+    loaded.load_state_dict(stored)
+    for name in ("position", "velocity", "acceleration"):
+        deviation = getattr(model, name).std
+        assert torch.equal(getattr(loaded, name).std, deviation)
+    assert float(loaded.velocity.std[0]) == pytest.approx(0.004, rel=1e-7)

@@ -1,6 +1,4 @@
-"""Strain since the first frame: affine motion has the strain of its matrix, images have
-images of it.
-"""
+"""Strain since the first frame, against affine motions and mirror images."""
 
 from __future__ import annotations
 
@@ -20,24 +18,23 @@ from lagbench.errors import UsageError
 BOUNDS = info().bounds
 
 
-def rest(position: Tensor, *, bodies: int = 1) -> RestShape:
+def rest_shape(position: Tensor, *, bodies: int = 1) -> RestShape:
     """Return the first frame of bodies whose particles take turns."""
     layer = torch.arange(len(position)) % bodies
-    return RestShape.build(
-        ParticleGrid(BOUNDS, 12, multiple=4), position, layer, bodies
-    )
+    grid = ParticleGrid(BOUNDS, 12, multiple=4)
+    return RestShape.build(grid, position, layer, bodies)
 
 
-def cloud(seed: int, low: float = 0.3, high: float = 0.7) -> Tensor:
+def square_body(seed: int) -> Tensor:
     """Return a square body."""
-    return torch.from_numpy(jittered(seed, low=low, high=high)).float()
+    return torch.from_numpy(jittered(seed, low=0.3, high=0.7)).float()
 
 
 @pytest.mark.parametrize(
-    "gradient",  # the second a rotation: no strain
+    "gradient",
     [
         (1.0, 0.0, 0.0, 1.0),
-        (0.6, -0.8, 0.8, 0.6),
+        (0.6, -0.8, 0.8, 0.6),  # a rotation: no strain
         (0.9, 0.0, 0.0, 0.9),
         (1.1, 0.05, -0.02, 0.92),
         (1, 0.3, 0, 1),
@@ -48,47 +45,63 @@ def test_affine_motion_has_the_strain_of_its_matrix(
 ) -> None:
     """(F F^T - 1) / 2, at the edges of the body too, wherever it went."""
     f = np.reshape(gradient, (2, 2))
-    e = 0.5 * (f @ f.T - np.eye(2))
-    first = cloud(0)
+    first = square_body(0)
     moved = first @ torch.from_numpy(f).float().T + 0.05
-    found = rest(first).strain(moved)
-    expected = np.tanh(np.array([e[0, 0], e[0, 1], e[1, 1]]) / UNIT)
-    np.testing.assert_allclose(
-        found.numpy(), np.tile(expected, (len(first), 1)), rtol=0, atol=0.05
-    )
-    np.testing.assert_allclose(found.mean(dim=0).numpy(), expected, rtol=0, atol=0.02)
-    with torch.autocast("cpu", torch.bfloat16):  # has the bits that it has in a rollout
-        assert torch.equal(rest(first).strain(moved), found)
+    strain = rest_shape(first).strain(moved)
+
+    (xx, xy), (_, yy) = 0.5 * (f @ f.T - np.eye(2))
+    expected = np.tanh(np.array([xx, xy, yy]) / UNIT)
+    everywhere = np.tile(expected, (len(first), 1))
+    np.testing.assert_allclose(strain.numpy(), everywhere, rtol=0, atol=0.05)
+    mean = strain.mean(dim=0).numpy()
+    np.testing.assert_allclose(mean, expected, rtol=0, atol=0.02)
+
+
+def test_strain_under_autocast_has_the_same_bits() -> None:
+    first = square_body(0)
+    shear = torch.tensor([[1.1, 0.05], [-0.02, 0.92]])
+    moved = first @ shear.T + 0.05
+    expected = rest_shape(first).strain(moved)
+    with torch.autocast("cpu", torch.bfloat16):
+        strain = rest_shape(first).strain(moved)
+    assert torch.equal(strain, expected)
 
 
 def test_bodies_in_layers_of_their_own_fly_apart_unstrained() -> None:
-    """Two that lie in each other at first and part: neither is strained."""
-    first = cloud(0)
-    apart = (
-        first + torch.tensor([[-0.1, 0.0], [0.1, 0.05]])[torch.arange(len(first)) % 2]
-    )
-    assert float(rest(first, bodies=2).strain(apart).abs().max()) < 1e-4
-    assert float(rest(first).strain(apart).abs().max()) > 0.1
+    """Neither of two bodies is strained that lie in each other at first and part."""
+    first = square_body(0)
+    shifts = torch.tensor([[-0.1, 0.0], [0.1, 0.05]])
+    apart = first + shifts[torch.arange(len(first)) % 2]
+    two_layers = rest_shape(first, bodies=2).strain(apart)
+    one_layer = rest_shape(first).strain(apart)
+    assert float(two_layers.abs().max()) < 1e-4
+    assert float(one_layer.abs().max()) > 0.1
 
 
 def test_an_image_is_strained_as_an_image() -> None:
     """A mirror image in x has the same xx and yy, and the opposite xy."""
-    frames = torch.stack([cloud(0), cloud(0) @ torch.tensor([[1.05, 0.1], [0.0, 0.9]])])
-    given = replace(batch(frames.numpy()), origin=frames[0])
-    mirrored = mirror_batch(given, torch.tensor([[[-1.0, 0.0], [0.0, 1.0]]]), BOUNDS)
-    here, there = (
-        rest(first_frame(one)).strain(one.position[:, 1]) for one in (given, mirrored)
-    )
-    torch.testing.assert_close(
-        there, here * torch.tensor([1.0, -1.0, 1.0]), rtol=0, atol=1e-3
-    )
+    first = square_body(0)
+    sheared = first @ torch.tensor([[1.05, 0.1], [0.0, 0.9]])
+    frames = torch.stack([first, sheared])
+    window = replace(batch(frames.numpy()), origin=first)
+    mirror_x = torch.tensor([[[-1.0, 0.0], [0.0, 1.0]]])
+    image = mirror_batch(window, mirror_x, BOUNDS)
+
+    strain = rest_shape(first_frame(window)).strain(window.position[:, 1])
+    image_strain = rest_shape(first_frame(image)).strain(image.position[:, 1])
+    expected = strain * torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(image_strain, expected, rtol=0, atol=1e-3)
 
 
-def test_the_first_frame_is_known_or_asked_for() -> None:
-    """Windows from the first frame hold it, others must bring it."""
-    given = batch(jittered(0)[None].repeat(3, axis=0))
-    assert torch.equal(first_frame(given), given.position[:, 0])
-    later = replace(given, frame=given.frame + 4)
+def test_windows_from_the_first_frame_have_it() -> None:
+    window = batch(jittered(0)[None].repeat(3, axis=0))
+    assert torch.equal(first_frame(window), window.position[:, 0])
+
+
+def test_later_windows_must_bring_the_first_frame() -> None:
+    window = batch(jittered(0)[None].repeat(3, axis=0))
+    later = replace(window, frame=window.frame + 4)
     with pytest.raises(UsageError, match="origin"):
         first_frame(later)
-    assert torch.equal(first_frame(replace(later, origin=cloud(1))), cloud(1))
+    origin = square_body(1)
+    assert torch.equal(first_frame(replace(later, origin=origin)), origin)

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from browser import (
     CHROMIUM,
     Browser,
@@ -29,6 +28,7 @@ from browser import (
     until,
 )
 from PIL import Image
+from sample_boards import make_board, with_entry
 
 from lagbench.board.columns import columns_of, format_value, presets_of, value_of
 from lagbench.board.model import Board, BoardRow, ReferenceRow, Tab
@@ -133,7 +133,7 @@ def test_long_author_lines_clip_no_column(
         f"[...{table}.querySelectorAll('thead th:not([hidden])')].map(th => "
         f"th.textContent)"
     )
-    assert len(heads) == 2 + 1 + 5 + 3
+    assert len(heads) == 2 + 1 + 4 + 4
     assert heads[-2:] == ["budgetself\u2011reported", "scores"]
     titles = page.value(
         f"[...{table}.querySelectorAll('tr[data-entry] .sub')].map(e => e.title)"

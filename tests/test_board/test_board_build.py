@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_up import PLACE, BoardBench, copied, master, noisy
+from board_bench import PLACE, BoardBench, copied, master, noisy
 from numpy.typing import NDArray
 
 from lagbench.board.build import (
@@ -296,10 +296,12 @@ def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:
     folder.
     """
     own.entry("noisy").rename(own.folder / PLACE / "other.yaml")
-    with pytest.raises(ChecksFailedError, match="another place"):
+    with pytest.raises(ChecksFailedError) as caught:
         collect(own.folder, registry=own.registry)
-    with pytest.raises(UsageError, match="no leaderboard here"):
+    assert caught.value.where == "submissions/cavity/tiny/other.yaml"
+    with pytest.raises(UsageError) as caught:
         collect(own.folder / "nothing", registry=own.registry)
+    assert caught.value.where.endswith("leaderboard/nothing")
 
 
 def test_some_data_sets_are_read_alone(board: Board, own: BoardBench) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from board_worlds import make_board
+from sample_boards import make_board
 from typer.testing import CliRunner
 
 from lagbench.__main__ import app

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from html_check import Element, read_html
 from page_reader import element_text, read_page_data
+from sample_boards import make_board, with_entry
 
 from lagbench.board.columns import columns_of
 from lagbench.board.entry import EntryCost, EntryFlag, Weights
@@ -212,8 +212,8 @@ def line_of(page: str, row: BoardRow) -> str:
 def test_rows_lead_to_code_paper_and_weights(board: Board, page: str) -> None:
     """A link each where the entry has one, and to nothing but the web."""
     for row in board.tabs[0].rows:
-        found = re.findall(r'<a href="(http[^"]*)"[^>]*>(\w+)</a>', line_of(page, row))
-        links = {label: address for address, label in found}
+        actual = re.findall(r'<a href="(http[^"]*)"[^>]*>(\w+)</a>', line_of(page, row))
+        links = {label: address for address, label in actual}
         expected = {}
         for key in ("code", "paper", "weights"):
             address = getattr(row.entry, key)

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from board_worlds import make_board, with_entry
 from browser import (
     CHROMIUM,
     Browser,
@@ -25,6 +24,7 @@ from browser import (
     still,
     until,
 )
+from sample_boards import make_board, with_entry
 
 from lagbench.board.cost import points_of
 from lagbench.board.entry import EntryFlag

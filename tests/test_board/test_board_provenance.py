@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from board_bench import BoardBench, copied, nearer
 from hypothesis import given
 from hypothesis import strategies as st
-from made_up import BoardBench, copied, nearer
 
 from lagbench.board.entry_file import read_entry
 from lagbench.submission import open_predictions

@@ -16,7 +16,7 @@ import netCDF4
 import numpy as np
 import pytest
 import yaml
-from made_up import (
+from board_bench import (
     PLACE,
     SCORES,
     BoardBench,
@@ -422,9 +422,9 @@ def test_without_git_it_says_so(
     """An unknown revision, and a folder outside any repository, are a matter of
     usage.
     """
-    with pytest.raises(UsageError) as error:
+    with pytest.raises(UsageError) as caught:
         checked(branch, base="nowhere")
-    assert "--base" in str(error.value.where)
+    assert "--base" in str(caught.value.where)
     outside = copied(home, tmp_path_factory.mktemp("outside"))
     with pytest.raises(UsageError):
         checked(outside, base="main")

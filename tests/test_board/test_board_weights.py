@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from board_bench import BoardBench, copied, nearer, noisy, still
 from file_size_limit import largest_file
-from made_up import BoardBench, copied, nearer, noisy, still
 from simple_models import INFO, Drift
 
 from lagbench.baselines.checkpoint import Checkpoint, load, round_weights, save
@@ -558,14 +558,16 @@ def test_only_sound_active_entries_get_seeds(
     submitted(own, runs[0])
     held = lying(own)["drift_0.pt"]
     put("pt", held + b"more")(own)
-    with pytest.raises(ChecksFailedError, match="weights"):
+    with pytest.raises(ChecksFailedError) as caught:
         submitted(own, runs[1], add=True)
+    assert caught.value.where.endswith("leaderboard/weights/cavity/tiny/drift_0.pt")
     put("pt", held)(own)
     own.edit(
         "drift", lambda entry: entry.update(status="withdrawn", reason="a mistake")
     )
-    with pytest.raises(UsageError, match="active"):
+    with pytest.raises(UsageError) as caught:
         submitted(own, runs[1], add=True)
+    assert caught.value.where.endswith("leaderboard/submissions/cavity/tiny/drift.yaml")
     own.edit("drift", lambda entry: entry.update(status="active", reason="it was none"))
 
     def meanwhile(*args: Any, **options: Any) -> ScoreCard:
@@ -574,8 +576,9 @@ def test_only_sound_active_entries_get_seeds(
         return score(*args, **options)
 
     monkeypatch.setattr(submitting, "score", meanwhile)
-    with pytest.raises(UsageError, match="while"):
+    with pytest.raises(UsageError) as caught:
         submitted(own, runs[2], add=True)
+    assert caught.value.where == "submissions/cavity/tiny/drift.yaml"
     entry = read_entry(own.entry("drift"))
     assert [made.seed for made in entry.predictions] == [0, 3]
     assert entry.reason == "it was none"

@@ -14,7 +14,7 @@ from conftest import SIZE, SPLIT
 from typer.testing import Result
 
 from lagbench.cli import demo
-from lagbench.cli.machine import SolverBench
+from lagbench.cli.solver_bench import SolverBench
 from lagbench.data.registry import Registry, load
 from lagbench.data.yamlfile import read_yaml
 from lagbench.errors import UsageError, WorkFailedError
@@ -22,148 +22,168 @@ from lagbench.references import references_of
 
 Run = Callable[..., Result]
 
-REFERENCES = [floor.name for floor in references_of(load().size(SPLIT, SIZE))]
+REFERENCES = [reference.name for reference in references_of(load().size(SPLIT, SIZE))]
+
+SOLVER_BENCH = SolverBench(
+    split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5
+)
 
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
-    """A function that runs lagbench in an empty folder, with our splits and no recorded
-    hashes.
-    """
-    (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path / "empty")
+    """A function that runs lagbench in an empty folder, without recorded hashes."""
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
     return run
 
 
 @pytest.fixture
-def only_one(
+def small_registry(
     run: Run, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path, tmp_path: Path
 ) -> Registry:
-    """A registry of two splits, of which one has a size tiny; the demo's model, quickly
-    trained, is its.
+    """A registry of two splits, of which one has a size tiny; the demo uses it.
+
+    Its model trains quickly.
     """
-    file = read_yaml(unmeasured_path)
-    small = file["splits"][SPLIT]
+    registry = read_yaml(unmeasured_path)
+    small = registry["splits"][SPLIT]
     large = {**small, "sizes": {"full": small["sizes"]["full"]}}
+    splits = {"large": large, SPLIT: small}
     path = tmp_path / "datasets.yaml"
     # JSON is YAML
-    path.write_text(json.dumps({**file, "splits": {"large": large, SPLIT: small}}))
+    path.write_text(json.dumps({**registry, "splits": splits}))
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(path))
     monkeypatch.setattr(demo, "MODEL_SPLIT", SPLIT)
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=2", "model.width=4"))
-    timed = SolverBench(
-        split=SPLIT, size=SIZE, particles=1, substeps=1, frames=1, seconds_per_frame=0.5
-    )
-    monkeypatch.setattr("lagbench.cli.machine.bench_apart", lambda *_: timed)
+    monkeypatch.setattr(demo, "bench_apart", lambda *_: SOLVER_BENCH)
     return load(path)
 
 
-def made_in(root: Path, run: Run) -> Any:
+@pytest.fixture
+def no_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let torch be missing."""
+
+    def refuse(_: tuple[str, ...]) -> None:
+        raise UsageError("torch is not installed", fix="pip install it")
+
+    monkeypatch.setattr(demo, "require_libraries", refuse)
+
+
+def run_demo(root: Path, run: Run) -> Any:
     """Return what the demo prints with --json."""
     result = run("demo", "--root", root, "--json")
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
 
-def test_without_the_extra_the_data_are_made_and_one_line_says_how_to_get_the_rest(
-    run: Run,
-    only_one: Registry,
-    copied: Callable[[], Path],
+def test_the_demo_takes_the_splits_of_size_tiny(small_registry: Registry) -> None:
+    assert demo.demo_splits(small_registry) == [SPLIT]
+    assert demo.explain_missing_model(small_registry) is None
+
+
+def test_a_registry_without_the_model_split_gives_no_model(
+    small_registry: Registry,
+) -> None:
+    registry = Registry({"large": small_registry.split("large")}, {})
+    reason = demo.explain_missing_model(registry)
+    assert reason == f"the registry has no {SPLIT} {SIZE}"
+
+
+def test_a_solver_that_cannot_be_timed_gives_no_speed_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """It says how to install it; no leaderboard, null in JSON; a split without a tiny
-    size is left out.
-    """
-
-    def no_torch(name: str, *, extra: str) -> None:
-        raise UsageError(
-            f"{name} is not installed", fix=f"pip install 'lagbench[{extra}]'"
-        )
-
-    def no_solver(*_: str) -> SolverBench:
+    def fail(*_: str) -> SolverBench:
         raise WorkFailedError("the solver could not be timed")
 
-    monkeypatch.setattr("lagbench.cli.machine.bench_apart", no_solver)
-    assert demo._solver_time() is None  # then the page shows no speed-up
-    assert demo.model_left_out(only_one) is None
-    without = demo.model_left_out(Registry({"large": only_one.split("large")}, {}))
-    assert without == f"the registry has no {SPLIT} {SIZE}"
-    monkeypatch.setattr(demo, "check_installed", no_torch)
+    monkeypatch.setattr(demo, "bench_apart", fail)
+    assert demo.bench_demo_solver() is None
+
+
+@pytest.mark.usefixtures("small_registry", "no_torch")
+def test_without_torch_the_demo_makes_data_only(
+    run: Run, copied: Callable[[], Path]
+) -> None:
+    """One line says how to install the rest; no leaderboard is made."""
     root = copied()
-    assert demo.demo_splits(only_one) == [SPLIT]
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
-    assert "1 data sets, verified and drawn, in" in result.stdout
-    assert "pip install 'lagbench[baselines]'" in result.stdout
+    lines = result.stdout.splitlines()
+    assert "no model, no leaderboard: torch is not installed; pip install it" in lines
     assert not (root / "leaderboard").exists()
-    made = made_in(root, run)
-    assert made["model"] is None
-    assert made["model_left_out"] in result.stdout
-    assert list(made["splits"]) == [SPLIT]
-    assert made["splits"][SPLIT]["generation"]["kept"] == [0, 1, 2, 3, 4]
-    assert Path(made["splits"][SPLIT]["picture"]).is_file()
+
+    data = run_demo(root, run)
+    assert data["model"] is None
+    assert data["model_left_out"] == "torch is not installed; pip install it"
+    assert list(data["splits"]) == [SPLIT]
+    split = data["splits"][SPLIT]
+    assert split["generation"]["kept"] == [0, 1, 2, 3, 4]
+    assert Path(split["picture"]).is_file()
 
 
-@pytest.mark.usefixtures("only_one")
+@pytest.mark.usefixtures("small_registry")
 @pytest.mark.slow
 def test_the_demo_ends_with_a_leaderboard_of_its_own(
     run: Run, copied: Callable[[], Path]
 ) -> None:
-    """Model and floors are on its page, nothing in the current folder; a second run
-    gives the same entry.
+    """Model and references are on its page, and the current folder stays empty.
+
+    A second run gives the same entry.
     """
     root = copied()
-    first = made_in(root, run)["model"]
+    first = run_demo(root, run)["model"]
     result = run("demo", "--root", root)
     assert result.exit_code == 0, result.output
     page = root / "leaderboard" / "index.html"
     assert f"leaderboard page: {page}" in result.stdout.splitlines()
-    assert all(name in page.read_text() for name in (*REFERENCES, "NeuralMPM, 2 steps"))
+    html = page.read_text()
+    for name in (*REFERENCES, "NeuralMPM, 2 steps"):
+        assert name in html
     assert list(Path.cwd().iterdir()) == []
-    entry = yaml.safe_load(
-        (root / f"leaderboard/submissions/{SPLIT}/{SIZE}/neuralmpm.yaml").read_text()
-    )
+
+    submissions = root / "leaderboard" / "submissions"
+    entry = yaml.safe_load((submissions / SPLIT / SIZE / "neuralmpm.yaml").read_text())
     assert entry["cost"]["solver_seconds_per_frame"] == 0.5
     checked = run("leaderboard", "check", "--board", root / "leaderboard", "--page")
     assert checked.exit_code == 0, checked.output
-    second = made_in(root, run)["model"]
-    assert second["training"] == {
-        **first["training"],
-        "first_step": first["training"]["step"],
-    }
-    assert second["card"]["predictions_sha256"] == first["card"]["predictions_sha256"]
-    assert second["card"]["rows"] == first["card"]["rows"]
+
+    second = run_demo(root, run)["model"]
+    first_step = first["training"]["step"]
+    assert second["training"] == {**first["training"], "first_step": first_step}
+    card = second["card"]
+    assert card["predictions_sha256"] == first["card"]["predictions_sha256"]
+    assert card["rows"] == first["card"]["rows"]
     assert second["page"]["rows"] == 1
     assert second["page"]["tabs"] == 1
-    ranked = second["card"]["rows"]["submission"][second["card"]["ranking_metric"]]
-    assert second["entry"]["mean"] == pytest.approx(ranked["mean"], rel=1e-5)
+    ranking_score = card["rows"]["submission"][card["ranking_metric"]]
+    assert second["entry"]["mean"] == pytest.approx(ranking_score["mean"], rel=1e-5)
 
 
-@pytest.mark.usefixtures("only_one")
+@pytest.mark.usefixtures("small_registry")
 @pytest.mark.slow
-def test_what_another_version_left_is_trained_anew(
+def test_a_training_of_another_version_is_trained_anew(
     copied: Callable[[], Path], run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A damaged checkpoint, and one of another recipe, cost a training and no error."""
+    """A damaged checkpoint, and one of another recipe, are no errors."""
     root = copied()
-    made_in(root, run)
-    (root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.pt").write_bytes(b"damaged")
+    run_demo(root, run)
+    checkpoint = root / "runs" / f"{SPLIT}-neuralmpm" / "checkpoint.pt"
+    checkpoint.write_bytes(b"damaged")
     assert demo.demo_model(root=root).training.state == "finished"
+
     monkeypatch.setattr(demo, "SETTINGS", ("training.steps=3", "model.width=4"))
-    again = demo.demo_model(root=root).training
-    assert again.state == "finished"
-    assert again.step == 3
-    assert again.steps == 3
-    assert torch.load(again.weights, weights_only=True)
+    training = demo.demo_model(root=root).training
+    assert training.state == "finished"
+    assert training.step == training.steps == 3
+    assert torch.load(training.weights, weights_only=True)
 
 
-def test_anothers_leaderboard_is_refused_before_the_work(
+def test_another_leaderboard_is_refused_before_the_work(
     run: Run, tmp_path: Path
 ) -> None:
-    """A folder with entries of another size is left alone: exit code 2, and nothing
-    generated.
-    """
-    entry = tmp_path / "leaderboard" / "submissions" / "cavity" / "mini" / "mine.yaml"
+    """A folder with entries of another size is left alone, and nothing is generated."""
+    submissions = tmp_path / "leaderboard" / "submissions"
+    entry = submissions / "cavity" / "mini" / "mine.yaml"
     entry.parent.mkdir(parents=True)
     entry.touch()
     result = run("demo", "--root", tmp_path)
@@ -174,21 +194,17 @@ def test_anothers_leaderboard_is_refused_before_the_work(
 
 @pytest.mark.slow
 def test_the_whole_demo_from_nothing(run: Run, tmp_path: Path) -> None:
-    """Four verified data sets, and a model that beats what costs no learning."""
-    made = made_in(tmp_path / "demo", run)
-    assert list(made["splits"]) == ["cavity", "curl-noise", "fluid", "multimaterial"]
-    assert [one["verification"]["problems"] for one in made["splits"].values()] == [
-        [],
-        [],
-        [],
-        [],
-    ]
-    model = made["model"]
+    """It gives four verified data sets, and a model that beats the naive baselines."""
+    data = run_demo(tmp_path / "demo", run)
+    splits = data["splits"]
+    assert list(splits) == ["cavity", "curl-noise", "fluid", "multimaterial"]
+    for split in splits.values():
+        assert split["verification"]["problems"] == []
+    model = data["model"]
     assert model["training"]["split"] == "cavity"
     assert model["solver"]["seconds_per_frame"] > 0
-    assert (
-        model["card"]["skill"]["value"] > 0.2
-    )  # better than anything that costs no learning
-    assert model["page"]["rows"] == 1
-    assert model["page"]["tabs"] == 1
-    assert Path(model["page"]["page"]).stat().st_size == model["page"]["bytes"]
+    assert model["card"]["skill"]["value"] > 0.2
+    page = model["page"]
+    assert page["rows"] == 1
+    assert page["tabs"] == 1
+    assert Path(page["page"]).stat().st_size == page["bytes"]

@@ -1,6 +1,4 @@
-"""Scenario files open anywhere, hash alike whoever wrote them, and tell when they are
-damaged.
-"""
+"""Scenario files: other readers, content hashes, and damage."""
 
 from __future__ import annotations
 
@@ -27,9 +25,13 @@ from lagbench.generators.split import Material
 
 KEY = make_key()
 TYPES = {
-    **dict.fromkeys(("frame", "particle"), "int32"),
-    **dict.fromkeys(("time", "particle_mass"), "float64"),
-    **dict.fromkeys(("position", "velocity", "wall_velocity"), "float32"),
+    "frame": "int32",
+    "particle": "int32",
+    "time": "float64",
+    "particle_mass": "float64",
+    "position": "float32",
+    "velocity": "float32",
+    "wall_velocity": "float32",
     "material": "int8",
 }
 
@@ -40,16 +42,15 @@ def written(tmp_path: Path) -> tuple[Path, str]:
     return write_scenario(tmp_path, KEY)
 
 
-def damaged(
+def assert_refused(
     path: Path, *parts: str, check: Callable[[Path], object] = check_scenario
 ) -> None:
-    """Assert that a file is refused with its name and these parts, in this order or
-    another.
-    """
+    """Assert that the error of a check has the name of the file and these parts."""
     with pytest.raises(DataError) as caught:
         check(path)
-    text = str(caught.value)
-    assert all(part in text for part in (path.name, *parts)), text
+    message = str(caught.value)
+    for part in (path.name, *parts):
+        assert part in message
 
 
 @pytest.mark.parametrize("engine", ["netcdf4", "h5netcdf"])
@@ -78,13 +79,10 @@ def test_xarray_opens_it_unaided(written: tuple[Path, str], engine: str) -> None
     assert tuple(material.name.lower() for material in Material) == MATERIALS
 
 
-def test_plain_h5py_opens_it(written: tuple[Path, str], tmp_path: Path) -> None:
-    """Chunks hold one frame; the only filters are shuffle and zlib level 1.
-
-    With one set of libraries even the packed bytes are the same: nothing depends on the
-    clock.
-    """
-    with h5py.File(written[0]) as file:
+def test_plain_h5py_opens_it(written: tuple[Path, str]) -> None:
+    """Chunks hold one frame; the only filters are shuffle and zlib level 1."""
+    path, _ = written
+    with h5py.File(path) as file:
         for name in ("position", "velocity"):
             variable = file[name]
             assert variable.chunks == (1, 8, 2)
@@ -92,49 +90,55 @@ def test_plain_h5py_opens_it(written: tuple[Path, str], tmp_path: Path) -> None:
             assert variable.compression_opts == 1
             assert variable.shuffle
         np.testing.assert_array_equal(file["velocity"][...], -frames_of(3, 4, 8))
+
+
+def test_equal_scenarios_have_equal_bytes(tmp_path: Path) -> None:
+    """With one set of libraries nothing depends on the clock."""
     first, _ = write_scenario(tmp_path / "a", KEY)
     second, _ = write_scenario(tmp_path / "b", KEY)
     assert file_sha256(first) == file_sha256(second)
 
 
 def test_all_routes_to_the_content_hash_agree(written: tuple[Path, str]) -> None:
-    """Ours, xarray's variables in memory, and thirty lines written from docs/format.md.
-
-    Sixteen digits suffice where one is expected; another one is told. A patch release
-    may better a long_name: no reader computes with it.
-    """
+    """By lagbench, from xarray, and by code written after docs/format.md."""
     path, content = written
-    assert (
-        independent_hash.content_hash(path)
-        == content
-        == rehash(path)
-        == check_scenario(path)
-    )
-    with xr.open_dataset(path) as scenario, read_scenario(path) as file:
-        hasher = ContentHasher(KEY.identity(file.header.seed, file.header.parameters))
+    assert rehash(path) == content
+    assert check_scenario(path) == content
+    assert independent_hash.content_hash(path) == content
+    with read_scenario(path) as file:
+        identity = KEY.identity(file.header.seed, file.header.parameters)
+    hasher = ContentHasher(identity)
+    with xr.open_dataset(path) as scenario:
         for name, variable in scenario.variables.items():
             hasher.declare(str(name), variable.dtype, variable.dims, variable.shape)
             hasher.update(str(name), variable.values)
     assert hasher.hexdigest() == content
+
+
+def test_sixteen_digits_of_an_expected_hash_suffice(written: tuple[Path, str]) -> None:
+    path, content = written
     assert check_scenario(path, content[:16]) == content
-    with pytest.raises(
-        DataError, match=r"(?s)another content hash.*expected: 0123.*got: " + content
-    ):
+    message = r"(?s)another content hash.*expected: 0123.*got: " + content
+    with pytest.raises(DataError, match=message):
         check_scenario(path, "0123456789abcdef")
+
+
+def test_a_patch_release_may_change_a_long_name(written: tuple[Path, str]) -> None:
+    """No reader computes with it."""
+    path, content = written
     with h5py.File(path, "r+") as file:
         file["position"].attrs["long_name"] = "where the particles are"
     assert check_scenario(path) == content
 
 
 def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
-    """Without wall velocities there is neither a wall dimension nor a Reynolds
-    number.
-    """
+    """Without wall velocities there is no Reynolds number either."""
     path, content = write_scenario(tmp_path, KEY, walls=False)
     with xr.open_dataset(path) as scenario:
         assert "wall" not in scenario.dims
         assert "reynolds_number" not in scenario.attrs
-    assert check_scenario(path) == content == independent_hash.content_hash(path)
+    assert check_scenario(path) == content
+    assert independent_hash.content_hash(path) == content
 
 
 @settings(
@@ -160,14 +164,14 @@ def test_free_surface_files_have_no_walls(tmp_path: Path) -> None:
 def test_parameters_survive_the_file(
     tmp_path: Path, parameters: dict[str, Any], seed: str
 ) -> None:
-    """What was hashed while writing is what two readers find, whatever the parameters
-    are.
-    """
+    """Two readers find the hash of the writer, whatever the parameters are."""
     path, content = write_scenario(tmp_path, KEY, parameters=parameters, seed=seed)
     with read_scenario(path) as file:
-        assert file.header.parameters == {**parameters, "reynolds_number": 100.0}
+        expected = parameters | {"reynolds_number": 100.0}
+        assert file.header.parameters == expected
         assert file.header.seed == seed
-    assert rehash(path) == content == independent_hash.content_hash(path)
+    assert rehash(path) == content
+    assert independent_hash.content_hash(path) == content
 
 
 @pytest.mark.parametrize("name", sorted(TYPES))
@@ -182,21 +186,28 @@ def test_every_variable_is_hashed_and_named(
         values = file[name][()]
         file[name][...] = values + np.ones_like(values)
     assert rehash(path) != content
-    damaged(path, "differ", f"variable '{name}'")
+    assert_refused(path, "differ", f"variable '{name}'")
 
 
 @pytest.mark.parametrize(
-    "name", ["dt", "wall_moving", "seed", "scenario", "subset", "hashed_parameters"]
+    ("name", "value"),
+    [
+        ("dt", 0.0021),
+        ("wall_moving", "other"),
+        ("seed", "other"),
+        ("scenario", 4),
+        ("subset", "other"),
+        ("hashed_parameters", "dt"),
+    ],
 )
-def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> None:
-    """Parameters and identity enter the hash; the error says that attributes differ."""
+def test_changed_attributes_are_found(
+    written: tuple[Path, str], name: str, value: object
+) -> None:
+    """Parameters and identity enter the hash."""
     path, _ = written
     with netCDF4.Dataset(path, "r+") as file:
-        file.setncattr(
-            name,
-            {"dt": 0.0021, "scenario": 4, "hashed_parameters": "dt"}.get(name, "other"),
-        )
-    damaged(path, "attributes differ", "attributes")
+        file.setncattr(name, value)
+    assert_refused(path, "attributes differ", "attributes")
 
 
 @pytest.mark.parametrize(
@@ -219,9 +230,7 @@ def test_changed_attributes_are_found(written: tuple[Path, str], name: str) -> N
 def test_attributes_that_change_the_meaning_are_refused(
     written: tuple[Path, str], variable: str, name: str, value: object
 ) -> None:
-    """The values are the same, yet readers that follow CF would read others: file,
-    variable, attribute.
-    """
+    """The values are the same, yet readers that follow CF would read others."""
     path, content = written
     with h5py.File(path, "r+") as file:
         if value is None:
@@ -229,13 +238,11 @@ def test_attributes_that_change_the_meaning_are_refused(
         else:
             file[variable].attrs[name] = value
     assert rehash(path) == content
-    damaged(path, f"variable '{variable}'", name)
+    assert_refused(path, f"variable '{variable}'", name)
 
 
 def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -> None:
-    """Damage inside packed frames is told as damage of that variable, not as a
-    traceback of HDF5.
-    """
+    """The error is that of the variable, not a traceback of HDF5."""
     path, _ = write_scenario(tmp_path, KEY, frames=4, particles=2000)
     with h5py.File(path) as file:
         offset = file["velocity"].id.get_chunk_info(2).byte_offset
@@ -243,83 +250,96 @@ def test_flipped_byte_in_a_compressed_chunk_names_the_variable(tmp_path: Path) -
     data[offset + 100] ^= 1
     path.write_bytes(data)
     for check in (rehash, check_scenario):
-        damaged(
+        assert_refused(
             path, "damaged", "variable 'velocity'", "lagbench generate", check=check
         )
 
 
 @pytest.mark.slow
 def test_no_flipped_byte_escapes_as_another_error(written: tuple[Path, str]) -> None:
-    """Each of 600 flips all over the file leaves the content as it is or gives a
-    DataError.
-    """
+    """Each of 600 flips leaves the content as it is or gives a DataError."""
     path, content = written
     good = path.read_bytes()
-    noticed = 0
+    messages = []
     for offset in range(0, len(good), len(good) // 600):
         data = bytearray(good)
         data[offset] ^= 0x55
         path.write_bytes(data)
         try:
-            found = check_scenario(path)
+            content_after = check_scenario(path)
         except DataError as error:
-            found = content if str(path) in str(error) else "an error without the path"
-            noticed += 1
-        assert found == content, f"byte {offset}"
-    assert noticed >= 20
-    for share in (0.0, 0.001, 0.3, 0.7, 0.999):  # cut anywhere
-        path.write_bytes(good[: int(share * len(good))])
-        damaged(path, "damaged")
+            messages.append(str(error))
+        else:
+            assert content_after == content, f"byte {offset}"
+    assert len(messages) >= 20
+    for message in messages:
+        assert str(path) in message
 
 
-def test_missing_foreign_and_impossible_files(
-    written: tuple[Path, str], tmp_path: Path
-) -> None:
-    """Missing, somebody else's netCDF, a shape of terabytes in kilobytes, a type that
-    no file of ours has.
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
+def test_a_truncated_file_is_damage(written: tuple[Path, str], share: float) -> None:
+    path, _ = written
+    good = path.read_bytes()
+    path.write_bytes(good[: int(share * len(good))])
+    assert_refused(path, "damaged")
 
-    The operating system's refusal becomes exit code 5 with the path and a remedy.
-    """
-    damaged(tmp_path / "0000.nc", "missing", check=read_scenario)
-    other = tmp_path / "other.nc"
-    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(other, engine="netcdf4")
-    damaged(other, "not one of lagbench", check=read_scenario)
-    old = tmp_path / "old.nc"  # has no HDF5 inside
-    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(
-        old, engine="netcdf4", format="NETCDF3_CLASSIC"
-    )
-    damaged(old, "damaged", check=read_scenario)
-    with h5py.File(other, "w") as file:
+
+def test_a_missing_file_is_an_error(tmp_path: Path) -> None:
+    assert_refused(tmp_path / "0000.nc", "missing", check=read_scenario)
+
+
+def test_other_netcdf_files_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.nc"
+    xr.Dataset({"a": ("b", [1.0])}).to_netcdf(path, engine="netcdf4")
+    assert_refused(path, "not one of lagbench", check=read_scenario)
+
+
+def test_netcdf_files_without_hdf5_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "old.nc"
+    data = xr.Dataset({"a": ("b", [1.0])})
+    data.to_netcdf(path, engine="netcdf4", format="NETCDF3_CLASSIC")
+    assert_refused(path, "damaged", check=read_scenario)
+
+
+def test_a_shape_of_terabytes_in_kilobytes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "large.nc"
+    with h5py.File(path, "w") as file:
         file.create_dataset("position", (2**40,), "f4", chunks=(1024,))
-    damaged(other, "larger than its file", "variable 'position'", check=read_scenario)
-    with netCDF4.Dataset(written[0], "r+") as file:
-        file.createVariable(
-            "odd", file.createCompoundType(np.dtype([("a", "i4")]), "pair"), ()
-        )
-    damaged(written[0], "damaged", "variable 'odd'", check=rehash)
-    (tmp_path / "root").mkdir()
-    (tmp_path / "root" / "cavity").write_text("in the way")
-    with pytest.raises(WorkFailedError, match=r"(?s)cannot write.*--root") as caught:
-        write_scenario(tmp_path / "root", KEY)
+    assert_refused(
+        path, "larger than its file", "variable 'position'", check=read_scenario
+    )
+
+
+def test_a_compound_type_is_damage(written: tuple[Path, str]) -> None:
+    path, _ = written
+    with netCDF4.Dataset(path, "r+") as file:
+        pair = file.createCompoundType(np.dtype([("a", "i4")]), "pair")
+        file.createVariable("odd", pair, ())
+    assert_refused(path, "damaged", "variable 'odd'", check=rehash)
+
+
+def test_a_root_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cavity").write_text("in the way")
+    with pytest.raises(WorkFailedError) as caught:
+        write_scenario(tmp_path, KEY)
+    assert str(caught.value.where).endswith("cavity/tiny/v2/test/0003.nc")
     assert caught.value.exit_code == 5
 
 
-def writer(path: Path, **changes: Any) -> ScenarioWriter:
-    """Return a writer of two frames of eight particles, unless told otherwise."""
-    told: dict[str, Any] = {
+def open_writer(path: Path, **changes: Any) -> ScenarioWriter:
+    """Return a writer of two frames of eight particles by default."""
+    options: dict[str, Any] = {
         "particles": 8,
         "frames": 2,
         "frame_interval": 0.1,
         "particle_mass": 1.0,
-    }
-    told |= {
         "material": np.zeros(8),
         "parameters": {},
         "seed": "s",
         "device": "cpu",
         "generator": "g",
     }
-    return ScenarioWriter(path, KEY, **(told | changes))
+    return ScenarioWriter(path, KEY, **(options | changes))
 
 
 def test_other_readers_may_have_the_file_open(written: tuple[Path, str]) -> None:
@@ -352,128 +372,142 @@ def _named_like_a_dimension(file: h5py.File) -> None:
     )
 
 
+def _soft_link(file: h5py.File) -> None:
+    """Show an array under a second name."""
+    file["too"] = h5py.SoftLink("/position")
+
+
+def _external_link(file: h5py.File) -> None:
+    """Show an array of another file."""
+    file["too"] = h5py.ExternalLink("other.nc", "/a")
+
+
 @pytest.mark.parametrize(
-    ("harm", "said"),
+    ("change", "words"),
     [
-        (
-            lambda file: file.update({"too": h5py.SoftLink("/position")}),
-            "'too' is a soft link",
-        ),
-        (
-            lambda file: file.update({"too": h5py.ExternalLink("other.nc", "/a")}),
-            "'too' is a external link",
-        ),
+        (_soft_link, "'too' is a soft link"),
+        (_external_link, "'too' is a external link"),
         (_crowd, "members"),
         (_virtual, "'spin' lie elsewhere: virtual"),
         (_named_like_a_dimension, "spin"),
     ],
 )
-def test_what_other_readers_would_follow_or_show_is_damage(
-    written: tuple[Path, str], harm: Callable[[h5py.File], None], said: str
+def test_members_that_other_readers_would_follow_or_show_are_damage(
+    written: tuple[Path, str], change: Callable[[h5py.File], None], words: str
 ) -> None:
-    """Links and virtual data sets are not followed, and no member is beyond the
-    count.
-    """
+    """Links and virtual data sets are not followed, and the members are counted."""
     path, _ = written
     with h5py.File(path, "r+") as file:
-        harm(file)
-    damaged(path, "damaged", said, check=read_scenario)
+        change(file)
+    assert_refused(path, "damaged", words, check=read_scenario)
 
 
 def test_texts_that_are_no_texts_are_damage(written: tuple[Path, str]) -> None:
-    """Bytes that are no UTF-8 in a text of no set length change the hash, and raise
-    nothing else.
-    """
+    """Bytes that are no UTF-8 change the hash, and raise no other error."""
     path, content = written
     with h5py.File(path, "r+") as file:
         del file.attrs["seed"]
         file.attrs.create("seed", b"\xff\xfe", dtype=h5py.string_dtype("utf-8"))
     assert rehash(path) != content
-    damaged(path, "attributes differ")
+    assert_refused(path, "attributes differ")
 
 
-def test_reading_parts(written: tuple[Path, str]) -> None:
-    """Method read takes frames or slices, blocks stream everything in order, unknown
-    names are told.
-    """
+def test_frames_and_slices_can_be_read(written: tuple[Path, str]) -> None:
     path, _ = written
     truth = frames_of(3, 4, 8)
     with read_scenario(path) as file:
-        np.testing.assert_array_equal(file.read("position", 2), truth[2])
-        np.testing.assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
-        np.testing.assert_array_equal(
-            np.concatenate(list(file.blocks("position"))), truth
-        )
-        assert file.read("particle_mass") == 1e-4 / 8
         assert file.header.frames == 4
         assert file.header.particles == 8
         assert file.header.key == KEY
-        with pytest.raises(DataError, match="variable 'density'"):
-            file.read("density")
+        assert file.read("particle_mass") == 1e-4 / 8
+        np.testing.assert_array_equal(file.read("position", 2), truth[2])
+        np.testing.assert_array_equal(file.read("position", slice(1, 3)), truth[1:3])
 
 
-def test_what_is_known_at_last_is_hashed_like_what_is_known_at_first(
-    tmp_path: Path,
-) -> None:
-    """A parameter stated after the frames gives the file that has it from the start."""
-    frames = frames_of(3, 4, 8)
-    digests = []
-    for place, (first, last) in enumerate(
-        [({"a": 1, "b": 2}, {}), ({"a": 1}, {"b": 2})]
-    ):
-        path = tmp_path / f"{place}.nc"
-        with writer(path, frames=4, parameters=first) as file:
-            for position in frames:
-                file.append(position, -position)
-            with pytest.raises(DataError):
-                file.state(seed=1)
-            file.state(**last)
-        digests.append(file.content_sha256)
-        assert check_scenario(path) == file.content_sha256
-        with read_scenario(path) as file:
+def test_blocks_stream_all_frames_in_order(written: tuple[Path, str]) -> None:
+    path, _ = written
+    with read_scenario(path) as file:
+        frames = np.concatenate(list(file.blocks("position")))
+    np.testing.assert_array_equal(frames, frames_of(3, 4, 8))
+
+
+def test_an_unknown_variable_is_an_error(written: tuple[Path, str]) -> None:
+    path, _ = written
+    with read_scenario(path) as file, pytest.raises(DataError) as caught:
+        file.read("density")
+    assert str(caught.value.where).endswith(f"{path.name}, variable 'density'")
+
+
+def write_with_parameters(
+    path: Path, first: dict[str, Any], last: dict[str, Any]
+) -> str | None:
+    """Write a scenario with parameters before and after its frames."""
+    with open_writer(path, frames=4, parameters=first) as file:
+        for position in frames_of(3, 4, 8):
+            file.append(position, -position)
+        with pytest.raises(DataError):
+            file.state(seed=1)
+        file.state(**last)
+    return file.content_sha256
+
+
+def test_a_parameter_may_be_stated_after_the_frames(tmp_path: Path) -> None:
+    """The file is the one that has it from the start."""
+    at_first = write_with_parameters(tmp_path / "0.nc", {"a": 1, "b": 2}, {})
+    at_last = write_with_parameters(tmp_path / "1.nc", {"a": 1}, {"b": 2})
+    assert at_first == at_last
+    for name in ("0.nc", "1.nc"):
+        assert check_scenario(tmp_path / name) == at_first
+        with read_scenario(tmp_path / name) as file:
             assert file.header.parameters == {"a": 1, "b": 2}
-    assert digests[0] == digests[1]
 
 
-def test_wrong_frames_are_refused(tmp_path: Path) -> None:
-    """Shape, type and number of frames; neither a file nor a temporary one appears, an
-    old file survives.
-    """
-    path, content = write_scenario(tmp_path, KEY)
-    frame = np.zeros((8, 2), np.float32)
-    for pieces, said in {
-        (8, 4): r"(?s)wrong shape.*'velocity'",
-        (1, 8): r"(?s)wrong shape.*'position'",
-        (8, 8): r"(?s)values are missing.*'position'",
-    }.items():
-        with pytest.raises(DataError, match=said), writer(path) as file:
-            file.append(*(frame[:length] for length in pieces))
-    with (
-        pytest.raises(DataError, match=r"(?s)another type.*'position'"),
-        writer(path) as file,
-    ):
-        file.append(frame.astype(np.float64), frame)
-    assert check_scenario(path) == content
-    assert list(path.parent.iterdir()) == [path]
-    with writer(tmp_path / "c.nc") as file:
-        file.append(frame, frame)
-        file.append(frame, frame)
-        with pytest.raises(DataError, match="too many values"):
-            file.append(frame, frame)
+FRAME = np.zeros((8, 2), np.float32)
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("position", "velocity", "words"),
     [
-        *((name, 1) for name in ("seed", "content_sha256", "two words", "")),
-        *(("depth", value) for value in ("", [1], {"a": 1}, np.array([1, 2]))),
+        (FRAME, FRAME[:4], r"(?s)wrong shape.*'velocity'"),
+        (FRAME[:1], FRAME, r"(?s)wrong shape.*'position'"),
+        (FRAME, FRAME, r"(?s)values are missing.*'position'"),
+        (FRAME.astype(np.float64), FRAME, r"(?s)another type.*'position'"),
     ],
 )
-def test_parameters_that_cannot_be_stored(
-    tmp_path: Path, name: str, value: object
+def test_wrong_frames_are_refused(
+    tmp_path: Path, position: Any, velocity: Any, words: str
 ) -> None:
-    """Names that would hide an attribute of the format, what netCDF would give back as
-    something else.
-    """
-    with pytest.raises(DataError, match="cannot be"):
-        write_scenario(tmp_path, KEY, parameters={name: value})
+    """No file appears, not even a temporary one, and an old file survives."""
+    path, content = write_scenario(tmp_path, KEY)
+    with pytest.raises(DataError, match=words), open_writer(path) as file:
+        file.append(position, velocity)
+    assert check_scenario(path) == content
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_too_many_frames_are_refused(tmp_path: Path) -> None:
+    with open_writer(tmp_path / "c.nc") as file:
+        file.append(FRAME, FRAME)
+        file.append(FRAME, FRAME)
+        with pytest.raises(DataError) as caught:
+            file.append(FRAME, FRAME)
+    assert caught.value.where == "variable 'position'"
+
+
+@pytest.mark.parametrize("name", ["seed", "content_sha256", "two words", ""])
+def test_parameters_that_would_hide_an_attribute_are_refused(
+    tmp_path: Path, name: str
+) -> None:
+    """So are names that are no names."""
+    with pytest.raises(DataError) as caught:
+        write_scenario(tmp_path, KEY, parameters={name: 1})
+    assert str(caught.value.where).endswith("0003.nc")
+
+
+@pytest.mark.parametrize("value", ["", [1], {"a": 1}, np.array([1, 2])])
+def test_parameters_that_netcdf_would_change_are_refused(
+    tmp_path: Path, value: object
+) -> None:
+    with pytest.raises(DataError) as caught:
+        write_scenario(tmp_path, KEY, parameters={"depth": value})
+    assert str(caught.value.where).endswith("0003.nc")

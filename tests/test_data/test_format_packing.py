@@ -42,14 +42,15 @@ def test_packing_does_not_matter(
 ) -> None:
     """Chunks, compression, library and order of attributes leave the hash as it is."""
 
-    def shuffled(names: Any) -> list[str]:  # without the one that only netCDF may write
-        listed = [name for name in names if name != "_NCProperties"]
-        order.shuffle(listed)
-        return listed
+    def shuffle_names(names: Any) -> list[str]:
+        # Only netCDF may write _NCProperties.
+        shuffled = [name for name in names if name != "_NCProperties"]
+        order.shuffle(shuffled)
+        return shuffled
 
     path, content = write_scenario(tmp_path, KEY)
     other = tmp_path / f"{library}.nc"
-    REPACK[library](path, other, Packing(level, shuffle, chunk, shuffled))
+    REPACK[library](path, other, Packing(level, shuffle, chunk, shuffle_names))
     assert rehash(other) == content
     assert independent_hash.content_hash(other) == content
 
@@ -63,81 +64,100 @@ class Packing(NamedTuple):
     level: int
     shuffle: bool
     chunk: tuple[int, int, int]
-    shuffled: Callable[[Any], list[str]]  # puts names into another order
+    shuffle_names: Callable[[Any], list[str]]  # puts names into another order
 
 
-def repack_h5py(path: Path, other: Path, how: Packing) -> None:
+def h5py_options(name: str, packing: Packing) -> dict[str, Any]:
+    """Return the options of a data set."""
+    options: dict[str, Any] = {}
+    if name in CHUNKED:
+        options["chunks"] = packing.chunk
+        options["shuffle"] = packing.shuffle
+        if packing.level:
+            options["compression"] = "gzip"
+            options["compression_opts"] = packing.level
+    return options
+
+
+def repack_h5py(path: Path, other: Path, packing: Packing) -> None:
     """Copy a scenario file by h5py with other packing."""
     with h5py.File(path) as old, h5py.File(other, "w", track_order=True) as new:
-        names = how.shuffled(old)
+        names = packing.shuffle_names(old)
         for name in names:
-            packing = (
-                {"chunks": how.chunk, "shuffle": how.shuffle} if name in CHUNKED else {}
-            )
-            if packing and how.level:
-                packing |= {"compression": "gzip", "compression_opts": how.level}
-            dtype = (
-                h5py.string_dtype()
-                if old[name].dtype.kind == "O"
-                else old[name].dtype.newbyteorder(">")
-            )
-            new.create_dataset(name, data=old[name][()], dtype=dtype, **packing)
+            values = old[name]
+            dtype = values.dtype.newbyteorder(">")
+            if values.dtype.kind == "O":
+                dtype = h5py.string_dtype()
+            options = h5py_options(name, packing)
+            new.create_dataset(name, data=values[()], dtype=dtype, **options)
             if DIMS[name] == (name,):
                 new[name].make_scale(name)
         for name in names:
-            for axis, dim in enumerate(DIMS[name] if DIMS[name] != (name,) else ()):
-                new[name].dims[axis].attach_scale(new[dim])
-        for name in how.shuffled(old.attrs):
+            if DIMS[name] != (name,):
+                for axis, dim in enumerate(DIMS[name]):
+                    new[name].dims[axis].attach_scale(new[dim])
+        for name in packing.shuffle_names(old.attrs):
             value = old.attrs[name]
-            new.attrs[name] = value.decode() if isinstance(value, bytes) else value
+            if isinstance(value, bytes):
+                value = value.decode()
+            new.attrs[name] = value
 
 
-def repack_netcdf4(path: Path, other: Path, how: Packing) -> None:
+def netcdf4_options(name: str, packing: Packing) -> dict[str, Any]:
+    """Return the options of a variable."""
+    options: dict[str, Any] = {}
+    if name in CHUNKED:
+        options["chunksizes"] = packing.chunk
+        options["shuffle"] = packing.shuffle
+        options["endian"] = "big"
+        options["complevel"] = packing.level
+        if packing.level:
+            options["compression"] = "zlib"
+    return options
+
+
+def repack_netcdf4(path: Path, other: Path, packing: Packing) -> None:
     """Copy a scenario file by netCDF4 with other packing."""
     with netCDF4.Dataset(path) as old, netCDF4.Dataset(other, "w") as new:
-        for name in how.shuffled(old.dimensions):
-            new.createDimension(
-                name, None if name == "frame" else old.dimensions[name].size
-            )
-        for name in how.shuffled(old.variables):
+        for name in packing.shuffle_names(old.dimensions):
+            length = old.dimensions[name].size
+            if name == "frame":
+                length = None
+            new.createDimension(name, length)
+        for name in packing.shuffle_names(old.variables):
             dtype = old[name].dtype
-            packing: dict[str, Any] = {}
             if name in CHUNKED:
-                packing = {
-                    "chunksizes": how.chunk,
-                    "shuffle": how.shuffle,
-                    "endian": "big",
-                }
-                packing |= {
-                    "compression": "zlib" if how.level else None,
-                    "complevel": how.level,
-                }
                 dtype = dtype.newbyteorder(">")
-            variable = new.createVariable(name, dtype, DIMS[name], **packing)
+            options = netcdf4_options(name, packing)
+            variable = new.createVariable(name, dtype, DIMS[name], **options)
             variable[...] = old[name][...]
-        new.setncatts(
-            {name: old.getncattr(name) for name in how.shuffled(old.ncattrs())}
-        )
+        for name in packing.shuffle_names(old.ncattrs()):
+            new.setncattr(name, old.getncattr(name))
 
 
-def repack_xarray(path: Path, other: Path, how: Packing) -> None:
+def repack_xarray(path: Path, other: Path, packing: Packing) -> None:
     """Copy a scenario file by xarray with other packing."""
     with xr.open_dataset(path) as old:
-        loaded = old.load().drop_encoding()
-    loaded = loaded[how.shuffled(loaded.data_vars)]
-    loaded.attrs = {name: loaded.attrs[name] for name in how.shuffled(loaded.attrs)}
-    packing = {
-        "chunksizes": how.chunk,
-        "zlib": how.level > 0,
-        "complevel": how.level,
-        "shuffle": how.shuffle,
-    }
-    encoding: dict[str, dict[str, Any]] = {
-        str(name): {"_FillValue": None} for name in loaded.variables
-    }
-    for name in ("position", "velocity"):
-        encoding[name] |= packing
-    loaded.to_netcdf(other, engine="netcdf4", encoding=encoding)
+        data = old.load().drop_encoding()
+    data = data[packing.shuffle_names(data.data_vars)]
+    names = packing.shuffle_names(data.attrs)
+    data.attrs = {name: data.attrs[name] for name in names}
+    encoding: dict[str, dict[str, Any]] = {}
+    for variable in data.variables:
+        name = str(variable)
+        encoding[name] = {"_FillValue": None}
+        if name in CHUNKED:
+            encoding[name] |= {
+                "chunksizes": packing.chunk,
+                "zlib": packing.level > 0,
+                "complevel": packing.level,
+                "shuffle": packing.shuffle,
+            }
+    data.to_netcdf(other, engine="netcdf4", encoding=encoding)
 
 
-REPACK = {"h5py": repack_h5py, "netcdf4": repack_netcdf4, "xarray": repack_xarray}
+REPACK = {
+    "h5py": repack_h5py,
+    "netcdf4": repack_netcdf4,
+    "xarray": repack_xarray,
+}

@@ -1,4 +1,4 @@
-"""The manifest tells what is there, and completes over partial generations."""
+"""The manifest lists the files, and completes over partial generations."""
 
 from __future__ import annotations
 
@@ -27,124 +27,137 @@ SUBSETS = {"train": (0, 1), "valid": (2,), "test": (3, 4), "extra": (5,)}
 STATISTICS = {"velocity_std": (0.00219, 0.00218)}
 
 
-def entry(scenario: int, content: str = "") -> FileEntry:
+def subset_of(scenario: int) -> str:
+    """Return the subset of a scenario."""
+    for name, scenarios in SUBSETS.items():
+        if scenario in scenarios:
+            return name
+    raise KeyError(scenario)
+
+
+def make_entry(scenario: int, content: str = "") -> FileEntry:
     """Return a made-up entry."""
-    subset = next(name for name, ids in SUBSETS.items() if scenario in ids)
-    told = {
-        "scenario": scenario,
-        "subset": subset,
-        "path": f"{subset}/{scenario:04d}.nc",
-        "bytes": 100,
-    }
-    hashes = {
-        "content_sha256": content or hashlib.sha256(bytes([scenario])).hexdigest()
-    }
-    facts = {"energy_last_over_max": 0.25}
+    subset = subset_of(scenario)
+    if not content:
+        content = hashlib.sha256(bytes([scenario])).hexdigest()
     return FileEntry(
-        **told,
-        **hashes,
+        scenario=scenario,
+        subset=subset,
+        path=f"{subset}/{scenario:04d}.nc",
+        bytes=100,
+        content_sha256=content,
         frames=4,
         particles=8,
         file_sha256="0" * 64,
         device="cpu",
-        facts=facts,
+        facts={"energy_last_over_max": 0.25},
     )
 
 
-OPTIONS: dict[str, Any] = {
-    "split": "cavity",
-    "size": "tiny",
-    "version": "1.2.0",
-    "subsets": SUBSETS,
-}
-
-
-def merged(
-    old: Manifest | None, ids: Iterable[int | FileEntry], **options: Any
+def merge(
+    old: Manifest | None, scenarios: Iterable[int | FileEntry], **changes: Any
 ) -> Manifest:
-    """Return an old manifest with entries merged in, made-up ones where only the id is
-    told.
-    """
-    entries = [entry(i) if isinstance(i, int) else i for i in ids]
-    return build_manifest(
-        old,
-        entries,
-        **{**OPTIONS, "environment": {"python": "3.11"}, "statistics": None, **options},
-    )
+    """Return an old manifest with entries merged in, made-up ones for plain ids."""
+    entries = []
+    for scenario in scenarios:
+        if isinstance(scenario, int):
+            scenario = make_entry(scenario)
+        entries.append(scenario)
+    options: dict[str, Any] = {
+        "split": "cavity",
+        "size": "tiny",
+        "version": "1.2.0",
+        "subsets": SUBSETS,
+        "environment": {"python": "3.11"},
+        "statistics": None,
+    }
+    return build_manifest(old, entries, **(options | changes))
+
+
+def listed_scenarios(manifest: Manifest) -> list[int]:
+    """Return the scenarios whose files a manifest lists."""
+    return [entry.scenario for entry in manifest.files]
 
 
 def test_partial_generations_complete_each_other() -> None:
     """Two halves in any order end with the manifest of one whole run."""
-    whole = merged(None, range(5), statistics=STATISTICS)
-    half = merged(None, (4, 2))
+    whole = merge(None, range(5), statistics=STATISTICS)
+    assert whole.complete
+    assert listed_scenarios(whole) == [0, 1, 2, 3, 4]
+
+    half = merge(None, (4, 2))
     assert not half.complete
     assert half.dataset_sha256 is None
     assert set(half.subset_sha256) == {"valid"}
-    assert merged(half, (3, 0, 1), statistics=STATISTICS) == whole
-    assert whole.complete
-    assert [file.scenario for file in whole.files] == [0, 1, 2, 3, 4]
-    # subset and data set hash follow from the content hashes; extra is hashed but
-    # outside
-    manifest = merged(None, range(6))
-    expected = {
-        name: subset_hash({i: entry(i).content_sha256 for i in ids})
-        for name, ids in SUBSETS.items()
-    }
+    assert merge(half, (3, 0, 1), statistics=STATISTICS) == whole
+
+
+def test_hashes_follow_from_the_content_hashes() -> None:
+    """The subset extra has a hash, but is no part of that of the data set."""
+    manifest = merge(None, range(6))
+    expected = {}
+    for name, scenarios in SUBSETS.items():
+        content = {i: make_entry(i).content_sha256 for i in scenarios}
+        expected[name] = subset_hash(content)
     assert manifest.subset_sha256 == expected
-    assert (
-        whole.dataset_sha256
-        == manifest.dataset_sha256
-        == dataset_hash("cavity", "tiny", 1, expected)
-    )
+    assert manifest.dataset_sha256 == dataset_hash("cavity", "tiny", 1, expected)
+    assert merge(None, range(5)).dataset_sha256 == manifest.dataset_sha256
 
 
 def test_new_entries_replace_old_ones() -> None:
-    """A regenerated file counts, not the one before it; ids that the size dropped go.
-
-    Which subset holds a scenario is the registry's word; the file is described anew.
-    """
-    old = merged(None, range(6))
-    less = {name: ids for name, ids in SUBSETS.items() if name != "extra"}
-    again = merged(old, [entry(3, "f" * 64)], version="1.3.0", subsets=less)
-    assert again.entry(3).content_sha256 == "f" * 64
-    assert again.entry(5) is None
-    assert again.dataset_sha256 != old.dataset_sha256
-    whole = merged(None, range(5))
-    moved = [
-        e.model_copy(update={"subset": "train"}) if e.scenario == 3 else e
-        for e in whole.files
-    ]
-    again = merged(whole.model_copy(update={"files": tuple(moved)}), ())
-    assert [e.scenario for e in again.files] == [0, 1, 2, 4]
+    old = merge(None, range(6))
+    changed = merge(old, [make_entry(3, "f" * 64)])
+    assert changed.entry(3).content_sha256 == "f" * 64
+    assert changed.dataset_sha256 != old.dataset_sha256
 
 
-def test_statistics_belong_to_train() -> None:
-    """Dropped while train is incomplete, kept when a later run brings none; a new train
-    file takes them.
-    """
-    assert merged(None, (0, 3), statistics=STATISTICS).statistics == {}
-    first = merged(None, (0, 1), statistics=STATISTICS)
-    assert first.statistics == STATISTICS
-    whole = merged(first, (2, 3, 4))
-    assert whole.statistics == STATISTICS
-    again = merged(whole, [entry(1, "f" * 64)])
-    assert again.complete
-    assert again.statistics == {}
+def test_scenarios_that_a_size_has_dropped_go() -> None:
+    old = merge(None, range(6))
+    subsets = dict(SUBSETS)
+    del subsets["extra"]
+    changed = merge(old, [make_entry(3)], version="1.3.0", subsets=subsets)
+    assert changed.entry(5) is None
 
 
-def machine(name: str, device: str = "cpu") -> dict[str, str]:
+def test_entries_under_another_subset_go() -> None:
+    """The registry decides which subset has a scenario."""
+    whole = merge(None, range(5))
+    entries = list(whole.files)
+    entries[3] = entries[3].model_copy(update={"subset": "train"})
+    moved = whole.model_copy(update={"files": tuple(entries)})
+    assert listed_scenarios(merge(moved, ())) == [0, 1, 2, 4]
+
+
+def test_an_incomplete_train_has_no_statistics() -> None:
+    manifest = merge(None, (0, 3), statistics=STATISTICS)
+    assert manifest.statistics == {}
+
+
+def test_statistics_stay_when_a_later_run_brings_none() -> None:
+    train = merge(None, (0, 1), statistics=STATISTICS)
+    assert train.statistics == STATISTICS
+    assert merge(train, (2, 3, 4)).statistics == STATISTICS
+
+
+def test_a_new_file_of_train_removes_the_statistics() -> None:
+    whole = merge(None, range(5), statistics=STATISTICS)
+    changed = merge(whole, [make_entry(1, "f" * 64)])
+    assert changed.complete
+    assert changed.statistics == {}
+
+
+def machine(name: str, device: str = "cpu", system: str = "Linux") -> dict[str, str]:
     """Return an environment."""
-    return {"machine": name, "system": "Linux", "device": device}
+    return {"machine": name, "system": system, "device": device}
 
 
 def test_environments_add_up() -> None:
     """Equal ones are listed once; a merge that wrote no file adds none."""
-    first = merged(None, (0,), environment=machine("x86_64"))
-    second = merged(first, (1,), environment=machine("aarch64"))
-    third = merged(
-        merged(second, (2,), environment=machine("x86_64")), (3,), environment=None
-    )
-    assert third.environments == (machine("x86_64"), machine("aarch64"))
+    manifest = merge(None, (0,), environment=machine("x86_64"))
+    manifest = merge(manifest, (1,), environment=machine("aarch64"))
+    manifest = merge(manifest, (2,), environment=machine("x86_64"))
+    manifest = merge(manifest, (3,), environment=None)
+    assert manifest.environments == (machine("x86_64"), machine("aarch64"))
 
 
 @pytest.mark.parametrize(
@@ -154,58 +167,67 @@ def test_environments_add_up() -> None:
         (machine("AMD64", "parallel"), "bitwise"),
         (machine("aarch64"), "tolerance"),
         (machine("x86_64", "cuda"), "tolerance"),
-        ({**machine("x86_64"), "system": "Darwin"}, "tolerance"),
+        (machine("x86_64", system="Darwin"), "tolerance"),
     ],
 )
 def test_identity_needs_a_promise_or_evidence(
     environment: dict[str, str], identity: str
 ) -> None:
-    """x86-64 Linux CPUs promise equal bits; elsewhere every file needs the hash of
-    datasets.yaml.
+    """x86-64 Linux CPUs promise equal bits.
+
+    Elsewhere every file needs the hash of datasets.yaml.
     """
-    files = [
-        entry(i).model_copy(update={"device": environment["device"]}) for i in range(3)
-    ]
-    made = merged(None, files, environment=environment)
-    assert made.identity == identity
-    hashes = {file.scenario: file.content_sha256[:16] for file in files}
-    assert merged(made, (), environment=None, recorded=hashes).identity == "bitwise"
-    for recorded in ({**hashes, 1: "0" * 16}, {0: hashes[0]}):
-        assert (
-            merged(made, (), environment=None, recorded=recorded).identity == identity
-        )
-    assert merged(made, (3,), environment=machine("x86_64")).identity == identity
+    entries = []
+    recorded = {}
+    for scenario in range(3):
+        entry = make_entry(scenario)
+        entries.append(entry.model_copy(update={"device": environment["device"]}))
+        recorded[scenario] = entry.content_sha256[:16]
+    manifest = merge(None, entries, environment=environment)
+    assert manifest.identity == identity
+
+    def identity_with(recorded: dict[int, str]) -> str:
+        return merge(manifest, (), environment=None, recorded=recorded).identity
+
+    assert identity_with(recorded) == "bitwise"
+    assert identity_with(recorded | {1: "0" * 16}) == identity
+    assert identity_with({0: recorded[0]}) == identity
+    with_another = merge(manifest, (3,), environment=machine("x86_64"))
+    assert with_another.identity == identity
+
+
+def test_without_perturbed_runs_there_is_no_mean_twin_floor() -> None:
+    assert merge(None, range(5)).mean_twin_floor() == ()
 
 
 def test_the_mean_twin_floor_is_that_of_test() -> None:
-    """Mean over the test scenarios at each frame that all have; none where one has no
-    twin.
-    """
-    whole = merged(None, range(5))
-    assert whole.mean_twin_floor() == ()
-    floors = {3: (1e-6, 2e-3), 4: (3e-6, 4e-3, 1.0)}
-    files = tuple(
-        e.model_copy(update={"twin_floor": floors.get(e.scenario, ())})
-        for e in whole.files
-    )
-    assert whole.model_copy(update={"files": files}).mean_twin_floor() == (2e-6, 3e-3)
+    """It is the mean over the scenarios at each frame that all have."""
+    twin_floors = {
+        3: (1e-6, 2e-3),
+        4: (3e-6, 4e-3, 1.0),
+    }
+    entries = []
+    for scenario in range(5):
+        twin_floor = twin_floors.get(scenario, ())
+        entry = make_entry(scenario)
+        entries.append(entry.model_copy(update={"twin_floor": twin_floor}))
+    assert merge(None, entries).mean_twin_floor() == (2e-6, 3e-3)
 
 
-def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
-    """What is written is read back, as plain JSON, with no temporary file left."""
-    manifest = merged(None, range(5), statistics=STATISTICS)
+def test_a_written_manifest_is_read_back(tmp_path: Path) -> None:
+    """It is plain JSON, and no temporary file stays."""
+    manifest = merge(None, range(5), statistics=STATISTICS)
     path = write_manifest(tmp_path, manifest)
     assert path == tmp_path / "cavity" / "tiny" / "v1" / "manifest.json"
     assert read_manifest(tmp_path, "cavity", "tiny", 1) == manifest
     assert list(path.parent.iterdir()) == [path]
-    assert json.loads(path.read_text())["files"][3]["facts"] == {
-        "energy_last_over_max": 0.25
-    }
+    content = json.loads(path.read_text())
+    assert content["files"][3]["facts"] == {"energy_last_over_max": 0.25}
     assert read_manifest(tmp_path, "cavity", "tiny", 2) is None
 
 
 @pytest.mark.parametrize(
-    ("change", "of_entry", "said"),
+    ("changes", "entry_changes", "key"),
     [
         # wrong types, unknown keys and formats
         ({"complete": "yes"}, {}, ", key complete"),
@@ -230,20 +252,29 @@ def test_round_trip_and_atomic_write(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_manifest_names_the_key(
-    tmp_path: Path, change: dict[str, Any], of_entry: dict[str, str], said: str
+    tmp_path: Path, changes: dict[str, Any], entry_changes: dict[str, str], key: str
 ) -> None:
-    """The error has file, key and hint; a FIFO is refused too."""
-    path = write_manifest(tmp_path, merged(None, range(5)))
-    told = json.loads(path.read_text())
-    told["files"][3] |= of_entry
-    path.write_text(json.dumps(told | change))
+    """The error has file, key and fix."""
+    path = write_manifest(tmp_path, merge(None, range(5)))
+    content = json.loads(path.read_text())
+    content["files"][3] |= entry_changes
+    path.write_text(json.dumps(content | changes))
     with pytest.raises(DataError) as caught:
         read_manifest(tmp_path, "cavity", "tiny", 1)
-    assert caught.value.where == f"{path}{said}"
-    assert bool(caught.value.fix)
+    assert caught.value.where == f"{path}{key}"
+    assert caught.value.fix
+
+
+def test_a_truncated_manifest_is_refused(tmp_path: Path) -> None:
+    path = write_manifest(tmp_path, merge(None, range(5)))
     path.write_text(path.read_text()[:-20])
-    with pytest.raises(DataError, match="whole file"):
+    with pytest.raises(DataError) as caught:
         read_manifest(tmp_path, "cavity", "tiny", 1)
+    assert caught.value.where == f"{path}, key (whole file)"
+
+
+def test_a_fifo_is_no_manifest(tmp_path: Path) -> None:
+    path = write_manifest(tmp_path, merge(None, range(5)))
     path.unlink()
     os.mkfifo(path)
     with pytest.raises(DataError):

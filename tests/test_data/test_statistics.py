@@ -110,5 +110,5 @@ def test_files_give_the_same_as_arrays(tmp_path: Path) -> None:
     ]
     expected = statistics(scenario_moments(frames_of(i, 3 + i, 9000)) for i in (0, 1))
     assert file_statistics(paths) == expected
-    with pytest.raises(DataError, match="no scenario files"):
+    with pytest.raises(DataError):
         file_statistics([])

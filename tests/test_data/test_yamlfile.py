@@ -25,8 +25,9 @@ def test_plain_values_are_read(tmp_path: Path) -> None:
     assert read_yaml(_write(tmp_path, text)) == {"a": [1, 2.5, "x"], "b": {"c": True}}
     with pytest.raises(UnreadableFileError, match=f"at most {MAX_BYTES} bytes"):
         read_yaml(_write(tmp_path, b"#" * (MAX_BYTES + 1)))
-    with pytest.raises(UnreadableFileError, match=r"absent\.yaml"):
+    with pytest.raises(UnreadableFileError) as caught:
         read_yaml(tmp_path / "absent.yaml")
+    assert caught.value.where.endswith("absent.yaml")
 
 
 @pytest.mark.parametrize(

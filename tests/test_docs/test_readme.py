@@ -115,7 +115,9 @@ def test_every_command_of_the_pages_exists() -> None:
             if hasattr(command, "commands"):
                 command = command.commands[words[2]]
             known = {
-                option for parameter in command.params for option in parameter.opts
+                option
+                for parameter in command.loaded.params
+                for option in parameter.opts
             }
             given = {word.partition("=")[0] for word in words if word.startswith("-")}
             assert given <= known | {"--help"}, f"{page.name}: {line}"
@@ -179,7 +181,7 @@ def test_every_option_of_score_is_described() -> None:
     cells = "".join(
         line.split("|")[1] for line in table.splitlines() if line.startswith("| `")
     )
-    score = get_command(app).commands["score"]  # type: ignore[attr-defined]
+    score = get_command(app).commands["score"].loaded  # type: ignore[attr-defined]
     options = {name for p in score.params for name in p.opts if name.startswith("-")}
     assert set(re.findall(r"(?<![\w-])--?[a-z]+(?:-[a-z]+)*", cells)) == options - {
         "--help"

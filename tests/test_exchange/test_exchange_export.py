@@ -328,8 +328,9 @@ def test_the_same_data_give_the_same_bytes(
     assert [path.read_bytes() for path in one.files] == [
         path.read_bytes() for path in two.files
     ]
-    with pytest.raises(UsageError, match="files of that name"):
+    with pytest.raises(UsageError) as caught:
         export(str(mixed.folder), format=form, output=tmp_path / "a")
+    assert caught.value.where.endswith("/a")
     export(
         str(mixed.folder),
         format=form,
@@ -519,13 +520,14 @@ def test_a_program_beside_the_data_is_refused(
 ) -> None:
     """The folder of an export must not hold a force.py: its readers would run it."""
     (tmp_path / "force.py").write_text("raise SystemExit")
-    with pytest.raises(UsageError, match="a program that readers"):
+    with pytest.raises(UsageError) as caught:
         export(
             str(mixed.folder),
             format="lagrangebench-h5",
             output=tmp_path,
             force=True,
         )
+    assert caught.value.where.endswith("force.py")
     assert [path.name for path in tmp_path.iterdir()] == ["force.py"]
 
 
@@ -542,8 +544,9 @@ def test_missing_and_foreign_scenarios_are_told(tmp_path: Path) -> None:
     )
     train = made.folder / "full" / "v1" / "train"
     (train / "0000.nc").write_bytes((train / "0001.nc").read_bytes())
-    with pytest.raises(DataError, match="not that of the registry"):
+    with pytest.raises(DataError) as caught:
         export(str(made.folder), format="gns-npz", output=tmp_path / "out")
+    assert caught.value.where.endswith("own/full/v1/train/0000.nc")
     (train / "0000.nc").unlink()
     with pytest.raises(DataError) as caught:
         export(str(made.folder), format="gns-npz", output=tmp_path / "out")

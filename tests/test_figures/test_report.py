@@ -15,10 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from html_check import Reading, read_html
-from hypothesis import example, given
-from hypothesis import strategies as st
-from made_up import (
+from board_bench import (
     METHODS,
     SPLITS,
     Method,
@@ -31,6 +28,9 @@ from made_up import (
     runaway,
     still,
 )
+from html_check import Reading, read_html
+from hypothesis import example, given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
 

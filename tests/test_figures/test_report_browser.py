@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from board_bench import page_of
 from browser import CHROMIUM, Browser
-from made_up import page_of
 from PIL import Image
 
 pytestmark = pytest.mark.skipif(

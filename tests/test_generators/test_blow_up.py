@@ -77,7 +77,7 @@ def failure(
     size: Size, scenarios: tuple[int, ...], root: Path, device: Device = Device.CPU
 ) -> WorkFailedError:
     """Return the error that simulating some scenarios ends with."""
-    with pytest.raises(WorkFailedError, match="the simulation blew up") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         simulate(
             SimulationJob(size=size, scenarios=scenarios, root=root, device=device),
             lambda units: None,
@@ -157,8 +157,9 @@ def test_a_perturbed_run_is_replayed_with_its_perturbation(
         lambda size, _: np.full((size.particles, 2), np.nan, np.float32),
     )
     job = SimulationJob(size=size, scenarios=(3,), root=copied())
-    with pytest.raises(WorkFailedError, match="blew up") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         simulation.measure_predictability(job, lambda units: None)
+    assert caught.value.where == "curl-noise tiny, scenario 3, substep 61"
     start = (size.task.input_frames - 1) * size.substeps_per_frame
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 3, substep {start + 1}"
     assert caught.value.expected == "every number is finite"
@@ -183,8 +184,9 @@ def test_a_failure_that_does_not_repeat_keeps_its_range(
             )
 
     monkeypatch.setattr(running.solver, "advance", flaky)
-    with pytest.raises(WorkFailedError, match="scenario 2, substeps 0 to 12"):
+    with pytest.raises(WorkFailedError) as caught:
         list(running.recordings())
+    assert caught.value.where == "curl-noise tiny, scenario 2, substeps 0 to 12"
 
 
 def test_a_failed_scenario_leaves_what_was_there(
@@ -196,7 +198,7 @@ def test_a_failed_scenario_leaves_what_was_there(
     before = copied()
     (before / SPLIT / SIZE / "v2" / "valid" / "0002.nc").unlink()
     for root in (tmp_path / "data", before):
-        with pytest.raises(WorkFailedError, match="blew up"):
+        with pytest.raises(WorkFailedError) as caught:
             generate(
                 SPLIT,
                 SIZE,
@@ -205,6 +207,7 @@ def test_a_failed_scenario_leaves_what_was_there(
                 workers=1,
                 registry=stiff_registry,
             )
+        assert caught.value.where == "curl-noise tiny, scenario 2, substep 9"
     found = [p.name for p in (tmp_path / "data").rglob("*") if p.is_file()]
     assert all(name.startswith(".lock") for name in found)
     after = read_manifest(before, SPLIT, SIZE, 2)

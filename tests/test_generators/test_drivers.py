@@ -105,10 +105,12 @@ def test_what_the_runtime_cannot_do_is_refused() -> None:
     pool of threads.
     """
     loaded(NO_SLIP, [scenario(NO_SLIP)])
-    with pytest.raises(UsageError, match="one worker per scenario"):
+    with pytest.raises(UsageError) as caught:
         build(NO_SLIP, device=Device.CPU, scenarios=2)
-    with pytest.raises(UsageError, match="another process"):
+    assert caught.value.where == "device cpu"
+    with pytest.raises(UsageError) as caught:
         build(NO_SLIP, device=Device.PARALLEL, threads=10_000)
+    assert caught.value.where == "device parallel, threads 10000"
 
 
 def test_a_closed_solver_leaves_the_others_alone() -> None:
@@ -238,7 +240,7 @@ def test_simulating_anew_without_taichi_names_the_remedy(
         "raise ModuleNotFoundError('no taichi', name='taichi')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(UsageError, match="taichi is not installed") as caught:
+    with pytest.raises(UsageError) as caught:
         verify(
             SPLIT,
             SIZE,
@@ -247,4 +249,5 @@ def test_simulating_anew_without_taichi_names_the_remedy(
             workers=1,
             registry=unmeasured,
         )
+    assert caught.value.where == "this needs the extra 'generate'"
     assert caught.value.fix == "pip install 'lagbench[generate]'"

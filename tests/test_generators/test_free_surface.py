@@ -191,10 +191,9 @@ def test_runaway_particle_is_reported() -> None:
     falling = dataclasses.replace(body, velocity=velocity)
     states = [ball(Material.SNOW), falling, ball(Material.JELLY)]
     solver = start(CONSTANTS, states, device=Device.PARALLEL)
-    with pytest.raises(
-        WorkFailedError, match=r"scenario 1, substeps 0 to 60(?s:.*)CFL"
-    ):
+    with pytest.raises(WorkFailedError) as caught:
         solver.advance(60)
+    assert caught.value.where == "scenario 1, substeps 0 to 60"
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30])
@@ -205,8 +204,9 @@ def test_what_is_not_a_number_is_reported(poison: float, device: Device) -> None
     carried = solver._kernels.carried.to_numpy()
     carried[0, 7, :2] = poison
     solver._kernels.carried.from_numpy(carried)
-    with pytest.raises(WorkFailedError, match="blew up") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         solver.advance(20)
+    assert caught.value.where == "scenario 0, substeps 0 to 20"
     names_bound = "every number is finite" in str(caught.value.expected)
     names_value = "NaN or an infinite number" in str(caught.value.got)
     assert names_bound == names_value
@@ -220,10 +220,11 @@ def test_states_that_do_not_fit_are_refused() -> None:
     """
     solver = start(CONSTANTS, [ball(Material.LIQUID)])
     good = ball(Material.LIQUID)
-    with pytest.raises(UsageError, match="number of scenarios"):
+    with pytest.raises(UsageError):
         solver.load([good, good])
-    with pytest.raises(UsageError, match="shape of position"):
+    with pytest.raises(UsageError) as caught:
         solver.load([dataclasses.replace(good, position=good.position[:-1])])
+    assert caught.value.where == "scenario 0"
     nowhere = dataclasses.replace(good, position=good.position * np.nan)
     fast = dataclasses.replace(good, velocity=good.velocity + 100.0)
     for state in (nowhere, fast):

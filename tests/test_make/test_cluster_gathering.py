@@ -165,8 +165,9 @@ def test_a_damaged_part_is_named(
     path = parts[1] / FOLDER / "test" / "0004.nc"
     for harmful in (path.read_bytes()[:-2000], path.with_name("0003.nc").read_bytes()):
         path.write_bytes(harmful)
-        with pytest.raises(DataError, match=r"0004\.nc"):
+        with pytest.raises(DataError) as caught:
             gather(parts[1])
+        assert caught.value.where.endswith("part-1/curl-noise/tiny/v2/test/0004.nc")
     assert not (tmp_path / "whole" / FOLDER / "test" / "0004.nc").exists()
 
 
@@ -174,8 +175,10 @@ def test_folders_without_parts(
     tmp_path: Path, gather: Gather, copied: Callable[[], Path]
 ) -> None:
     """An empty folder, and the one that is written to, are no sources."""
-    with pytest.raises(UsageError, match="no manifest of that data set"):
+    with pytest.raises(UsageError) as caught:
         gather(tmp_path / "none")
+    assert caught.value.where.endswith("/none")
     root = copied()
-    with pytest.raises(UsageError, match="the folder to write to"):
+    with pytest.raises(UsageError) as caught:
         gather(root, root=root)
+    assert caught.value.where.endswith("/root")

@@ -103,7 +103,7 @@ def test_a_lost_scheduler_is_an_error_and_resumed(
             if state.stage == "simulating" and state.scenarios_done == 1:
                 process.kill()
 
-        with pytest.raises(WorkFailedError, match="the Dask cluster is lost") as caught:
+        with pytest.raises(WorkFailedError) as caught:
             generate(
                 SPLIT,
                 SIZE,
@@ -136,9 +136,7 @@ def test_a_folder_that_workers_do_not_share(
             yield FolderMark(mark.path, "the word of another folder", 0.0)
 
     monkeypatch.setattr(cluster, "mark_folder", elsewhere)
-    with pytest.raises(
-        WorkFailedError, match="does not see the folder of the data set"
-    ) as caught:
+    with pytest.raises(WorkFailedError) as caught:
         generate(
             SPLIT,
             SIZE,
@@ -155,8 +153,9 @@ def test_a_missing_folder_and_a_late_mark(tmp_path: Path) -> None:
     """No folder at all is told as such; a mark that is seen late, its name before its
     word, is waited for.
     """
-    with pytest.raises(WorkFailedError, match="no such folder"):
+    with pytest.raises(WorkFailedError) as caught:
         FolderMark(tmp_path / "none" / "mark", "word", 0.0).check("w")
+    assert caught.value.where.endswith("none, worker w")
     late = FolderMark(tmp_path / "mark", "word", 20.0)
     late.path.touch()
     Timer(0.2, lambda: late.path.write_text("word")).start()
@@ -170,8 +169,9 @@ def test_unfit_workers_are_refused(tmp_path: Path, unmeasured: Registry) -> None
 
     A worker with another lagbench might write other bits: it does nothing.
     """
-    with pytest.raises(WorkFailedError, match="another version of lagbench") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         Client("c", version="0").check("w", threads=1)
+    assert caught.value.where == "worker w"
     assert caught.value.expected == "0"
     with local_cluster(threads=2) as running, pytest.raises(WorkFailedError) as caught:
         generate(
@@ -213,7 +213,7 @@ def test_no_scheduler_there(
     made.
     """
     monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.5)
-    with pytest.raises(WorkFailedError, match="cannot reach the Dask scheduler"):
+    with pytest.raises(WorkFailedError) as caught:
         generate(
             SPLIT,
             SIZE,
@@ -221,10 +221,12 @@ def test_no_scheduler_there(
             scheduler="tcp://127.0.0.1:9",
             registry=unmeasured,
         )
-    with pytest.raises(UsageError, match="tcp://"):
+    assert caught.value.where == "--scheduler tcp://127.0.0.1:9"
+    with pytest.raises(UsageError) as caught:
         generate(
             SPLIT, SIZE, root=tmp_path, scheduler="pigeon://roof", registry=unmeasured
         )
+    assert caught.value.where == "--scheduler pigeon://roof"
     assert not list(tmp_path.rglob("*.nc"))
     monkeypatch.setattr(
         distributed, "Client", lambda *_, **__: pytest.fail("a client was made")

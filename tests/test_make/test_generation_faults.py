@@ -105,10 +105,9 @@ def test_a_disk_too_small_is_refused_at_once(
     small_disk: Path, unmeasured: Registry
 ) -> None:
     """The message tells bytes needed and free; nothing is written."""
-    with pytest.raises(
-        WorkFailedError, match=r"(?s)not enough disk space.*bytes free"
-    ) as caught:
+    with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=small_disk, registry=unmeasured)
+    assert caught.value.where.endswith("/disk")
     assert caught.value.exit_code == 5
     assert files(small_disk) == []
 
@@ -120,8 +119,9 @@ def test_a_disk_that_fills_up_leaves_whole_files_only(
     leaves no trace.
     """
     monkeypatch.setattr("lagbench.make.generate.check_disk", lambda root, needed: None)
-    with pytest.raises(WorkFailedError, match="free disk space") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, root=small_disk, workers=1, registry=unmeasured)
+    assert caught.value.where.endswith("disk/curl-noise/tiny/v2/train/0001.nc")
     assert caught.value.exit_code == 5
     assert partial_files(small_disk) == []
     manifest = manifest_of(small_disk)
@@ -340,7 +340,8 @@ def test_a_draw_out_of_range_names_its_scenario(
             "velocity_scale: 0.0052", "velocity_scale: 90.0052"
         )
     )
-    with pytest.raises(WorkFailedError, match="exact float32") as caught:
+    with pytest.raises(WorkFailedError) as caught:
         generate(SPLIT, SIZE, scenarios="2", root=tmp_path / "data", registry=load(own))
+    assert caught.value.where == "curl-noise tiny, scenario 2"
     assert caught.value.where == f"{SPLIT} {SIZE}, scenario 2"
     assert files(tmp_path / "data") == []

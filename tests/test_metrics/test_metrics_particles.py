@@ -117,7 +117,7 @@ def test_average_and_end_over_horizons() -> None:
         scenario.config.predicted_frames,
     )
     scores = {
-        name: found.mean for name, found in aggregate(metrics, {7: pieces}).items()
+        name: actual.mean for name, actual in aggregate(metrics, {7: pieces}).items()
     }
     # z-score of x: k; of u: 0.3 / 0.01 = 30; L = (k^2 + 30^2) / 4 for k = 1..6
     expected = [(k**2 + 900) / 4 for k in range(1, 7)]
@@ -157,7 +157,7 @@ def test_what_cannot_be_measured_is_refused() -> None:
     x = lattice(4)
     y = x.copy()
     y[3, 1] = np.nan
-    with pytest.raises(ChecksFailedError, match="1 of 16 particles"):
+    with pytest.raises(ChecksFailedError):
         pair_of(x, 0 * x, 0 * x, predicted_position=y)
     with pytest.raises(UsageError):
         pair_of(x, 0 * x, 0 * x[:9], predicted_position=x[:9])
@@ -435,8 +435,9 @@ def test_sinkhorn_of_a_shift(monkeypatch: pytest.MonkeyPatch) -> None:
     x = cloud(0)
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "ot", None)
-        with pytest.raises(UsageError, match=r"pip install 'lagbench\[transport\]'"):
+        with pytest.raises(UsageError) as caught:
             sinkhorn_divergence(x, x)
+        assert caught.value.where == "this needs the extra 'transport'"
     pytest.importorskip("ot")
     assert sinkhorn_divergence(x, x) == 0.0
     near = sinkhorn_divergence(x, x + 0.1)

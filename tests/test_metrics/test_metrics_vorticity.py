@@ -52,7 +52,7 @@ def test_a_scaled_flow_has_closed_errors() -> None:
     pair = rotating_disc(1.2)
     omega = pair.true_vorticity
     laws = ("mse", "mae", "pearson", "residual_slope", "residual_mean")
-    found = measured(pair, *(f"vorticity_{law}" for law in laws))
+    actual = measured(pair, *(f"vorticity_{law}" for law in laws))
     expected = [
         0.04 * np.mean(omega**2),
         0.2 * np.mean(np.abs(omega)),
@@ -60,13 +60,13 @@ def test_a_scaled_flow_has_closed_errors() -> None:
         0.2,
         0.2 * np.mean(omega),
     ]
-    assert found == pytest.approx(expected)
+    assert actual == pytest.approx(expected)
     for still in (
         rotating_disc(0.0),
         flying(1e-3, 0.0),
     ):  # at rest, or all by one vector
-        found = measured(still, "vorticity_residual_slope", "vorticity_pearson")
-        assert found == pytest.approx([-1.0, math.nan], nan_ok=True)
+        actual = measured(still, "vorticity_residual_slope", "vorticity_pearson")
+        assert actual == pytest.approx([-1.0, math.nan], nan_ok=True)
     x = lattice(30)
     u = 0.01 * swirl(x)
     turn = 0.003 * np.stack([-(x[:, 1] - 0.5), x[:, 0] - 0.5], axis=1)
@@ -107,10 +107,10 @@ def test_correlation_slope_and_residuals_are_scipys_and_numpys() -> None:
     )
     residual = y - x
     names = ("mean", "std", "max", "p05", "p25", "p50", "p75", "p95")
-    found = measured(pair, *(f"vorticity_residual_{name}" for name in names))
+    actual = measured(pair, *(f"vorticity_residual_{name}" for name in names))
     percentiles = [np.percentile(residual, q) for q in (5, 25, 50, 75, 95)]
     expected = [residual.mean(), residual.std(), np.abs(residual).max(), *percentiles]
-    assert_allclose(found, expected, rtol=1e-12)
+    assert_allclose(actual, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("constant", [0.0, 0.1, 1e9])

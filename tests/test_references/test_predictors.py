@@ -76,30 +76,35 @@ def given(
     root: Path = Path(),
     **changes: Any,
 ) -> Given:
-    """Return what a made-up scenario gives; its walls are at rest unless told
-    otherwise.
-    """
-    tier = load().size(split, size)
-    frames = tier.task.input_frames + tier.task.horizon
-    walls = np.zeros((frames, 4, 2))
+    """Return what a made-up scenario gives; its walls are at rest by default."""
+    described = load().size(split, size)
+    frame_count = described.task.input_frames + described.task.horizon
+    walls = np.zeros((frame_count, 4, 2))
     walls[:, :] = changes.pop("wall", 0.0)
-    (left, right), (bottom, top) = tier.bounds
+    (left, right), (bottom, top) = described.bounds
+    box_area = (right - left) * (top - bottom)
+    liquid = np.zeros(position.shape[1], np.int8)
     return Given(
-        size=tier,
+        size=described,
         root=root,
         position=np.asarray(position, np.float64),
-        material=changes.pop("material", np.zeros(position.shape[1], np.int8)),
+        material=changes.pop("material", liquid),
         walls=walls,
-        area=changes.pop("area", (right - left) * (top - bottom)),
+        area=changes.pop("area", box_area),
         parameters=changes,
     )
 
 
 def scattered(count: int, low: float, high: float, seed: int = 0) -> Floats:
     """Return points of a square, shape [point, 2]."""
-    return np.asarray(
-        low + (high - low) * np.random.default_rng(seed).random((count, 2))
-    )
+    share = np.random.default_rng(seed).random((count, 2))
+    return np.asarray(low + (high - low) * share)
+
+
+def lattice(side: int) -> Floats:
+    """Return the corners of side x side unit squares, shape [point, 2]."""
+    axis = np.arange(side, dtype=float)
+    return np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
 
 
 def predicted(name: str, scenario: Given) -> NDArray[np.float32]:
@@ -107,21 +112,20 @@ def predicted(name: str, scenario: Given) -> NDArray[np.float32]:
     return np.array(list(REFERENCES[name].predict(scenario)))
 
 
-def own(size: Size, *, placement: str) -> Size:
-    """Return a split of a user's own: without generator, gravity or recorded scores."""
-    parameters = {
-        name: value for name, value in size.parameters.items() if name != "gravity"
-    }
+def own_split(size: Size, *, placement: str) -> Size:
+    """Return a split of a user: without generator, gravity or recorded scores."""
+    parameters = dict(size.parameters)
+    parameters.pop("gravity", None)
     grid = size.task.score_grid.model_copy(update={"placement": placement})
     task = size.task.model_copy(update={"score_grid": grid})
-    told = {
+    changes = {
         "split": "own",
         "name": "full",
         "generator": "none",
         "parameters": parameters,
         "task": task,
     }
-    return size.model_copy(update=told)
+    return size.model_copy(update=changes)
 
 
 SURFACE = "persistence constant-velocity ballistic climatology analog ballistic-analog"
@@ -151,7 +155,7 @@ def test_a_size_has_the_predictors_of_its_kind_of_box(
 ) -> None:
     """A user's own split goes by its kind of box; without gravity nothing falls."""
     if split == "own":
-        tier = own(load().size("fluid", "mini"), placement=size)
+        tier = own_split(load().size("fluid", "mini"), placement=size)
         assert shipped(tier) is None
     else:
         tier = load().size(split, size)
@@ -162,6 +166,7 @@ def test_a_size_has_the_predictors_of_its_kind_of_box(
 
 
 def test_every_predictor_says_what_it_is() -> None:
+    """Name, title and a sentence; those that integrate equations are not naive."""
     for name, predictor in REFERENCES.items():
         assert predictor.name == name
         assert predictor.title
@@ -170,104 +175,109 @@ def test_every_predictor_says_what_it_is() -> None:
     assert frozenset(REFERENCES) - NAIVE == solvers
 
 
-def test_extrapolations_stay_inside_the_walls() -> None:
-    """Fast particles stop at the walls; positions are float32, one frame per frame of
-    the horizon.
-    """
+@pytest.mark.parametrize("name", ["persistence", "constant-velocity", "ballistic"])
+def test_extrapolations_stay_inside_the_walls(name: str) -> None:
+    """Fast particles stop at the walls; positions are float32, one per frame."""
     start = scattered(300, 0.2, 0.8)
-    fast = np.stack([start, start + 0.05])
-    for name in ("persistence", "constant-velocity", "ballistic"):
-        found = predicted(name, scenario := given("fluid", fast))
-        (left, right), (bottom, top) = scenario.size.bounds
-        assert found.dtype == np.float32
-        assert found.shape == (scenario.size.task.horizon, 300, 2)
-        assert found[..., 0].max() <= np.float32(right)
-        assert found[..., 1].max() <= np.float32(top)
-        assert found.min() >= np.float32(min(left, bottom))
+    scenario = given("fluid", np.stack([start, start + 0.05]))
+    positions = predicted(name, scenario)
+    (left, right), (bottom, top) = scenario.size.bounds
+    assert positions.dtype == np.float32
+    assert positions.shape == (scenario.size.task.horizon, 300, 2)
+    assert positions[..., 0].max() <= np.float32(right)
+    assert positions[..., 1].max() <= np.float32(top)
+    assert positions.min() >= np.float32(min(left, bottom))
 
 
 def test_ballistic_flight_is_a_parabola() -> None:
     """Frames of y = y0 + v t - g t^2 / 2 continue on the same parabola."""
     size = load().size("fluid", "tiny")
-    time = np.arange(size.task.input_frames + size.task.horizon) * size.frame_interval
+    n = size.task.input_frames
+    time = np.arange(n + size.task.horizon) * size.frame_interval
+    fall = 0.5 * size.value("gravity") * time**2
     start = scattered(50, 0.4, 0.6)
     path = np.repeat(start[None], len(time), axis=0)
-    path[..., 0] += 0.1 * time[:, None]
-    path[..., 1] += (0.8 * time - 0.5 * size.value("gravity") * time**2)[:, None]
-    n = size.task.input_frames
-    found = predicted("ballistic", given("fluid", path[:n]))
-    np.testing.assert_allclose(found, path[n:], atol=2e-6)
+    path[..., 0] += (0.1 * time)[:, None]
+    path[..., 1] += (0.8 * time - fall)[:, None]
+    positions = predicted("ballistic", given("fluid", path[:n]))
+    np.testing.assert_allclose(positions, path[n:], atol=2e-6)
 
 
 def test_a_frozen_rotation_stays_a_rotation() -> None:
-    """Particles of a rigid rotation by 0.05 a frame keep their distance and turn by
-    0.05 a frame.
-    """
+    """Particles of a rigid rotation keep their distance and their angle per frame."""
     centre = np.array([0.5, 0.5])
-    angle = 0.05
-    offset = scattered(4000, -0.4, 0.4)
+    angle = 0.05  # per frame
     cos = math.cos(angle)
     sin = math.sin(angle)
+    offset = scattered(4000, -0.4, 0.4)
     before = centre + offset @ np.array([[cos, -sin], [sin, cos]])
-    scenario = given("cavity", np.stack([*([before] * 5), centre + offset]), wall=1e-9)
-    found = predicted("frozen-field", scenario)
-    inner = np.hypot(*offset.T) < 0.25
-    now = found[-1][inner] - centre
-    steps = scenario.size.task.horizon
-    np.testing.assert_allclose(np.hypot(*now.T), np.hypot(*offset[inner].T), rtol=2e-3)
-    gone = np.arctan2(now[:, 1], now[:, 0]) - np.arctan2(
-        offset[inner, 1], offset[inner, 0]
-    )
-    np.testing.assert_allclose(np.cos(gone - steps * angle), 1.0, atol=1e-3)
+    frames = np.stack([*([before] * 5), centre + offset])
+    scenario = given("cavity", frames, wall=1e-9)
+    positions = predicted("frozen-field", scenario)
+
+    is_inner = np.hypot(*offset.T) < 0.25
+    first = offset[is_inner]
+    last = positions[-1][is_inner] - centre
+    np.testing.assert_allclose(np.hypot(*last.T), np.hypot(*first.T), rtol=2e-3)
+    first_angle = np.arctan2(first[:, 1], first[:, 0])
+    last_angle = np.arctan2(last[:, 1], last[:, 0])
+    expected_turn = scenario.size.task.horizon * angle
+    deviation = last_angle - first_angle - expected_turn
+    np.testing.assert_allclose(np.cos(deviation), 1.0, atol=1e-3)
 
 
 def test_decay_of_an_exponential() -> None:
-    """Displacements that shrink by 0.9 a frame decay by 0.9; growing ones and rest do
-    not decay.
+    """Displacements that shrink by 0.9 a frame decay by 0.9.
+
+    Growing ones and rest do not decay.
     """
     step = scattered(20, -0.01, 0.01)
     shrinking = np.cumsum([step * 0.9**k for k in range(6)], axis=0)
-    assert decay(shrinking, UNIT_SQUARE) == pytest.approx(0.9)
     growing = np.cumsum([step * 1.1**k for k in range(6)], axis=0)
+    at_rest = np.repeat(step[None], 6, axis=0)
+    assert decay(shrinking, UNIT_SQUARE) == pytest.approx(0.9)
     assert decay(growing, UNIT_SQUARE) == 1.0
-    assert decay(np.repeat(step[None], 6, axis=0), UNIT_SQUARE) == 1.0
+    assert decay(at_rest, UNIT_SQUARE) == 1.0
 
 
-@pytest.mark.parametrize("speed", [0.0, 0.02])
-def test_the_mirrored_field_meets_the_wall(speed: float) -> None:
-    """A shear flow goes on through a wall that slides at 0.02; one at rest lets a
-    stagnation flow slide.
+@pytest.mark.parametrize("wall_speed", [0.0, 0.02])
+def test_the_mirrored_field_meets_the_wall(wall_speed: float) -> None:
+    """A shear flow goes on through a wall that slides.
+
+    A wall at rest lets a stagnation flow slide.
     """
     wall = np.zeros((4, 2))
-    wall[3, 0] = speed
+    wall[3, 0] = wall_speed
     scenario = given("cavity", np.zeros((6, 1, 2)), wall=wall)
     low, high = scenario.size.bounds[0]
     points = scattered(3000, low, high)
     depth = high - points[:, 1]
-    tangential = speed + 0.3 * depth if speed else np.full_like(depth, 0.01)
-    field = linear_field(
-        *with_wall_images(
-            scenario, points, np.stack([tangential, 0.2 * depth], axis=1), wall
-        )
-    )
-    at_wall = np.stack([np.linspace(0.3, 0.7, 20), np.full(20, high)], axis=1)
-    np.testing.assert_allclose(
-        field(at_wall), np.tile((speed or 0.01, 0.0), (20, 1)), atol=1e-12
-    )
+    if wall_speed:
+        tangential = wall_speed + 0.3 * depth
+        expected = (wall_speed, 0.0)
+    else:
+        tangential = np.full_like(depth, 0.01)
+        expected = (0.01, 0.0)
+    velocity = np.stack([tangential, 0.2 * depth], axis=1)
+    field = linear_field(*with_wall_images(scenario, points, velocity, wall))
+
+    x = np.linspace(0.3, 0.7, 20)
+    at_wall = np.stack([x, np.full(20, high)], axis=1)
+    expected_velocity = np.tile(expected, (20, 1))
+    np.testing.assert_allclose(field(at_wall), expected_velocity, atol=1e-12)
 
 
 def test_the_field_is_linear_and_has_no_holes() -> None:
-    """A linear field is met exactly between the points; far outside, the nearest point
-    answers.
-    """
+    """A linear field is exact between the points; outside the nearest point answers."""
     points = scattered(200, 0.0, 1.0)
     gradient = np.array([[0.1, -0.3], [0.2, 0.05]])
     field = linear_field(points, points @ gradient)
     inside = scattered(50, 0.3, 0.7, seed=1)
     np.testing.assert_allclose(field(inside), inside @ gradient, atol=1e-12)
-    beyond = np.array([[5.0, 5.0]])
-    corner = points[np.argmin(np.sum((points - beyond) ** 2, axis=1))]
-    np.testing.assert_allclose(field(beyond)[0], corner @ gradient)
+    outside = np.array([[5.0, 5.0]])
+    square_distance = np.sum((points - outside) ** 2, axis=1)
+    nearest = points[np.argmin(square_distance)]
+    np.testing.assert_allclose(field(outside)[0], nearest @ gradient)
 
 
 @pytest.fixture(autouse=True)
@@ -285,200 +295,197 @@ def opened(root: Path, size: Size, scenario: int) -> tuple[Given, NDArray[np.flo
         return given_in(file, size, root), future
 
 
-def test_analogs_of_a_copy_and_of_another(bench: ScoreBench) -> None:
-    """A full box that stands in train is its own analog, and its motion carries it
-    where it goes.
-
-    A test scenario gets another one's motion: particles start where they are and stay
-    in the box.
-    """
+def test_a_scenario_of_train_is_its_own_analog(bench: ScoreBench) -> None:
+    """Its motion carries the particles where they go."""
     number = bench.size.subsets["train"][1]
     scenario, future = opened(bench.root, bench.size, number)
     analog, mirror = find_analog(scenario)
     assert analog == number
     assert mirror.axes == ()
     np.testing.assert_allclose(predicted("analog", scenario), future, atol=1e-5)
-    scenario, future = opened(bench.root, bench.size, bench.size.subsets["test"][0])
-    assert find_analog(scenario)[0] in bench.size.subsets["train"]
-    found = predicted("analog", scenario)
-    assert found.shape == future.shape
-    assert np.abs(found[0] - scenario.last).max() < 0.1
+
+
+def test_a_test_scenario_gets_the_motion_of_one_of_train(bench: ScoreBench) -> None:
+    """Particles start where they are."""
+    number = bench.size.subsets["test"][0]
+    scenario, future = opened(bench.root, bench.size, number)
+    analog, _ = find_analog(scenario)
+    assert analog in bench.size.subsets["train"]
+    positions = predicted("analog", scenario)
+    assert positions.shape == future.shape
+    first_step = positions[0] - scenario.last
+    assert np.abs(first_step).max() < 0.1
 
 
 def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None:
-    """Moved together two clouds stay as far apart; 0.1 over the deviation along a
-    direction.
+    """Moved together two clouds stay as far apart.
+
+    On the mean over directions 0.1 along x has half its square, and the cloud half of
+    its variances' sum.
     """
-    scenario, _ = opened(bench.root, bench.size, bench.size.subsets["test"][0])
+    number = bench.size.subsets["test"][0]
+    scenario, _ = opened(bench.root, bench.size, number)
     start = describe_start(scenario)
 
-    def moved(by: Floats) -> InitialCloud:
-        return replace(
-            start,
-            clouds={kind: c + by @ DIRECTIONS for kind, c in start.clouds.items()},
-        )
+    def move(x: float, y: float) -> InitialCloud:
+        shift = np.array([x, y]) @ DIRECTIONS
+        clouds = {kind: cloud + shift for kind, cloud in start.clouds.items()}
+        return replace(start, clouds=clouds)
 
-    near = distance(start, moved(np.array([0.1, 0.0])))
-    assert distance(
-        moved(np.array([0.3, -0.2])), moved(np.array([0.4, -0.2]))
-    ) == pytest.approx(near)
-    # on the mean over directions 0.1 along x has half its square, and the cloud half of
-    # its variances' sum
-    assert near == pytest.approx(
-        0.1 / np.sqrt(scenario.last.var(axis=0).sum()), rel=0.01
-    )
+    near = distance(start, move(0.1, 0.0))
+    elsewhere = distance(move(0.3, -0.2), move(0.4, -0.2))
+    assert elsewhere == pytest.approx(near)
+    deviation = np.sqrt(scenario.last.var(axis=0).sum())
+    assert near == pytest.approx(0.1 / deviation, rel=0.01)
 
 
-def test_assignment_goes_by_material() -> None:
-    """A permuted, slightly moved cloud is matched particle by particle, each material
-    on its own.
-
-    Fewer particles are taken more than once, more are left out; a lacking material
-    takes any.
-    """
+def test_a_permuted_cloud_is_assigned_particle_by_particle() -> None:
+    """Each material is assigned on its own."""
     points = scattered(120, 0.0, 1.0)
-    rng = np.random.default_rng(1)
     material = np.repeat([0, 2], 60)
-    order = rng.permutation(120)
-    partner = assign_particles(points, points[order] + 1e-6, material, material[order])
+    order = np.random.default_rng(1).permutation(120)
+    moved = points[order] + 1e-6
+    partner = assign_particles(points, moved, material, material[order])
     np.testing.assert_array_equal(order[partner], np.arange(120))
+
+
+def test_unequal_clouds_are_assigned_evenly() -> None:
+    """Fewer particles are taken more than once; of more some are left out."""
     points = scattered(90, 0.0, 1.0)
-    zeros = np.zeros(90, np.int64)
-    fewer = assign_particles(points, points[:30], zeros, zeros[:30])
+    liquid = np.zeros(90, np.int64)
+    fewer = assign_particles(points, points[:30], liquid, liquid[:30])
     assert np.bincount(fewer, minlength=30).tolist() == [3] * 30
-    more = assign_particles(points[:30], points, zeros[:30], zeros)
+    more = assign_particles(points[:30], points, liquid[:30], liquid)
     assert len(set(more.tolist())) == 30
-    assert set(
-        assign_particles(points[:9], points[:9], zeros[:9] + 3, zeros[:9]).tolist()
-    ) == set(range(9))
+
+
+def test_a_material_that_is_lacking_takes_any() -> None:
+    """Every particle has a partner of its own."""
+    points = scattered(9, 0.0, 1.0)
+    liquid = np.zeros(9, np.int64)
+    partner = assign_particles(points, points, liquid + 3, liquid)
+    assert set(partner.tolist()) == set(range(9))
 
 
 def test_the_subset_that_carries_mass_is_spread_evenly() -> None:
-    """A quarter of a jittered lattice has four in 4 x 4 spacings, far more evenly than
-    by chance.
+    """A quarter of a jittered lattice has four in 4 x 4 spacings.
+
+    Their number per cell deviates less than that of a random choice, which is 2.
     """
-    side = np.stack(np.meshgrid(np.arange(48), np.arange(48)), axis=-1).reshape(-1, 2)
-    points = (side + 0.5 + 0.2 * scattered(48 * 48, -0.5, 0.5)) / 48
+    jitter = 0.2 * scattered(48 * 48, -0.5, 0.5)
+    points = (lattice(48) + 0.5 + jitter) / 48
     material = (points[:, 0] > 0.5).astype(np.int8)
     chosen = spread_subset(points, material, 576)
     assert len(set(chosen.tolist())) == 576
     assert np.count_nonzero(material[chosen]) == 288
-    cell = (points[chosen] * 12).astype(int)
-    counts = np.bincount(cell[:, 0] * 12 + cell[:, 1], minlength=144)
+    column, row = (points[chosen] * 12).astype(int).T
+    counts = np.bincount(column * 12 + row, minlength=144)
     assert counts.min() >= 1
-    assert counts.std() < 1.4  # a random choice: 2
-    np.testing.assert_array_equal(chosen, spread_subset(points, material, 576))
+    assert counts.std() < 1.4
+    again = spread_subset(points, material, 576)
+    np.testing.assert_array_equal(chosen, again)
 
 
 def test_the_coarse_solver_at_full_resolution_is_the_solver() -> None:
-    """With the grid, time step and particles of its own size it moves them as the
-    solver does.
-    """
+    """With its own grid, time step and particles it moves them as the solver does."""
     size = load().size("fluid", "tiny")
-    n = size.task.input_frames
-    count = size.particles
-    block = (
-        np.stack(np.meshgrid(np.arange(16), np.arange(16)), axis=-1).reshape(-1, 2) / 80
-        + 0.4
+    interval = size.frame_interval
+    block = lattice(16) / 80 + 0.4
+    speed = np.tile([0.5, 0.2], (size.particles, 1))
+    frames = []
+    for k in reversed(range(size.task.input_frames)):
+        frames.append(block - speed * interval * k)
+    scenario = given("fluid", np.stack(frames), area=0.04)
+    positions = list(predict_with(scenario, size))
+
+    fall = np.array([0.0, -0.5 * size.value("gravity") * interval])
+    state = InitialState(
+        position=frames[-1],
+        velocity=(frames[-1] - frames[-2]) / interval + fall,
+        affine=np.zeros((size.particles, 2, 2)),
+        material=np.zeros(size.particles, np.int8),
+        area=0.04,
     )
-    speed = np.tile([0.5, 0.2], (count, 1))
-    path = np.stack([block - speed * size.frame_interval * k for k in range(n)[::-1]])
-    scenario = given("fluid", path, area=0.04)
-    found = list(predict_with(scenario, size))
-    fall = np.array([0.0, -0.5 * size.value("gravity") * size.frame_interval])
     solver = compiled(solver_constants(size))
-    velocity = (path[-1] - path[-2]) / size.frame_interval + fall
-    rest = {
-        "affine": np.zeros((count, 2, 2)),
-        "material": np.zeros(count, np.int8),
-        "area": 0.04,
-    }
-    solver.load([InitialState(position=path[-1], velocity=velocity, **rest)])
-    for frame in found:
+    solver.load([state])
+    for position in positions:
         solver.advance(size.substeps_per_frame)
-        np.testing.assert_array_equal(frame, solver.position()[0])
+        np.testing.assert_array_equal(position, solver.position()[0])
 
 
 def test_the_coarse_solver_is_driven_by_the_walls_of_each_frame() -> None:
-    """A solver that is told each frame's walls before it moves there goes the same way,
-    to the bit.
-    """
+    """It goes the way of a solver that is told each frame's walls, to the bit."""
     size = load().size("cavity", "tiny")
     n = size.task.input_frames
-    frames = size.task.input_frames + size.task.horizon
+    frame_count = n + size.task.horizon
     (left, right), (bottom, top) = size.bounds
-    unit = (
-        np.stack(np.meshgrid(np.arange(18), np.arange(18)), axis=-1).reshape(-1, 2)
-        + 0.5
-    ) / 18
-    place = np.array([left, bottom]) + unit * np.array([right - left, top - bottom])
-    walls = np.zeros((frames, 4, 2))
-    walls[:, 3, 0] = (
-        0.2 * np.random.default_rng(0).normal(size=frames) * size.frame_interval
-    )
-    scenario = given(
-        "cavity", np.stack([place] * n), area=(right - left) * (top - bottom)
-    )
+    extent = np.array([right - left, top - bottom])
+    share = (lattice(18) + 0.5) / 18
+    position = np.array([left, bottom]) + share * extent
+    walls = np.zeros((frame_count, 4, 2))
+    lid_speed = 0.2 * np.random.default_rng(0).normal(size=frame_count)
+    walls[:, 3, 0] = lid_speed * size.frame_interval
+    scenario = given("cavity", np.stack([position] * n), area=float(np.prod(extent)))
     scenario = replace(scenario, walls=walls, parameters={"viscosity": 1e-3})
-    found = list(predict_with(scenario, size))
-    solver = compiled(replace(solver_constants(size), particles=len(place)))
-    still = {
-        "affine": np.zeros((len(place), 2, 2)),
-        "material": scenario.material,
-        "area": scenario.area,
-    }
-    still |= {
-        "velocity": np.zeros_like(place),
-        "wall_velocity": np.zeros((4, 2)),
-        "viscosity": 1e-3,
-    }
-    solver.load([InitialState(position=place, **still)])
-    for frame, speed in zip(found, walls[n:] / size.frame_interval, strict=True):
-        solver.move_walls(speed[None].astype(np.float32))
+    positions = list(predict_with(scenario, size))
+
+    state = InitialState(
+        position=position,
+        velocity=np.zeros_like(position),
+        affine=np.zeros((len(position), 2, 2)),
+        material=scenario.material,
+        area=scenario.area,
+        wall_velocity=np.zeros((4, 2)),
+        viscosity=1e-3,
+    )
+    solver = compiled(replace(solver_constants(size), particles=len(position)))
+    solver.load([state])
+    wall_velocities = walls[n:] / size.frame_interval
+    for expected, wall_velocity in zip(positions, wall_velocities, strict=True):
+        solver.move_walls(wall_velocity[None].astype(np.float32))
         solver.advance(size.substeps_per_frame)
-        np.testing.assert_array_equal(frame, solver.position()[0])
+        np.testing.assert_array_equal(expected, solver.position()[0])
 
 
 def test_the_coarse_solver_moves_all_particles() -> None:
-    """A falling block on the coarser grid falls as a whole: bodies in flight keep their
-    parabola.
-    """
+    """A block in flight keeps its parabola on the coarser grid."""
     size = load().size("fluid", "mini")
     coarse = coarser(size, 2)
     assert coarse is not None
-    side = np.stack(np.meshgrid(np.arange(25), np.arange(25)), axis=-1).reshape(-1, 2)
-    block = side / 120 + np.array([0.4, 0.6])
-    scenario = given(
-        "fluid", np.stack([block, block]), size="mini", area=(25 / 120) ** 2
-    )
-    frames = predict_with(scenario, coarse)
-    for k, frame in zip(range(1, 11), frames, strict=False):
-        fallen = 0.5 * size.value("gravity") * size.frame_interval**2 * k * (k + 1)
-        np.testing.assert_allclose(
-            np.mean(block - frame, axis=0), [0.0, fallen], atol=1e-3
-        )
-        assert frame.shape == block.shape
+    block = lattice(25) / 120 + np.array([0.4, 0.6])
+    area = (25 / 120) ** 2
+    frames = np.stack([block, block])
+    scenario = given("fluid", frames, size="mini", area=area)
+    positions = predict_with(scenario, coarse)
+    fall_unit = 0.5 * size.value("gravity") * size.frame_interval**2
+    for k, position in zip(range(1, 11), positions, strict=False):
+        assert position.shape == block.shape
+        mean_fall = np.mean(block - position, axis=0)
+        expected = [0.0, fall_unit * k * (k + 1)]
+        np.testing.assert_allclose(mean_fall, expected, atol=1e-3)
 
 
 def test_an_analog_needs_all_of_train(
     bench: ScoreBench, copied: Callable[[], Path]
 ) -> None:
-    """One scenario of train that is missing: the other floors are measured, and scoring
-    works.
+    """Without a scenario of train the other references are measured.
 
-    Who asks for an analog all the same is told.
+    A prediction by an analog is refused; scoring works.
     """
     root = copied()
     assert "analog" in measurable(bench.size, root)
-    train = root / bench.size.split / bench.size.name / f"v{bench.size.major}" / "train"
-    next(iter(sorted(train.glob("*.nc")))).unlink()
+    train = bench.size.folder(root) / "train"
+    first_file = min(train.glob("*.nc"))
+    first_file.unlink()
     expected = ("persistence", "constant-velocity", "frozen-field")
     assert measurable(bench.size, root) == expected
+
     shutil.rmtree(train)
+    scenario, _ = opened(root, bench.size, bench.size.subsets["test"][0])
     with pytest.raises(DataError):
-        predicted("analog", opened(root, bench.size, bench.size.subsets["test"][0])[0])
-    alone = replace(bench, root=root)
-    card = alone.evaluate(bench.submit(root / "predictions.nc", straight))
+        predicted("analog", scenario)
+    predictions = bench.submit(root / "predictions.nc", straight)
+    card = replace(bench, root=root).evaluate(predictions)
     assert tuple(card.scores) == (SUBMISSION, *expected)
     assert card.skill is not None
 
@@ -487,51 +494,47 @@ def test_an_analog_needs_all_of_train(
     "path", sorted(FOLDER.glob("*.json")), ids=lambda path: path.stem
 )
 def test_shipped_scores_belong_to_the_registry(path: Path) -> None:
-    """Hash, floors, scenarios and ranking metric are those of the size that the file
-    names.
-    """
-    said = json.loads(path.read_text())
-    size = load().size(said["split"], said["size"])
+    """Hash, references, scenarios and ranking metric are those of the file's size."""
+    content = json.loads(path.read_text())
+    size = load().size(content["split"], content["size"])
     assert path == shipped_path(size)
     assert path.stat().st_size < 200_000
-    if major_of(said["dataset_version"]) != size.major:
+    if major_of(content["dataset_version"]) != size.major:
         pytest.skip("measured on another version of the data")
-    scenario = shipped(size)
-    assert list(scenario) == [floor.name for floor in references_of(size)]
+
+    references = shipped(size)
+    assert list(references) == [predictor.name for predictor in references_of(size)]
     ranking = ranking_metric(size)
-    for floor in scenario.values():
-        score = floor.scores[ranking]
+    naive_scores = {}
+    for name, reference in references.items():
+        score = reference.scores[ranking]
         assert score.scenarios == tuple(sorted(size.subsets["test"]))
         assert score.mean > 0.0
-        assert floor.correlation.shape == score.values.shape
-    assert (
-        best_reference(
-            {
-                name: scenario[name].scores[ranking]
-                for name in NAIVE.intersection(scenario)
-            }
-        )
-        is not None
-    )
+        assert reference.correlation.shape == score.values.shape
+        if name in NAIVE:
+            naive_scores[name] = score
+    assert best_reference(naive_scores) is not None
 
 
 @pytest.mark.parametrize("axes", [(), (0,), (1,), (0, 1)])
 def test_a_mirror_image_of_a_mirror_image_is_the_scenario(
     axes: tuple[int, ...],
 ) -> None:
+    """A wall's upward motion is that of the wall across in the image along x."""
     box = Box.from_bounds(load().size("cavity", "mini").bounds)
     mirror = Mirror(box, axes)
     points = scattered(30, 0.1, 0.9)
-    walls = np.random.default_rng(1).normal(size=(5, 4, 2))
     image = mirror.positions(points)
     assert box.contains(image).all()
     np.testing.assert_allclose(mirror.positions(image), points, atol=1e-15)
-    np.testing.assert_array_equal(mirror.walls(mirror.walls(walls)), walls)
+
+    walls = np.random.default_rng(1).normal(size=(5, 4, 2))
+    wall_image = mirror.walls(walls)
+    np.testing.assert_array_equal(mirror.walls(wall_image), walls)
     if 0 in axes:
-        # what moved up beside the left wall moves up beside the right one
-        np.testing.assert_array_equal(
-            np.abs(mirror.walls(walls)[:, 1]), np.abs(walls[:, 0])
-        )
+        right_speed = np.abs(wall_image[:, 1])
+        left_speed = np.abs(walls[:, 0])
+        np.testing.assert_array_equal(right_speed, left_speed)
 
 
 def test_the_mirror_image_of_a_scenario_of_train_is_found_and_predicted(
@@ -541,17 +544,14 @@ def test_the_mirror_image_of_a_scenario_of_train_is_found_and_predicted(
     number = bench.size.subsets["train"][0]
     scenario, future = opened(bench.root, bench.size, number)
     mirror = Mirror(scenario.box, (0,))
-    image = replace(
-        scenario,
-        position=mirror.positions(scenario.position),
-        walls=mirror.walls(scenario.walls),
-    )
+    position = mirror.positions(scenario.position)
+    walls = mirror.walls(scenario.walls)
+    image = replace(scenario, position=position, walls=walls)
     analog, reversal = find_analog(image)
     assert analog == number
     assert reversal.axes == (0,)
-    np.testing.assert_allclose(
-        predicted("analog", image), mirror.positions(future), atol=1e-5
-    )
+    expected = mirror.positions(future)
+    np.testing.assert_allclose(predicted("analog", image), expected, atol=1e-5)
 
 
 def test_two_bodies_touch_when_they_are_a_radius_apart() -> None:
@@ -629,16 +629,19 @@ def test_after_contact_the_particles_follow_their_analogs(
 
 
 def test_what_predicts_train_best_is_chosen(splash: tuple[Path, Size]) -> None:
+    """No other lag and number of analogs has a smaller mean error."""
     root, size = splash
-    best = choose(size, root)
-    scenarios = {n: opened(root, size, n)[0] for n in size.subsets["train"]}
+    scenarios = {}
+    for number in size.subsets["train"]:
+        scenarios[number], _ = opened(root, size, number)
 
     def mean_error(choice: Choice) -> float:
-        return float(
-            np.mean([cloud_error(given, choice, n) for n, given in scenarios.items()])
-        )
+        errors = []
+        for number, scenario in scenarios.items():
+            errors.append(cloud_error(scenario, choice, number))
+        return float(np.mean(errors))
 
-    least = mean_error(best)
+    least = mean_error(choose(size, root))
     for choice in (Choice(lag=0, analogs=1), Choice(lag=10, analogs=2)):
         assert least <= mean_error(choice)
 

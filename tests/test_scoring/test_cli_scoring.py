@@ -29,9 +29,7 @@ Run = Callable[..., Result]
 
 @pytest.fixture
 def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult) -> Run:
-    """A function that runs lagbench on the generated data set with no recorded
-    hashes.
-    """
+    """A function that runs lagbench on a generated data set without hashes."""
     monkeypatch.setenv("LAGBENCH_ROOT", str(generated.root))
     return run
 
@@ -40,14 +38,13 @@ def run(run: Run, monkeypatch: pytest.MonkeyPatch, generated: GenerationResult) 
 def predictions(run: Run, tmp_path: Path) -> Path:
     """The template of a submission."""
     path = tmp_path / "predictions.nc"
-    assert run("template", "--split", SPLIT, "--size", SIZE, "-o", path).exit_code == 0
+    result = run("template", "--split", SPLIT, "--size", SIZE, "-o", path)
+    assert result.exit_code == 0
     return path
 
 
-def test_from_template_to_tables(run: Run, predictions: Path) -> None:
-    """A template validates, scores, and its tables name floors, undefined frames, flags
-    and files.
-    """
+def test_a_template_validates_and_scores(run: Run, predictions: Path) -> None:
+    """The output names references, undefined frames, flags and files."""
     assert run("validate", predictions).exit_code == 0
     result = run("score", predictions)
     assert result.exit_code == 0
@@ -59,68 +56,88 @@ def test_from_template_to_tables(run: Run, predictions: Path) -> None:
         "flag copy_suspect",
         "scores.nc",
     )
-    assert [word for word in words if word not in result.stdout] == []
-    assert all(
-        "scenarios" in line for line in result.stderr.splitlines()
-    )  # progress, on a slow machine
+    for word in words:
+        assert word in result.stdout
+    for line in result.stderr.splitlines():
+        assert "scenarios" in line  # progress, on a slow machine
 
 
 def test_json_is_the_file(run: Run, predictions: Path) -> None:
-    """Score --json prints what scores.json holds; --output moves both files; --quiet
-    prints nothing.
-    """
+    """``--json`` prints the content of scores.json; ``--output`` moves both files."""
     folder = predictions.parent / "scores"
     result = run("score", predictions, "--json", "--output", folder)
-    assert json.loads(result.stdout) == json.loads((folder / "scores.json").read_text())
-    assert {path.name for path in folder.iterdir()} == {"scores.json", "scores.nc"}
+    content = json.loads((folder / "scores.json").read_text())
+    assert json.loads(result.stdout) == content
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"scores.json", "scores.nc"}
     assert not (predictions.parent / "scores.json").exists()
+
+
+def test_quiet_prints_nothing(run: Run, predictions: Path) -> None:
     assert run("score", predictions, "--quiet").stdout == ""
 
 
-def test_a_template_keeps_what_is_there(
-    run: Run, predictions: Path, tmp_path: Path
+def test_a_template_replaces_predictions_only_on_request(
+    run: Run, predictions: Path
 ) -> None:
-    """Predictions are not replaced unless one says so; the only size that is here is
-    the default.
-    """
+    """The default size is the only one that is on the disk."""
     predictions.write_bytes(b"the work of a week")
-    words = ("template", SPLIT, "-o", predictions)
-    assert run(*words).exit_code == 2
+    arguments = ("template", SPLIT, "-o", predictions)
+    assert run(*arguments).exit_code == 2
     assert predictions.read_bytes() == b"the work of a week"
-    assert run(*words, "--overwrite").exit_code == 0
+    assert run(*arguments, "--overwrite").exit_code == 0
     assert run("validate", predictions).exit_code == 0
-    assert run("template", SPLIT, "-o", tmp_path, "--overwrite").exit_code == 2
-    nothing = run(
-        "template", SPLIT, "-o", tmp_path / "u.nc", "--root", tmp_path / "empty"
-    )
-    assert nothing.exit_code == 2
-    assert f"lagbench generate --split {SPLIT} --size" in nothing.stderr
+
+
+def test_a_template_is_no_folder(run: Run, tmp_path: Path) -> None:
+    result = run("template", SPLIT, "-o", tmp_path, "--overwrite")
+    assert result.exit_code == 2
+
+
+def test_a_template_without_data_names_the_command_that_makes_them(
+    run: Run, tmp_path: Path
+) -> None:
+    output = tmp_path / "predictions.nc"
+    result = run("template", SPLIT, "-o", output, "--root", tmp_path / "empty")
+    assert result.exit_code == 2
+    assert f"lagbench generate --split {SPLIT} --size" in result.stderr
 
 
 def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> None:
-    """Scores of gns.nc lie in gns/; those of another method are never written over."""
+    """Scores of gns.nc lie in gns/."""
+    other = predictions.with_name("gns.nc")
+    shutil.copy(predictions, other)
+    assert run("score", other).exit_code == 0
+    assert (predictions.parent / "gns" / "scores.nc").is_file()
+
+
+def test_scores_of_another_method_are_not_replaced(run: Run, predictions: Path) -> None:
+    """Those of the same method are."""
+    assert run("score", predictions).exit_code == 0
+    assert run("score", predictions).exit_code == 0
+    scores = predictions.with_name("scores.json")
+    before = scores.read_bytes()
     other = predictions.with_name("gns.nc")
     shutil.copy(predictions, other)
     with h5py.File(other, "a") as file:
         file.attrs["method"] = "gns"
-    assert [run("score", predictions).exit_code for _ in range(2)] == [0, 0]
-    kept = predictions.with_name("scores.json").read_bytes()
-    assert run("score", other).exit_code == 0
-    assert (predictions.parent / "gns" / "scores.nc").is_file()
-    refused = run("score", other, "--output", predictions.parent)
-    assert refused.exit_code == 2
-    assert "persistence" in refused.stderr
-    assert predictions.with_name("scores.json").read_bytes() == kept
+    result = run("score", other, "--output", predictions.parent)
+    assert result.exit_code == 2
+    assert "persistence" in result.stderr
+    assert scores.read_bytes() == before
 
 
-def too_wide(text: str) -> list[str]:
-    """Return lines wider than 80 columns, colours left out, but paths and remarks."""
-    lines = re.sub(r"\x1b\[[0-9;]*m", "", text).split("\n")
-    return [
-        line
-        for line in lines
-        if len(line.rstrip()) > 80 and not re.search(r":|\w/\w+/", line)
-    ]
+def find_wide_lines(text: str) -> list[str]:
+    """Return lines wider than 80 columns except paths and remarks.
+
+    Colours do not count.
+    """
+    wide_lines = []
+    for line in re.sub(r"\x1b\[[0-9;]*m", "", text).split("\n"):
+        is_path_or_remark = re.search(r":|\w/\w+/", line)
+        if len(line.rstrip()) > 80 and not is_path_or_remark:
+            wide_lines.append(line)
+    return wide_lines
 
 
 @pytest.fixture
@@ -133,98 +150,105 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("terminal")
 def test_tables_fit_eighty_columns(run: Run, predictions: Path) -> None:
-    """No line of any table is wider, with every metric and every floor too."""
+    """No line is wider, with every metric and every reference too."""
     run("score", predictions)
     board = Path(lagbench.__file__).parents[1] / "leaderboard"
-    here = f"{SPLIT} --size {SIZE}"
-    for line in (
+    dataset = f"{SPLIT} --size {SIZE}"
+    for command in (
         f"score {predictions}",
         f"score {predictions} --all --all-floors",
         f"compare {predictions.parent} analog --all",
         "list",
         "info cavity",
-        f"info {here}",
-        f"verify {here}",
+        f"info {dataset}",
+        f"verify {dataset}",
         f"leaderboard show --board {board}",
     ):
-        result = run(*line.split())
+        result = run(*command.split())
         assert result.exit_code == 0, result.output
         assert result.stdout
-        assert line == line
-        assert too_wide(result.stdout) == []
+        assert find_wide_lines(result.stdout) == [], command
 
 
-def commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
+def list_commands(group: Any, *before: str) -> Iterator[tuple[str, ...]]:
     """Yield the words of every command below a group."""
     for name, command in group.commands.items():
-        yield from (
-            commands(command, *before, name)
-            if hasattr(command, "commands")
-            else [(*before, name)]
-        )
+        words = (*before, name)
+        if hasattr(command, "commands"):
+            yield from list_commands(command, *words)
+        else:
+            yield words
 
 
 @pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize(
-    "words", [(), ("leaderboard",), *commands(get_command(app))], ids=" ".join
+    "words",
+    [
+        (),
+        ("leaderboard",),
+        *list_commands(get_command(app)),
+    ],
+    ids=" ".join,
 )
 def test_help_fits_eighty_columns(run: Run, words: tuple[str, ...]) -> None:
-    """The help of each command, and of those above, is told in 80 columns."""
+    """The help of each command, and of those above."""
     result = run(*words, "--help")
     assert result.exit_code == 0
-    assert [
-        line for line in result.stdout.split("\n") if too_wide(line.replace(":", "."))
-    ] == []
+    # In help texts a colon makes no remark.
+    assert find_wide_lines(result.stdout.replace(":", ".")) == []
 
 
 def test_compare_says_that_two_scenarios_are_few(run: Run, predictions: Path) -> None:
-    """With two scenarios no significance is claimed, in words and as null in JSON."""
+    """It claims no significance, in words and as null in JSON."""
     run("score", predictions)
-    result = run("compare", predictions.parent, "constant-velocity")
+    arguments = ("compare", predictions.parent, "constant-velocity")
+    result = run(*arguments)
     assert result.exit_code == 0
     assert "no significance is claimed under 6" in result.stdout
-    said = json.loads(
-        run("compare", predictions.parent, "constant-velocity", "--json").stdout
-    )
-    assert said["metrics"]["vorticity_rmse"]["p"] is None
-    assert (
-        run(
-            "compare", predictions.parent, "constant-velocity", "--metric", "mse"
-        ).exit_code
-        == 2
-    )
+    content = json.loads(run(*arguments, "--json").stdout)
+    assert content["metrics"]["vorticity_rmse"]["p"] is None
 
 
-def test_unreadable_files(
+def test_compare_refuses_an_unknown_metric(run: Run, predictions: Path) -> None:
+    run("score", predictions)
+    arguments = ("compare", predictions.parent, "constant-velocity")
+    assert run(*arguments, "--metric", "mse").exit_code == 2
+
+
+def test_other_files_of_lagbench_are_no_predictions(
     run: Run, predictions: Path, generated: GenerationResult
 ) -> None:
-    """Score and validate agree on the exit code and say what to do; one finding tells
-    files of ours.
-    """
+    """The validation says so in one finding."""
     run("score", predictions)
-    for path in (
-        predictions.with_name("scores.nc"),
-        next(generated.folder.glob("test/*.nc")),
-    ):
-        assert [finding.check for finding in submission.validate(path).findings] == [
-            "readable"
-        ]
+    scores = predictions.with_name("scores.nc")
+    scenario = next(generated.folder.glob("test/*.nc"))
+    for path in (scores, scenario):
+        findings = submission.validate(path).findings
+        assert [finding.check for finding in findings] == ["readable"]
         assert run("validate", path).exit_code == 3
-    whole = predictions.read_bytes()
-    for content in (b"text", whole[:20_000], None):
-        predictions.unlink() if content is None else predictions.write_bytes(content)
-        scored = run("score", predictions)
-        validated = run("validate", predictions)
-        assert scored.exit_code == validated.exit_code == 3
-        assert "fix:" in scored.stderr
-        assert "Traceback" not in scored.stderr + scored.stdout
+
+
+@pytest.mark.parametrize("damage", ["text", "truncated", "missing"])
+def test_score_and_validate_agree_on_unreadable_files(
+    run: Run, predictions: Path, damage: str
+) -> None:
+    """The message has a fix and no traceback."""
+    if damage == "text":
+        predictions.write_bytes(b"text")
+    elif damage == "truncated":
+        predictions.write_bytes(predictions.read_bytes()[:20_000])
+    else:
+        predictions.unlink()
+    result = run("score", predictions)
+    assert result.exit_code == 3
+    assert run("validate", predictions).exit_code == 3
+    assert "fix:" in result.stderr
+    assert "Traceback" not in result.output
 
 
 @pytest.mark.parametrize("method", ["[/b]", "[red]x[/red]", "a [link=http://b]"])
 def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
-    """A method's name with square brackets is printed as it is, in titles and heads of
-    columns.
-    """
+    """Titles and heads of columns print square brackets as they are."""
     with h5py.File(predictions, "r+") as file:
         file.attrs["method"] = method
     scored = run("score", predictions)
@@ -238,12 +262,14 @@ def test_names_are_no_markup(run: Run, predictions: Path, method: str) -> None:
 
 
 @pytest.fixture
-def two(predictions: Path) -> list[Path]:
+def two_submissions(predictions: Path) -> list[Path]:
     """Copies of a submission under one name in two folders."""
-    paths = [predictions.parent / name / "p.nc" for name in "ab"]
-    for path in paths:
+    paths = []
+    for folder_name in ("a", "b"):
+        path = predictions.parent / folder_name / "p.nc"
         path.parent.mkdir()
         shutil.copyfile(predictions, path)
+        paths.append(path)
     return paths
 
 
@@ -265,108 +291,120 @@ METRICS = (
 """
 
 
-def test_where_a_metric_of_a_package_fails(
+def test_a_failing_metric_of_a_package_is_located(
     run: Run, predictions: Path, package: Callable[..., Path]
 ) -> None:
-    """What a user's own metric raises is told with its line, name, frame and
-    scenario.
-    """
+    """The message has the line, the metric, the frame and the scenario."""
     module = package("metrics", "failing_metric:METRICS", FAILING)
     with h5py.File(predictions) as file:
-        first = min(file["scenario"][:])
+        first_scenario = min(file["scenario"][:])
     result = run("score", predictions)
     assert result.exit_code == 5
-    for told in (f"{module}, line 6", "my_enstrophy", "frame 10", f"scenario {first}"):
-        assert told in result.stderr
+    assert f"{module}, line 6" in result.stderr
+    assert "my_enstrophy" in result.stderr
+    assert "frame 10" in result.stderr
+    assert f"scenario {first_scenario}" in result.stderr
     assert not predictions.with_name("scores.json").exists()
 
 
 def test_several_files_keep_their_scores(
-    run: Run, two: list[Path], tmp_path: Path
+    run: Run, two_submissions: list[Path], tmp_path: Path
 ) -> None:
-    """Scores go beside each file, the page into the report folder; namesakes are
-    compared as (1) and (2).
-    """
-    result = run("score", *two, "--report", tmp_path / "rep")
-    compared = run("compare", *two)
-    assert (result.exit_code, compared.exit_code) == (0, 0), (
-        result.stderr + compared.stderr
-    )
-    for number, path in enumerate(two, start=1):
-        assert {held.name for held in (path.parent / "p").iterdir()} == {
-            "scores.json",
-            "scores.nc",
-        }
-        assert f"({number}): {path}" in compared.stdout
-    assert [path.name for path in (tmp_path / "rep").iterdir()] == ["index.html"]
+    """Scores go beside each file, the page into the report folder."""
+    report = tmp_path / "report"
+    result = run("score", *two_submissions, "--report", report)
+    assert result.exit_code == 0, result.stderr
+    for path in two_submissions:
+        names = {file.name for file in (path.parent / "p").iterdir()}
+        assert names == {"scores.json", "scores.nc"}
+    assert [path.name for path in report.iterdir()] == ["index.html"]
+
+
+def test_namesakes_are_numbered(run: Run, two_submissions: list[Path]) -> None:
+    result = run("compare", *two_submissions)
+    assert result.exit_code == 0, result.stderr
+    for number, path in enumerate(two_submissions, start=1):
+        assert f"({number}): {path}" in result.stdout
 
 
 def test_a_reader_that_leaves_early_leaves_the_report(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``score --report R | head`` closes the pipe after ten lines: by then the report
-    is there.
-    """
+    """``score --report R | head`` closes the pipe when the report is written."""
 
-    def gone(*_: object, **__: object) -> None:
+    def raise_broken_pipe(*_: object, **__: object) -> None:
         raise BrokenPipeError
 
-    monkeypatch.setattr(typer, "echo", gone)
-    assert (
-        run("score", predictions, "--report", predictions.parent / "rep").exit_code
-        == 141
-    )
-    assert (predictions.parent / "rep" / "index.html").is_file()
+    monkeypatch.setattr(typer, "echo", raise_broken_pipe)
+    report = predictions.parent / "report"
+    assert run("score", predictions, "--report", report).exit_code == 141
+    assert (report / "index.html").is_file()
 
 
-def test_scores_never_share_a_folder(run: Run, two: list[Path], tmp_path: Path) -> None:
-    """Two files whose scores would overwrite each other are a usage error before any is
-    scored.
-    """
-    for words in ((*two, "--output", tmp_path / "rep"), (two[0], two[0])):
-        result = run("score", *words, "--report", tmp_path / "rep")
+def test_two_files_never_share_a_folder_of_scores(
+    run: Run, two_submissions: list[Path], tmp_path: Path
+) -> None:
+    """It is a usage error before any is scored."""
+    report = tmp_path / "report"
+    first, second = two_submissions
+    for arguments in (
+        (first, second, "--output", report),
+        (first, first),
+    ):
+        result = run("score", *arguments, "--report", report)
         assert result.exit_code == 2
         assert "one folder" in result.stderr
-    assert not (tmp_path / "rep").exists()
-    assert [path.name for path in two[0].parent.iterdir()] == ["p.nc"]
+    assert not report.exists()
+    assert [path.name for path in first.parent.iterdir()] == ["p.nc"]
 
 
-def test_several_files_are_checked_before_any_is_scored(
-    run: Run, two: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_files_of_two_data_sets_are_refused_before_any_is_scored(
+    run: Run,
+    two_submissions: list[Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Another size, or a broken last file, ends the command before the first is
-    scored.
-    """
-    real = validation.validate
+    report = tmp_path / "report"
+    first, second = two_submissions
+    validate = validation.validate
 
-    def other(path: Path, **options: Any) -> submission.ValidationResult:
-        found = real(path, **options)
-        return (
-            dataclasses.replace(found, size="mini") if Path(path) == two[1] else found
-        )
+    def validate_second_as_mini(
+        path: Path, **options: Any
+    ) -> submission.ValidationResult:
+        result = validate(path, **options)
+        if Path(path) == second:
+            result = dataclasses.replace(result, size="mini")
+        return result
 
-    with monkeypatch.context() as patch:
-        patch.setattr(validation, "validate", other)
-        result = run("score", *two, "--report", tmp_path / "rep")
+    monkeypatch.setattr("lagbench.cli.score.validate", validate_second_as_mini)
+    result = run("score", first, second, "--report", report)
     assert result.exit_code == 2
     assert "two data sets" in result.stderr
-    two[1].write_text("text")
-    assert run("score", *two, "--report", tmp_path / "rep").exit_code == 3
-    assert not (two[0].parent / "p").exists()
-    assert not (tmp_path / "rep").exists()
+    assert not (first.parent / "p").exists()
+    assert not report.exists()
+
+
+def test_all_files_are_read_before_any_is_scored(
+    run: Run, two_submissions: list[Path], tmp_path: Path
+) -> None:
+    report = tmp_path / "report"
+    first, second = two_submissions
+    second.write_text("text")
+    result = run("score", first, second, "--report", report)
+    assert result.exit_code == 3
+    assert not (first.parent / "p").exists()
+    assert not report.exists()
 
 
 @pytest.mark.parametrize("option", ["--output", "--report"])
-def test_an_unusable_folder_is_told_before_the_work(
+def test_an_unusable_folder_is_an_error_before_the_work(
     run: Run, predictions: Path, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    """A file in the place of the folder ends the command before any scenario is
-    measured.
-    """
+    """A file is in the place of the folder."""
     monkeypatch.setattr(score, "run_all", None)
-    taken = predictions.parent / "taken"
-    taken.write_text("")
-    result = run("score", predictions, option, taken)
+    file = predictions.parent / "taken"
+    file.write_text("")
+    result = run("score", predictions, option, file)
     assert result.exit_code == 5
     assert f"write to: {option}" in result.stderr
 
@@ -375,13 +413,13 @@ def test_an_unusable_folder_is_told_before_the_work(
 def test_foreign_text_does_not_reach_the_terminal(
     run: Run, predictions: Path, method: str
 ) -> None:
-    """Control characters or endless text in a scores.json make it unreadable; none is
-    printed.
-    """
+    """Control characters or endless text make a scores.json unreadable."""
     run("score", predictions, "--quiet")
     path = predictions.parent / "scores.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"method": method}))
+    content = json.loads(path.read_text()) | {"method": method}
+    path.write_text(json.dumps(content))
     result = run("compare", path, "persistence")
     assert result.exit_code == 3
     assert "method" in result.stderr
-    assert not set("\x1b\a") & set(result.stdout + result.stderr)
+    assert "\x1b" not in result.output
+    assert "\a" not in result.output

@@ -27,9 +27,7 @@ HORIZON = 6
 
 
 def trace_of(truth: Floats, prediction: Floats) -> Trace:
-    """Return the trace of whole trajectories of the swirl, two frames given, six
-    predicted.
-    """
+    """Return the trace of trajectories of the swirl; six frames are predicted."""
     scenario = scenario_of(truth)
     tracer = Tracer(scenario)
     for pair in pairs_of(scenario, truth, prediction):
@@ -37,22 +35,24 @@ def trace_of(truth: Floats, prediction: Floats) -> Trace:
     return tracer.result()
 
 
-def made(error: Sequence[float], *, cosine: float = 1.0, motion: float = 1.0) -> Trace:
+def make_trace(
+    error: Sequence[float], *, cosine: float = 1.0, motion: float = 1.0
+) -> Trace:
     """Return a trace with these RMS errors and one cosine between neighbours.
 
     No shift fits better.
     """
-    e = np.array(error)
-    ones = np.ones(len(e))
-    products = cosine * e[1:] * e[:-1]
+    rms = np.array(error)
+    ones = np.ones(len(rms))
+    products = cosine * rms[1:] * rms[:-1]
     return Trace(
-        error=e**2,
+        error=rms**2,
         overlap=np.concatenate([[np.nan], products]),
         motion=motion**2 * ones,
         predicted_motion=motion**2 * ones,
-        shifted=dict.fromkeys(SHIFTS, 4.0 * e**2),
+        shifted=dict.fromkeys(SHIFTS, 4.0 * rms**2),
         occupancy=ones,
-        outside=0.0 * ones,
+        outside=np.zeros(len(rms)),
     )
 
 
@@ -97,122 +97,179 @@ def test_trace_finds_the_shift(shift: int) -> None:
     assert dynamics.shift_gain == 0.0
 
 
-def test_trace_occupancy_and_outside() -> None:
-    """A quarter of the particles thrown out of the box are counted; a cloud in half the
-    box fills half.
-    """
+def test_particles_out_of_the_box_are_counted() -> None:
+    """A quarter of the particles is far outside in every predicted frame."""
     truth = rollout()
-    thrown = truth.copy()
-    thrown[2:, ::4] = 2.0
-    np.testing.assert_allclose(trace_of(truth, thrown).outside, 0.25)
+    prediction = truth.copy()
+    prediction[2:, ::4] = 2.0
+    np.testing.assert_allclose(trace_of(truth, prediction).outside, 0.25)
+
+
+def test_a_cloud_in_half_the_box_occupies_half() -> None:
+    """Of ten columns of nodes it fills five, and the sixth by the spline's tail."""
+    truth = rollout()
     squeezed = truth.copy()
     squeezed[:, :, 0] /= 2.0
-    # ten columns of nodes: five are filled, and the sixth keeps enough of the spline's
-    # tail or not
-    assert np.all(np.abs(trace_of(truth, squeezed).occupancy - 0.5) <= 0.1)
+    occupancy = trace_of(truth, squeezed).occupancy
+    assert np.all(np.abs(occupancy - 0.5) <= 0.1)
     np.testing.assert_allclose(trace_of(truth, truth).occupancy, 1.0)
+
+
+GROWING = make_trace([1, 2, 3, 4, 5, 6])
+
+
+@pytest.mark.parametrize(
+    "trace",
+    [
+        GROWING,
+        # It does not grow, but is larger than a frame's motion.
+        make_trace([3, 3, 3, 3, 3, 3]),
+        # Among rounding errors a drop means nothing.
+        make_trace([1e-9, 9e-9, 1e-9, 9e-9, 1e-7, 1e-6]),
+    ],
+)
+def test_honest_errors_are_no_copies(trace: Trace) -> None:
+    assert not judge_copying([GROWING, trace]).raised
 
 
 @pytest.mark.parametrize(
     ("trace", "reason"),
     [
-        (made([1, 2, 3, 4, 5, 6]), None),
-        (
-            made([3, 3, 3, 3, 3, 3]),
-            None,
-        ),  # it does not grow, but is larger than a frame's motion
-        (made([0.3, 0.3, 0.3, 0.3, 0.3, 0.3]), "accumulate"),
-        (made([1, 2, 3, 4, 5, 6], cosine=0.3), "does not follow"),
-        (made([1, 2, 3, 1, 2, 3]), "drops"),
-        (made([0, 0, 0, 0, 0, 0]), "are the truth"),
-        (
-            made([1e-9, 9e-9, 1e-9, 9e-9, 1e-7, 1e-6]),
-            None,
-        ),  # falls among rounding errors are none
+        (make_trace([0.3, 0.3, 0.3, 0.3, 0.3, 0.3]), "accumulate"),
+        (make_trace([1, 2, 3, 4, 5, 6], cosine=0.3), "does not follow"),
+        (make_trace([1, 2, 3, 1, 2, 3]), "drops"),
+        (make_trace([0, 0, 0, 0, 0, 0]), "are the truth"),
     ],
 )
-def test_copy_suspect_by_hand(trace: Trace, reason: str | None) -> None:
-    """Each kind of trace raises for its own reason, and honest growth for none; one
-    scenario is enough.
+def test_copies_raise_the_flag_for_their_own_reason(trace: Trace, reason: str) -> None:
+    """One scenario is enough."""
+    flag = judge_copying([GROWING, trace])
+    assert flag.raised
+    assert len(flag.reasons) == 1
+    assert reason in flag.reasons[0]
+
+
+PERTURBED_ERROR = [1e-6, 1e-5, 1e-4, 0.5]
+PERSISTENCE_ERROR = np.array([0.01, 0.1, 0.5, 1.0])
+
+
+def test_errors_below_the_perturbed_run_raise_the_flag() -> None:
+    """Frames 0 and 3 are below it, and only the first of these counts.
+
+    At frame 3 the perturbed run is past a tenth of persistence.
     """
-    flag = judge_copying([made([1, 2, 3, 4, 5, 6]), trace])
-    assert flag.raised == (reason is not None)
-    if reason is not None:
-        assert len(flag.reasons) == 1
-        assert reason in flag.reasons[0]
-
-
-def test_twin_floor_and_physics_by_hand() -> None:
-    """Below the perturbed run in frames 0 and 3; only the first of these counts.
-
-    At frame 3 the perturbed run is past a tenth of persistence. A prediction at rest
-    and one of twenty times the energy are raised, one of twice is not.
-    """
-    limit = [1e-6, 1e-5, 1e-4, 0.5]
-    persistence = np.array([0.01, 0.1, 0.5, 1.0])
-    close = np.array([5e-7, 1e-3, 1e-2, 0.4])
-    flag = judge_predictability(close, persistence, limit)
+    error = np.array([5e-7, 1e-3, 1e-2, 0.4])
+    flag = judge_predictability(error, PERSISTENCE_ERROR, PERTURBED_ERROR)
     assert flag.raised
     assert flag.evidence == {"frames_below": 1.0, "frames_compared": 3.0}
-    honest = np.array([5e-5, 1e-3, 1e-2, 0.4])
-    assert judge_predictability(honest, persistence, limit).raised is False
-    assert judge_predictability(persistence, persistence, ()).raised is None
 
-    # as workers send it
-    faster = trace_of(rollout(), rollout(speed=0.012))
-    trace = pickle.loads(pickle.dumps(faster))
-    assert set(trace.shifted) == set(SHIFTS)
 
-    rest = made([1, 2, 3])
-    for factor, raised in ((0.0, True), (0.5, False), (2.0, False), (20.0, True)):
-        trace = replace(rest, predicted_motion=factor * rest.motion)
-        assert judge_physics([trace]).raised == raised
-    wide = replace(rest, occupancy=2.0 * rest.occupancy)
+def test_errors_above_the_perturbed_run_do_not_raise_the_flag() -> None:
+    error = np.array([5e-5, 1e-3, 1e-2, 0.4])
+    flag = judge_predictability(error, PERSISTENCE_ERROR, PERTURBED_ERROR)
+    assert flag.raised is False
+
+
+def test_without_a_perturbed_run_the_flag_is_undecided() -> None:
+    flag = judge_predictability(PERSISTENCE_ERROR, PERSISTENCE_ERROR, ())
+    assert flag.raised is None
+
+
+def test_a_trace_can_be_pickled() -> None:
+    """Workers send it so."""
+    trace = trace_of(rollout(), rollout(speed=0.012))
+    copied = pickle.loads(pickle.dumps(trace))
+    assert set(copied.shifted) == set(SHIFTS)
+
+
+@pytest.mark.parametrize(
+    ("energy", "is_raised"),
+    [
+        (0.0, True),
+        (0.5, False),
+        (2.0, False),
+        (20.0, True),
+    ],
+)
+def test_a_wrong_energy_raises_the_flag(energy: float, is_raised: bool) -> None:
+    """The energy is relative to the truth."""
+    trace = make_trace([1, 2, 3])
+    trace = replace(trace, predicted_motion=energy * trace.motion)
+    assert judge_physics([trace]).raised == is_raised
+
+
+def test_a_wrong_area_raises_the_flag() -> None:
+    trace = make_trace([1, 2, 3])
+    wide = replace(trace, occupancy=2.0 * trace.occupancy)
     assert "area" in judge_physics([wide]).reasons[0]
 
 
 def one_step(truth: Floats, n: int, h: int) -> Floats:
     """Extrapolate each frame from the two true frames before it."""
-    return np.asarray(
-        2.0 * truth[n - 1 : n + h - 1].astype(float) - truth[n - 2 : n + h - 2]
-    )
+    last = truth[n - 1 : n + h - 1].astype(float)
+    before = truth[n - 2 : n + h - 2]
+    return np.asarray(2.0 * last - before)
 
 
 def noisy(truth: Floats, n: int, h: int) -> Floats:
     """Add noise of a twentieth of a frame's motion to the truth."""
     rng = np.random.Generator(np.random.PCG64(1))
-    scale = 0.05 * np.sqrt(np.mean(np.diff(truth, axis=0) ** 2))
-    return np.asarray(
-        truth[n : n + h] + scale * rng.standard_normal(truth[n : n + h].shape)
-    )
+    motion = np.sqrt(np.mean(np.diff(truth, axis=0) ** 2))
+    frames = truth[n : n + h]
+    noise = rng.standard_normal(frames.shape)
+    return np.asarray(frames + 0.05 * motion * noise)
 
 
 def restarted(truth: Floats, n: int, h: int) -> Floats:
     """Extrapolate at constant velocity, restarting from the truth every five frames."""
-    return np.concatenate([straight(truth, f, 5) for f in range(n, n + h, 5)])[:h]
+    parts = [straight(truth, frame, 5) for frame in range(n, n + h, 5)]
+    return np.concatenate(parts)[:h]
 
 
-@pytest.mark.parametrize(
-    "predict", [still, straight, right, late, noisy, one_step, restarted, half_right]
-)
-def test_copies_on_generated_data(bench: ScoreBench, predict: Predict) -> None:
-    """On simulated flows both floors pass and what was made from the answer does
-    not.
-    """
-    n = bench.size.task.input_frames
-    h = bench.size.task.horizon
+def trace_scenarios(bench: ScoreBench, predict: Predict) -> list[Trace]:
+    """Return the traces of a prediction in the test scenarios."""
+    first = bench.size.task.input_frames
+    horizon = bench.size.task.horizon
     traces = []
     for number in bench.size.subsets["test"]:
         with bench.task.opened(number) as opened:
-            tracer = Tracer(opened.scenario)
             scenario = opened.scenario
-            truth = opened.file.read("position")
-            guess = snapshots(scenario, predict(truth, n, h))
-            for frame, true, predicted in zip(
-                range(n, n + h), opened.snapshots(), guess, strict=True
-            ):
+            tracer = Tracer(scenario)
+            positions = predict(opened.file.read("position"), first, horizon)
+            frames = zip(
+                range(first, first + horizon),
+                opened.snapshots(),
+                snapshots(scenario, positions),
+                strict=True,
+            )
+            for frame, true, predicted in frames:
                 tracer.add(FramePair(scenario, frame, true, predicted))
             traces.append(tracer.result())
-    if predict is half_right:
-        assert [analyse_error(trace).exact for trace in traces] == [h // 2, h // 2]
-    assert judge_copying(traces).raised == (predict not in (still, straight))
+    return traces
+
+
+@pytest.mark.parametrize(
+    ("predict", "is_copy"),
+    [
+        (still, False),
+        (straight, False),
+        (right, True),
+        (late, True),
+        (noisy, True),
+        (one_step, True),
+        (restarted, True),
+        (half_right, True),
+    ],
+)
+def test_copies_of_generated_data_raise_the_flag(
+    bench: ScoreBench, predict: Predict, is_copy: bool
+) -> None:
+    """Predictions that do not use the answer do not raise it."""
+    traces = trace_scenarios(bench, predict)
+    assert judge_copying(traces).raised == is_copy
+
+
+def test_frames_that_are_the_truth_are_counted(bench: ScoreBench) -> None:
+    half = bench.size.task.horizon // 2
+    for trace in trace_scenarios(bench, half_right):
+        assert analyse_error(trace).exact == half

@@ -1,11 +1,8 @@
-"""Own data that the scorer cannot use: counted, said before a training, and mended as
-it says.
-"""
+"""Local data that the scorer cannot use: warnings before a training and fixes."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +19,18 @@ from lagbench.errors import WorkFailedError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.metrics.coverage import Cloud, covered_nodes
+from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.scorability import check_scorability
 from lagbench.scoring.score import score
 
-GIVEN = 2
+INPUT_FRAMES = 2
 FRAMES = 5
+NEEDED_NODES = 16
+
+Trajectory = NDArray[np.float32]
 
 
-def lattice(side: int, *, seed: int = 0, speed: float = 0.1) -> NDArray[np.float32]:
+def lattice(side: int, *, seed: int = 0, speed: float = 0.1) -> Trajectory:
     """Return particles that fill the unit box and rotate a little about its centre.
 
     The shape is [frame, particle, 2].
@@ -50,64 +51,81 @@ def lattice(side: int, *, seed: int = 0, speed: float = 0.1) -> NDArray[np.float
     return np.clip(position, 0.0, 1.0).astype(np.float32)
 
 
-def own_split(
-    folder: Path, runs: list[NDArray[np.float32]], **wishes: Any
+def four_lattices(side: int, *, speed: float = 0.1) -> list[Trajectory]:
+    """Return four trajectories."""
+    return [lattice(side, seed=seed, speed=speed) for seed in range(4)]
+
+
+def adopt_trajectories(
+    folder: Path, trajectories: list[Trajectory], **options: Any
 ) -> LocalSplit:
     """Adopt trajectories of which the last two are the test subset."""
-    for number, run in enumerate(runs):
-        np.save(folder / f"{number}.npy", run)
-    files = [folder / f"{number}.npy" for number in range(len(runs))]
-    known: dict[str, Any] = {
+    files = []
+    for number, trajectory in enumerate(trajectories):
+        file = folder / f"{number}.npy"
+        np.save(file, trajectory)
+        files.append(file)
+    all_options: dict[str, Any] = {
         "radius": 0.2,
         "frame_interval": 0.1,
-        "input_frames": GIVEN,
-        **wishes,
-    }
-    return adopt(files, output=folder / "own", valid=1, test=2, **known)
+        "input_frames": INPUT_FRAMES,
+        "valid": 1,
+        "test": 2,
+    } | options
+    return adopt(files, output=folder / "own", **all_options)
 
 
-def runs(side: int, **options: Any) -> list[NDArray[np.float32]]:
-    """Return four trajectories."""
-    return [lattice(side, seed=seed, **options) for seed in range(4)]
+def ranking_values(card: ScoreCard) -> NDArray[np.float64]:
+    """Return the ranking metric of the submission in each scenario."""
+    return card.scores[SUBMISSION][card.ranking].values
+
+
+def undefined_warnings(card: ScoreCard) -> list[Any]:
+    """Return the warnings of a card about scenarios without a score."""
+    return [warning for warning in card.warnings if warning.check == "undefined"]
 
 
 @pytest.mark.parametrize(
-    ("side", "cells", "word"), [(12, 5, "finer"), (3, 40, "coarser")]
+    ("side", "cells", "word"),
+    [
+        (12, 5, "finer"),
+        (3, 40, "coarser"),
+    ],
 )
-def test_the_proposed_grid_makes_it_defined(
+def test_the_proposed_grid_makes_the_score_defined(
     tmp_path: Path, side: int, cells: int, word: str
 ) -> None:
-    """The message counts scenarios and nodes and names a grid; with that one in
-    split.yaml it scores.
-    """
-    made = own_split(tmp_path, runs(side), cells=cells, full_box=True)
-    lagbench.template(str(made.folder), output=tmp_path / "p.nc")
-    card = score(tmp_path / "p.nc", root=tmp_path, write=False)
-    assert np.isnan(card.scores["submission"][card.ranking].values).all()
-    (warning,) = [found for found in card.warnings if found.check == "undefined"]
-    with lagbench.open_split(str(made.folder), subset="test") as data:
-        clouds = [
-            Cloud(data["position"].values[i, GIVEN], side**2 * made.spacing**2)
-            for i in range(2)
-        ]
-    nodes = {
-        covered_nodes(cloud, Grid(cells, Placement.CELL_CENTRES)) for cloud in clouds
-    }
-    assert str(warning.got).startswith("2 of 2 test scenarios undefined: ")
-    assert max(nodes) < 16
-    spelled = " to ".join(str(count) for count in sorted(nodes))
-    assert f"{spelled} nodes counted, 16 needed" in str(warning.got)
-    found = re.match(
-        rf"a {word} grid: cells: (\d+) under score_grid in own/split.yaml",
-        str(warning.fix),
+    """The warning counts scenarios and nodes and names a grid for split.yaml."""
+    split = adopt_trajectories(
+        tmp_path, four_lattices(side), cells=cells, full_box=True
     )
-    described = made.folder / "split.yaml"
-    text = described.read_text()
+    predictions = tmp_path / "p.nc"
+    lagbench.template(str(split.folder), output=predictions)
+    card = score(predictions, root=tmp_path, write=False)
+    assert np.isnan(ranking_values(card)).all()
+    (warning,) = undefined_warnings(card)
+
+    area = side**2 * split.spacing**2
+    grid = Grid(cells, Placement.CELL_CENTRES)
+    node_counts = set()
+    with lagbench.open_split(str(split.folder), subset="test") as data:
+        for position in data["position"].values[:2, INPUT_FRAMES]:
+            node_counts.add(covered_nodes(Cloud(position, area), grid))
+    assert max(node_counts) < NEEDED_NODES
+    count_range = " to ".join(str(count) for count in sorted(node_counts))
+    assert str(warning.got).startswith("2 of 2 test scenarios undefined: ")
+    assert f"{count_range} nodes counted, {NEEDED_NODES} needed" in str(warning.got)
+
+    pattern = rf"a {word} grid: cells: (\d+) under score_grid in own/split.yaml"
+    match = re.match(pattern, str(warning.fix))
+    assert match is not None
+    description = split.folder / "split.yaml"
+    text = description.read_text()
     assert text.count(f"cells: {cells}") == 1
-    described.write_text(text.replace(f"cells: {cells}", f"cells: {found[1]}"))
-    card = score(tmp_path / "p.nc", root=tmp_path, write=False)
-    assert np.isfinite(card.scores["submission"][card.ranking].values).all()
-    assert not [found for found in card.warnings if found.check == "undefined"]
+    description.write_text(text.replace(f"cells: {cells}", f"cells: {match[1]}"))
+    card = score(predictions, root=tmp_path, write=False)
+    assert np.isfinite(ranking_values(card)).all()
+    assert not undefined_warnings(card)
 
 
 @pytest.mark.parametrize("side", [8, 9, 10, 12, 15, 20, 30])
@@ -115,94 +133,98 @@ def test_the_proposed_grid_makes_it_defined(
 def test_the_default_grid_fits_the_particles(
     tmp_path: Path, side: int, full_box: bool
 ) -> None:
-    """From 64 particles on every test scenario covers 16 nodes in the first and the
-    last frame.
+    """From 64 particles on every test scenario covers enough nodes.
+
+    It does so in the first and in the last frame.
     """
-    made = own_split(tmp_path, runs(side), full_box=full_box)
-    size, root, _ = locate(str(made.folder))
-    grid = Grid(size.task.score_grid.cells, Placement(size.task.score_grid.placement))
-    with lagbench.open_split(str(made.folder), subset="test") as data:
-        for position in (
-            data["position"].values[:, [GIVEN, FRAMES - 1]].reshape(-1, side**2, 2)
-        ):
-            assert covered_nodes(Cloud(position, side**2 * made.spacing**2), grid) >= 16
+    split = adopt_trajectories(tmp_path, four_lattices(side), full_box=full_box)
+    size, root, _ = locate(str(split.folder))
+    score_grid = size.task.score_grid
+    grid = Grid(score_grid.cells, Placement(score_grid.placement))
+    area = side**2 * split.spacing**2
+    with lagbench.open_split(str(split.folder), subset="test") as data:
+        frames = data["position"].values[:, [INPUT_FRAMES, FRAMES - 1]]
+    for position in frames.reshape(-1, side**2, 2):
+        assert covered_nodes(Cloud(position, area), grid) >= NEEDED_NODES
     assert list(check_scorability(size, root)) == []
 
 
-def test_nodes_are_counted_as_the_metrics_do() -> None:
-    """A full box of n cells across has (n - 2)^2 nodes with neighbours on all sides; no
-    particles, none.
-    """
-    position = lattice(40)[0]
-    for cells in (4, 6, 10):
-        assert (
-            covered_nodes(Cloud(position, 1.0), Grid(cells, Placement.CELL_CENTRES))
-            == (cells - 2) ** 2
-        )
-    assert (
-        covered_nodes(Cloud(position[:1], 1.0), Grid(10, Placement.CELL_CENTRES)) <= 1
-    )
+@pytest.mark.parametrize("cells", [4, 6, 10])
+def test_nodes_are_counted_as_the_metrics_do(cells: int) -> None:
+    """A full box of n cells across has (n - 2)^2 nodes with neighbours on all sides."""
+    cloud = Cloud(lattice(40)[0], 1.0)
+    grid = Grid(cells, Placement.CELL_CENTRES)
+    assert covered_nodes(cloud, grid) == (cells - 2) ** 2
 
 
-COARSE = {"cells": 5, "full_box": True}
+def test_a_single_particle_covers_one_node_at_most() -> None:
+    cloud = Cloud(lattice(40)[0, :1], 1.0)
+    grid = Grid(10, Placement.CELL_CENTRES)
+    assert covered_nodes(cloud, grid) <= 1
+
+
+def list_reasons(split: LocalSplit) -> str:
+    """Return why a split cannot be scored or validated."""
+    size, root, _ = locate(str(split.folder))
+    return "\n".join(check_scorability(size, root))
+
+
+def test_a_coarse_grid_is_a_reason(tmp_path: Path) -> None:
+    split = adopt_trajectories(tmp_path, four_lattices(12), cells=5, full_box=True)
+    reasons = list_reasons(split)
+    assert "2 of 2 test scenarios undefined: 9" in reasons
+    assert "1 of 1 valid scenarios undefined" in reasons
+
+
+def test_different_particle_numbers_are_a_reason(tmp_path: Path) -> None:
+    trajectories = four_lattices(12)
+    trajectories[3] = lattice(10)
+    split = adopt_trajectories(tmp_path, trajectories)
+    assert "100 to 144 particles" in list_reasons(split)
+
+
+def test_data_without_motion_are_a_reason(tmp_path: Path) -> None:
+    split = adopt_trajectories(tmp_path, four_lattices(12, speed=0.0))
+    assert "nothing moves in test" in list_reasons(split)
+
+
+def test_a_short_scenario_is_a_reason(tmp_path: Path) -> None:
+    trajectories = four_lattices(12)
+    trajectories[1] = lattice(12)[:4]
+    split = adopt_trajectories(tmp_path, trajectories)
+    assert "a valid scenario is too short" in list_reasons(split)
 
 
 @pytest.mark.parametrize(
-    ("made_of", "wishes", "words"),
+    ("cells", "is_warned"),
     [
-        (
-            lambda: runs(12),
-            COARSE,
-            ["2 of 2 test scenarios undefined: 9", "1 of 1 valid scenarios undefined"],
-        ),
-        (lambda: [*runs(12)[:3], lattice(10)], {}, ["100 to 144 particles"]),
-        (lambda: runs(12, speed=0.0), {}, ["nothing moves in test"]),
-        (
-            lambda: [*runs(12)[:1], lattice(12)[:4], *runs(12)[2:]],
-            {},
-            ["a valid scenario is too short"],
-        ),
+        (5, True),
+        (8, False),
     ],
 )
-def test_reasons(
-    tmp_path: Path,
-    made_of: Callable[[], list[NDArray[np.float32]]],
-    wishes: dict[str, Any],
-    words: list[str],
+def test_a_training_begins_with_the_warning(
+    tmp_path: Path, cells: int, is_warned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each way in which own data cannot be scored or validated is said."""
-    made = own_split(tmp_path, made_of(), **wishes)
-    size, root, _ = locate(str(made.folder))
-    reasons = "\n".join(check_scorability(size, root))
-    assert [said for said in words if said not in reasons] == []
+    """There is one warning, with a grid that helps, or none without a reason."""
 
-
-@pytest.mark.parametrize(("cells", "warned"), [(5, True), (8, False)])
-def test_training_says_so_first(
-    tmp_path: Path, cells: int, warned: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One warning with a grid that mends it precedes the training, which is begun; none
-    without a reason.
-    """
-
-    def begin(*_: object, **__: object) -> None:
+    def stop_training(*_: object, **__: object) -> None:
         raise WorkFailedError("begun")
 
-    monkeypatch.setattr("lagbench.baselines.train.train", begin)
-    made = own_split(tmp_path, runs(12), cells=cells, full_box=True)
+    monkeypatch.setattr("lagbench.baselines.train.train", stop_training)
+    split = adopt_trajectories(tmp_path, four_lattices(12), cells=cells, full_box=True)
     recipe = tmp_path / "own.yaml"
-    recipe.write_text(f"format: 1\nrecipes:\n  '*/{made.size}': {{}}\n")
-    words = [
+    recipe.write_text(f"format: 1\nrecipes:\n  '*/{split.size}': {{}}\n")
+    arguments = [
         "train",
         "--baseline",
         "mlp",
         "--split",
-        str(made.folder),
+        str(split.folder),
         "--recipe",
         str(recipe),
     ]
-    done = CliRunner().invoke(app, words)
-    before, begun, _ = done.stderr.partition("lagbench: begun")
-    assert begun
-    assert before.count("warning:") == warned
-    assert ("under score_grid in own/split.yaml" in before) == warned
+    result = CliRunner().invoke(app, arguments)
+    before_training, message, _ = result.stderr.partition("lagbench: begun")
+    assert message
+    assert before_training.count("warning:") == is_warned
+    assert ("under score_grid in own/split.yaml" in before_training) == is_warned

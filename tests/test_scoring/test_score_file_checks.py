@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from made_up import SCORES, BoardBench, copied
+from board_bench import SCORES, BoardBench, copied
 
 from lagbench.board.check import check_board
 from lagbench.errors import UnreadableFileError

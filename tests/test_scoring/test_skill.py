@@ -1,6 +1,4 @@
-"""Skill against hand-worked ratios, and shipped scores of floors against measured
-ones.
-"""
+"""Skill against hand-worked ratios; shipped scores of references against measured."""
 
 from __future__ import annotations
 
@@ -22,8 +20,8 @@ from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
 from lagbench.references.shipped import (
     shipped_path,
+    write_costs,
     write_shipped,
-    write_solver_seconds,
 )
 from lagbench.references.table import NAIVE
 from lagbench.scoring import references as references_of_scoring
@@ -52,26 +50,29 @@ def scored(
     return Score(METRICS[metric], ids, (), empty, np.array(values), (0,) * len(values))
 
 
-def test_skill_is_one_minus_the_ratio_of_means() -> None:
-    """Means 1 and 4: skill 3/4; a perfect score has 1, twice the reference's -1.
-
-    The coarse solver knows the equations: however good, skill is measured against
-    references that do not; unknown ones do not count. A scenario that is undefined in
-    one of the two is left out of both.
-    """
+@pytest.mark.parametrize(
+    ("values", "skill"),
+    [
+        ([0.5, 1.5], 0.75),
+        ([0.0, 0.0], 1.0),
+        ([6.0, 10.0], -1.0),
+    ],
+)
+def test_skill_is_one_minus_the_ratio_of_means(
+    values: list[float], skill: float
+) -> None:
+    """The mean of the best reference is 4."""
     references = {
         "persistence": scored([6.0, 6.0]),
         "frozen-field": scored([3.0, 5.0]),
     }
-    for values, expected in (
-        ([0.5, 1.5], 0.75),
-        ([0.0, 0.0], 1.0),
-        ([6.0, 10.0], -1.0),
-    ):
-        result = compute_skill([scored(values)], references)
-        assert result.reference == "frozen-field"
-        assert result.value == expected
+    result = compute_skill([scored(values)], references)
+    assert result.reference == "frozen-field"
+    assert result.value == skill
 
+
+def test_skill_is_measured_against_references_without_equations() -> None:
+    """The coarse solver knows the equations, and unknown references do not count."""
     references = {
         "analog": scored([2.0]),
         "coarse-solver": scored([0.1]),
@@ -80,36 +81,49 @@ def test_skill_is_one_minus_the_ratio_of_means() -> None:
     counting = {name: references[name] for name in NAIVE.intersection(references)}
     assert best_reference(counting) == "analog"
 
-    partial = {"analog": scored([4.0, math.nan])}
-    result = compute_skill([scored([1.0, 9.0])], partial)
+
+def test_scenarios_that_one_side_lacks_are_left_out() -> None:
+    references = {"analog": scored([4.0, math.nan])}
+    result = compute_skill([scored([1.0, 9.0])], references)
     assert result.value == 0.75
-    assert all(math.isnan(bound) for bound in result.interval)
+    assert np.isnan(result.interval).all()
 
 
-def test_what_skill_and_its_interval_need() -> None:
-    """No reference, an undefined one, a perfect one, or other scenarios: no skill.
-
-    The same holds for a metric of which more is better. A ratio that is 1/2 in every
-    scenario is certain; three scenarios have no interval.
-    """
+@pytest.mark.parametrize(
+    "reference",
+    [
+        scored([math.nan, math.nan]),
+        scored([0.0, 0.0]),
+        scored([1.0, 1.0], first=7),
+    ],
+    ids=["undefined", "perfect", "other scenarios"],
+)
+def test_some_references_give_no_skill(reference: Score) -> None:
     method = scored([1.0, 1.0])
-    assert compute_skill([method], {}) is None
-    undefined = scored([math.nan] * 2)
-    perfect = scored([0.0, 0.0])
-    elsewhere = scored([1.0, 1.0], first=7)
-    for reference in (undefined, perfect, elsewhere):
-        assert compute_skill([method], {"analog": reference}) is None
+    assert compute_skill([method], {"analog": reference}) is None
+
+
+def test_without_a_reference_there_is_no_skill() -> None:
+    assert compute_skill([scored([1.0, 1.0])], {}) is None
+
+
+def test_a_metric_of_which_more_is_better_gives_no_skill() -> None:
     pearson = scored([0.5, 0.5], "vorticity_pearson")
     assert compute_skill([pearson], {"analog": pearson}) is None
 
-    base = scored([1.0, 2.0, 5.0, 3.0])
+
+def test_a_ratio_that_is_the_same_in_every_scenario_is_certain() -> None:
+    reference = scored([1.0, 2.0, 5.0, 3.0])
     half = scored([0.5, 1.0, 2.5, 1.5])
-    certain = compute_skill([half], {"analog": base})
-    assert certain.value == 0.5
-    assert certain.interval == (0.5, 0.5)
-    short_base = scored([1.0, 2.0, 5.0])
-    few = compute_skill([scored([1.0, 1.0, 4.0])], {"analog": short_base})
-    assert all(math.isnan(bound) for bound in few.interval)
+    result = compute_skill([half], {"analog": reference})
+    assert result.value == 0.5
+    assert result.interval == (0.5, 0.5)
+
+
+def test_three_scenarios_have_no_interval() -> None:
+    reference = scored([1.0, 2.0, 5.0])
+    result = compute_skill([scored([1.0, 1.0, 4.0])], {"analog": reference})
+    assert np.isnan(result.interval).all()
 
 
 def test_the_interval_is_that_of_resampled_ratios() -> None:
@@ -181,167 +195,231 @@ def test_seeds_widen_the_interval_of_skill() -> None:
 
 @pytest.fixture(scope="module")
 def measured_references(bench: ScoreBench) -> dict[str, Any]:
-    """All floors of it, measured once."""
+    """All references of the data set, measured once."""
     return measure(bench.size, bench.root)
 
 
-def recorded(size: Size, sha256: str = "a" * 64) -> Size:
+SHA256 = "a" * 64
+OTHER_SHA256 = "b" * 64
+
+
+def record(size: Size, sha256: str = SHA256) -> Size:
     """Return a size as if its data set were recorded."""
-    statistics = {"position_std": (0.3, 0.3), "velocity_std": (1e-3, 1e-3)}
-    hashes = {"dataset_sha256": sha256, "subset_sha256": {}, "scenario_sha256": {}}
-    measured = Measured(**hashes, statistics=statistics, twin_floor=())
+    measured = Measured(
+        dataset_sha256=sha256,
+        subset_sha256={},
+        scenario_sha256={},
+        statistics={"position_std": (0.3, 0.3), "velocity_std": (1e-3, 1e-3)},
+        twin_floor=(),
+    )
     return size.model_copy(update={"measured": measured})
+
+
+def mean_at(score: Score, frame: int) -> float:
+    """Return the mean over scenarios at a frame, or 0 where all are undefined."""
+    values = score.at(frame)
+    if not np.isfinite(values).any():
+        return 0.0
+    return float(np.nanmean(values))
+
+
+def mean_curve(score: Score) -> Any:
+    """Return the mean over scenarios in each frame."""
+    return score.per_frame.mean(axis=0)
 
 
 def test_shipped_scores_are_the_measured_ones(
     bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Written and read again they are equal to five digits, curves to three; another
-    data set has none.
-    """
-    found = measured_references
-    assert list(found) == [floor.name for floor in references_of(bench.size)]
-    size = recorded(bench.size)
-    frames = (15, 25)
+    """Written and read again, values are equal to five digits, curves to three."""
+    names = [reference.name for reference in references_of(bench.size)]
+    assert list(measured_references) == names
+    size = record(bench.size)
     path = write_shipped(
-        size, found, dataset_sha256="a" * 64, reported=frames, folder=tmp_path
+        size,
+        measured_references,
+        dataset_sha256=SHA256,
+        reported=(15, 25),
+        folder=tmp_path,
     )
-    held = shipped(size, tmp_path)
-    assert differences(held, found) == {}
-    for name, floor in found.items():
-        for metric, score in floor.scores.items():
-            told = held[name].scores[metric]
-            assert told.undefined == score.undefined
-            if score.metric.per_frame:
-                at = [
-                    np.nanmean(s.at(25)) if np.isfinite(s.at(25)).any() else 0.0
-                    for s in (told, score)
-                ]
-                assert at[0] == pytest.approx(at[1], rel=1e-3)
-    before = found["frozen-field"]
-    after = held["frozen-field"]
-    last = before.scores["vorticity_pearson"].per_frame[:, -1]
-    np.testing.assert_allclose(after.correlation, last, rtol=1e-3)
-    curves = [
-        side.scores["position_rmse"].per_frame.mean(axis=0) for side in (after, before)
-    ]
-    np.testing.assert_allclose(*curves, rtol=6e-3)
     assert path == shipped_path(size, tmp_path)
-    assert shipped(recorded(bench.size, "b" * 64), tmp_path) is None
+    from_file = shipped(size, tmp_path)
+    assert differences(from_file, measured_references) == {}
+    for name, reference in measured_references.items():
+        for metric, expected in reference.scores.items():
+            score = from_file[name].scores[metric]
+            assert score.undefined == expected.undefined
+            if expected.metric.per_frame:
+                mean = mean_at(score, 25)
+                assert mean == pytest.approx(mean_at(expected, 25), rel=1e-3)
+
+    frozen = from_file["frozen-field"]
+    expected_scores = measured_references["frozen-field"].scores
+    correlation = expected_scores["vorticity_pearson"].per_frame[:, -1]
+    np.testing.assert_allclose(frozen.correlation, correlation, rtol=1e-3)
+    curve = mean_curve(frozen.scores["position_rmse"])
+    expected_curve = mean_curve(expected_scores["position_rmse"])
+    np.testing.assert_allclose(curve, expected_curve, rtol=6e-3)
+
+
+def test_another_data_set_has_no_shipped_scores(
+    bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
+) -> None:
+    write_shipped(
+        record(bench.size),
+        measured_references,
+        dataset_sha256=SHA256,
+        reported=(15, 25),
+        folder=tmp_path,
+    )
+    assert shipped(record(bench.size, OTHER_SHA256), tmp_path) is None
     assert shipped(bench.size, tmp_path) is None
 
 
-def test_one_floor_measured_anew_leaves_the_others(
+def test_one_reference_measured_anew_leaves_the_others(
     bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
 ) -> None:
-    """Its scores change; order, the others, its cost and the solver's stay, which one
-    run has measured.
+    """Its scores change; the order, the others and all costs stay.
+
+    One run has measured all costs, and that of the solver.
     """
-    size = recorded(bench.size)
-    known = {"dataset_sha256": "a" * 64, "reported": (15,), "folder": tmp_path}
-    path = write_shipped(size, measured_references, **known)
-    write_solver_seconds(size, 0.5, tmp_path)
+    size = record(bench.size)
+    options: dict[str, Any] = {
+        "dataset_sha256": SHA256,
+        "reported": (15,),
+        "folder": tmp_path,
+    }
+    path = write_shipped(size, measured_references, **options)
+    write_costs(size, {}, solver=0.5, folder=tmp_path)
     before = json.loads(path.read_text())
-    other = replace(
+    analog = replace(
         measured_references["persistence"], name="analog", seconds_per_frame=9.0
     )
-    write_shipped(size, {"analog": other}, partial=True, **known)
+    write_shipped(size, {"analog": analog}, partial=True, **options)
     after = json.loads(path.read_text())
+
     assert list(after["floors"]) == list(before["floors"])
-    assert (
-        after["floors"]["analog"].pop("values")
-        == before["floors"]["persistence"]["values"]
-    )
-    assert (
-        after["floors"]["analog"]["seconds_per_frame"]
-        == before["floors"]["analog"]["seconds_per_frame"]
-    )
-    for held in (before, after):
-        del held["floors"]["analog"]
+    analog_before = before["floors"].pop("analog")
+    analog_after = after["floors"].pop("analog")
+    persistence = before["floors"]["persistence"]
+    assert analog_after["values"] == persistence["values"]
+    cost_key = "seconds_per_frame"
+    assert analog_after[cost_key] == analog_before[cost_key]
     assert after == before
-    write_shipped(size, {"analog": other}, **known)
-    assert list(json.loads(path.read_text())["floors"]) == ["analog"]
+
     with pytest.raises(DataError):
         write_shipped(
-            recorded(bench.size, "b" * 64), {"analog": other}, partial=True, **known
+            record(bench.size, OTHER_SHA256),
+            {"analog": analog},
+            partial=True,
+            **options,
         )
 
 
-def test_a_floor_that_a_data_set_lacks_is_not_measured(
+def test_a_full_measurement_replaces_all_references(
+    bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
+) -> None:
+    size = record(bench.size)
+    options: dict[str, Any] = {
+        "dataset_sha256": SHA256,
+        "reported": (15,),
+        "folder": tmp_path,
+    }
+    path = write_shipped(size, measured_references, **options)
+    write_shipped(size, {"analog": measured_references["analog"]}, **options)
+    assert list(json.loads(path.read_text())["floors"]) == ["analog"]
+
+
+def test_a_reference_that_a_data_set_lacks_is_not_measured(
     bench: ScoreBench, tmp_path: Path
 ) -> None:
     """A coarse solver at tiny: nothing is written."""
     with pytest.raises(UsageError):
         measure_and_ship(
-            recorded(bench.size), bench.root, folder=tmp_path, names=["coarse-solver"]
+            record(bench.size),
+            bench.root,
+            folder=tmp_path,
+            names=["coarse-solver"],
         )
     assert not list(tmp_path.iterdir())
 
 
 def test_a_forged_shipped_score_is_found(
+    bench: ScoreBench, measured_references: dict[str, Any], tmp_path: Path
+) -> None:
+    """A value changed by 1 % differs, and so does a reference that is left out."""
+    references = {
+        "persistence": measured_references["persistence"],
+        "constant-velocity": measured_references["constant-velocity"],
+    }
+    size = record(bench.size)
+    path = write_shipped(
+        size,
+        references,
+        dataset_sha256=SHA256,
+        reported=(15,),
+        folder=tmp_path,
+    )
+    content = json.loads(path.read_text())
+    content["floors"]["persistence"]["values"]["position_rmse"][1] *= 1.01
+    del content["floors"]["constant-velocity"]
+    path.write_text(json.dumps(content))
+
+    changed_metrics = differences(shipped(size, tmp_path), references)
+    assert changed_metrics["persistence"] == ("position_rmse",)
+    all_metrics = set(references["constant-velocity"].scores)
+    assert set(changed_metrics["constant-velocity"]) == all_metrics
+
+
+def test_a_new_measurement_finds_a_forged_score(
     bench: ScoreBench,
     measured_references: dict[str, Any],
-    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """One value changed by 1 % differs from what is measured again; so does a floor
-    that is left out.
-    """
-    found = {
-        name: measured_references[name] for name in ("persistence", "constant-velocity")
-    }
-    size = recorded(bench.size)
-    path = write_shipped(
-        size, found, dataset_sha256="a" * 64, reported=(15,), folder=tmp_path
-    )
-    said = json.loads(path.read_text())
-    said["floors"]["persistence"]["values"]["position_rmse"][1] *= 1.01
-    del said["floors"]["constant-velocity"]
-    path.write_text(json.dumps(said))
-    unlike = differences(shipped(size, tmp_path), found)
-    assert unlike["persistence"] == ("position_rmse",)
-    assert set(unlike["constant-velocity"]) == set(found["constant-velocity"].scores)
+    stored = dict(measured_references)
+    monkeypatch.setattr(references_of_scoring, "shipped", lambda size: stored)
+    assert remeasure(bench.size, bench.root) == (tuple(stored), {})
 
-    assert [
-        size.name for size in measured_sizes(bench.root, registry=bench.registry)
-    ] == [bench.size.name]
-    held = dict(measured_references)
-    monkeypatch.setattr(references_of_scoring, "shipped", lambda size: held)
-    assert remeasure(bench.size, bench.root) == (tuple(held), {})
     monkeypatch.setattr(
         references_of_scoring, "measure", lambda *_, **__: measured_references
     )
-    still = held["persistence"]
-    score = still.scores["position_rmse"]
-    forged = {
-        **still.scores,
-        "position_rmse": replace(score, values=1.01 * score.values),
-    }
-    held["persistence"] = replace(still, scores=forged)
-    assert remeasure(bench.size, bench.root)[1] == {"persistence": ("position_rmse",)}
+    persistence = stored["persistence"]
+    score = persistence.scores["position_rmse"]
+    forged_score = replace(score, values=1.01 * score.values)
+    forged_scores = persistence.scores | {"position_rmse": forged_score}
+    stored["persistence"] = replace(persistence, scores=forged_scores)
+    _, changed_metrics = remeasure(bench.size, bench.root)
+    assert changed_metrics == {"persistence": ("position_rmse",)}
+
+
+def test_sizes_that_lie_in_a_root_can_be_measured(bench: ScoreBench) -> None:
+    sizes = measured_sizes(bench.root, registry=bench.registry)
+    assert [size.name for size in sizes] == [bench.size.name]
 
 
 def test_an_interrupted_measurement_goes_on(
     bench: ScoreBench, copied: Callable[[], Path]
 ) -> None:
-    """What is kept is taken as it is: a file altered on purpose shows in the second
-    run.
-    """
-    size = recorded(bench.size)
+    """It takes stored statistics as they are: an altered file shows in its result."""
+    size = record(bench.size)
     root = copied()
-    first = measure(size, root, names=["persistence"], resume=True)
-    kept = sorted(saved_folder(size, root).glob("*.npz"))
-    assert len(kept) == len(size.subsets["test"])
-    with np.load(kept[0]) as held:
-        values = dict(held)
-    np.savez(kept[0], **{**values, "total": 4.0 * values["total"]})
-    again = measure(size, root, names=["persistence"], resume=True)
-    fresh = measure(size, root, names=["persistence"])
-    one, two, three = (
-        m["persistence"].scores["position_mse"].values for m in (first, again, fresh)
-    )
-    np.testing.assert_allclose(two[0], 4.0 * one[0])
-    np.testing.assert_array_equal(one, three)
+
+    def measure_persistence(**options: Any) -> Any:
+        references = measure(size, root, names=["persistence"], **options)
+        return references["persistence"].scores["position_mse"].values
+
+    first = measure_persistence(resume=True)
+    files = sorted(saved_folder(size, root).glob("*.npz"))
+    assert len(files) == len(size.subsets["test"])
+    with np.load(files[0]) as stored:
+        arrays = dict(stored)
+    arrays["total"] = 4.0 * arrays["total"]
+    np.savez(files[0], **arrays)
+
+    resumed = measure_persistence(resume=True)
+    np.testing.assert_allclose(resumed[0], 4.0 * first[0])
+    fresh = measure_persistence()
+    np.testing.assert_array_equal(fresh, first)
 
 
 def test_scoring_takes_what_is_shipped(
@@ -365,19 +443,24 @@ def test_scoring_takes_what_is_shipped(
     assert card.as_json() == measured.as_json()
 
 
-def test_skill_stands_in_the_card(bench: ScoreBench, tmp_path: Path) -> None:
-    """The truth has skill 1; persistence has none above 0; first row and JSON say the
-    same.
-    """
-    perfect = bench.evaluate(bench.submit(tmp_path / "right.nc", right))
-    standing: ScoreCard = bench.score(bench.submit(tmp_path / "still.nc", still))
-    assert perfect.skill.value == 1.0
-    assert standing.skill.value <= 0.0
-    said = standing.as_json()["skill"]
-    assert said["floor"] == standing.skill.reference
-    assert REFERENCES[said["floor"]].counts
-    assert said["value"] == pytest.approx(standing.skill.value)
-    again = read_statistics(standing.files[1]).skill()
-    assert again.reference == standing.skill.reference
-    assert again.value == standing.skill.value
-    assert next(iter(card_tables(standing))).rows[0][0].startswith("skill")
+def test_the_truth_has_skill_1(bench: ScoreBench, tmp_path: Path) -> None:
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", right))
+    assert card.skill.value == 1.0
+
+
+def test_persistence_has_no_skill(bench: ScoreBench, tmp_path: Path) -> None:
+    """Card, JSON, scores.nc and the first row of the table agree on it."""
+    path = bench.submit(tmp_path / "predictions.nc", still)
+    card: ScoreCard = bench.score(path)
+    skill = card.skill
+    assert skill.value <= 0.0
+    assert REFERENCES[skill.reference].counts
+
+    as_json = card.as_json()["skill"]
+    assert as_json["floor"] == skill.reference
+    assert as_json["value"] == pytest.approx(skill.value)
+    stored = read_statistics(card.files[1]).skill()
+    assert stored.reference == skill.reference
+    assert stored.value == skill.value
+    first_table = next(iter(card_tables(card)))
+    assert first_table.rows[0][0].startswith("skill")

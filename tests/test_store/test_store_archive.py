@@ -1,6 +1,4 @@
-"""Archives of data sets: the same bytes each time, read from a store, and nothing in
-them is trusted.
-"""
+"""Archives of data sets: their bytes, reading from a store, archives that lie."""
 
 from __future__ import annotations
 
@@ -26,7 +24,8 @@ from lagbench.store import archive, fetch, objects
 
 DATA = f"{SPLIT}/{SIZE}/v2"
 
-Members = list[tuple[tarfile.TarInfo, bytes]]
+Member = tuple[tarfile.TarInfo, bytes]
+Members = list[Member]
 
 
 @pytest.fixture(autouse=True)
@@ -39,9 +38,8 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def packed(original: LocalSplit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The archive of a data set."""
-    return archive.write_archive(
-        str(original.folder), output=tmp_path_factory.mktemp("packed")
-    )
+    folder = tmp_path_factory.mktemp("packed")
+    return archive.write_archive(str(original.folder), output=folder)
 
 
 @pytest.fixture
@@ -53,7 +51,7 @@ def server(packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[M
         yield running
 
 
-def fetched(url: str, root: Path, subset: str | None = None) -> DownloadResult:
+def fetch_own(url: str, root: Path, subset: str | None = None) -> DownloadResult:
     """Download and simulate nothing."""
     return download("own", mirror=url, root=root, subset=subset, or_generate=False)
 
@@ -63,15 +61,31 @@ def is_right(root: Path) -> bool:
     return lagbench.verify("own", root=root, complete=True).warnings == ()
 
 
-def left(root: Path) -> set[str]:
+def list_data_files(root: Path) -> set[str]:
     """Return the paths of all scenario files and temporary files below a folder."""
-    files = (
-        path for path in root.rglob("*") if path.name.endswith((".nc", ".partial"))
-    )
-    return {path.relative_to(root).as_posix() for path in files}
+    names = set()
+    for path in root.rglob("*"):
+        if path.name.endswith((".nc", ".partial")):
+            names.add(path.relative_to(root).as_posix())
+    return names
 
 
-def rewritten(path: Path, change: Callable[[Members], Members]) -> None:
+def read_scenarios(root: Path) -> dict[Path, bytes]:
+    """Return the content of all scenario files below a folder."""
+    content = {}
+    for path in root.rglob("*.nc"):
+        content[path.relative_to(root)] = path.read_bytes()
+    return content
+
+
+def flip_bit(data: bytes) -> bytes:
+    """Change a bit near the end."""
+    changed = bytearray(data)
+    changed[-500] ^= 1
+    return bytes(changed)
+
+
+def rewrite_archive(path: Path, change: Callable[[Members], Members]) -> None:
     """Write an archive anew with other members."""
     with tarfile.open(path) as tar:
         members: Members = []
@@ -88,47 +102,52 @@ def rewritten(path: Path, change: Callable[[Members], Members]) -> None:
 def test_the_same_files_give_the_same_bytes(
     generated: GenerationResult, copied: Callable[[], Path], tmp_path: Path
 ) -> None:
-    """Times and modes of files do not matter; the name is that of the content, members
-    are sorted.
-    """
+    """Times and modes of files do not matter; the name is that of the content."""
     root = copied()
     for path in (root / DATA).rglob("*.nc"):
         path.chmod(0o600)
         os.utime(path, (1, 1))
     first = archive.write_archive(SPLIT, SIZE, root=generated.root, output=tmp_path)
-    again = archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
-    assert again.read_bytes() == first.read_bytes()
+    second = archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
+    assert second.read_bytes() == first.read_bytes()
     assert generated.dataset_sha256 is not None
-    assert (
-        again.name
-        == first.name
-        == f"{SPLIT}-{SIZE}-{generated.dataset_sha256[:16]}.tar"
-    )
-    with tarfile.open(first) as tar:
-        names = tar.getnames()
-        assert names == ["manifest.json", *sorted(names[1:])]
-        assert {(m.uid, m.gid, m.uname, m.mtime, m.mode) for m in tar} == {
-            (0, 0, "", 0, 0o644)
-        }
-        tar.extractall(tmp_path / "out", filter="data")
-    out = tmp_path / "out"
-    there = generated.root / DATA
-    assert all(
-        (out / name).read_bytes() == (there / name).read_bytes() for name in names
-    )
+    name = f"{SPLIT}-{SIZE}-{generated.dataset_sha256[:16]}.tar"
+    assert first.name == name
+    assert second.name == name
 
 
-@pytest.mark.parametrize("harm", ["missing", "flipped"])
-def test_only_right_data_are_packed(
-    copied: Callable[[], Path], tmp_path: Path, harm: str
+def test_an_archive_has_the_files_in_order(
+    generated: GenerationResult, tmp_path: Path
 ) -> None:
-    """What is missing or damaged is said; there is no archive."""
+    """The manifest comes first; owner, time and mode are those of nobody."""
+    path = archive.write_archive(SPLIT, SIZE, root=generated.root, output=tmp_path)
+    unpacked = tmp_path / "unpacked"
+    with tarfile.open(path) as tar:
+        names = tar.getnames()
+        for member in tar:
+            assert member.uid == 0
+            assert member.gid == 0
+            assert member.uname == ""
+            assert member.mtime == 0
+            assert member.mode == 0o644
+        tar.extractall(unpacked, filter="data")
+    assert names == ["manifest.json", *sorted(names[1:])]
+    for name in names:
+        expected = (generated.root / DATA / name).read_bytes()
+        assert (unpacked / name).read_bytes() == expected
+
+
+@pytest.mark.parametrize("damage", ["missing", "flipped"])
+def test_only_right_data_are_packed(
+    copied: Callable[[], Path], tmp_path: Path, damage: str
+) -> None:
+    """Otherwise there is an error and no archive."""
     root = copied()
-    victim = root / DATA / "train/0001.nc"
-    data = victim.read_bytes()
-    victim.unlink()
-    if harm == "flipped":
-        victim.write_bytes(data[:-500] + bytes([data[-500] ^ 1]) + data[-499:])
+    path = root / DATA / "train/0001.nc"
+    data = path.read_bytes()
+    path.unlink()
+    if damage == "flipped":
+        path.write_bytes(flip_bit(data))
     with pytest.raises(LagbenchError) as caught:
         archive.write_archive(SPLIT, SIZE, root=root, output=tmp_path / "new")
     assert caught.value.exit_code in (3, 4)
@@ -138,226 +157,258 @@ def test_only_right_data_are_packed(
 def test_releases_have_one_address(
     generated: GenerationResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The command's archive there comes without ``--from``; the data set is that of
-    datasets.yaml.
-    """
+    """An archive there comes without ``--from``."""
+    releases = tmp_path / "releases"
+    root = tmp_path / "root"
     arguments = [
         "--root",
         str(generated.root),
         "--output",
-        str(tmp_path / "out"),
+        str(releases),
         "--size",
         SIZE,
         "--split",
     ]
     assert archive.main([*arguments, SPLIT]) == 0
     assert archive.main([*arguments, "nowhere"]) == 2
-    with serving(tmp_path / "out") as running:
+    with serving(releases) as running:
         monkeypatch.setenv(archive.RELEASES_VARIABLE, running.url)
-        result = download(SPLIT, SIZE, root=tmp_path / "here", or_generate=False)
+        result = download(SPLIT, SIZE, root=root, or_generate=False)
     assert result.downloaded == (0, 1, 2, 3, 4)
     assert result.mirror == running.url
     assert result.verdict == "equal to datasets.yaml"
     assert result.complete
     assert running.count(".nc") == 0
-    here, there = (
-        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.nc")}
-        for root in (tmp_path / "here", generated.root)
-    )
-    assert here == there
+    assert read_scenarios(root) == read_scenarios(generated.root)
 
 
-def test_nobody_is_asked(
-    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch
+def test_without_a_release_no_server_is_asked(
+    here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Local splits are nobody's business; a placeholder is no address, and the error
-    says what is missing.
-    """
-    with monkeypatch.context() as patch:
-        patch.setattr(archive, "open_object", None)
-        with pytest.raises(UsageError) as caught:
-            download(SPLIT, SIZE, root=here, or_generate=False)
+    """A placeholder is no address, and the error says what is missing."""
+    monkeypatch.setattr(archive, "open_object", None)
+    with pytest.raises(UsageError) as caught:
+        download(SPLIT, SIZE, root=here, or_generate=False)
     assert caught.value.exit_code == 2
     assert caught.value.where == f"{SPLIT} {SIZE}"
     assert archive.RELEASES in str(caught.value.got)
+
+
+def test_no_server_is_asked_for_a_local_split(
+    server: Mirror, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(archive.RELEASES_VARIABLE, server.url)
     with pytest.raises(UsageError):
         download("own", root=here)
     assert server.asked == []
 
 
-def test_a_manifest_comes_before_an_archive(
-    original: LocalSplit, server: Mirror, here: Path
-) -> None:
-    """A store that has files is not asked for an archive, which is read through fsspec
-    as well.
-    """
-    assert fetched(server.folder.as_uri(), here).complete
+def test_an_archive_is_read_through_fsspec(server: Mirror, here: Path) -> None:
+    assert fetch_own(server.folder.as_uri(), here).complete
     assert is_right(here)
-    shutil.rmtree(here / "own/full/v1")
+
+
+def test_a_manifest_comes_before_an_archive(original: LocalSplit, here: Path) -> None:
+    """A store that has files is not asked for an archive."""
     with serving(original.folder.parent) as running:
-        assert fetched(running.url, here).complete
+        assert fetch_own(running.url, here).complete
         assert running.count(".tar") == 0
 
 
+def requested_ranges(server: Mirror) -> list[str | None]:
+    """Return the ranges of the archive that were asked for."""
+    return [ranges for path, ranges in server.asked if path.endswith(".tar")]
+
+
 @pytest.mark.parametrize("fault", ["", "no ranges"])
-def test_only_what_is_missing_is_asked_for(
+def test_only_missing_members_are_asked_for(
     server: Mirror, here: Path, fault: str
 ) -> None:
-    """Members that are here or not wanted are passed over; where there are no ranges,
-    read and dropped.
-    """
-    first = fetched(server.url, here, subset="train")
+    """The others are passed over, or read and dropped where there are no ranges."""
+    first = fetch_own(server.url, here, subset="train")
     if fault:
         server.faults = {".tar": fault}
-    last = fetched(server.url, here)
+    last = fetch_own(server.url, here)
     assert {*first.downloaded, *last.downloaded} == {0, 1, 2, 3}
     assert last.kept == first.downloaded
     assert last.complete
     if not fault:
-        assert any(wanted for path, wanted in server.asked if path.endswith(".tar"))
+        assert any(requested_ranges(server))
 
 
 @pytest.mark.parametrize("fault", ["drops", "no ranges", "busy once", "wrong range"])
 def test_a_bad_line_costs_time_only(server: Mirror, here: Path, fault: str) -> None:
-    """Broken connections are taken up by range, or from the start where the server
-    knows no ranges.
-    """
+    """Broken connections go on by range, or from the start without ranges."""
     server.faults = {".tar": fault}
-    assert fetched(server.url, here).complete
-    ranges = [wanted for path, wanted in server.asked if path.endswith(".tar")]
+    assert fetch_own(server.url, here).complete
     if fault == "drops":
-        third = next(server.folder.glob("*.tar")).stat().st_size // 3
-        assert ranges == [None, f"bytes={third}-", f"bytes={2 * third}-"]
+        (path,) = server.folder.glob("*.tar")
+        third = path.stat().st_size // 3
+        expected = [None, f"bytes={third}-", f"bytes={2 * third}-"]
+        assert requested_ranges(server) == expected
 
 
 @pytest.mark.parametrize(
     ("fault", "error"),
     [
-        *(
-            (fault, objects.TruncatedError)
-            for fault in ("chopped", "ends early", "announces more")
-        ),
+        ("chopped", objects.TruncatedError),
+        ("ends early", objects.TruncatedError),
+        ("announces more", objects.TruncatedError),
         ("drops always", LagbenchError),
-        *(
-            (fault, objects.NotDataError)
-            for fault in ("page", "hidden page", "endless")
-        ),
+        ("page", objects.NotDataError),
+        ("hidden page", objects.NotDataError),
+        ("endless", objects.NotDataError),
         ("busy", objects.StoreUnreachableError),
     ],
 )
-def test_a_lying_server(
-    server: Mirror, here: Path, fault: str, error: type[LagbenchError]
+def test_a_lying_server_is_named(
+    server: Mirror, packed: Path, here: Path, fault: str, error: type[LagbenchError]
 ) -> None:
-    """The address is named; files that were right stay, and the next command completes
-    them.
-    """
+    """Files that were right stay, and the next command completes them."""
     server.faults = {".tar": fault}
     with pytest.raises(error) as caught:
-        fetched(server.url, here)
-    assert (
-        caught.value.where == f"{server.url}/{next(server.folder.glob('*.tar')).name}"
-    )
+        fetch_own(server.url, here)
+    assert caught.value.where == f"{server.url}/{packed.name}"
     if issubclass(error, DataError):
-        assert not [name for name in left(here) if "partial" in name]
+        for name in list_data_files(here):
+            assert "partial" not in name
     server.faults = {}
-    assert fetched(server.url, here).complete
+    assert fetch_own(server.url, here).complete
     assert is_right(here)
 
 
-def foreign(name: str, kind: bytes = tarfile.REGTYPE) -> tuple[tarfile.TarInfo, bytes]:
-    """Return a member that should not be there."""
+def foreign_file(name: str) -> Member:
+    """Return a file that does not belong to the archive."""
+    return tarfile.TarInfo(name), b"\x89HDF\r\n\x1a\n" * 100
+
+
+def foreign_link(name: str) -> Member:
+    """Return a link to a file of the system."""
     member = tarfile.TarInfo(name)
-    member.type = kind
-    member.linkname = "/etc/passwd" if kind == tarfile.SYMTYPE else ""
-    return member, b"" if kind == tarfile.SYMTYPE else b"\x89HDF\r\n\x1a\n" * 100
+    member.type = tarfile.SYMTYPE
+    member.linkname = "/etc/passwd"
+    return member, b""
 
 
-def garbled(members: Members) -> Members:
-    """Change a byte of the second scenario."""
-    member, data = members[2]
-    return [
-        *members[:2],
-        (member, data[:-500] + bytes([data[-500] ^ 1]) + data[-499:]),
-        *members[3:],
-    ]
+def insert(index: int, member: Member) -> Callable[[Members], Members]:
+    """Return a change that puts a member at a place."""
+
+    def change(members: Members) -> Members:
+        return [*members[:index], member, *members[index:]]
+
+    return change
 
 
-def other(members: Members) -> Members:
+def append_foreign_file(members: Members) -> Members:
+    """Add a member after the last."""
+    return [*members, foreign_file("train/0099.nc")]
+
+
+def insert_link(members: Members) -> Members:
+    """Put a link under the name of the first scenario before it."""
+    manifest, first, *others = members
+    return [manifest, foreign_link(first[0].name), first, *others]
+
+
+def reverse_order(members: Members) -> Members:
+    """Give the scenarios another order."""
+    return [members[0], *reversed(members[1:])]
+
+
+def drop_last(members: Members) -> Members:
+    """Leave out the last member."""
+    return members[:-1]
+
+
+def flip_second_scenario(members: Members) -> Members:
+    """Change a bit of the second scenario."""
+    manifest, first, (member, data), *others = members
+    return [manifest, first, (member, flip_bit(data)), *others]
+
+
+def lengthen_first_scenario(members: Members) -> Members:
+    """Add bytes to the first scenario."""
+    manifest, (member, data), *others = members
+    return [manifest, (member, data + bytes(9)), *others]
+
+
+def change_all_hashes(members: Members) -> Members:
     """Give all scenarios another content hash."""
-    (head, text), *rest = members
+    (member, text), *others = members
     manifest = Manifest.model_validate_json(text)
-    files = [
-        entry.model_copy(update={"content_sha256": "0" * 64})
-        for entry in manifest.files
-    ]
-    return [
-        (
-            head,
-            manifest.model_copy(update={"files": tuple(files)})
-            .model_dump_json()
-            .encode(),
+    entries = []
+    for entry in manifest.files:
+        entries.append(entry.model_copy(update={"content_sha256": "0" * 64}))
+    changed = manifest.model_copy(update={"files": tuple(entries)})
+    return [(member, changed.model_dump_json().encode()), *others]
+
+
+def empty_manifest(members: Members) -> Members:
+    """Make the manifest an empty object."""
+    (member, _), *others = members
+    return [(member, b"{}"), *others]
+
+
+def lengthen_hashes(members: Members) -> Members:
+    """Give all hashes a digit too much."""
+    (member, text), *others = members
+    changed = text.replace(b'"content_sha256": "', b'"content_sha256": "0')
+    return [(member, changed), *others]
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        pytest.param(
+            insert(0, foreign_file("a.nc")),
+            objects.NotDataError,
+            id="foreign first",
         ),
-        *rest,
-    ]
-
-
-LIES: dict[str, tuple[Callable[[Members], Members], type[LagbenchError]]] = {
-    "foreign first": (lambda m: [foreign("a.nc"), *m], objects.NotDataError),
-    "foreign between": (
-        lambda m: [*m[:2], foreign("../evil.nc"), *m[2:]],
-        objects.WrongContentError,
-    ),
-    "foreign last": (
-        lambda m: [*m, foreign("train/0099.nc")],
-        objects.WrongContentError,
-    ),
-    "absolute": (
-        lambda m: [*m[:2], foreign("/tmp/evil.nc"), *m[2:]],
-        objects.WrongContentError,
-    ),
-    "link": (
-        lambda m: [m[0], foreign(m[1][0].name, tarfile.SYMTYPE), *m[1:]],
-        objects.WrongContentError,
-    ),
-    "another order": (lambda m: [m[0], *reversed(m[1:])], objects.WrongContentError),
-    "one missing": (lambda m: m[:-1], objects.NotDataError),
-    "wrong bytes": (garbled, objects.WrongContentError),
-    "longer": (
-        lambda m: [m[0], (m[1][0], m[1][1] + bytes(9)), *m[2:]],
-        objects.WrongLengthError,
-    ),
-    "another data set": (other, objects.WrongContentError),
-    "no manifest": (lambda m: [(m[0][0], b"{}"), *m[1:]], objects.NotDataError),
-    "other hashes": (
-        lambda m: [
-            (m[0][0], m[0][1].replace(b'"content_sha256": "', b'"content_sha256": "0')),
-            *m[1:],
-        ],
-        objects.NotDataError,
-    ),
-}
-
-
-@pytest.mark.parametrize("lie", LIES)
-def test_archives_that_lie(server: Mirror, packed: Path, here: Path, lie: str) -> None:
-    """Each has its error; only right files of the data set are left, and none
-    elsewhere.
-    """
-    change, error = LIES[lie]
-    target = server.folder / packed.name
-    rewritten(target, change)
+        pytest.param(
+            insert(2, foreign_file("../evil.nc")),
+            objects.WrongContentError,
+            id="foreign between",
+        ),
+        pytest.param(
+            insert(2, foreign_file("/tmp/evil.nc")),
+            objects.WrongContentError,
+            id="absolute",
+        ),
+        pytest.param(append_foreign_file, objects.WrongContentError, id="foreign last"),
+        pytest.param(insert_link, objects.WrongContentError, id="link"),
+        pytest.param(reverse_order, objects.WrongContentError, id="another order"),
+        pytest.param(drop_last, objects.NotDataError, id="one missing"),
+        pytest.param(flip_second_scenario, objects.WrongContentError, id="wrong bytes"),
+        pytest.param(lengthen_first_scenario, objects.WrongLengthError, id="longer"),
+        pytest.param(change_all_hashes, objects.WrongContentError, id="other data set"),
+        pytest.param(empty_manifest, objects.NotDataError, id="no manifest"),
+        pytest.param(lengthen_hashes, objects.NotDataError, id="other hashes"),
+    ],
+)
+def test_archives_that_lie_are_refused(
+    server: Mirror,
+    packed: Path,
+    here: Path,
+    change: Callable[[Members], Members],
+    error: type[LagbenchError],
+) -> None:
+    """Only right files of the data set stay, and no file lies elsewhere."""
+    served = server.folder / packed.name
+    rewrite_archive(served, change)
     with pytest.raises(error) as caught:
-        fetched(server.url, here)
+        fetch_own(server.url, here)
     assert type(caught.value) is error
     assert caught.value.exit_code == 4
     assert str(caught.value.where).startswith(f"{server.url}/{packed.name}")
     with tarfile.open(packed) as tar:
-        assert left(here) <= {f"own/full/v1/{name}" for name in tar.getnames()}
-    assert not (
-        left(here) and lie == "another data set"
-    )  # it is refused before any file is taken
+        right_names = {f"own/full/v1/{name}" for name in tar.getnames()}
+    names = list_data_files(here)
+    assert names <= right_names
+    if change is change_all_hashes:
+        # Another data set is refused before any file is taken.
+        assert not names
     assert not list(here.rglob("evil.nc"))
-    shutil.copy(packed, target)
-    fetched(server.url, here)
+
+    shutil.copy(packed, served)
+    fetch_own(server.url, here)
     assert is_right(here)

@@ -1,6 +1,4 @@
-"""Reading from a store: only what is needed comes, it is checked, and then all is as in
-a folder.
-"""
+"""Reading from a store: only the needed files come, and they are checked."""
 
 from __future__ import annotations
 
@@ -46,18 +44,18 @@ def store(
     request: pytest.FixtureRequest, generated: GenerationResult, tmp_path: Path
 ) -> Iterator[Store]:
     """A store of each kind that holds the tiny data set."""
-    place = request.getfixturevalue("s3") if request.param == "s3" else request.param
-    with holding(place, tmp_path, generated.root) as held:
-        yield held
+    place = request.param
+    if place == "s3":
+        place = request.getfixturevalue("s3")
+    with holding(place, tmp_path, generated.root) as filled:
+        yield filled
 
 
 @pytest.fixture
 def folder(generated: GenerationResult, tmp_path: Path) -> Iterator[Store]:
-    """A folder by its URL that holds it, for what the kind of a store does not matter
-    to.
-    """
-    with holding("file", tmp_path, generated.root) as held:
-        yield held
+    """A folder as a store, where the kind of the store does not matter."""
+    with holding("file", tmp_path, generated.root) as filled:
+        yield filled
 
 
 @pytest.fixture
@@ -70,150 +68,166 @@ def url(folder: Store) -> str:
 def tiny(
     unmeasured: Registry, monkeypatch: pytest.MonkeyPatch, unmeasured_path: Path
 ) -> Registry:
-    """Our splits without hashes, for functions too that take no registry."""
+    """The splits without hashes, also for functions that take no registry."""
     monkeypatch.setenv("LAGBENCH_REGISTRY", str(unmeasured_path))
     return unmeasured
 
 
-def here(url: str) -> list[str]:
+def list_copy(url: str) -> list[str]:
     """Return the names of the working copy's files."""
-    return sorted(name.removeprefix(f"{FOLDER}/") for name in files(resolve_root(url)))
+    names = files(resolve_root(url))
+    return sorted(name.removeprefix(f"{FOLDER}/") for name in names)
 
 
-def without(text: bytes, key: str, value: object) -> bytes:
+def drop_entries(text: bytes, key: str, value: object) -> bytes:
     """Return a manifest without the files of a scenario or subset."""
-    held = json.loads(text)
-    held["files"] = [entry for entry in held["files"] if entry[key] != value]
-    return json.dumps(held).encode()
+    content = json.loads(text)
+    content["files"] = [entry for entry in content["files"] if entry[key] != value]
+    return json.dumps(content).encode()
 
 
-def test_a_subset_comes_and_nothing_else(
+def test_only_the_files_of_a_subset_come(
     store: Store, generated: GenerationResult, tiny: Registry
 ) -> None:
-    """The arrays are those of the folder; a second look fetches nothing; what the store
-    lacks is named.
-    """
+    """The arrays are those of the folder."""
     with (
-        lagbench.open_split(SPLIT, size=SIZE, root=store.url) as far,
-        lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as near,
+        lagbench.open_split(SPLIT, size=SIZE, root=store.url) as data,
+        lagbench.open_split(SPLIT, size=SIZE, root=generated.root) as expected,
     ):
-        xr.testing.assert_identical(far.compute(), near.compute())
-    assert here(store.url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+        xr.testing.assert_identical(data.compute(), expected.compute())
+    names = list_copy(store.url)
+    assert names == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+
+
+def test_a_second_look_fetches_nothing(store: Store, tiny: Registry) -> None:
+    lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
     store.remove(f"{FOLDER}/test/0003.nc")
     lagbench.open_split(SPLIT, size=SIZE, root=store.url).close()
-    assert not store.server or store.server.count("0004.nc") == 1
-    with pytest.raises(DataError, match="0-1"):
-        lagbench.open_split(
-            SPLIT, size=SIZE, subset="train", root=f"{store.url}/nothing"
-        )
+    if store.server:
+        assert store.server.count("0004.nc") == 1
+
+
+def test_scenarios_that_the_store_lacks_are_an_error(
+    store: Store, tiny: Registry
+) -> None:
+    root = f"{store.url}/nothing"
+    with pytest.raises(DataError):
+        lagbench.open_split(SPLIT, size=SIZE, subset="train", root=root)
 
 
 def test_scores_are_those_of_the_folder(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """Template, validation and scores need test alone; a floor that reads train is
-    scored where it is.
+    """They need the test subset alone.
+
+    The reference that reads train is scored only where train is.
     """
-    written = template(
-        SPLIT, SIZE, output=tmp_path / "p.nc", root=generated.root, registry=tiny
-    ).path
-    result = lagbench.validate(written, root=url, require_truth=True, registry=tiny)
+    path = tmp_path / "p.nc"
+    template(SPLIT, SIZE, output=path, root=generated.root, registry=tiny)
+    result = lagbench.validate(path, root=url, require_truth=True, registry=tiny)
     assert result.valid
-    assert dict(result.skipped) == {}
-    assert here(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
-    far, near = (
-        lagbench.score(written, root=root, write=False, registry=tiny).as_json()
-        for root in (url, generated.root)
-    )
-    assert near["rows"].keys() - far["rows"].keys() == {"analog"}
-    assert all(near["rows"][row] == scores for row, scores in far["rows"].items())
+    assert not result.skipped
+    assert list_copy(url) == ["manifest.json", "test/0003.nc", "test/0004.nc"]
+
+    from_store = lagbench.score(path, root=url, write=False, registry=tiny)
+    from_folder = lagbench.score(path, root=generated.root, write=False, registry=tiny)
+    rows = from_store.as_json()["rows"]
+    expected = from_folder.as_json()["rows"]
+    assert expected.keys() - rows.keys() == {"analog"}
+    for row, scores in rows.items():
+        assert expected[row] == scores
 
 
-def test_baselines_and_exports_read_from_a_store(
+def test_baselines_read_from_a_store(
+    url: str, generated: GenerationResult, tiny: Registry
+) -> None:
+    """The dataset info needs one file; training needs those of train and valid."""
+    dataset_info = read_dataset_info(SPLIT, SIZE, root=url)
+    assert dataset_info == read_dataset_info(SPLIT, SIZE, root=generated.root)
+    assert list_copy(url) == ["manifest.json", "train/0000.nc"]
+
+    size = tiny.size(SPLIT, SIZE)
+    paths = copy.scenario_files(size, resolve_root(url), ("train", "valid"))
+    names = ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
+    for path, name in zip(paths.values(), names, strict=True):
+        assert path.read_bytes() == (generated.folder / name).read_bytes()
+
+
+def test_an_export_from_a_store_has_the_same_bytes(
     url: str, generated: GenerationResult, tiny: Registry, tmp_path: Path
 ) -> None:
-    """Dataset info, training files and the bytes of an export are those of the folder.
+    """It needs all subsets."""
 
-    An export needs all subsets.
-    """
-    assert read_dataset_info(SPLIT, SIZE, root=url) == read_dataset_info(
-        SPLIT, SIZE, root=generated.root
-    )
-    assert here(url) == ["manifest.json", "train/0000.nc"]
-    found = copy.scenario_files(
-        tiny.size(SPLIT, SIZE), resolve_root(url), ("train", "valid")
-    )
-    names = ("train/0000.nc", "train/0001.nc", "valid/0002.nc")
-    there = [(generated.folder / name).read_bytes() for name in names]
-    assert [path.read_bytes() for path in found.values()] == there
-    far, near = (
-        files(
-            export(
-                SPLIT,
-                SIZE,
-                format="gns-npz",
-                output=tmp_path / name,
-                root=root,
-                registry=tiny,
-            ).folder
+    def export_files(root: str | Path, output: Path) -> dict[str, bytes]:
+        result = export(
+            SPLIT,
+            SIZE,
+            format="gns-npz",
+            output=output,
+            root=root,
+            registry=tiny,
         )
-        for name, root in (("far", url), ("near", generated.root))
-    )
-    assert far == near
+        return files(result.folder)
+
+    from_store = export_files(url, tmp_path / "store")
+    from_folder = export_files(generated.root, tmp_path / "folder")
+    assert from_store == from_folder
 
 
 def test_a_listing_counts_what_the_store_has(url: str, tiny: Registry) -> None:
-    """Of a store the manifest counts, not the working copy; nothing is fetched."""
-    found = overview(tiny.size(SPLIT, SIZE), resolve_root(url))
-    assert found.state == "yes"
-    assert found.present == {"train": 2, "valid": 1, "test": 2}
-    assert here(url) == []
-    assert (
-        overview(tiny.size(SPLIT, SIZE), resolve_root(f"{url}/nothing")).state == "no"
-    )
+    """The manifest counts, not the working copy; nothing is fetched."""
+    size = tiny.size(SPLIT, SIZE)
+    listing = overview(size, resolve_root(url))
+    assert listing.state == "yes"
+    assert listing.present == {"train": 2, "valid": 1, "test": 2}
+    assert list_copy(url) == []
+    assert overview(size, resolve_root(f"{url}/nothing")).state == "no"
 
 
-def test_verify_mends_the_copy_and_tells_of_the_store(
-    store: Store, tiny: Registry
-) -> None:
-    """A damaged file comes again; an object that is gone is named, but over HTTP, which
-    lists nothing.
-
-    Files that are in the working copy alone make no data set of the store whole, be it
-    one or all.
-    """
+def test_verify_mends_the_copy(store: Store, tiny: Registry) -> None:
+    """A damaged file comes again."""
     verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
     path = resolve_root(store.url) / FOLDER / "valid/0002.nc"
     path.write_bytes(path.read_bytes()[:-9] + bytes(9))
     verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
-    good = store.read(f"{FOLDER}/valid/0002.nc")
+
+
+def test_verify_names_an_object_that_is_gone(store: Store, tiny: Registry) -> None:
+    """A server that lists nothing cannot tell."""
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
     store.remove(f"{FOLDER}/valid/0002.nc")
     if not store.server:
         with pytest.raises(DataError) as caught:
             verify(SPLIT, SIZE, root=store.url, registry=tiny)
         assert str(caught.value.where).endswith("scenarios 2")
-    store.put(f"{FOLDER}/valid/0002.nc", good)
-    store.put(MANIFEST, without(store.read(MANIFEST), "scenario", 3))
-    lost = verify(SPLIT, SIZE, root=store.url, registry=tiny)
-    assert "scenario 3 is in the working copy alone, not in the store" in lost.problems
+
+
+def test_files_of_the_copy_make_no_store_whole(store: Store, tiny: Registry) -> None:
+    """Be it one file or all."""
+    verify(SPLIT, SIZE, root=store.url, complete=True, registry=tiny).check()
+    store.put(MANIFEST, drop_entries(store.read(MANIFEST), "scenario", 3))
+    problems = verify(SPLIT, SIZE, root=store.url, registry=tiny).problems
+    assert "scenario 3 is in the working copy alone, not in the store" in problems
     store.remove(MANIFEST)
     assert len(verify(SPLIT, SIZE, root=store.url, registry=tiny).problems) == 5
 
 
-def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
-    """The error names the object, and no file of it is left."""
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "another scenario"])
+def test_other_content_is_refused(folder: Store, tiny: Registry, damage: str) -> None:
+    """The error names the object, and no file of it stays."""
     name = f"{FOLDER}/test/0003.nc"
-    good = folder.read(name)
-    changed = bytearray(good)
-    changed[-9] ^= 1
-    other_scenario = folder.read(f"{FOLDER}/test/0004.nc")
-    for wrong in (bytes(changed), good[:-1], other_scenario):
-        folder.put(name, wrong)
-        with pytest.raises((WrongContentError, WrongLengthError)) as caught:
-            lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
-        assert caught.value.where == f"{folder.url}/{name}"
-        assert {*here(folder.url)} <= {"test/0004.nc"}
-        shutil.rmtree(resolve_root(folder.url) / FOLDER)
+    content = bytearray(folder.read(name))
+    if damage == "flipped":
+        content[-9] ^= 1
+    elif damage == "truncated":
+        content.pop()
+    else:
+        content = bytearray(folder.read(f"{FOLDER}/test/0004.nc"))
+    folder.put(name, bytes(content))
+    with pytest.raises((WrongContentError, WrongLengthError)) as caught:
+        lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
+    assert caught.value.where == f"{folder.url}/{name}"
+    assert set(list_copy(folder.url)) <= {"test/0004.nc"}
 
 
 @pytest.mark.parametrize(
@@ -226,32 +240,34 @@ def test_other_content_is_refused(folder: Store, tiny: Registry) -> None:
         ("version", "7.0.0", NotDataError),
     ],
 )
-def test_what_a_manifest_cannot_say_is_refused(
+def test_a_wrong_manifest_is_refused(
     folder: Store, tmp_path: Path, key: str, value: object, error: type[DataError]
 ) -> None:
-    """Other hashes than those of datasets.yaml, endless files, names that lead
-    elsewhere: nothing comes.
+    """Other hashes than those of datasets.yaml, endless files, names that lead away.
+
+    No file comes.
     """
-    text = json.loads(folder.read(MANIFEST))
-    for part in text["files"] if key in ("content_sha256", "bytes") else [text]:
-        part[key] = value
-    folder.put(MANIFEST, json.dumps(text).encode())
+    manifest = json.loads(folder.read(MANIFEST))
+    if key in ("content_sha256", "bytes"):
+        for entry in manifest["files"]:
+            entry[key] = value
+    else:
+        manifest[key] = value
+    folder.put(MANIFEST, json.dumps(manifest).encode())
     before = set(tmp_path.rglob("manifest.json"))
     with pytest.raises(error):
         lagbench.open_split(SPLIT, size=SIZE, root=folder.url)
-    assert here(folder.url) == []
+    assert list_copy(folder.url) == []
     assert set(tmp_path.rglob("manifest.json")) == before
 
 
-def test_who_watches_is_told_how_far_it_is(
+def test_a_terminal_shows_the_progress(
     url: str,
     tiny: Registry,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """On a terminal a line on stderr counts files and bytes; with --quiet it does
-    not.
-    """
+    """A line on stderr counts files and bytes; with --quiet there is none."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     lagbench.open_split(SPLIT, size=SIZE, root=url).close()
     assert f"fetching from {url}: 2 of 2 files" in capsys.readouterr().err
@@ -260,55 +276,63 @@ def test_who_watches_is_told_how_far_it_is(
     assert capsys.readouterr() == ("", "")
 
 
-def test_what_only_the_copy_has_stays_known(
+def test_files_that_only_the_copy_has_stay_in_its_manifest(
     folder: Store, tiny: Registry, generated: GenerationResult
 ) -> None:
-    """Reading loses nothing of a generation that could not put its files yet."""
-    shutil.copytree(generated.root, resolve_root(folder.url), dirs_exist_ok=True)
-    (resolve_root(folder.url) / FOLDER / "test/0003.nc").unlink()
-    full = folder.read(MANIFEST)
-    folder.put(MANIFEST, without(full, "subset", "train"))
+    """A generation could not upload them yet."""
+    root = resolve_root(folder.url)
+    shutil.copytree(generated.root, root, dirs_exist_ok=True)
+    (root / FOLDER / "test/0003.nc").unlink()
+    manifest = folder.read(MANIFEST)
+    folder.put(MANIFEST, drop_entries(manifest, "subset", "train"))
     lagbench.open_split(SPLIT, size=SIZE, root=folder.url).close()
-    assert (resolve_root(folder.url) / MANIFEST).read_bytes() == full
+    assert (root / MANIFEST).read_bytes() == manifest
 
 
-def test_urls_and_paths_are_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A Path takes a slash away and means the same; LAGBENCH_ROOT may be a URL; a
-    stranger's mark is none.
-    """
-    copy = resolve_root("s3://bucket/some/where/")
-    assert copy == resolve_root(Path("s3://bucket/some/where"))
-    assert copy.name.startswith("s3-bucket-some-where-")
-    assert url_of(copy) == "s3://bucket/some/where"
-    assert resolve_root(copy) == copy
+def test_a_url_may_come_as_a_path() -> None:
+    """A Path takes a slash away and means the same."""
+    root = resolve_root("s3://bucket/some/where/")
+    assert root == resolve_root(Path("s3://bucket/some/where"))
+    assert root.name.startswith("s3-bucket-some-where-")
+    assert url_of(root) == "s3://bucket/some/where"
+    assert resolve_root(root) == root
+    assert as_url(Path("file:///tmp/x")) == "file:///tmp/x"
+
+
+def test_the_default_root_may_be_a_url(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LAGBENCH_ROOT", "memory://x/y")
     assert url_of(resolve_root()) == "memory://x/y"
-    shutil.copytree(copy, tmp_path / copy.name)
-    assert url_of(tmp_path / copy.name) is None
-    assert as_url(Path("file:///tmp/x")) == "file:///tmp/x"
-    assert [
-        as_url(path) for path in ("data", "/data", "C:/data", "./s3:", tmp_path)
-    ] == [None] * 5
+
+
+def test_a_copy_of_a_working_copy_has_no_url(tmp_path: Path) -> None:
+    root = resolve_root("s3://bucket/some/where/")
+    shutil.copytree(root, tmp_path / root.name)
+    assert url_of(tmp_path / root.name) is None
+
+
+@pytest.mark.parametrize("path", ["data", "/data", "C:/data", "./s3:", Path("data")])
+def test_paths_are_no_urls(path: str | Path) -> None:
+    assert as_url(path) is None
 
 
 def test_the_command_line_takes_a_url(
     url: str, run: Callable[..., Result], tmp_path: Path
 ) -> None:
-    """List, template, verify and info work on a store as on a folder; the list says
-    where it is.
-    """
-    one = (SPLIT, "--size", SIZE)
-    more = {
-        "list": (),
-        "template": (*one, "--output", tmp_path / "p.nc"),
-        "verify": one,
-        "info": one,
-    }
-    done = {word: run(word, *words, "--root", url) for word, words in more.items()}
-    assert [result.exit_code for result in done.values()] == [0, 0, 0, 0]
-    assert url in done["list"].output.replace("\n", "")
-    assert "2 scenarios" in done["template"].output
-    assert "data set hash:" in done["verify"].output
-    assert "Path" not in done["info"].output
+    """List, template, verify and info work on a store as on a folder."""
+    dataset = (SPLIT, "--size", SIZE)
+    root = ("--root", url)
+    listing = run("list", *root)
+    assert listing.exit_code == 0
+    assert url in listing.output.replace("\n", "")
+
+    written = run("template", *dataset, "--output", tmp_path / "p.nc", *root)
+    assert written.exit_code == 0
+    assert "2 scenarios" in written.output
+
+    verified = run("verify", *dataset, *root)
+    assert verified.exit_code == 0
+    assert "data set hash:" in verified.output
+
+    described = run("info", *dataset, *root)
+    assert described.exit_code == 0
+    assert "Path" not in described.output

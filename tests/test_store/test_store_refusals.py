@@ -94,11 +94,10 @@ def test_refusals(s3: str, use: Use, monkeypatch: pytest.MonkeyPatch, why: str) 
 
 def test_no_bucket_and_no_such_kind(s3: str, use: Use) -> None:
     """The bucket is named; a scheme that fsspec does not know is a usage error."""
-    with pytest.raises(
-        DataError, match=r"no such bucket(.*\n)*.*got: elsewhere\n  fix: create"
-    ):
+    with pytest.raises(DataError) as caught:
         use("s3://elsewhere/data")
-    with pytest.raises(UsageError, match="no such kind of address"):
+    assert caught.value.where == "s3://elsewhere/data"
+    with pytest.raises(UsageError):
         use("nonsense://data/x")
 
 

@@ -1,6 +1,4 @@
-"""Windows are the stored frames, in a seeded order that can be resumed, in bounded
-memory.
-"""
+"""Windows of frames: their content, their seeded order, their memory, rollouts."""
 
 from __future__ import annotations
 
@@ -9,7 +7,7 @@ import json
 import os
 import pickle
 import resource
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -51,16 +49,16 @@ WINDOWS = 34 + 20 + 25
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with three scenarios of train, of unequal lengths and particle numbers,
-    and two of test.
+    """A folder with three scenarios of train and two of test.
+
+    Those of train have unequal lengths and particle numbers.
     """
     folder = tmp_path_factory.mktemp("windows")
-    for i, frames in FRAMES.items():
-        write_scenario(
-            folder, make_key(i, subset="train"), frames=frames, particles=PARTICLES[i]
-        )
-    for i in (4, 5):
-        write_scenario(folder, make_key(i, subset="test"), frames=26)
+    for scenario, frames in FRAMES.items():
+        key = make_key(scenario, subset="train")
+        write_scenario(folder, key, frames=frames, particles=PARTICLES[scenario])
+    for scenario in (4, 5):
+        write_scenario(folder, make_key(scenario, subset="test"), frames=26)
     return folder
 
 
@@ -69,12 +67,12 @@ def registry(
     tmp_path_factory: pytest.TempPathFactory, unmeasured_path: Path
 ) -> Registry:
     """A registry that describes these scenarios as cavity tiny."""
-    held = read_yaml(unmeasured_path)
-    tiny = held["splits"]["cavity"]["sizes"]["tiny"]
+    content = read_yaml(unmeasured_path)
+    tiny = content["splits"]["cavity"]["sizes"]["tiny"]
     tiny["subsets"] = {"train": "0-2", "valid": 3, "test": "4-5"}
     tiny["frames"] = {40: "0", 26: "1,3-5", 31: "2"}
     path = tmp_path_factory.mktemp("registry") / "datasets.yaml"
-    path.write_text(yaml.safe_dump(held))
+    path.write_text(yaml.safe_dump(content))
     return load(path)
 
 
@@ -83,85 +81,107 @@ Open = Callable[..., WindowDataset]
 
 @pytest.fixture
 def train(root: Path, registry: Registry) -> Open:
-    """A function that opens train with windows of 6 + 1 frames unless told
-    otherwise.
-    """
+    """A function that opens train with windows of 6 + 1 frames by default."""
 
-    def opened(
+    def open_windows(
         folder: Path = root, *, subset: str | list[str] = "train", **changes: int
     ) -> WindowDataset:
-        lengths = {"history": 6, "future": 1, **changes}
+        options: dict[str, Any] = {"history": 6, "future": 1} | changes
         return WindowDataset(
             "cavity",
             size="tiny",
             subset=subset,
             root=folder,
             registry=registry,
-            **lengths,
+            **options,
         )
 
-    return opened
+    return open_windows
 
 
-def same(a: Batch, b: Batch) -> bool:
-    """Tell whether two batches hold the same bits."""
-    names = ("position", "sample", "material", "wall_velocity", "scenario", "frame")
-    return all(torch.equal(getattr(a, name), getattr(b, name)) for name in names)
+def assert_same(batch: Batch, expected: Batch) -> None:
+    """Assert that two batches have the same bits."""
+    for name in (
+        "position",
+        "sample",
+        "material",
+        "wall_velocity",
+        "scenario",
+        "frame",
+    ):
+        assert torch.equal(getattr(batch, name), getattr(expected, name)), name
+
+
+def stored_frames(scenario: int) -> Any:
+    """Return the positions of a scenario of train, shape [frame, particle, 2]."""
+    return frames_of(scenario, FRAMES[scenario], PARTICLES[scenario])
 
 
 def test_every_window_is_the_stored_frames(train: Open) -> None:
-    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames.
-
-    Where it is asked for, each holds the scenario's frame 0, which batches put side by
-    side.
-    """
+    """All windows of all scenarios, each once: 34 + 20 + 25 of 40, 26 and 31 frames."""
     data = train()
-    more = train(origin=True)
-    assert len(data) == len(more) == WINDOWS
-    places = []
-    for window, other in ((data[i], more[i]) for i in range(len(data))):
-        frames = frames_of(
-            window.scenario, FRAMES[window.scenario], PARTICLES[window.scenario]
-        )
-        expected = frames[window.frame : window.frame + LENGTH]
-        np.testing.assert_array_equal(
-            window.position.numpy(), expected.transpose(1, 0, 2)
-        )
-        np.testing.assert_array_equal(other.origin, frames[0])
-        assert torch.equal(window.position, other.position)
-        assert window.position.is_contiguous()
-        assert window.origin is None
-        places.append((window.scenario, window.frame))
-    assert places == [
-        (i, f) for i, frames in FRAMES.items() for f in range(frames - LENGTH + 1)
-    ]
-    assert collate([more[3], more[40]]).origin[PARTICLES[0] :].equal(more[40].origin)
+    assert len(data) == WINDOWS
+    number = 0
+    for scenario, frame_count in FRAMES.items():
+        frames = stored_frames(scenario)
+        for first in range(frame_count - LENGTH + 1):
+            window = data[number]
+            assert window.scenario == scenario
+            assert window.frame == first
+            expected = frames[first : first + LENGTH].transpose(1, 0, 2)
+            np.testing.assert_array_equal(window.position.numpy(), expected)
+            assert window.position.is_contiguous()
+            assert window.origin is None
+            number += 1
+    assert number == WINDOWS
+
+
+def test_windows_have_the_first_frame_on_request(train: Open) -> None:
+    data = train()
+    with_origin = train(origin=True)
+    assert len(with_origin) == WINDOWS
+    for number in range(WINDOWS):
+        window = with_origin[number]
+        np.testing.assert_array_equal(window.origin, stored_frames(window.scenario)[0])
+        assert torch.equal(window.position, data[number].position)
+
+
+def test_batches_put_first_frames_side_by_side(train: Open) -> None:
+    """All windows of a batch need one."""
+    with_origin = train(origin=True)
+    batch = collate([with_origin[3], with_origin[40]])
+    assert batch.origin[PARTICLES[0] :].equal(with_origin[40].origin)
     with pytest.raises(UsageError):
-        collate([more[3], data[40]])
-    # windows of several subsets follow each other
-    both = train(subset=["test", "train"])
-    assert len(both) == WINDOWS + 2 * 20
-    assert [both.place(i) for i in (0, 40, -1)] == [(4, 0), (0, 0), (2, 24)]
+        collate([with_origin[3], train()[40]])
 
 
-def test_material_and_walls(tmp_path: Path, train: Open) -> None:
-    """A window holds the particles' materials and its own frames of the walls'
-    velocity.
+def test_windows_of_several_subsets_follow_each_other(train: Open) -> None:
+    data = train(subset=["test", "train"])
+    assert len(data) == WINDOWS + 2 * 20
+    assert data.place(0) == (4, 0)
+    assert data.place(40) == (0, 0)
+    assert data.place(-1) == (2, 24)
 
-    Without material all is liquid, without moving walls there is no velocity of walls.
-    """
+
+def test_a_window_has_materials_and_velocities_of_walls(train: Open) -> None:
+    """The velocities of the walls are those of its own frames."""
     window = train(history=2, future=0)[3]
     assert window.material.tolist() == [0, 1, 2, 3, 0, 1, 2, 3]
     assert window.material.dtype == torch.int64
     assert window.wall_velocity is not None
-    assert window.wall_velocity.tolist() == 2 * [[[0, 0], [0, 0], [0, 0], [0.125, 0]]]
-    for i, frames in FRAMES.items():
-        path, _ = write_scenario(
-            tmp_path, make_key(i, subset="train"), frames=frames, walls=False
-        )
+    of_one_frame = [[0, 0], [0, 0], [0, 0], [0.125, 0]]
+    assert window.wall_velocity.tolist() == [of_one_frame, of_one_frame]
+
+
+def test_without_material_all_is_liquid(tmp_path: Path, train: Open) -> None:
+    """Without moving walls there is no velocity of walls."""
+    for scenario, frames in FRAMES.items():
+        key = make_key(scenario, subset="train")
+        path, _ = write_scenario(tmp_path, key, frames=frames, walls=False)
         with h5py.File(path, "a") as file:
             del file["material"]
-    batch = collate([train(tmp_path)[i] for i in (0, 40)])
+    data = train(tmp_path)
+    batch = collate([data[0], data[40]])
     assert not batch.material.any()
     assert batch.material.dtype == torch.int64
     assert batch.wall_velocity is None
@@ -171,107 +191,107 @@ def test_material_and_walls(tmp_path: Path, train: Open) -> None:
 def test_arrays_tensors_and_open_split_agree(
     generated: GenerationResult, unmeasured: Registry
 ) -> None:
-    """Both public routes give, value for value, the frames of the lazy xarray data
-    set.
-    """
-    options: dict[str, Any] = {
+    """Both public routes give the frames of the lazy xarray data set."""
+    location: dict[str, Any] = {
         "subset": "valid",
         "size": "tiny",
         "root": generated.root,
-        "history": 3,
     }
-    options |= {"future": 2, "origin": True, "registry": unmeasured}
-    arrays = lagbench.windows("curl-noise", **options)
-    tensors = WindowDataset("curl-noise", **options)
-    truth = lagbench.open_split(
-        "curl-noise", subset="valid", size="tiny", root=generated.root
-    )
-    assert len(arrays) == len(tensors) == sum(truth.frame_count.values - 4)
-    for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
-        assert (
-            arrays.place(number)
-            == (array.scenario, array.frame)
-            == (tensor.scenario, tensor.frame)
-        )
-        frames = truth.sel(scenario=array.scenario).isel(
-            frame=slice(array.frame, array.frame + 5)
-        )
-        expected = {
-            "position": frames.position.transpose("particle", "frame", "space"),
-            "origin": truth.position.sel(scenario=array.scenario).isel(frame=0),
-            **{name: frames[name] for name in ("material", "wall_velocity")},
-        }
-        for name, values in expected.items():
-            np.testing.assert_array_equal(getattr(array, name), values.values)
-            np.testing.assert_array_equal(getattr(tensor, name), values.values)
-    truth.close()
+    options: dict[str, Any] = {
+        "history": 3,
+        "future": 2,
+        "origin": True,
+        "registry": unmeasured,
+    }
+    arrays = lagbench.windows("curl-noise", **location, **options)
+    tensors = WindowDataset("curl-noise", **location, **options)
+    with lagbench.open_split("curl-noise", **location) as truth:
+        window_count = sum(truth.frame_count.values - 4)
+        assert len(arrays) == window_count
+        assert len(tensors) == window_count
+        for number, (array, tensor) in enumerate(zip(arrays, tensors, strict=True)):
+            assert arrays.place(number) == (array.scenario, array.frame)
+            assert tensor.scenario == array.scenario
+            assert tensor.frame == array.frame
+            scenario = truth.sel(scenario=array.scenario)
+            frames = scenario.isel(frame=slice(array.frame, array.frame + 5))
+            expected = {
+                "position": frames.position.transpose("particle", "frame", "space"),
+                "origin": scenario.position.isel(frame=0),
+                "material": frames.material,
+                "wall_velocity": frames.wall_velocity,
+            }
+            for name, values in expected.items():
+                np.testing.assert_array_equal(getattr(array, name), values.values)
+                np.testing.assert_array_equal(getattr(tensor, name), values.values)
 
 
-def test_what_is_published_comes_along(
-    root: Path, registry: Registry, tmp_path: Path, unmeasured: Registry
+def test_the_task_gives_the_default_history(root: Path, registry: Registry) -> None:
+    data = lagbench.windows("cavity", size="tiny", root=root, registry=registry)
+    assert data.history == 6
+    assert data.future == 1
+    assert data.length == 7
+    assert data.gravity == 0.0
+    assert data.viscosity is None
+
+
+def test_gravity_and_viscosity_are_those_of_all_scenarios(
+    tmp_path: Path, unmeasured: Registry
 ) -> None:
-    """The task gives the default history; gravity and viscosity are told where all
-    scenarios share them.
-    """
-    box = lagbench.windows("cavity", size="tiny", root=root, registry=registry)
-    assert box.history == 6
-    assert box.future == 1
-    assert box.length == 7
-    assert box.gravity == 0.0
-    assert box.viscosity is None
-    for i in unmeasured.size("fluid", "tiny").subsets["valid"]:
-        frames = unmeasured.size("fluid", "tiny").frame_count(i)
-        write_scenario(
-            tmp_path,
-            make_key(i, subset="valid", split="fluid"),
-            frames=frames,
-            walls=False,
-        )
-    splash = lagbench.windows(
+    size = unmeasured.size("fluid", "tiny")
+    for scenario in size.subsets["valid"]:
+        key = make_key(scenario, subset="valid", split="fluid")
+        frames = size.frame_count(scenario)
+        write_scenario(tmp_path, key, frames=frames, walls=False)
+    data = lagbench.windows(
         "fluid", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
     )
-    assert splash.history == 2
-    assert splash.gravity == 2.5
-    assert splash.viscosity == 1e-3
+    assert data.history == 2
+    assert data.gravity == 2.5
+    assert data.viscosity == 1e-3
 
 
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
-    """Windows of 8 and 11 particles make one row; each keeps its number, scenario and
-    first frame.
-
-    No windows, unequal lengths and walls that move in some only are errors.
-    """
+    """Each window keeps its number, scenario and first frame."""
     data = train()
-    windows = [data[2], data[34 + 20 + 1]]
-    batch = collate(windows)
+    first = data[2]  # of 8 particles
+    second = data[34 + 20 + 1]  # of 11 particles
+    batch = collate([first, second])
     assert batch.sample.tolist() == 8 * [0] + 11 * [1]
     assert batch.scenario.tolist() == [0, 2]
     assert batch.frame.tolist() == [2, 1]
-    assert torch.equal(batch.position[8:], windows[1].position)
+    assert torch.equal(batch.position[8:], second.position)
     assert batch.material.shape == (19,)
     assert batch.wall_velocity is not None
     assert batch.wall_velocity.shape == (2, LENGTH, 4, 2)
-    window = windows[0]
+
+
+def test_windows_that_do_not_fit_are_not_collated(train: Open) -> None:
+    """No windows, unequal lengths, and walls that move in some only."""
+    window = train()[2]
+    shorter = train(history=3)[0]
+    without_walls = window._replace(wall_velocity=None)
     for windows in (
         [],
-        [window, train(history=3)[0]],
-        [window, window._replace(wall_velocity=None)],
+        [window, shorter],
+        [window, without_walls],
     ):
-        with pytest.raises(UsageError, match="side by side"):
+        with pytest.raises(UsageError) as caught:
             collate(windows)
+        assert caught.value.where == "collate"
 
 
 def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None:
-    """Noise added to a window in place reaches neither the cache nor the file."""
+    """Noise added in place reaches neither the cache nor the file."""
     data = train()
     path = next(root.rglob("0000.nc"))
     stored = path.read_bytes()
-    first = data[0].position.clone()
-    spoilt = data[0]
-    for values in (spoilt.position, spoilt.material, spoilt.wall_velocity):
+    position = data[0].position.clone()
+    changed = data[0]
+    for values in (changed.position, changed.material, changed.wall_velocity):
         assert values is not None
         values.fill_(7)
-    assert torch.equal(data[0].position, first)
+    assert torch.equal(data[0].position, position)
     batch = collate([data[0]])
     assert batch.material.max() == 3
     assert batch.wall_velocity is not None
@@ -281,243 +301,291 @@ def test_changing_a_window_changes_nothing_else(train: Open, root: Path) -> None
 
 @pytest.mark.parametrize("limit", [0, 100, 10 * 8 * 8])
 def test_memory_is_bounded(train: Open, limit: int) -> None:
-    """However little may be kept, windows are the same and no more is kept."""
+    """With any limit of the cache windows are the same."""
     data = train(cache_bytes=limit)
     whole = train()
-    for i in torch.randperm(
-        len(data), generator=torch.Generator().manual_seed(0)
-    ).tolist():
-        assert torch.equal(data[i].position, whole[i].position)
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
+    for number in order.tolist():
+        assert torch.equal(data[number].position, whole[number].position)
         assert data.store.cached_bytes <= limit
-    kept = sum(frame.nbytes for frame in data.store._cached_frames.values())
-    assert kept == data.store.cached_bytes
-    assert all(frame.base is None for frame in data.store._cached_frames.values())
+    frames = data.store._cached_frames.values()
+    assert sum(frame.nbytes for frame in frames) == data.store.cached_bytes
+    for frame in frames:
+        assert frame.base is None
+
+
+def list_open_scenarios() -> set[Path]:
+    """Return the descriptors of this process that lead to scenario files."""
+    descriptors = Path("/proc/self/fd").iterdir()
+    return {path for path in descriptors if path.resolve().suffix == ".nc"}
 
 
 def test_open_files_are_bounded(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
     """With one file open at a time, others are opened anew."""
-
-    def open_scenarios() -> set[Path]:
-        return {
-            path
-            for path in Path("/proc/self/fd").iterdir()
-            if path.resolve().suffix == ".nc"
-        }
-
-    before = open_scenarios()
+    before = list_open_scenarios()
     monkeypatch.setattr(store_windows, "OPEN_FILES", 1)
     data = train(cache_bytes=0)
-    for i in (0, 40, 60, 0, 40, 60):
-        assert data[i].scenario == data.place(i)[0]
+    for number in (0, 40, 60, 0, 40, 60):
+        scenario, _ = data.place(number)
+        assert data[number].scenario == scenario
         assert len(data.store._open_scenarios) == 1
-        assert len(open_scenarios() - before) <= 1
+        assert len(list_open_scenarios() - before) <= 1
 
 
 def test_the_systems_limit_of_files_is_no_damage(train: Open) -> None:
-    """Where the system opens no more files, the error says that, and reading goes on
-    once it does.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    """Reading goes on once the system opens files again."""
+    soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_NOFILE)
     data = train()
-    with open(os.devnull) as lowest:
-        free = lowest.fileno()
-    resource.setrlimit(resource.RLIMIT_NOFILE, (free, hard))
+    with open(os.devnull) as file:
+        lowest_free = file.fileno()
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard_limit))
     try:
         with pytest.raises(WorkFailedError):
             data[0]
     finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-    assert data[0].scenario == data.place(0)[0]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft_limit, hard_limit))
+    assert data[0].scenario == 0
 
 
 def test_every_epoch_draws_every_window_once(train: Open) -> None:
     """Epochs are different orders of all windows; seed and epoch alone decide them."""
     data = train()
     sampler = WindowSampler(data, seed=5)
-    other = WindowSampler(train(cache_bytes=0), seed=5)
     epochs = [list(sampler) for _ in range(3)]
-    assert all(sorted(epoch) == list(range(WINDOWS)) for epoch in epochs)
-    assert epochs[0] != epochs[1] != epochs[2]
-    assert epochs == [list(other) for _ in range(3)]
-    assert epochs[0] != list(WindowSampler(data, seed=6))
-    # pinned: a change would break the resumption of older runs
-    assert WindowSampler(data, seed=0).order(0)[:8].tolist() == [
-        61,
-        70,
-        63,
-        8,
-        2,
-        53,
-        11,
-        18,
-    ]
+    for epoch in epochs:
+        assert sorted(epoch) == list(range(WINDOWS))
+    assert epochs[0] != epochs[1]
+    assert epochs[1] != epochs[2]
     assert sampler.state_dict() == {"seed": 5, "epoch": 3, "position": 0}
 
+    same_seed = WindowSampler(train(cache_bytes=0), seed=5)
+    assert [list(same_seed) for _ in range(3)] == epochs
+    another_seed = WindowSampler(data, seed=6)
+    assert list(another_seed) != epochs[0]
 
-@pytest.mark.parametrize("odd", [-1, 1.5, None, "1"])
-def test_places_that_there_are_not(train: Open, odd: Any) -> None:
-    """Seeds, epochs and positions are whole numbers from 0.
 
-    The last position is the end of the epoch itself; what is refused moves nothing.
-    """
+def test_the_order_of_a_seed_stays(train: Open) -> None:
+    """A change would break the resumption of older runs."""
+    order = WindowSampler(train(), seed=0).order(0)
+    assert order[:8].tolist() == [61, 70, 63, 8, 2, 53, 11, 18]
+
+
+@pytest.mark.parametrize("wrong", [-1, 1.5, None, "1"])
+def test_seeds_epochs_and_positions_are_whole_numbers_from_0(
+    train: Open, wrong: Any
+) -> None:
+    """What is refused moves nothing."""
     with pytest.raises(UsageError):
-        WindowSampler(train(), seed=odd)
+        WindowSampler(train(), seed=wrong)
+    sampler = WindowSampler(train(), seed=0)
+    sampler.seek(3, 10)
+    before = sampler.state_dict()
+    with pytest.raises(UsageError):
+        sampler.load_state_dict({"seed": 9, "epoch": wrong, "position": 0})
+    with pytest.raises(UsageError):
+        sampler.load_state_dict({"seed": 9, "epoch": 0, "position": wrong})
+    assert sampler.state_dict() == before
+
+
+def test_the_last_position_is_the_end_of_the_epoch(train: Open) -> None:
     sampler = WindowSampler(train(), seed=0)
     sampler.seek(np.int64(3), np.int64(WINDOWS))  # type: ignore[arg-type]
-    assert json.loads(json.dumps(sampler.state_dict())) == sampler.state_dict()
-    for epoch, position in ((odd, 0), (0, odd), (4, WINDOWS + 1)):
-        with pytest.raises(UsageError):
-            sampler.load_state_dict({"seed": 9, "epoch": epoch, "position": position})
+    state = sampler.state_dict()
+    assert state == {"seed": 0, "epoch": 3, "position": WINDOWS}
+    assert json.loads(json.dumps(state)) == state
+    beyond = {"seed": 9, "epoch": 4, "position": WINDOWS + 1}
+    with pytest.raises(UsageError):
+        sampler.load_state_dict(beyond)
     with pytest.raises(UsageError):
         sampler.seek(4, WINDOWS + 1)
-    assert sampler.state_dict() == {"seed": 0, "epoch": 3, "position": WINDOWS}
+    assert sampler.state_dict() == state
 
 
-def test_an_index_may_be_of_numpy_or_torch(train: Open) -> None:
+@pytest.mark.parametrize("index", [np.array(-1), torch.tensor(-1)])
+def test_an_index_may_be_of_numpy_or_torch(train: Open, index: Any) -> None:
     """The window is the same, and the caller's index stays."""
     data = train()
-    for index in (np.array(-1), torch.tensor(-1)):
-        window = data[index]  # type: ignore[index]
-        assert window.scenario == data[-1].scenario
-        assert window.frame == data[-1].frame
-        assert type(window.frame) is int
-        assert int(index) == -1
+    window = data[index]
+    last = data[-1]
+    assert window.scenario == last.scenario
+    assert window.frame == last.frame
+    assert type(window.frame) is int
+    assert int(index) == -1
+
+
+def repeat_epochs(sampler: WindowSampler) -> Iterator[int]:
+    """Yield the windows of endless epochs."""
+    return itertools.chain.from_iterable(itertools.repeat(sampler))
 
 
 @pytest.mark.parametrize("drawn", [0, 1, 30, WINDOWS - 1, WINDOWS, WINDOWS + 3])
 def test_resuming_continues_bit_by_bit(train: Open, drawn: int) -> None:
-    """A sampler loaded from a state in mid-epoch draws on as the first would have."""
+    """A sampler loaded from a state in mid-epoch goes on as the first would have."""
     first = WindowSampler(train(), seed=3)
-    run = itertools.chain.from_iterable(itertools.repeat(first))
-    assert len(list(itertools.islice(run, drawn))) == drawn
+    windows = repeat_epochs(first)
+    assert len(list(itertools.islice(windows, drawn))) == drawn
+    state = json.loads(json.dumps(first.state_dict()))
     second = WindowSampler(train(), seed=0)
-    second.load_state_dict(json.loads(json.dumps(first.state_dict())))
-    resumed = itertools.chain.from_iterable(itertools.repeat(second))
-    count = 2 * WINDOWS
-    expected = list(itertools.islice(run, count))
-    assert list(itertools.islice(resumed, count)) == expected
+    second.load_state_dict(state)
+
+    expected = list(itertools.islice(windows, 2 * WINDOWS))
+    resumed = repeat_epochs(second)
+    assert list(itertools.islice(resumed, 2 * WINDOWS)) == expected
 
 
-def test_ranks_share_out_one_order(
+def test_ranks_share_out_one_order(train: Open) -> None:
+    """Three ranks draw every third window each, together all but the last few."""
+    data = train()
+    order = WindowSampler(data, seed=1).order(0).tolist()
+    share = WINDOWS // 3
+    for rank in range(3):
+        sampler = WindowSampler(data, seed=1, rank=rank, ranks=3)
+        assert len(sampler) == share
+        assert list(sampler) == order[rank : 3 * share : 3]
+
+
+@pytest.mark.parametrize(
+    ("rank", "ranks"),
+    [
+        (2, 2),
+        (-1, 2),
+        (0, WINDOWS + 1),
+    ],
+)
+def test_ranks_that_do_not_exist_are_refused(
+    train: Open, rank: int, ranks: int
+) -> None:
+    """More ranks than windows are refused too."""
+    with pytest.raises(UsageError) as caught:
+        WindowSampler(train(), seed=0, rank=rank, ranks=ranks)
+    assert caught.value.where == "WindowSampler"
+
+
+def test_a_sampler_asks_torch_for_its_rank(
     train: Open, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Three ranks draw every third window of the one order each, together all but the
-    last few.
-
-    A rank that does not exist, and more ranks than windows, are errors.
-    torch.distributed tells its own. What two ranks have not drawn, one rank draws.
-    """
     data = train()
-    alone = WindowSampler(data, seed=1).order(0).tolist()
-    ranks = [WindowSampler(data, seed=1, rank=rank, ranks=3) for rank in range(3)]
-    parts = [list(sampler) for sampler in ranks]
-    assert (
-        [len(sampler) for sampler in ranks]
-        == [len(part) for part in parts]
-        == 3 * [WINDOWS // 3]
-    )
-    assert [window for turn in zip(*parts, strict=True) for window in turn] == alone[
-        : WINDOWS // 3 * 3
-    ]
-    for rank, count in ((2, 2), (-1, 2), (0, WINDOWS + 1)):
-        with pytest.raises(UsageError, match="rank"):
-            WindowSampler(data, seed=0, rank=rank, ranks=count)
-    for name, value in {
-        "is_initialized": True,
-        "get_rank": 1,
-        "get_world_size": 3,
-    }.items():
-        monkeypatch.setattr(torch.distributed, name, lambda value=value: value)
-    assert list(WindowSampler(data, seed=1)) == parts[1]
-    monkeypatch.undo()
-    two = WindowSampler(data, seed=1, rank=1, ranks=2)
-    one = WindowSampler(data, seed=1)
-    assert len(list(itertools.islice(two, 5))) == 5
-    one.load_state_dict(two.state_dict())
-    assert list(one) == alone[10:]
+    expected = list(WindowSampler(data, seed=1, rank=1, ranks=3))
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_rank", lambda: 1)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 3)
+    assert list(WindowSampler(data, seed=1)) == expected
+
+
+def test_one_rank_draws_what_two_ranks_have_left(train: Open) -> None:
+    data = train()
+    order = WindowSampler(data, seed=1).order(0).tolist()
+    of_two = WindowSampler(data, seed=1, rank=1, ranks=2)
+    assert len(list(itertools.islice(of_two, 5))) == 5
+    alone = WindowSampler(data, seed=1)
+    alone.load_state_dict(of_two.state_dict())
+    assert list(alone) == order[10:]
 
 
 def test_a_pool_shares_its_frames(train: Open, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With room for one pool, an epoch reads hardly more frames than there are, not
-    seven times as many.
+    """With room for one pool, an epoch reads hardly more frames than there are.
+
+    Without a pool it would read each frame seven times.
     """
     monkeypatch.setattr(lagbench_torch, "RUN", 8)
     data = train(cache_bytes=3 * 14 * 11 * 8)
     monkeypatch.setattr(lagbench_torch, "POOL_BYTES", 3 * 14 * data.frame_bytes)
-    read: list[int] = []
-    inner = store_windows.FrameStore._read
+    frames_read: list[int] = []
+    read = store_windows.FrameStore._read
 
-    def counted(
+    def read_and_count(
         store: store_windows.FrameStore, scenario: int, first: int, last: int
     ) -> object:
-        read.extend(range(first, last))
-        return inner(store, scenario, first, last)
+        frames_read.extend(range(first, last))
+        return read(store, scenario, first, last)
 
-    monkeypatch.setattr(store_windows.FrameStore, "_read", counted)
+    monkeypatch.setattr(store_windows.FrameStore, "_read", read_and_count)
     order = list(WindowSampler(data, seed=0))
     assert sorted(order) == list(range(WINDOWS))
-    assert all(
-        len({data.place(i)[0] for i in order[k : k + 24]}) <= 3
-        for k in range(0, WINDOWS, 24)
-    )
-    for i in order:
-        data[i]
-    # a run of 8 windows has 14 frames: 79 windows at 14/8 frames, and a few more of
-    # shorter runs
-    assert len(read) <= 2 * WINDOWS
+    for start in range(0, WINDOWS, 24):
+        pool = order[start : start + 24]
+        scenarios = {data.place(number)[0] for number in pool}
+        assert len(scenarios) <= 3
+    for number in order:
+        data[number]
+    # A run of 8 windows has 14 frames: 79 windows at 14/8 frames, and a few more of
+    # shorter runs.
+    assert len(frames_read) <= 2 * WINDOWS
+
+
+def test_a_pickled_data_set_takes_no_files_and_frames_along(train: Open) -> None:
+    data = train()
+    position = data[0].position
+    copied = pickle.loads(pickle.dumps(data))
+    assert copied.store.cached_bytes == 0
+    assert len(copied.store._open_scenarios) == 0
+    assert torch.equal(copied[0].position, position)
 
 
 @pytest.mark.filterwarnings(
     "ignore:This DataLoader will create:UserWarning"
 )  # on one core
 def test_worker_processes_read_the_same(train: Open) -> None:
-    """Two forked workers, after this process has opened the files, give the batches of
-    none.
-
-    A pickled data set takes neither open files nor frames along.
-    """
+    """They are forked after this process has opened the files."""
     data = train()
-    first = data[0]
-    sent = pickle.loads(pickle.dumps(data))
-    assert sent.store.cached_bytes == 0
-    assert len(sent.store._open_scenarios) == 0
-    assert torch.equal(sent[0].position, first.position)
-    batches = [
-        list(
-            DataLoader(
-                data,
-                5,
-                sampler=WindowSampler(data, seed=2),
-                collate_fn=collate,
-                num_workers=count,
-            )
+    assert data[0].scenario == 0
+
+    def load_batches(workers: int) -> list[Batch]:
+        loader = DataLoader(
+            data,
+            5,
+            sampler=WindowSampler(data, seed=2),
+            collate_fn=collate,
+            num_workers=workers,
         )
-        for count in (0, 2)
-    ]
-    assert len(batches[0]) == 16
-    assert all(same(a, b) for a, b in zip(*batches, strict=True))
+        return list(loader)
+
+    expected = load_batches(0)
+    batches = load_batches(2)
+    assert len(expected) == 16
+    for batch, expected_batch in zip(batches, expected, strict=True):
+        assert_same(batch, expected_batch)
 
 
-def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
-    """All test scenarios side by side; unequal lengths do not go together."""
-    paths = scenario_paths("cavity", size="tiny", root=root, registry=registry)
-    batch = scenario_batch(list(paths.values()), slice(3, 9))
-    assert list(paths) == [4, 5]
+@pytest.fixture
+def paths_of_test(root: Path, registry: Registry) -> dict[int, Path]:
+    """The files of the test scenarios."""
+    return scenario_paths("cavity", size="tiny", root=root, registry=registry)
+
+
+def test_whole_scenarios_lie_side_by_side(paths_of_test: dict[int, Path]) -> None:
+    batch = scenario_batch(list(paths_of_test.values()), slice(3, 9))
+    assert list(paths_of_test) == [4, 5]
     assert batch.windows == 2
     assert batch.frames == 6
     assert batch.scenario.tolist() == [4, 5]
     assert batch.frame.tolist() == [3, 3]
-    for row, scenario in enumerate(paths):
+    for row, scenario in enumerate(paths_of_test):
         expected = frames_of(scenario, 26, 8)[3:9].transpose(1, 0, 2)
         position = batch.position[batch.sample == row]
         np.testing.assert_array_equal(position.numpy(), expected)
-    assert scenario_batch(paths[4]).frames == 26
-    assert scenario_batch(paths[4], slice(-2, None)).frame.tolist() == [24]
-    for frames in (slice(50, 60), slice(0, 10, 2), slice(5, 5)):
-        with pytest.raises(UsageError, match="no consecutive frames"):
-            scenario_batch(paths[4], frames)
-    with pytest.raises(UsageError, match="side by side"):
+
+
+def test_a_whole_scenario_has_all_frames_by_default(
+    paths_of_test: dict[int, Path],
+) -> None:
+    assert scenario_batch(paths_of_test[4]).frames == 26
+    assert scenario_batch(paths_of_test[4], slice(-2, None)).frame.tolist() == [24]
+
+
+@pytest.mark.parametrize("frames", [slice(50, 60), slice(0, 10, 2), slice(5, 5)])
+def test_frames_that_do_not_follow_each_other_are_refused(
+    paths_of_test: dict[int, Path], frames: slice
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        scenario_batch(paths_of_test[4], frames)
+    assert caught.value.where == str(paths_of_test[4])
+
+
+def test_scenarios_of_unequal_lengths_do_not_go_together(root: Path) -> None:
+    with pytest.raises(UsageError) as caught:
         scenario_batch(sorted(root.rglob("*.nc")))
+    assert caught.value.where == "collate"
 
 
 @pytest.mark.parametrize(
@@ -536,78 +604,112 @@ def test_whole_scenarios_for_rollouts(root: Path, registry: Registry) -> None:
         ),
     ],
 )
-def test_what_is_not_there_is_said(
+def test_options_without_data_are_refused(
     root: Path, registry: Registry, options: dict[str, object], words: str
 ) -> None:
-    """Unknown names, too few frames and missing files are errors that say what to
-    do.
-    """
-    given: dict[str, Any] = {"split": "cavity", "size": "tiny", "history": 6, **options}
+    """The error says what to do."""
+    all_options: dict[str, Any] = {
+        "split": "cavity",
+        "size": "tiny",
+        "history": 6,
+    } | options
     with pytest.raises(LagbenchError, match="(?s)" + words):
-        WindowDataset(**given, root=root, registry=registry)
+        WindowDataset(**all_options, root=root, registry=registry)
 
 
-def test_another_scenario_under_its_name_is_refused(
-    tmp_path: Path, train: Open, registry: Registry
-) -> None:
-    """Files of another id or length, or of other values than the registry's hash names,
-    are data errors.
+def write_train(root: Path) -> Path:
+    """Write the scenarios of train and return their folder."""
+    for scenario, frames in FRAMES.items():
+        write_scenario(root, make_key(scenario, subset="train"), frames=frames)
+    return next(root.rglob("train"))
 
-    So are bytes that are no netCDF file.
-    """
-    for i, frames in FRAMES.items():
-        write_scenario(tmp_path, make_key(i, subset="train"), frames=frames + (i == 1))
-    folder = next(tmp_path.rglob("train"))
-    (folder / "0002.nc").rename(folder / "kept")
-    (folder / "0002.nc").write_bytes((folder / "0000.nc").read_bytes())
+
+def assert_data_error(data: WindowDataset, number: int, words: str) -> None:
+    """Assert that a window cannot be read, and that the error names its file."""
+    scenario, _ = data.place(number)
+    with pytest.raises(DataError, match=words) as caught:
+        data[number]
+    assert f"000{scenario}.nc" in str(caught.value)
+
+
+def test_bytes_that_are_no_netcdf_file_are_damage(tmp_path: Path, train: Open) -> None:
+    folder = write_train(tmp_path)
     (folder / "0000.nc").write_bytes(b"nothing")
+    assert_data_error(train(tmp_path), 0, "damaged")
+
+
+def test_a_scenario_of_another_length_is_refused(tmp_path: Path, train: Open) -> None:
+    write_train(tmp_path)
+    key = make_key(1, subset="train")
+    write_scenario(tmp_path, key, frames=FRAMES[1] + 1)
+    assert_data_error(train(tmp_path), 40, "not that of the registry")
+
+
+def test_a_scenario_under_another_id_is_refused(tmp_path: Path, train: Open) -> None:
+    """Its own file can be read as soon as it is back."""
+    folder = write_train(tmp_path)
+    path = folder / "0002.nc"
+    content = path.read_bytes()
+    path.write_bytes((folder / "0000.nc").read_bytes())
     data = train(tmp_path)
-    for window, words in (
-        (0, "damaged"),
-        (40, "not that of the registry"),
-        (60, "not that of the registry"),
-    ):
-        with pytest.raises(DataError, match=words) as caught:
-            data[window]
-        assert f"000{data.place(window)[0]}.nc" in str(caught.value)
-    (folder / "kept").replace(folder / "0002.nc")
+    assert_data_error(data, 60, "not that of the registry")
+    path.unlink()
+    path.write_bytes(content)
     assert isinstance(data[60], Window)
+
+
+def test_there_is_no_window_beyond_the_last(train: Open) -> None:
     with pytest.raises(IndexError):
-        data[WINDOWS]
+        train()[WINDOWS]
+
+
+def test_a_scenario_of_another_hash_is_refused(
+    tmp_path: Path, registry: Registry
+) -> None:
+    path = write_train(tmp_path) / "0002.nc"
     measured = SimpleNamespace(scenario_sha256={2: "0" * 16})
     size = registry.size("cavity", "tiny").model_copy(update={"measured": measured})
-    store = store_windows.FrameStore(size, {2: folder / "0002.nc"})
-    with pytest.raises(
-        DataError, match=r"(?s)not that of the registry.*content hash 0{16}"
-    ):
+    store = store_windows.FrameStore(size, {2: path})
+    with pytest.raises(DataError) as caught:
         store.frames(2, 0, 2)
+    assert caught.value.where == str(path)
 
 
-def drifting(batch: Batch) -> torch.Tensor:
-    """Move every particle on as before, and with what the first wall's successors do on
-    the way.
-    """
+def extrapolate(batch: Batch) -> torch.Tensor:
+    """Move particles on as before, plus the walls' velocities of the next frame."""
     before, now = batch.position[:, -2:].unbind(1)
     assert batch.wall_velocity is not None
-    coming = batch.wall_velocity[batch.sample, batch.frames]  # [particle, wall, 2]
-    return 2 * now - before + coming.sum(1)
+    next_wall_velocity = batch.wall_velocity[batch.sample, batch.frames]
+    return 2 * now - before + next_wall_velocity.sum(1)
 
 
 def test_a_window_is_followed_by_a_frame(train: Open) -> None:
-    """The first frame leaves, the new one joins, with forcing and frame number.
-
-    Parts are consecutive frames: with steps the forcing would be another frame's.
-    """
+    """The first frame leaves, the new one joins, with forcing and frame number."""
     data = train(history=3, future=2)
     batch = collate([data[0], data[4]])
-    given = batch.part(slice(3))
-    later = given.followed_by(batch.position[:, 3])
-    assert same(later, batch.part(slice(1, 4)))
+    window = batch.part(slice(3))
+    later = window.followed_by(batch.position[:, 3])
+    assert_same(later, batch.part(slice(1, 4)))
     assert later.frame.tolist() == [1, 5]
-    assert given.frames == later.frames == 3
-    for odd in (slice(0, 4, 2), slice(None, None, -1), slice(2, 2), slice(9, 12)):
-        with pytest.raises(UsageError):
-            batch.part(odd)
+    assert window.frames == 3
+    assert later.frames == 3
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        slice(0, 4, 2),
+        slice(None, None, -1),
+        slice(2, 2),
+        slice(9, 12),
+    ],
+)
+def test_parts_are_consecutive_frames(train: Open, frames: slice) -> None:
+    """With steps the forcing would be that of another frame."""
+    data = train(history=3, future=2)
+    batch = collate([data[0], data[4]])
+    with pytest.raises(UsageError):
+        batch.part(frames)
 
 
 def test_a_rollout_feeds_on_itself(train: Open) -> None:
@@ -622,72 +724,94 @@ def test_a_rollout_feeds_on_itself(train: Open) -> None:
     x2 = 2 * x1 - x0 + w2
     x3 = 2 * x2 - x1 + w3
     expected = torch.stack([x2, x3], 1)
-    given_positions = torch.stack([x0, x1], 1)
-    given = replace(batch.part(slice(2)), position=given_positions)
-    found = roll_out(drifting, given, 2)
-    assert torch.equal(found, expected)
-    found.sum().backward()
+
+    window = replace(batch.part(slice(2)), position=torch.stack([x0, x1], 1))
+    path = roll_out(extrapolate, window, 2)
+    assert torch.equal(path, expected)
+    path.sum().backward()
     assert x0.grad is not None
     assert torch.equal(x0.grad, torch.full_like(x0, -3.0))
 
 
-def test_a_rollout_ends_where_the_forcing_does(train: Open) -> None:
-    """Beyond it no wall moves as it did: a model that takes the last velocity known
-    would be wrong unseen.
+@pytest.fixture
+def two_frames(train: Open) -> Batch:
+    """A window of two frames with the forcing of three more."""
+    return collate([train(history=2, future=3)[0]]).part(slice(2))
 
-    A model may use the memory of its answer again: every frame is kept as it was
-    returned. Answers of another shape than positions (an axis more, a particle too few,
-    one axis) or of NumPy, and no frames, are refused.
-    """
-    given = collate([train(history=2, future=3)[0]]).part(slice(2))
-    shapes: list[Callable[[Any], Any]] = [
-        lambda p: p[None],
-        lambda p: p[:-1],
-        lambda p: p[:, :1],
-        np.asarray,
-    ]
-    for wrong in shapes:
-        with pytest.raises(UsageError):
-            roll_out(lambda seen, wrong=wrong: wrong(seen.position[:, -1]), given, 2)
-    with pytest.raises(UsageError):
-        roll_out(drifting, given, 0)
-    memory = torch.empty_like(given.position[:, -1])
-    found = roll_out(drifting, given, 3)
-    assert found.shape[1] == 3
-    assert torch.equal(
-        found, roll_out(lambda seen: memory.copy_(drifting(seen)), given, 3)
-    )
+
+def test_a_rollout_ends_where_the_forcing_does(two_frames: Batch) -> None:
+    """A model that takes the last known velocity of walls would be wrong unseen."""
+    assert roll_out(extrapolate, two_frames, 3).shape[1] == 3
     with pytest.raises(UsageError) as caught:
-        roll_out(lambda seen: seen.position[:, -1], given, 4)
+        roll_out(lambda batch: batch.position[:, -1], two_frames, 4)
     assert caught.value.where == "roll_out"
 
 
+def test_a_model_may_use_the_memory_of_its_output_again(two_frames: Batch) -> None:
+    """Every frame of the rollout is as the model returned it."""
+    memory = torch.empty_like(two_frames.position[:, -1])
+    path = roll_out(lambda batch: memory.copy_(extrapolate(batch)), two_frames, 3)
+    assert torch.equal(path, roll_out(extrapolate, two_frames, 3))
+
+
+@pytest.mark.parametrize(
+    "change_output",
+    [
+        lambda position: position[None],
+        lambda position: position[:-1],
+        lambda position: position[:, :1],
+        np.asarray,
+    ],
+    ids=["an axis more", "a particle less", "one axis", "NumPy"],
+)
+def test_outputs_that_are_no_positions_are_refused(
+    two_frames: Batch, change_output: Callable[[Any], Any]
+) -> None:
+    with pytest.raises(UsageError):
+        roll_out(lambda batch: change_output(batch.position[:, -1]), two_frames, 2)
+
+
+def test_a_rollout_of_no_frames_is_refused(two_frames: Batch) -> None:
+    with pytest.raises(UsageError):
+        roll_out(extrapolate, two_frames, 0)
+
+
 @pytest.mark.parametrize("history", [None, 2])
-def test_predictions_are_rollouts_from_what_the_task_gives(
+def test_predictions_are_rollouts_of_the_task(
     root: Path, registry: Registry, history: int | None
 ) -> None:
-    """Every test scenario once, from its own last given frames, over the horizon, with
-    the walls of then.
+    """They start from the last input frames of every test scenario.
+
+    They reach over the horizon, with the walls of these frames.
     """
-    seen: list[Batch] = []
+    batches: list[Batch] = []
 
     def step(batch: Batch) -> torch.Tensor:
-        seen.append(batch)
-        return drifting(batch)
+        batches.append(batch)
+        return extrapolate(batch)
 
-    where: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
-    found = dict(predict(step, "cavity", history=history, device="cpu", **where))
-    for wrong in (0, 7):  # none, or more than the task gives
-        with pytest.raises(UsageError, match="from 1 to 6"):
-            next(predict(drifting, "cavity", history=wrong, **where))
+    location: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
+    predictions = dict(
+        predict(step, "cavity", history=history, device="cpu", **location)
+    )
+    assert list(predictions) == [4, 5]
+
     task = registry.size("cavity", "tiny").task
-    assert list(found) == [4, 5]
-    files = scenario_paths("cavity", **where)
-    for row, (scenario, path) in enumerate(files.items()):
-        whole = scenario_batch(path)
-        start = task.input_frames - (history or task.input_frames)
-        given = whole.part(slice(start, task.input_frames))
-        assert same(seen[row * task.horizon], given)
-        expected = roll_out(drifting, given, task.horizon).transpose(0, 1)
-        assert found[scenario].dtype == np.float32
-        np.testing.assert_array_equal(found[scenario], expected.numpy())
+    start = task.input_frames - (history or task.input_frames)
+    paths = scenario_paths("cavity", **location)
+    for row, (scenario, path) in enumerate(paths.items()):
+        window = scenario_batch(path).part(slice(start, task.input_frames))
+        assert_same(batches[row * task.horizon], window)
+        expected = roll_out(extrapolate, window, task.horizon).transpose(0, 1)
+        assert predictions[scenario].dtype == np.float32
+        np.testing.assert_array_equal(predictions[scenario], expected.numpy())
+
+
+@pytest.mark.parametrize("history", [0, 7])
+def test_predictions_start_from_the_input_frames_of_the_task(
+    root: Path, registry: Registry, history: int
+) -> None:
+    location: dict[str, Any] = {"size": "tiny", "root": root, "registry": registry}
+    with pytest.raises(UsageError) as caught:
+        next(predict(extrapolate, "cavity", history=history, **location))
+    assert caught.value.where == "predict"

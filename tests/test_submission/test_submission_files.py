@@ -17,7 +17,7 @@ import pytest
 import torch
 import xarray as xr
 from bad_submissions import FAULTS
-from faulty import DIMS, positions, rows, store
+from fault_registry import DIMS, positions, rows, store
 from file_size_limit import largest_file
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -111,12 +111,11 @@ def test_the_template_is_the_last_given_frame_repeated(
         assert file["position"].chunks == (1, 1, PARTICLES, 2)
     again = template("cavity", "tiny", output=bench.folder / "twice.nc", **made)
     assert again.path.read_bytes() == result.path.read_bytes()
-    with pytest.raises(
-        DataError, match="lagbench generate --split cavity --size tiny --subset test"
-    ):
+    with pytest.raises(DataError) as caught:
         template(
             "cavity", "tiny", output=tmp_path / "t.nc", **{**made, "root": tmp_path}
         )
+    assert caught.value.where.endswith("cavity/tiny/v2/test")
     assert not (tmp_path / "t.nc").exists()
 
 
@@ -131,8 +130,9 @@ def test_without_a_recorded_hash_one_must_be_given(
         "method": "m",
         "registry": unmeasured,
     }
-    with pytest.raises(DataError, match="hash of the data set is not known"):
+    with pytest.raises(DataError) as caught:
         write(tmp_path / "p.nc", zeros, root=tmp_path, **more)
+    assert caught.value.where == "cavity tiny"
     path = write(
         tmp_path / "p.nc",
         zeros,
@@ -282,11 +282,10 @@ def test_velocities_and_frozen_rollouts_are_recorded(bench: Bench) -> None:
     with open_predictions(path) as predictions:
         assert predictions.header.diverged_at == {5: 7}
     assert not bench.validate(path).findings
-    with pytest.raises(
-        WorkFailedError, match="cannot write"
-    ) as told:  # a parent that is a file
+    with pytest.raises(WorkFailedError) as caught:
         write(bench.valid / "p.nc", RIGHT, **options(bench))
-    assert "--output" in str(told.value.fix)
+    assert caught.value.where.endswith("valid.nc/p.nc")
+    assert "--output" in str(caught.value.fix)
 
 
 @pytest.mark.parametrize("size", [0, 5_000])
@@ -298,9 +297,9 @@ def test_a_full_disk_is_said(
     lack.
     """
     values = RIGHT if whole else {TESTS[0]: RIGHT[TESTS[0]]}
-    with largest_file(size), pytest.raises(WorkFailedError) as told:
+    with largest_file(size), pytest.raises(WorkFailedError) as caught:
         write(tmp_path / "p.nc", values, **options(bench))
-    assert "--output" in str(told.value.fix)
+    assert "--output" in str(caught.value.fix)
     assert not list(tmp_path.iterdir())
 
 
@@ -312,7 +311,7 @@ def test_labels_may_come_while_writing(bench: Bench) -> None:
     with PredictionsWriter(path, **options(bench)) as writer:
         for scenario in reversed(TESTS):
             writer.add(scenario, truth(scenario))
-        with pytest.raises(UsageError, match="written twice"):
+        with pytest.raises(UsageError):
             writer.add(3, truth(3))
         writer.label(
             seconds_per_frame=np.float32(0.5),
@@ -366,8 +365,9 @@ def test_frames_are_found_by_id_and_absolute_number(bench: Bench) -> None:
         got = predictions.frames(4, 5, 3)
         header = predictions.header
         for place in ((9, 3, 1), (3, 2, 1), (3, 3, 9), (3, 11, 1), (3, 3, -1)):
-            with pytest.raises(UsageError, match="no such frames"):
+            with pytest.raises(UsageError) as caught:
                 predictions.frames(*place)
+            assert caught.value.where.endswith("valid.nc")
     assert got.dtype == np.float32
     np.testing.assert_array_equal(got, truth(4)[5 - GIVEN : 8 - GIVEN])
     assert header.split == "cavity"

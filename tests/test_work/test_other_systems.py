@@ -97,8 +97,8 @@ def test_validating_and_scoring(
     )
     bench.score(tmp_path / "predictions.nc")
     paths = tmp_path / "less-scores/scores.json", tmp_path / "scores.json"
-    found, expected = (json.loads(path.read_bytes()) for path in paths)
-    assert found == expected
+    actual, expected = (json.loads(path.read_bytes()) for path in paths)
+    assert actual == expected
 
 
 @pytest.mark.slow

@@ -80,7 +80,9 @@ def _draw_scenarios(subject: Subject, number: int, name: str) -> ReportFigure:
         series.append(Series(label, series_kind(i), score.per_frame[i]))
 
     # the axis holds the curves of all entries
-    every = [other.card.submission[name].per_frame for other in subject.entries]
+    every = []
+    for other in subject.entries:
+        every.append(other.card.submission[name].per_frame)
     x_axis = _frame_axis(subject)
     y_label = format_quantity(score.metric)
     plot = Plot(x_axis, spanning(every), x_label="frame", y_label=y_label)

@@ -106,7 +106,9 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     vorticities = [moment.true_vorticity]
     for entry in subject.entries:
         vorticities.append(moment.predicted_vorticity(entry.number))
-    errors = [vorticity - vorticities[0] for vorticity in vorticities]
+    errors = []
+    for vorticity in vorticities:
+        errors.append(vorticity - vorticities[0])
     speed_limit = limit_of(speeds[:1])
     vorticity_limit = limit_of(vorticities[:1])
 
@@ -211,7 +213,9 @@ def _true_vorticities(moments: Sequence[Moment]) -> list[Floats]:
 def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
     """Return vorticity at the key frame in every test scenario (5.26 and 5.27)."""
     frame = subject.key_frame
-    moments = [gallery.moments[scenario, frame] for scenario in subject.scenarios]
+    moments = []
+    for scenario in subject.scenarios:
+        moments.append(gallery.moments[scenario, frame])
     true_fields = _true_vorticities(moments)
     limits = [limit_of([field]) for field in true_fields]
 
@@ -227,7 +231,9 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
 
     rows = [("truth", draw_row("true vorticity", true_fields))]
     for entry in subject.entries:
-        fields = [moment.predicted_vorticity(entry.number) for moment in moments]
+        fields = []
+        for moment in moments:
+            fields.append(moment.predicted_vorticity(entry.number))
         rows.append((entry.name, draw_row("predicted", fields)))
     columns = []
     for moment in moments:

@@ -60,7 +60,9 @@ def _scenario_figure(
         alt = f"{what}, frame {moment.frame}"
         return draw_image_panel(png, label.classes, alt, smooth=True)
 
-    true_panels = [draw_panel(moment, moment.truth, "truth") for moment in moments]
+    true_panels = []
+    for moment in moments:
+        true_panels.append(draw_panel(moment, moment.truth, "truth"))
     rows = [("truth", true_panels)]
     for entry in subject.entries:
         panels = []

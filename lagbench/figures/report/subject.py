@@ -102,7 +102,11 @@ class Subject:
 
     def rows_with(self, metric: str) -> list[ReportRow]:
         """Return the rows that have a score of a metric."""
-        return [row for row in self.rows if metric in row.scores]
+        rows = []
+        for row in self.rows:
+            if metric in row.scores:
+                rows.append(row)
+        return rows
 
     @property
     def ranking(self) -> Metric:

@@ -76,7 +76,10 @@ def every_metric(subject: Subject) -> Markup:
             parts.append(_horizon_table(subject, names))
 
     submission = subject.entries[0].card.submission
-    names = [name for name in submission if name not in METRICS]
+    names = []
+    for name in submission:
+        if name not in METRICS:
+            names.append(name)
     if names:
         parts.append(tag("h4", "Of other packages"))
         parts.append(_horizon_table(subject, names))
@@ -100,7 +103,9 @@ def _horizon_table(subject: Subject, names: Sequence[str]) -> Markup:
     for name in names:
         metric = subject.rows[0].scores[name].metric
         # reference predictors lack metrics of other packages
-        scores = [row.scores.get(name) for row in subject.rows]
+        scores = []
+        for row in subject.rows:
+            scores.append(row.scores.get(name))
         values: list[Sequence[float] | Floats] = []
         for score in scores:
             if score is None:
@@ -190,7 +195,9 @@ def frame_table(subject: Subject) -> Markup:
         lines.append([_draw_heading(row)])
     for name in names:
         metric = subject.rows[0].scores[name].metric
-        values = [row.scores[name].at(frame) for row in subject.rows]
+        values = []
+        for row in subject.rows:
+            values.append(row.scores[name].at(frame))
         comparable = _comparable(subject, metric, values)
         best = _find_best(metric, comparable)
         for number, line in enumerate(lines):

@@ -43,6 +43,7 @@ predictions.
 DAY = datetime.date(2026, 1, 31)
 PLACE = "submissions/cavity/tiny"
 SCORES = "scores/cavity/tiny"
+FULL_BOXES = ("cavity", "curl-noise")
 SPLITS = ("cavity", "curl-noise", "fluid", "multimaterial")
 
 
@@ -65,15 +66,19 @@ class ReportBench:
         """Write the submission of a method."""
         n = self.size.task.input_frames
         h = self.size.task.horizon
-        guesses = {
-            i: method(motion(self.size, i), n, h) for i in self.size.subsets["test"]
-        }
-        where = {
-            "split": self.size.split,
-            "size": self.size.name,
-            "registry": self.registry,
-        }
-        return write(path, guesses, method=name, **where, **labels)
+        predictions = {}
+        for scenario in self.size.subsets["test"]:
+            truth = motion(self.size, scenario)
+            predictions[scenario] = method(truth, n, h)
+        return write(
+            path,
+            predictions,
+            method=name,
+            split=self.size.split,
+            size=self.size.name,
+            registry=self.registry,
+            **labels,
+        )
 
     def card(self, path: Path) -> ScoreCard:
         """Return the score card of a submission."""
@@ -84,10 +89,10 @@ class ReportBench:
     def report(self, folder: Path, files: Mapping[str, Method]) -> Path:
         """Submit, score and report methods by name."""
         folder.mkdir(parents=True, exist_ok=True)
-        paths = [
-            self.submit(folder / f"{i}.nc", method, name)
-            for i, (name, method) in enumerate(files.items())
-        ]
+        paths = []
+        for number, (name, method) in enumerate(files.items()):
+            path = self.submit(folder / f"{number}.nc", method, name)
+            paths.append(path)
         cards = [self.card(path) for path in paths]
         return write_report(
             folder / "report", cards, paths, root=self.root, registry=self.registry
@@ -95,68 +100,77 @@ class ReportBench:
 
 
 def make_report_bench(home: Path, split: str) -> ReportBench:
-    """Write the test scenarios of a split and its registry, once for all processes that
-    share a folder.
+    """Write the test scenarios of a split and its registry.
+
+    They are written once for all processes that share a folder.
     """
     folder = home / f"report-{split}"
     path = folder / "datasets.yaml"
     with FileLock(home / f"report-{split}.lock"):
         if not path.exists():
-            plain = load().size(split, "tiny")
-            hashes = {
-                i: _write(folder / "root", plain, i) for i in plain.subsets["test"]
-            }
-            path.write_text(_registry(plain, hashes))
+            size = load().size(split, "tiny")
+            hashes = {}
+            for scenario in size.subsets["test"]:
+                hashes[scenario] = _write(folder / "root", size, scenario)
+            path.write_text(_registry(size, hashes))
     registry = load(path)
     return ReportBench(folder / "root", registry, registry.size(split, "tiny"))
 
 
 def page_of(home: Path, split: str) -> Path:
-    """Return the report on two methods of a split, one of a hostile name, made once
-    likewise.
+    """Return the report on two methods of a split, one of a hostile name.
+
+    It is made once for all processes that share a folder.
     """
     page = home / f"page-{split}" / "report" / "index.html"
     with FileLock(home / f"page-{split}.lock"):
         if not page.exists():
-            assert (
-                make_report_bench(home, split).report(page.parents[1], METHODS) == page
-            )
+            bench = make_report_bench(home, split)
+            path = bench.report(page.parents[1], METHODS)
+            assert path == page
     return page
 
 
 def motion(size: Size, scenario: int) -> Floats:
-    """Return true positions: four eddies in a full box, else two bodies that fall
-    turning.
+    """Return true positions, shape [frame, particle, 2].
+
+    Four eddies turn in a full box; elsewhere two bodies fall and turn.
     """
-    frames = size.task.input_frames + size.task.horizon
-    full = size.split in ("cavity", "curl-noise")
-    return _eddies(size, scenario, frames) if full else _falling(size, scenario, frames)
+    frame_count = size.task.input_frames + size.task.horizon
+    if size.split in FULL_BOXES:
+        return _eddies(size, scenario, frame_count)
+    return _falling_bodies(size, scenario, frame_count)
 
 
-def _eddies(size: Size, scenario: int, frames: int) -> Floats:
+def _eddies(size: Size, scenario: int, frame_count: int) -> Floats:
     (low, high), _ = size.bounds
     rng = np.random.Generator(np.random.PCG64(scenario))
-    share = rng.random((size.particles, 2))
-    positions = [share]
-    for _ in range(frames - 1):
-        x, y = 2.0 * np.pi * positions[-1].T
-        step = np.stack([np.sin(x) * np.cos(y), -np.cos(x) * np.sin(y)], axis=1)
-        positions.append(np.clip(positions[-1] + 0.004 * step, 0.0, 1.0))
-    return low + (high - low) * np.stack(positions)
+    shares = [rng.random((size.particles, 2))]  # of the box, by frame
+    for _ in range(frame_count - 1):
+        x, y = 2.0 * np.pi * shares[-1].T
+        velocity_x = np.sin(x) * np.cos(y)
+        velocity_y = -np.cos(x) * np.sin(y)
+        step = 0.004 * np.stack([velocity_x, velocity_y], axis=1)
+        shares.append(np.clip(shares[-1] + step, 0.0, 1.0))
+    return low + (high - low) * np.stack(shares)
 
 
-def _falling(size: Size, scenario: int, frames: int) -> Floats:
+def _falling_bodies(size: Size, scenario: int, frame_count: int) -> Floats:
     rng = np.random.Generator(np.random.PCG64(scenario))
-    half = size.particles // 2
     body = 0.1 * (rng.random((size.particles, 2)) - 0.5)
-    angle = 0.03 * np.arange(frames)[:, None]
-    (x, y), cos, sin = body.T, np.cos(angle), np.sin(angle)
+    x, y = body.T
+    frame = np.arange(frame_count)[:, None]
+    cos = np.cos(0.03 * frame)
+    sin = np.sin(0.03 * frame)
     turned = np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-    middle = np.where(
-        np.arange(size.particles)[:, None] < half, [0.3, 0.7], [0.7, 0.75]
-    )
-    turned[..., 1] -= 0.0004 * np.arange(frames)[:, None] ** 2
+    turned[..., 1] -= 0.0004 * frame**2
+    middle = np.where(_is_first_body(size)[:, None], [0.3, 0.7], [0.7, 0.75])
     return np.asarray(turned + middle)
+
+
+def _is_first_body(size: Size) -> NDArray[np.bool_]:
+    """Return whether a particle belongs to the first of two bodies."""
+    return np.arange(size.particles) < size.particles // 2
 
 
 def _material(size: Size, scenario: int) -> NDArray[np.int64]:
@@ -164,14 +178,22 @@ def _material(size: Size, scenario: int) -> NDArray[np.int64]:
         return np.zeros(size.particles, np.int64)
     pairs = [(0, 2), (3, 2), (3, 0), (2, 2), (3, 1), (0, 0)]
     first, second = pairs[scenario % 6]
-    return np.where(np.arange(size.particles) < size.particles // 2, first, second)
+    return np.where(_is_first_body(size), first, second)
 
 
 def _write(root: Path, size: Size, scenario: int) -> str:
+    """Write a scenario and return its content hash."""
     key = size.key(scenario)
     positions = motion(size, scenario).astype(np.float32)
-    cavity = size.split == "cavity"
-    marks = {"cavity": {"reynolds_number": 80.0}, "curl-noise": {"frequency": 2}}
+    wall_velocity = None
+    if size.split == "cavity":
+        wall_velocity = np.array([[0, 0], [0, 0], [0, 0], [0.1, 0]])
+    parameters_by_split = {
+        "cavity": {"reynolds_number": 80.0},
+        "curl-noise": {"frequency": 2},
+    }
+    parameters = parameters_by_split.get(size.split, {"family": "two <bodies>"})
+    mass = float(size.value("density")) * _area(size)
     with ScenarioWriter(
         scenario_path(root, key),
         key,
@@ -179,9 +201,9 @@ def _write(root: Path, size: Size, scenario: int) -> str:
         frames=len(positions),
         frame_interval=0.1,
         material=_material(size, scenario),
-        particle_mass=float(size.value("density")) * _area(size) / size.particles,
-        wall_velocity=np.array([[0, 0], [0, 0], [0, 0], [0.1, 0]]) if cavity else None,
-        parameters=marks.get(size.split, {"family": "two <bodies>"}),
+        particle_mass=mass / size.particles,
+        wall_velocity=wall_velocity,
+        parameters=parameters,
         seed="none",
         device="cpu",
         generator="tests",
@@ -193,23 +215,35 @@ def _write(root: Path, size: Size, scenario: int) -> str:
 
 
 def _area(size: Size) -> float:
+    """Return the area of all particles."""
     (low, high), _ = size.bounds
-    return (high - low) ** 2 if size.split in ("cavity", "curl-noise") else 2.0 * 0.1**2
+    if size.split in FULL_BOXES:
+        return (high - low) ** 2
+    return 2.0 * 0.1**2
 
 
 def _registry(size: Size, hashes: Mapping[int, str]) -> str:
-    """Return our registry with what would be measured of this data set."""
-    file = read_yaml(default_path())
-    subsets = {"train": "0" * 64, "valid": "1" * 64, "test": subset_hash(hashes)}
+    """Return our registry with a measured block of this data set."""
+    subsets = {
+        "train": "0" * 64,
+        "valid": "1" * 64,
+        "test": subset_hash(hashes),
+    }
+    statistics = {
+        "position_std": [0.25, 0.25],
+        "velocity_std": [0.002, 0.002],
+    }
+    predictability_limit = [1e-6 * (k + 1) for k in range(size.task.horizon)]
     measured = {
         "dataset_sha256": dataset_hash(size.split, size.name, size.major, subsets),
         "subset_sha256": subsets,
         "scenario_sha256": {i: content[:16] for i, content in hashes.items()},
-        "statistics": {"position_std": [0.25, 0.25], "velocity_std": [0.002, 0.002]},
-        "twin_floor": [1e-6 * (k + 1) for k in range(size.task.horizon)],
+        "statistics": statistics,
+        "twin_floor": predictability_limit,
     }
-    file["measured"] = {size.split: {size.name: measured}}
-    return format_yaml(file)
+    content = read_yaml(default_path())
+    content["measured"] = {size.split: {size.name: measured}}
+    return format_yaml(content)
 
 
 def still(truth: Floats, n: int, h: int) -> Floats:
@@ -219,28 +253,29 @@ def still(truth: Floats, n: int, h: int) -> Floats:
 
 def damped(truth: Floats, n: int, h: int) -> Floats:
     """Predict the true steps, each smaller than the one before."""
-    steps = (
-        np.diff(truth[n - 1 : n + h], axis=0)
-        * (0.95 ** np.arange(1, h + 1))[:, None, None]
-    )
-    return truth[n - 1] + np.cumsum(steps, axis=0)
+    steps = np.diff(truth[n - 1 : n + h], axis=0)
+    shrinkage = 0.95 ** np.arange(1, h + 1)
+    shrunk_steps = steps * shrinkage[:, None, None]
+    return truth[n - 1] + np.cumsum(shrunk_steps, axis=0)
 
 
 def noisy(truth: Floats, n: int, h: int) -> Floats:
     """Predict the truth with an error that wanders off."""
+    future = truth[n : n + h]
     rng = np.random.Generator(np.random.PCG64(7))
-    return truth[n : n + h] + np.cumsum(
-        1e-4 * (rng.random(truth[n : n + h].shape) - 0.5), axis=0
-    )
+    noise = 1e-4 * (rng.random(future.shape) - 0.5)
+    return future + np.cumsum(noise, axis=0)
 
 
 def runaway(truth: Floats, n: int, h: int) -> Floats:
-    """Predict particles that leave the box ever faster, up to 9 lengths away, the most
-    that is scored.
+    """Predict five particles that leave the box ever faster.
+
+    They end 9 lengths away, the most that is scored.
     """
-    guess = np.array(noisy(truth, n, h))
-    guess[1:, :5] += 9.0 * 10.0 ** np.linspace(-8.0, 0.0, h - 1)[:, None, None]
-    return guess
+    prediction = np.array(noisy(truth, n, h))
+    distance = 9.0 * 10.0 ** np.linspace(-8.0, 0.0, h - 1)
+    prediction[1:, :5] += distance[:, None, None]
+    return prediction
 
 
 HOSTILE = (
@@ -254,10 +289,9 @@ METHODS: dict[str, Method] = {"GNS & friends": damped, HOSTILE: noisy}
 
 @dataclass(frozen=True)
 class BoardBench:
-    """A leaderboard's folder, and the data and registry that its entries were scored
-    with.
+    """A leaderboard's folder, and the data and registry of its scores.
 
-    It has the floors, ``damped`` with two seeds, ``noisy`` and the wild ``flipping``.
+    Its entries are ``damped`` with two seeds, ``noisy`` and the wild ``flipping``.
     """
 
     folder: Path
@@ -270,18 +304,22 @@ class BoardBench:
 
     def predict(self, method: Method, name: str, **labels: Any) -> Path:
         """Write predictions outside the folder."""
-        seed = f"_{labels['seed']}" if "seed" in labels else ""
-        return self.data.submit(
-            self.folder.parent / f"{name}{seed}.nc", method, name, **labels
-        )
+        stem = name
+        if "seed" in labels:
+            stem = f"{name}_{labels['seed']}"
+        path = self.folder.parent / f"{stem}.nc"
+        return self.data.submit(path, method, name, **labels)
 
     def submit(
         self, *paths: Path, replace: bool = False, add: bool = False, **keys: Any
     ) -> SubmitResult:
         """Submit predictions."""
-        meta = Meta(
-            **{"authors": ("A. Author",), "command": "make", "date": DAY, **keys}
-        )
+        description: dict[str, Any] = {
+            "authors": ("A. Author",),
+            "command": "make",
+            "date": DAY,
+        }
+        meta = Meta(**(description | keys))
         return submit(
             paths, meta, replace=replace, add=add, new_board=True, **self.where
         )
@@ -302,45 +340,46 @@ class BoardBench:
 
     def edit(self, method: str, change: Callable[[dict[str, Any]], object]) -> None:
         """Change the YAML file of an entry by hand."""
-        held = yaml.load(self.entry(method).read_text(), Loader=yaml.CSafeLoader)
-        change(held)
-        self.entry(method).write_text(
-            yaml.dump(held, Dumper=yaml.CSafeDumper, sort_keys=False)
-        )
+        path = self.entry(method)
+        content = yaml.load(path.read_text(), Loader=yaml.CSafeLoader)
+        change(content)
+        text = yaml.dump(content, Dumper=yaml.CSafeDumper, sort_keys=False)
+        path.write_text(text)
 
     def forge(self, method: str) -> None:
-        """Make hashes and aggregates of an entry follow from its score files, as one
-        does who knows how.
+        """Make hashes and aggregates of an entry follow from its score files.
+
+        A forger who knows the format does so.
         """
         self.rehash(method)
         entry = read_entry(self.entry(method))
-        stored = [
-            read_score_file(self.folder / path).scores.tallies
-            for path in entry.score_paths
-        ]
-        plain = {
-            name: summary.model_dump()
-            for name, summary in summarise(combine(stored)).items()
-        }
-        self.edit(method, lambda held: held["score"].update(metrics=plain))
+        tallies = []
+        for path in entry.score_paths:
+            score_file = read_score_file(self.folder / path)
+            tallies.append(score_file.scores.tallies)
+        metrics = {}
+        for name, summary in summarise(combine(tallies)).items():
+            metrics[name] = summary.model_dump()
+        self.edit(method, lambda content: content["score"].update(metrics=metrics))
 
     def rehash(self, method: str) -> None:
         """Make the hashes of an entry those of its score files, whatever these hold."""
         paths = read_entry(self.entry(method)).score_paths
 
-        def change(held: dict[str, Any]) -> None:
-            for said, path in zip(held["score"]["files"], paths, strict=True):
-                said["sha256"] = file_sha256(self.folder / path)
+        def change(content: dict[str, Any]) -> None:
+            for file, path in zip(content["score"]["files"], paths, strict=True):
+                file["sha256"] = file_sha256(self.folder / path)
 
         self.edit(method, change)
 
     def state(self) -> dict[str, str]:
         """Return path to hash of every file in the folder."""
         files = sorted(path for path in self.folder.rglob("*") if path.is_file())
-        return {
-            path.relative_to(self.folder).as_posix(): file_sha256(path)
-            for path in files
-        }
+        hashes = {}
+        for path in files:
+            name = path.relative_to(self.folder).as_posix()
+            hashes[name] = file_sha256(path)
+        return hashes
 
 
 def master(home: Path) -> BoardBench:
@@ -353,17 +392,21 @@ def master(home: Path) -> BoardBench:
         if not finished.exists():
             shutil.rmtree(finished.parent, ignore_errors=True)
             finished.parent.mkdir()
-            seeds = [
-                bench.predict(
-                    damped, "damped", seed=0, device="cpu", seconds_per_frame=0.25
-                )
-            ]
-            seeds.append(
-                bench.predict(
-                    _worse, "damped", seed=3, device="cpu", seconds_per_frame=0.75
-                )
+            first_seed = bench.predict(
+                damped,
+                "damped",
+                seed=0,
+                device="cpu",
+                seconds_per_frame=0.25,
             )
-            bench.submit(*seeds, solver_seconds_per_frame=2.0)
+            second_seed = bench.predict(
+                _worse,
+                "damped",
+                seed=3,
+                device="cpu",
+                seconds_per_frame=0.75,
+            )
+            bench.submit(first_seed, second_seed, solver_seconds_per_frame=2.0)
             bench.submit(bench.predict(noisy, "noisy", parameters=5))
             bench.submit(bench.predict(flipping, "flipping"))
             finished.touch()
@@ -371,50 +414,60 @@ def master(home: Path) -> BoardBench:
 
 
 def flipping(truth: Any, n: int, h: int) -> Any:
-    """Predict a box that is mirrored every other frame from the third on: a vorticity
-    out of all bounds.
+    """Predict a box that is mirrored every other frame from the third on.
+
+    Its vorticity is out of all bounds.
     """
-    guess = np.array(truth[n : n + h])
-    guess[3::2, :, 0] = 1.0 - guess[3::2, :, 0]
-    return guess
+    prediction = np.array(truth[n : n + h])
+    prediction[3::2, :, 0] = 1.0 - prediction[3::2, :, 0]
+    return prediction
 
 
 def _worse(truth: Any, n: int, h: int) -> Any:
-    return damped(truth, n, h) + 2.0 * (noisy(truth, n, h) - truth[n : n + h])
+    error = noisy(truth, n, h) - truth[n : n + h]
+    return damped(truth, n, h) + 2.0 * error
 
 
 def nearer(truth: Any, n: int, h: int) -> Any:
     """Predict the truth with half the error of ``noisy``."""
-    return truth[n : n + h] + 0.5 * (noisy(truth, n, h) - truth[n : n + h])
+    future = truth[n : n + h]
+    error = noisy(truth, n, h) - future
+    return future + 0.5 * error
 
 
 def copied(home: Path, folder: Path, *, without: Sequence[str] = ()) -> BoardBench:
-    """Return the bench with a copy of the leaderboard that a test may damage, without
-    some entries.
+    """Return the bench with a copy of the leaderboard that a test may damage.
+
+    Args:
+        home: the folder that all processes share.
+        folder: where the copy goes.
+        without: methods whose entries are left out.
     """
     shared = master(home)
-    left_out = [f"{name}{end}" for name in without for end in (".yaml", ".nc", "_*.nc")]
-    shutil.copytree(
-        shared.folder, folder / "leaderboard", ignore=shutil.ignore_patterns(*left_out)
-    )
-    return BoardBench(folder / "leaderboard", shared.data)
+    patterns = []
+    for name in without:
+        patterns += [f"{name}.yaml", f"{name}.nc", f"{name}_*.nc"]
+    target = folder / "leaderboard"
+    shutil.copytree(shared.folder, target, ignore=shutil.ignore_patterns(*patterns))
+    return BoardBench(target, shared.data)
 
 
-def set_mean(held: dict[str, Any], factor: float = 0.9) -> None:
+def set_mean(content: dict[str, Any], factor: float = 0.9) -> None:
     """Better the ranking metric of an entry."""
-    held["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
+    content["score"]["metrics"]["vorticity_rmse"]["mean"] *= factor
 
 
 def reform(
     bench: BoardBench, change: Callable[[Any], object], *, whole: bool = True
 ) -> None:
-    """Change the values of a score file and make its hash, and the aggregates,
-    follow.
-    """
+    """Change the values of a score file; its hash and the aggregates follow."""
     with netCDF4.Dataset(bench.folder / SCORES / "noisy.nc", "r+") as file:
         file.set_auto_maskandscale(False)
         change(file)
-    (bench.forge if whole else bench.rehash)("noisy")
+    if whole:
+        bench.forge("noisy")
+    else:
+        bench.rehash("noisy")
 
 
 def scale(statistic: str, factor: float) -> Callable[[Any], object]:

@@ -1,0 +1,89 @@
+"""The commands plot and animate."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import SIZE, SPLIT
+from typer.testing import Result
+
+from lagbench.make.generate import GenerationResult
+
+Run = Callable[..., Result]
+
+
+def test_a_picture_is_named_after_its_data(
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """By default it shows the last of the 26 frames."""
+    monkeypatch.chdir(tmp_path)
+    words = ["plot", SPLIT, "--size", SIZE, "--root", generated.root, "--kind", "speed"]
+    result = run(*words, "--frame", 5)
+    assert result.exit_code == 0, result.output
+    picture = tmp_path / "curl-noise-tiny-0003-frame5.png"
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert run(*words).exit_code == 0
+    assert (tmp_path / "curl-noise-tiny-0003-frame25.png").is_file()
+
+
+def test_two_files_become_one_film(
+    run: Run,
+    generated: GenerationResult,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = generated.folder / "test"
+    files = (folder / "0003.nc", folder / "0004.nc")
+    film = run("animate", *files, "--every", 13, "-o", "two.gif", "--json")
+    assert film.exit_code == 0, film.output
+    assert json.loads(film.stdout) == {"output": "two.gif"}
+    assert (tmp_path / "two.gif").read_bytes()[:3] == b"GIF"
+
+
+def test_a_picture_of_missing_data_exits_4(run: Run, tmp_path: Path) -> None:
+    assert run("plot", SPLIT, "--size", SIZE, "--root", tmp_path).exit_code == 4
+
+
+@pytest.mark.parametrize("command", ["plot", "animate"])
+@pytest.mark.parametrize("name", ["none.nc", "text.nc"])
+def test_a_named_file_that_cannot_be_read_exits_3(
+    command: str,
+    name: str,
+    run: Run,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A missing file and a text file are unreadable files, not damaged data sets."""
+    monkeypatch.chdir(tmp_path)
+    Path("text.nc").write_text("no netCDF")
+    for source in (name, tmp_path / name, f"./{name}"):
+        result = run(command, source)
+        assert result.exit_code == 3, result.output
+        assert name in result.stderr
+        assert "lagbench plot cavity" in result.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("plot", "-o", "{}/a.png"),
+        ("plot", "--sheet", "-o", "{}/a.png"),
+        ("animate", "-o", "{}/a.gif"),
+    ],
+)
+def test_a_misspelt_folder_is_refused_and_not_made(
+    words: tuple[str, ...], run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    folder = tmp_path / "lost"
+    command, *options = (word.format(folder) for word in words)
+    result = run(command, SPLIT, "--size", SIZE, "--root", generated.root, *options)
+    assert result.exit_code == 2, result.output
+    assert str(folder) in result.stderr
+    assert not folder.exists()

@@ -1,0 +1,141 @@
+"""How commands end: exit codes, messages on stderr, closed pipes, full disks."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import lagbench
+from lagbench.__main__ import app
+from lagbench.data.registry import default_path
+
+Run = Callable[..., Result]
+
+PROGRAM = [sys.executable, "-m", "lagbench"]
+
+
+@pytest.mark.parametrize(
+    ("line", "culprit"),
+    [
+        ("info", "--split"),
+        ("info cavity --split fluid", "cavity and fluid"),
+        ("info cavty", "'cavity'"),
+        ("verify --split cavity --size ful", "'full'"),
+        ("generate cavity --size tiny --scenarios 7-3", "7-3"),
+        ("generate cavity --size tiny --scenarios 70", "70"),
+        ("generate cavity --size tiny --device tpu", "tpu"),
+        ("plot cavity --kind sped", "'speed'"),
+        ("animate cavity -o film.avi", "avi"),
+    ],
+)
+def test_usage_errors_exit_2(line: str, culprit: str, run: Run, tmp_path: Path) -> None:
+    """A wrong name, option or value gives one message on stderr and no traceback."""
+    result = run(*line.split(), "--root", tmp_path)
+    assert result.exit_code == 2, result.output
+    assert culprit in result.stderr
+    assert "Traceback" not in result.output
+    assert result.stdout == ""
+
+
+def test_an_unknown_command_exits_2(run: Run) -> None:
+    result = run("genrate")
+    assert result.exit_code == 2
+    assert "'generate'" in result.stderr
+    assert result.stdout == ""
+
+
+def test_one_split_may_be_named_twice(run: Run) -> None:
+    """SPLIT and --split mean the same."""
+    by_argument = run("cite", "cavity")
+    by_both = run("cite", "cavity", "--split", "cavity")
+    assert by_argument.exit_code == by_both.exit_code == 0
+    assert by_argument.stdout == by_both.stdout
+
+
+def test_an_unreadable_registry_exits_3(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The message names the wrong key."""
+    text = default_path().read_text()
+    registry = tmp_path / "own.yaml"
+    registry.write_text(text.replace("licence: CC-BY-4.0", "license: CC-BY-4.0", 1))
+    monkeypatch.setenv("LAGBENCH_REGISTRY", str(registry))
+    result = run("list")
+    assert result.exit_code == 3
+    assert "'license'" in result.stderr
+    assert "'licence'" in result.stderr
+
+
+def raise_in_list(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the command list raise an error."""
+
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr("lagbench.cli.inventory.load", fail)
+
+
+def test_an_unexpected_error_is_short(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fault of ours gives a message; LAGBENCH_DEBUG=1 gives the traceback."""
+    error = RuntimeError("out of\x1b[2J luck")
+    raise_in_list(error, monkeypatch)
+    result = run("list")
+    assert result.exit_code == 5
+    assert r"RuntimeError: out of\x1b[2J luck" in result.stderr
+    assert "Traceback" not in result.stderr
+    monkeypatch.setenv("LAGBENCH_DEBUG", "1")
+    assert run("list").exception is error
+
+
+def test_an_interruption_is_no_error_to_trace(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raise_in_list(KeyboardInterrupt(), monkeypatch)
+    result = run("list")
+    assert result.exit_code == 130
+    assert "interrupted" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("words", [("--help",), ("list",), ("list", "--json")])
+def test_a_closed_pipe_ends_in_silence(words: tuple[str, ...]) -> None:
+    """Text, tables and help end as the shell's commands do when nobody reads them."""
+    reading_end, writing_end = os.pipe()
+    os.close(reading_end)
+    with os.fdopen(writing_end, "w") as pipe:
+        done = subprocess.run(
+            [*PROGRAM, *words], stdout=pipe, stderr=subprocess.PIPE, check=False
+        )
+    assert done.returncode == 141
+    assert done.stderr == b""
+
+
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
+def test_a_full_disk_exits_5() -> None:
+    """It is work that failed, and no fault of lagbench."""
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [*PROGRAM, "--version"], stdout=full, stderr=subprocess.PIPE, check=False
+        )
+    assert done.returncode == 5
+    assert b"fix:" in done.stderr
+    assert b"unexpected" not in done.stderr
+
+
+def test_letters_that_a_stream_lacks_are_escaped() -> None:
+    """The sign for equal ranks is no ASCII; the table is printed all the same."""
+    board = Path(lagbench.__file__).parents[1] / "leaderboard"
+    line = f"leaderboard show --board {board} --split cavity --size mini"
+    done = CliRunner(charset="ascii").invoke(app, line.split())
+    assert done.exit_code == 0
+    assert "\\u2248" in done.stdout

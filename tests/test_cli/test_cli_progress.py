@@ -1,0 +1,81 @@
+"""Progress that commands print on stderr."""
+
+from __future__ import annotations
+
+import re
+import sys
+
+import pytest
+
+from lagbench.cli.progress import progress_bar
+from lagbench.work.progress import Progress, watched
+
+
+def training_progress(step: int) -> Progress:
+    """Return the progress of a training of 240 steps, one a second."""
+    return Progress(
+        stage="loss 1",
+        done=step,
+        total=240,
+        scenarios_done=step,
+        scenarios=240,
+        seconds=step,
+    )
+
+
+WRITING = Progress(
+    stage="writing train",
+    done=2,
+    total=0,
+    scenarios_done=2,
+    scenarios=0,
+    seconds=1.0,
+)
+
+
+def test_a_file_gets_lines_with_the_count_and_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 0.0)
+    with progress_bar(quiet=False, unit="steps") as listener:
+        assert listener is not None
+        listener(training_progress(60))
+        listener(training_progress(200))
+    output = capsys.readouterr()
+    assert output.out == ""
+    pattern = r"(\d+)/240 steps, 1.00/s, (.+) left"
+    assert re.findall(pattern, output.err) == [("60", "3 min"), ("200", "40 s")]
+
+
+def test_an_unknown_total_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 0.0)
+    with progress_bar(quiet=False) as listener:
+        assert listener is not None
+        listener(WRITING)
+    assert capsys.readouterr().err == "writing train: 2 scenarios, 2.00/s\n"
+
+
+def test_quick_work_prints_no_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 3600.0)
+    with progress_bar(quiet=False, unit="steps") as listener:
+        assert listener is not None
+        listener(training_progress(60))
+        listener(WRITING)
+    assert capsys.readouterr().err == ""
+
+
+def test_quiet_work_has_no_listener() -> None:
+    with progress_bar(quiet=True) as listener:
+        assert listener is None
+
+
+def test_work_goes_on_without_stderr(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where stderr is closed, Python has no such stream."""
+    monkeypatch.setattr(sys, "stderr", None)
+    assert not watched()
+    with progress_bar(quiet=False) as listener:
+        assert listener is not None

@@ -1,0 +1,229 @@
+"""Transfer and slopes in two and three dimensions, between walls and periodic."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from lagbench.data.box import Box
+from lagbench.data.grid import (
+    Grid,
+    Placement,
+    curl,
+    differentiable_nodes,
+    divergence,
+    fields,
+    scatter_in_box,
+    slope_along,
+    transfer,
+    vorticity,
+)
+from lagbench.errors import UsageError
+
+Floats = NDArray[np.float64]
+
+WALLED = Box.from_bounds([(0.0, 1.0)] * 2)
+CHANNEL = Box.from_bounds([(0.0, 1.0)] * 2, periodic=[True, False])
+TORUS = Box.from_bounds([(0.0, 1.0)] * 2, periodic=[True, True])
+SOLID = Box.from_bounds([(0.0, 1.0)] * 3)
+SOLID_CHANNEL = Box.from_bounds(
+    [(0.0, 1.0), (0.0, 1.0), (0.25, 0.75)], periodic=[False, True, True]
+)
+SOLID_TORUS = Box.from_bounds([(-0.5, 1.0), (0.0, 1.0), (0.0, 0.5)], [True] * 3)
+BOXES = (WALLED, CHANNEL, TORUS, SOLID, SOLID_CHANNEL, SOLID_TORUS)
+EVERY_BOX = pytest.mark.parametrize("box", BOXES)
+EVERY_PLACEMENT = pytest.mark.parametrize("placement", list(Placement))
+
+
+def node_places(grid: Grid) -> Floats:
+    """Return the positions of all nodes [length], shape [*node, axis]."""
+    axes = [grid.places(axis) for axis in range(grid.dimension)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+
+
+def lattice(box: Box, per_length: int) -> Floats:
+    """Return particles that fill a box evenly, shape [particle, axis]."""
+    axes = []
+    for low, length in zip(box.low, box.lengths, strict=True):
+        count = round(float(length) * per_length)
+        axes.append(low + (np.arange(count) + 0.5) / per_length)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    return points.reshape(-1, box.dimension)
+
+
+def inner(field: Floats, box: Box, rim: int) -> Floats:
+    """Cut off the nodes within a rim along axes with walls."""
+    cut = [slice(None) if flag else slice(rim, -rim) for flag in box.periodic]
+    return field[tuple(cut)]
+
+
+@EVERY_PLACEMENT
+@EVERY_BOX
+def test_a_constant_velocity_stays_constant_and_full(
+    box: Box, placement: Placement
+) -> None:
+    grid = Grid(8, placement, box)
+    x = lattice(box, 16)
+    velocity = np.arange(1.0, 1.0 + box.dimension)
+    full = grid.full_weight(len(x), box.volume)
+    result = fields(x, np.broadcast_to(velocity, x.shape), grid, full=full)
+    assert result.weight.shape == grid.shape
+    np.testing.assert_allclose(inner(result.density, box, 2), 1.0, rtol=1e-12)
+    for axis, component in enumerate(velocity):
+        nodes = inner(result.velocity[..., axis], box, 2)
+        np.testing.assert_allclose(nodes, component, rtol=1e-12)
+
+
+@EVERY_PLACEMENT
+def test_both_scatters_agree_between_walls(placement: Placement) -> None:
+    rng = np.random.default_rng(0)
+    grid = Grid(11, placement)
+    x = rng.uniform(-0.05, 1.05, (500, 2))
+    x[3] = np.nan
+    u = rng.standard_normal((500, 2))
+    fast = transfer(x, u, grid)
+    sums = np.empty((3, *grid.shape))
+    scatter_in_box(x, u, grid, sums)
+    np.testing.assert_allclose(sums[0], fast.weight, atol=1e-12)
+    np.testing.assert_allclose(sums[1:], np.moveaxis(fast.momentum, -1, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("box", [CHANNEL, TORUS, SOLID_CHANNEL, SOLID_TORUS])
+def test_weights_sum_to_the_particles_where_no_wall_cuts_the_stencil(box: Box) -> None:
+    rng = np.random.default_rng(1)
+    grid = Grid(8, Placement.CELL_CENTRES, box)
+    margin = np.where(box.periodic, 0.0, 0.2)
+    room = box.lengths - 2.0 * margin
+    x = box.low + margin + room * rng.random((200, box.dimension))
+    u = rng.standard_normal(x.shape)
+    sums = transfer(x, u, grid)
+    assert sums.weight.sum() == pytest.approx(200.0, rel=1e-12)
+    total = sums.momentum.reshape(-1, box.dimension).sum(axis=0)
+    np.testing.assert_allclose(total, u.sum(axis=0), rtol=1e-10)
+
+
+@EVERY_PLACEMENT
+@pytest.mark.parametrize("box", [CHANNEL, TORUS, SOLID_CHANNEL, SOLID_TORUS])
+def test_a_shift_by_a_cell_along_a_periodic_axis_rolls_the_fields(
+    box: Box, placement: Placement
+) -> None:
+    rng = np.random.default_rng(2)
+    grid = Grid(8, placement, box)
+    x = box.low + box.lengths * rng.random((150, box.dimension))
+    u = rng.standard_normal(x.shape)
+    before = transfer(x, u, grid)
+    for axis, is_periodic in enumerate(box.periodic):
+        if not is_periodic:
+            continue
+        shift = np.zeros(box.dimension)
+        shift[axis] = grid.spacing
+        after = transfer(x + shift, u, grid)
+        rolled = np.roll(before.weight, 1, axis=axis)
+        np.testing.assert_allclose(after.weight, rolled, atol=1e-10)
+        rolled = np.roll(before.momentum, 1, axis=axis)
+        np.testing.assert_allclose(after.momentum, rolled, atol=1e-10)
+
+
+@pytest.mark.parametrize("box", [TORUS, SOLID, SOLID_CHANNEL])
+def test_particles_that_are_nowhere_carry_no_weight(box: Box) -> None:
+    grid = Grid(8, Placement.CELL_CENTRES, box)
+    x = np.full((3, box.dimension), 0.5)
+    x[1, 0] = np.nan
+    x[2, -1] = np.inf
+    sums = transfer(x, np.ones_like(x), grid)
+    assert sums.weight.sum() == pytest.approx(1.0)
+
+
+def test_the_curl_of_a_rigid_rotation_is_twice_its_rate() -> None:
+    grid = Grid(9, Placement.NODES, SOLID)
+    rate = np.array([0.2, -0.3, 0.5])
+    velocity = np.cross(rate, node_places(grid) - 0.5)
+    omega = curl(velocity, grid.spacing)
+    assert omega.shape == (*grid.shape, 3)
+    expected = np.broadcast_to(2.0 * rate, inner(omega, SOLID, 1).shape)
+    np.testing.assert_allclose(inner(omega, SOLID, 1), expected, atol=1e-12)
+
+    plane = Grid(9, Placement.NODES)
+    x, y = np.moveaxis(node_places(plane) - 0.5, -1, 0)
+    omega = curl(np.stack([-0.5 * y, 0.5 * x], axis=-1), plane.spacing)
+    np.testing.assert_allclose(inner(omega, WALLED, 1), 1.0, atol=1e-12)
+
+
+def test_the_generic_curl_agrees_with_that_between_walls_in_two_dimensions() -> None:
+    rng = np.random.default_rng(3)
+    velocity = rng.standard_normal((7, 9, 2))
+    slopes = slope_along(velocity[..., 1], -2, 0.1)
+    generic = slopes - slope_along(velocity[..., 0], -1, 0.1)
+    np.testing.assert_allclose(generic, vorticity(velocity, 0.1), atol=1e-12)
+    periodic = curl(velocity, 0.1, [True, False])
+    np.testing.assert_allclose(
+        periodic[1:-1], vorticity(velocity, 0.1)[1:-1], atol=1e-12
+    )
+
+
+@EVERY_BOX
+def test_the_divergence_of_the_position_is_the_dimension_between_walls(
+    box: Box,
+) -> None:
+    grid = Grid(8, Placement.CELL_CENTRES, box)
+    velocity = node_places(grid)
+    velocity[..., list(box.periodic)] = 0.3  # the position jumps at a period
+    walled_axes = box.dimension - sum(box.periodic)
+    rate = divergence(velocity, grid.spacing, box.periodic)
+    np.testing.assert_allclose(inner(rate, box, 1), walled_axes, atol=1e-12)
+
+
+def test_slopes_of_a_wave_have_no_seam_along_a_periodic_axis() -> None:
+    grid = Grid(16, Placement.CELL_CENTRES, SOLID_TORUS)
+    x = node_places(grid)
+    waves = 2.0 * np.pi / SOLID_TORUS.lengths
+    # Central differences of sin(k x) are cos(k x) sin(k h) / h.
+    for axis, wave in enumerate(waves):
+        slope = slope_along(
+            np.sin(wave * x[..., axis]), axis - 3, grid.spacing, is_periodic=True
+        )
+        factor = np.sin(wave * grid.spacing) / grid.spacing
+        expected = factor * np.cos(wave * x[..., axis])
+        np.testing.assert_allclose(slope, expected, atol=1e-12)
+
+
+@EVERY_BOX
+def test_a_node_is_differentiable_where_all_its_neighbours_count(box: Box) -> None:
+    rng = np.random.default_rng(4)
+    grid = Grid(6, Placement.CELL_CENTRES, box)
+    counted = rng.random(grid.shape) < 0.8
+    result = differentiable_nodes(counted, box.periodic)
+    for node in np.ndindex(counted.shape):
+        expected = True
+        for axis, count in enumerate(counted.shape):
+            for step in (-1, 1):
+                place = node[axis] + step
+                if box.periodic[axis]:
+                    place %= count
+                if not 0 <= place < count:
+                    expected = False
+                    continue
+                neighbour = (*node[:axis], place, *node[axis + 1 :])
+                expected = expected and bool(counted[neighbour])
+        assert result[node] == expected
+
+
+def test_fields_of_a_batch_are_those_of_its_frames() -> None:
+    rng = np.random.default_rng(5)
+    grid = Grid(6, Placement.CELL_CENTRES, SOLID_CHANNEL)
+    low = np.asarray(SOLID_CHANNEL.low)
+    x = low + SOLID_CHANNEL.lengths * rng.random((2, 300, 3))
+    u = rng.standard_normal(x.shape)
+    full = grid.full_weight(300, SOLID_CHANNEL.volume)
+    batch = fields(x, u, grid, full=full)
+    for frame in range(2):
+        single = fields(x[frame], u[frame], grid, full=full)
+        np.testing.assert_array_equal(batch.vorticity[frame], single.vorticity)
+        np.testing.assert_array_equal(batch.divergence[frame], single.divergence)
+
+
+def test_a_period_is_a_whole_number_of_cells() -> None:
+    with pytest.raises(UsageError) as caught:
+        Grid(5, Placement.CELL_CENTRES, SOLID_CHANNEL)
+    assert caught.value.where == "cells"
