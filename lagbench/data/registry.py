@@ -136,7 +136,7 @@ class Task(_RegistryModel):
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
-    # kinematic viscosity that models are told where scenarios state none [length^2/s]
+    # kinematic viscosity of classical solvers where scenarios state none [length^2/s]
     effective_viscosity: float | None = Field(None, gt=0, allow_inf_nan=False)
 
 
