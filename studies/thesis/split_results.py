@@ -398,11 +398,14 @@ class SplitResults:
 
         Entries state the time of our solver on their machine: theirs is scaled by it.
         """
+        if name in REFERENCES:
+            references = shipped(self.size) or {}
+            if name in references:
+                return references[name].seconds_per_frame
+            return None
         cost = self.methods[name].cost
         if cost is None:
             return None
-        if name in REFERENCES:
-            return cost.seconds_per_frame
         return seconds_where_measured(
             seconds_per_frame=cost.seconds_per_frame,
             solver_seconds=cost.solver_seconds_per_frame,
@@ -421,7 +424,8 @@ class SplitResults:
         costs = {}
         for solver in CLASSICAL.intersection(self.methods):
             cost = self.seconds_per_frame(solver)
-            if cost is not None and self.ranking in self.methods[solver].scores:
+            is_scored = self.ranking in self.methods[solver].scores
+            if cost is not None and is_scored:
                 solvers[solver] = self.methods[solver].scores[self.ranking]
                 costs[solver] = cost
         trainings = self.methods[name].trainings
