@@ -261,7 +261,6 @@ def make_card(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
             attribute_std=(1.0, 1.0, 1.0, 1.0),
             radius=task.radius,
             materials=(),
-            bounds=size.bounds,
         ),
         ranking=ranking,
         tallies=tallies,

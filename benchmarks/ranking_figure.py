@@ -73,7 +73,7 @@ def make_pair(truth: Motion, prediction: Motion, placement: Placement) -> FrameP
     given_positions = np.stack([position - 2 * velocity, position - velocity])
     scenario = Scenario(
         config=config,
-        given=given_positions,
+        input_positions=given_positions,
         material=np.zeros(len(position), np.int8),
         particle_mass=1.0 / len(position),
         area=1.0 if config.is_full_box else 0.12,
