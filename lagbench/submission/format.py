@@ -248,8 +248,8 @@ def require_valid_attribute(name: str, value: object) -> None:
 def inspect_file(file: h5py.File, path: Path) -> FileInfo:
     """Return what a file holds; of values only coordinates are read."""
     length = path.stat().st_size
-    root = file["/"]
     with hdf5_errors(path):
+        root = file["/"]
         links, link_count = list_members(root)
         attributes = {}
         for name in ("lagbench_format", *REQUIRED, *OPTIONAL):
