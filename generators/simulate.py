@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,11 @@ from .batch import Report, ScenarioBatch, SimulationJob, substep_count
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
 from .solver import Health
+from .soundness import SoundnessRecorder
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+
+if TYPE_CHECKING:
+    from .free_surface import FreeSurface
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
@@ -169,24 +174,31 @@ def simulate(
             writer = scenario_writer(job, scenario, state)
             writers.append(stack.enter_context(writer))
 
+        recorders = _soundness_recorders(batch)
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
             writers[index].append(position, velocity)
             energies[index].append(_kinetic_energy(velocity, masses[index]))
+            if recorders:
+                recorders[index].add(velocity, batch.volume_ratio(index))
             if frame == COMPILING - 1:
                 started = clock()
 
-        is_free_surface = isinstance(batch.solver.parameters, FreeSurfaceParameters)
         for index, writer in enumerate(writers):
-            if is_free_surface:
-                writer.state(active_frames=active_frames(energies[index], size.task))
             diagnostics = _diagnose(
                 size,
                 batch.states[index],
                 energies=energies[index],
                 extremes=batch.extremes[index],
             )
-            writer.state_facts(asdict(diagnostics))
+            facts = asdict(diagnostics)
+            if recorders:
+                writer.state(active_frames=active_frames(energies[index], size.task))
+                solver = cast("FreeSurface", batch.solver)
+                least, greatest = solver.volume_ratio_extremes()
+                soundness = recorders[index].summary(least[index], greatest[index])
+                facts |= asdict(soundness)
+            writer.state_facts(facts)
     seconds = clock() - started
 
     pace = None
@@ -203,6 +215,14 @@ def simulate(
         )
         for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
+
+
+def _soundness_recorders(batch: ScenarioBatch) -> list[SoundnessRecorder]:
+    """Return a recorder for each scenario of a free surface, none for a full box."""
+    parameters = batch.solver.parameters
+    if not isinstance(parameters, FreeSurfaceParameters):
+        return []
+    return [SoundnessRecorder(parameters, state.material) for state in batch.states]
 
 
 def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:
