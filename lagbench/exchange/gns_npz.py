@@ -65,9 +65,8 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
         zipfile.ZipFile(temporary, "w") as archive,
     ):
         for frame_count, read_position, kinds in runs:
-            position = np.empty((frame_count, len(kinds), 2), np.float32)
-            for frame in range(frame_count):
-                position[frame] = read_position(frame)
+            frames = [read_position(frame) for frame in range(frame_count)]
+            position = np.stack(frames).astype(np.float32, copy=False)
             pair = np.empty(2, dtype=object)
             pair[0] = position
             pair[1] = kinds
@@ -162,6 +161,7 @@ def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Traj
         frames=len(position),
         material=material,
         read=lambda: ((frame, None) for frame in position),
+        dimension=position.shape[2],
         parameters=parameters,
     )
 
