@@ -151,7 +151,9 @@ class ScenarioWriter:
         self._add_constant("time", ("frame",), times)
         numbers = np.arange(particles, dtype=np.int32)
         self._add_constant("particle", ("particle",), numbers)
-        self._add_constant("space", ("space",), np.array(AXES[:dimension], dtype=object))
+        self._add_constant(
+            "space", ("space",), np.array(AXES[:dimension], dtype=object)
+        )
         materials = np.asarray(material, dtype=np.int8)
         self._add_constant("material", ("particle",), materials)
         mass = np.asarray(particle_mass, dtype=np.float64)

@@ -65,8 +65,11 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
         zipfile.ZipFile(temporary, "w") as archive,
     ):
         for frame_count, read_position, kinds in runs:
-            frames = [read_position(frame) for frame in range(frame_count)]
-            position = np.stack(frames).astype(np.float32, copy=False)
+            first = read_position(0)
+            position = np.empty((frame_count, *first.shape), np.float32)
+            position[0] = first
+            for frame in range(1, frame_count):
+                position[frame] = read_position(frame)
             pair = np.empty(2, dtype=object)
             pair[0] = position
             pair[1] = kinds

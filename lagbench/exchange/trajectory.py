@@ -148,7 +148,7 @@ class DataOptions(TypedDict, total=False):
     licence: str
     radius: float
     frame_interval: float
-    bounds: Bounds
+    bounds: Annotated[Bounds, Field(min_length=2, max_length=3)]
     periodic: Sequence[str]
     rescale: bool
     density: float
@@ -301,13 +301,6 @@ class Description:
             )
 
     def _check_bounds(self) -> None:
-        if self.bounds is not None and len(self.bounds) not in DIMENSIONS:
-            raise UsageError(
-                "bounds have a pair for each axis",
-                where="--bounds",
-                expected="two or three pairs",
-                got=len(self.bounds),
-            )
         for low, high in self.bounds or ():
             if not -MOST <= low < high <= MOST:
                 raise UsageError(

@@ -94,7 +94,7 @@ class FrameStore:
         self.__init__(**state)  # type: ignore[misc]
 
     def frames(self, scenario: int, start: int, stop: int) -> list[Floats]:
-        """Return positions of consecutive frames [length], each of shape [particle, axis].
+        """Return positions of consecutive frames [length], each [particle, axis].
 
         The arrays are those of the cache: copy them, never write to them.
         """
@@ -275,8 +275,8 @@ class Window(NamedTuple):
     # particle positions [length], shape [particle, frame, axis]
     position: NDArray[np.float32]
     material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
-    # velocity of the walls [length/s], shape [frame, wall, axis]: the forcing on the way
-    # to each frame, those to predict included; None in a split without moving walls
+    # velocity of the walls [length/s], shape [frame, wall, axis]: the forcing on the
+    # way to each frame, those to predict included; None in a split without moving walls
     wall_velocity: NDArray[np.float32] | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
@@ -421,8 +421,8 @@ def windows(
 
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, axis];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
-    [frame, wall, axis], or None; the ids ``scenario`` and ``frame``. ``data.size`` is the
-    description of the data set. `lagbench.torch.WindowDataset` gives the same
+    [frame, wall, axis], or None; the ids ``scenario`` and ``frame``. ``data.size`` is
+    the description of the data set. `lagbench.torch.WindowDataset` gives the same
     windows as tensors.
 
     Args:

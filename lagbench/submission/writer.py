@@ -584,9 +584,7 @@ def template(
     with writer:
         for scenario in scenarios:
             last_given = truth.given_frames(scenario)[-1]
-            writer.add(
-                scenario, np.broadcast_to(last_given, writer.shape_of(scenario))
-            )
+            writer.add(scenario, np.broadcast_to(last_given, writer.shape_of(scenario)))
     frames = frames_to_predict(entry)
     return TemplateResult(
         path=writer.path,
