@@ -340,7 +340,7 @@ def list_entries(board: str | Path | None) -> dict[Place, Path]:
     Raises:
         UsageError: the named folder is no leaderboard.
     """
-    folders = DEFAULT_BOARDS
+    folders: tuple[Path, ...] = DEFAULT_BOARDS
     if board is not None:
         folders = (Path(board),)
     for folder in folders:
