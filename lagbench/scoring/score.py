@@ -27,6 +27,12 @@ from lagbench.work.run import run_all
 
 from .card import JSON_NAME, SUBMISSION, ScoreCard, format_scores
 from .flags import Flag, judge_copying, judge_physics, judge_predictability
+from .package_metrics import (
+    PackageMetricError,
+    describe_failure,
+    drop_metric,
+    package_metric_errors,
+)
 from .published_scores import read_scores
 from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
@@ -39,9 +45,6 @@ from .skill import (
     seconds_where_measured,
 )
 from .task import ScoredTask, load_scored_task
-
-PREDICTIONS = "predictions.nc"
-"""The usual name of a submission; its scores lie beside it."""
 
 WORTH_WORKERS = 1_000_000
 """Least particles times predicted frames for which worker processes are worth it."""
@@ -66,8 +69,8 @@ def score(
     Args:
         predictions: a predictions.nc.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        output_dir: folder for the two files; by default that of a predictions.nc, and
-            beside a file of another name the folder of that name.
+        output_dir: folder for the two files; by default the folder of the predictions'
+            name beside them, see :func:`scores_folder`.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
         extras: extras whose metrics are measured too, as in ("transport",).
@@ -84,7 +87,8 @@ def score(
 
     Raises:
         UsageError: an extra that brings no metrics, or that is not installed; scores of
-            another method lie where these would go.
+            another method lie where these would go. (A metric of another package that
+            fails is left out, with a warning on the card.)
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing
@@ -131,27 +135,26 @@ def score(
     references: tuple[str, ...] = ()
     if not shipped_references:
         references = measurable(size, data_root)
-    outcomes = score_scenarios(
-        task,
-        path,
-        info,
-        metrics=tuple(metric.name for metric in metrics),
-        references=references,
-        workers=workers,
-        scheduler=scheduler,
-        meter=Meter(progress),
-    )
-
-    # aggregation
-    tallies = {}
-    for row in outcomes[0].tallies:
-        tallies_of_row = {}
-        for outcome in outcomes:
-            tallies_of_row[outcome.scenario] = outcome.tallies[row]
-        tallies[row] = tallies_of_row
-    scores: dict[str, Mapping[str, Score]] = {}
-    for row, row_tallies in tallies.items():
-        scores[row] = aggregate(metrics, row_tallies)
+    warnings = list(result.warnings)
+    meter = Meter(progress)
+    while True:
+        try:
+            outcomes = score_scenarios(
+                task,
+                path,
+                info,
+                metrics=tuple(metric.name for metric in metrics),
+                references=references,
+                workers=workers,
+                scheduler=scheduler,
+                meter=meter,
+            )
+            tallies, scores = _aggregate(outcomes, metrics)
+            break
+        except PackageMetricError as error:
+            # measured again without it: its column is left out, the others are whole
+            metrics = drop_metric(metrics, error.metric)
+            warnings.append(describe_failure(error))
     for name, reference in shipped_references.items():
         scores[name] = reference.scores
 
@@ -172,12 +175,28 @@ def score(
             header, size, scores[SUBMISSION][ranking], shipped_references
         ),
         flags=_judge(task, outcomes, scores),
-        warnings=(*result.warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
+        warnings=(*warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
         preview=next(one.preview for one in outcomes if one.preview is not None),
     )
     if write:
         return _write(card, folder)
     return card
+
+
+def _aggregate(
+    outcomes: Sequence[ScenarioScores], metrics: Sequence[Metric]
+) -> tuple[dict[str, dict[int, Tally]], dict[str, Mapping[str, Score]]]:
+    """Return tallies by row and scenario, and scores by row and metric."""
+    tallies: dict[str, dict[int, Tally]] = {}
+    for row in outcomes[0].tallies:
+        tallies[row] = {}
+        for outcome in outcomes:
+            tallies[row][outcome.scenario] = outcome.tallies[row]
+    scores: dict[str, Mapping[str, Score]] = {}
+    with package_metric_errors():
+        for row, row_tallies in tallies.items():
+            scores[row] = aggregate(metrics, row_tallies)
+    return tallies, scores
 
 
 def _compare_with_solvers(
@@ -210,16 +229,16 @@ def _compare_with_solvers(
 
 
 def scores_folder(predictions: Path) -> Path:
-    """Return the default folder of the scores of a file.
+    """Return the default folder of the scores of a file: beside it, with its name.
 
-    >>> scores_folder(Path("runs/predictions.nc")).as_posix()
-    'runs'
     >>> scores_folder(Path("runs/gns.nc")).as_posix()
     'runs/gns'
+    >>> scores_folder(Path("runs/gns")).as_posix()
+    'runs/gns-scores'
     """
-    if predictions.name == PREDICTIONS:
-        return predictions.parent
-    return predictions.parent / predictions.stem
+    if predictions.suffix:
+        return predictions.parent / predictions.stem
+    return predictions.parent / f"{predictions.name}-scores"
 
 
 def _check_overwriting(path: Path, header: Header) -> None:
@@ -238,7 +257,7 @@ def _check_overwriting(path: Path, header: Header) -> None:
             where=str(path),
             expected=f"no such file, or the scores of {expected}",
             got=present,
-            fix="keep them: --output FOLDER; or remove them first",
+            fix="keep them: --output FOLDER",
         )
 
 
