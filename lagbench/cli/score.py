@@ -32,7 +32,7 @@ from .options import (
 )
 from .output import print_errors, print_json, print_line, print_tables
 from .progress import progress_bar
-from .validate import ExpectedSplitOption, require_split
+from .validate import ExpectedSplitOption
 
 
 def score_command(
@@ -88,31 +88,27 @@ def score_command(
             fix="add --report FOLDER",
         )
     folders = _score_folders(predictions, output)
-    expected_split = None
     if split is not None:
-        expected_split, root, _ = locate_split(split, root=root)
+        root = locate_split(split, root=root).root
     validations: Sequence[ValidationResult | None] = [None]
     if len(predictions) > 1:
         validations = _validate_together(predictions, root)
     if report is not None:
         check_folder(report)
 
-    def examine(result: ValidationResult) -> None:
-        require_split(result, expected_split)
-        print_errors(result)
-
     cards = []
     for path, folder, validation in zip(predictions, folders, validations, strict=True):
         with progress_bar(quiet=quiet) as progress:
             card = score(
                 path,
+                split=split,
                 root=root,
                 output_dir=folder,
                 workers=workers,
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=progress,
-                examined=examine,
+                examined=print_errors,
                 validated=validation,
             )
         cards.append(card)

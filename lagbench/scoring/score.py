@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
@@ -20,7 +20,7 @@ from lagbench.references.table import CLASSICAL, NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
-from lagbench.submission.validation import validate
+from lagbench.submission.validation import require_split, validate
 from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
@@ -53,6 +53,7 @@ WORTH_WORKERS = 1_000_000
 def score(
     predictions: str | Path,
     *,
+    split: str | Path | None = None,
     root: str | Path | None = None,
     output_dir: str | Path | None = None,
     workers: int | None = None,
@@ -68,6 +69,8 @@ def score(
 
     Args:
         predictions: a predictions.nc.
+        split: the split to which they must belong, or the path of a local split's
+            folder; the one that they name when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         output_dir: folder for the two files; by default the folder of the predictions'
             name beside them, see :func:`scores_folder`.
@@ -83,12 +86,12 @@ def score(
             this very file and root; the file is then not validated again.
 
     Returns:
-        The score card; ``files`` names the written files.
+        The score card; ``files`` names the written files. A metric of another package
+        that fails is left out, and ``warnings`` says why.
 
     Raises:
-        UsageError: an extra that brings no metrics, or that is not installed; scores of
-            another method lie where these would go. (A metric of another package that
-            fails is left out, with a warning on the card.)
+        UsageError: predictions for another split; an extra that brings no metrics, or
+            that is not installed; scores of another method lie where these would go.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing
@@ -98,6 +101,9 @@ def score(
     """
     metrics = _select_metrics(extras)
     path = Path(predictions).absolute()
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root, registry=registry)
     data_root = resolve_root(root)
     splits = load_rooted_registry(data_root, registry)
     folder = scores_folder(Path(predictions))
@@ -113,6 +119,7 @@ def score(
         raise UsageError(
             "the validation is of another file", where=str(path), got=result.path
         )
+    require_split(result, expected_split)
     if examined is not None:
         examined(result)
     result.check()

@@ -10,7 +10,7 @@ from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
 
-from .card import SUBMISSION, ScoreCard
+from .card import BRIEF_ROWS, SUBMISSION, ScoreCard
 from .compare import ComparisonResult, MetricComparison
 from .flags import Flag
 
@@ -38,9 +38,6 @@ ARROWS = {
 }
 """Marks of the better side of a metric, behind its name."""
 
-BRIEF_ROWS = 5
-"""Metrics in the table that is shown by default."""
-
 LEGEND = "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
 
 FLAG_STATES = {True: "raised", False: "not raised", None: "unknown"}
@@ -57,7 +54,7 @@ def card_tables(
         floors: whether all references are shown beside the submission, not only the
             best one.
     """
-    names = _chosen_metrics(card)
+    names = card.chosen_metrics
     if every:
         names = list(card.submission)
         frame_names = []
@@ -79,15 +76,6 @@ def card_tables(
     yield _per_scenario(card, [SUBMISSION, *references])
 
 
-def _chosen_metrics(card: ScoreCard) -> list[str]:
-    """Return the most important metrics that a card has, the ranking one first."""
-    names = []
-    for name in dict.fromkeys((card.ranking, *CHOSEN)):
-        if name in card.submission:
-            names.append(name)
-    return names
-
-
 def _best_reference(card: ScoreCard) -> list[str]:
     """Return the reference of the skill, else the first one, else none."""
     if card.skill:
@@ -98,14 +86,14 @@ def _best_reference(card: ScoreCard) -> list[str]:
 
 def brief_table(card: ScoreCard) -> Table:
     """Return skill and the first metrics, beside the best reference."""
-    names = _chosen_metrics(card)[:BRIEF_ROWS]
+    names = card.chosen_metrics[:BRIEF_ROWS]
     return _over_horizon(card, names, _best_reference(card))
 
 
 def brief_lines(card: ScoreCard) -> Iterator[str]:
     """Yield the lines below the brief table: comparison, raised flags, warnings."""
     yield LEGEND
-    yield from _undefined_lines(card, _chosen_metrics(card)[:BRIEF_ROWS])
+    yield from _undefined_lines(card, card.chosen_metrics[:BRIEF_ROWS])
     for row in _best_reference(card):
         yield f"against {row}: {_against(card, row)}"
     for flag in card.flags:

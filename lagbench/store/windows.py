@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -316,6 +317,7 @@ class WindowReader:
         self.history = history  # given frames of a model
         self.future = future  # frames after them
         self.length = history + future  # frames in a window
+        self.subsets = subsets  # names of the subsets
         self.origin = origin  # whether windows hold the scenario's first frame too
         self.scenarios = tuple(paths)
         # float32 for every component
@@ -354,6 +356,31 @@ class WindowReader:
     def __len__(self) -> int:
         """Return the number of windows."""
         return self.starts[-1]
+
+    def __repr__(self) -> str:
+        """Return data set, subsets, number and length of the windows."""
+        facts = ", ".join(f"{name} {value}" for name, value in self._facts.items())
+        return f"<{type(self).__name__}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, for notebooks; escaped."""
+        rows = []
+        for name, value in self._facts.items():
+            rows.append(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>")
+        caption = escape(type(self).__name__)
+        return f"<table><caption>{caption}</caption>{''.join(rows)}</table>"
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """What the windows are, by name."""
+        return {
+            "data set": f"{self.size.split} {self.size.name}",
+            "subsets": "+".join(self.subsets),
+            "scenarios": str(len(self.scenarios)),
+            "windows": str(len(self)),
+            "frames": f"{self.history} given + {self.future} to predict",
+            "particles": str(self.size.particles),
+        }
 
     @property
     def gravity(self) -> float:
@@ -428,7 +455,7 @@ def windows(
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.

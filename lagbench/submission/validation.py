@@ -386,3 +386,22 @@ def _without_truth(result: ValidationResult, error: DataError) -> ValidationResu
     return dataclasses.replace(
         result, findings=sort_issues(issues), passed=tuple(passed), skipped=skipped
     )
+
+
+def require_split(result: ValidationResult, expected_split: str | None) -> None:
+    """Refuse predictions for another split than the expected one.
+
+    Predictions that name no split pass here; their validation rejects them.
+
+    Raises:
+        UsageError: the predictions are for another split.
+    """
+    if expected_split is None or result.split in (None, expected_split):
+        return
+    raise UsageError(
+        "the predictions are for another split",
+        where=str(result.path),
+        expected=expected_split,
+        got=ascii(result.split),
+        fix="name that split, or leave --split out",
+    )

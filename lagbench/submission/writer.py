@@ -53,7 +53,7 @@ class PredictionsWriter:
     Args:
         path: file to write.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what makes the predictions.
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
@@ -446,7 +446,7 @@ def write(
             one array [scenario, frame, particle, space] with the test scenarios by
             ascending id.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what made the predictions.
         velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
@@ -555,7 +555,7 @@ def template(
 
     Args:
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         output: file to write.
         overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
