@@ -2,9 +2,9 @@
 
 What a surrogate must be compared with: accuracy against cost. It learns nothing, but it
 knows the equations, the viscosity, the materials and the motion of the walls to the
-end. Its grid and time step are those of a smaller size of the split: half as many cells
-along each axis, or a quarter. A seeded subset of the particles, as many as the smaller
-size has and as evenly spread as they are, carries the mass. In a full box the others
+end. Its grid has half as many cells along each axis, or a quarter, and its time step is
+two or four times as long. A seeded subset of the particles, a quarter or a sixteenth of
+them and as evenly spread, carries the mass. In a full box the others
 move as those around them do (see :mod:`.predictor`); on a free surface each keeps its
 offset to the nearest particle of its material that carries mass.
 
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data.registry import Size, load
+from lagbench.data.registry import Size
 from lagbench.errors import require
 
 from .predictor import (
@@ -45,33 +45,44 @@ if TYPE_CHECKING:
         InitialState,
     )
 
-SMALLER = {
-    ("full", 2): "mini",
-    ("full", 4): "tiny",
-    ("mini", 2): "tiny",
-}
-"""Size whose grid is used, by size and by how many times fewer cells are asked for."""
+MIN_CELLS = 16
+"""Least cells of a coarser grid across the unit box."""
+
+MIN_PARTICLES = 100
+"""Least particles that carry the mass on a coarser grid."""
 
 SOLVED = ("fluid", "multimaterial")
 """Splits that are solved; in full boxes the projection solver is cheaper and better."""
 
 
 def coarser(size: Size, times: int) -> Size | None:
-    """Return the size whose grid has so many times fewer cells along each axis.
+    """Return a size with so many times fewer cells along each axis.
 
-    None where a split is not solved or no size has such a grid.
+    Its time step is as many times longer, and its particles fill cells as densely.
+    None where the split is not solved, where a wall would lie between two nodes, or
+    where too few cells or particles would be left.
 
     Args:
         size: the split and size that is predicted.
         times: cells of its grid over those of the coarser one, 2 or 4.
     """
-    name = SMALLER.get((size.name, times))
-    if size.split not in SOLVED or name is None:
+    if size.split not in SOLVED:
         return None
-    smaller = load().size(size.split, name)
-    if smaller.grid * times != size.grid:
+    wall = int(size.value("wall"))
+    if size.grid % times or wall % times:
         return None
-    return smaller
+    values = {
+        "grid": size.grid // times,
+        "wall": wall // times,
+        "substeps_per_frame": math.ceil(size.substeps_per_frame / times),
+        "particles": size.particles // (times * times),
+    }
+    if values["grid"] < MIN_CELLS or values["particles"] < MIN_PARTICLES:
+        return None
+    parameters = dict(size.parameters)
+    for name, value in values.items():
+        parameters[name] = parameters[name].model_copy(update={"value": value})
+    return size.model_copy(update={"parameters": parameters})
 
 
 def predict(given: Given, times: int) -> Prediction:
