@@ -93,13 +93,19 @@ def _particle_mass(size: Size, state: InitialState) -> float:
     return float(size.value("density")) * state.area / size.particles
 
 
-def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
+def file_parameters(
+    size: Size, scenario: int, state: InitialState
+) -> dict[str, object]:
     """Return what a scenario's file states and hashes: constants, then what was
     drawn.
+
+    Constants of one subset stand in its files only.
     """
+    subset = size.subset_of(scenario)
     parameters: dict[str, object] = {}
     for name, parameter in size.parameters.items():
-        parameters[name] = parameter.value
+        if parameter.subset in (None, subset):
+            parameters[name] = parameter.value
     for name, value in state.parameters.items():
         parameters[_FILE_NAMES.get(name, name)] = value
     parameters["start_frame"] = state.start_frame
@@ -130,7 +136,7 @@ def scenario_writer(
         material=state.material,
         particle_mass=_particle_mass(size, state),
         wall_velocity=wall_velocity,
-        parameters=file_parameters(size, state),
+        parameters=file_parameters(size, scenario, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
