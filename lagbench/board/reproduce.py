@@ -14,6 +14,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -39,7 +40,15 @@ from lagbench.scoring.score_file_checks import read_score_file
 from lagbench.scoring.task import ScoredTask, load_scored_task
 from lagbench.work.progress import Meter, Progress
 
-from .entry import Entry, Level, Prediction, Reproduction, Status, Verification
+from .entry import (
+    Entry,
+    Level,
+    MeasuredCost,
+    Prediction,
+    Reproduction,
+    Status,
+    Verification,
+)
 from .entry_file import read_entry
 from .folder import Folder
 from .measured_cost import TimedEntry, TimeSolver, measure_costs
@@ -486,9 +495,7 @@ class _Run:
             for runner in opened:
                 runner.close()
         for entry, cost in costs:
-            self._change(
-                entry, lambda line, c=cost: line.model_copy(update={"cost": c})
-            )
+            self._change(entry, partial(_with_cost, cost=cost))
 
     def _open_first_model(self, entry: Entry) -> Runner | None:
         """Return the model of the first seed that has one; None where it fails."""
@@ -509,6 +516,10 @@ class _Run:
                 if path not in failed:
                     self.result.failures.append(Failure(entry=path, error=error))
         return None
+
+
+def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
+    return line.model_copy(update={"cost": cost})
 
 
 def compare(

@@ -100,7 +100,9 @@ def master(
     info = read_dataset_info("curl-noise", "tiny", root=generated.root)
     torch.manual_seed(3)
     model = GraphNetwork.with_operator(GNS).build(SMALL, info)
-    torch.nn.init.normal_(model.network.decoder[-1].weight, std=0.1)
+    last_layer = model.network.decoder[-1]
+    assert isinstance(last_layer, torch.nn.Linear)
+    torch.nn.init.normal_(last_layer.weight, std=0.1)
     recipe = {"name": "curl-noise/tiny", "training": {"seed": 0}}
     checkpoint = Checkpoint(
         baseline="gns",
