@@ -274,7 +274,8 @@ def _check_headers(
 ) -> bool:
     """Make the checks that need no positions; return whether positions can be read."""
     has_format = check_format(info, issues)
-    has_dims = check_dims(info, issues)
+    dimension = None if size is None else size.dimension
+    has_dims = check_dims(info, issues, dimension=dimension)
     has_dtype = check_dtype(info, issues)
     check_diverged_at(info, issues)
     if size is None:
