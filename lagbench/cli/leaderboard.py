@@ -255,7 +255,7 @@ def reproduce_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Run the models of entries again, compare their scores, measure their costs.
+    """Run the models of entries again, compare scores, measure costs.
 
     Exit code 0: all scores agree; 1: some differ; 2: no such entry, or one without a
     model; 3: a model cannot be read; 4: data are missing; 5: out of memory or disk.
