@@ -202,7 +202,8 @@ class ScenarioBatch:
         """Return J of liquid and Jp of snow at the last recording [1], shape
         [particle]; free surfaces only.
         """
-        return self._volume_ratio[index]
+        ratio: NDArray[np.float32] = self._volume_ratio[index]
+        return ratio
 
     def displace(self, offset: NDArray[np.float32]) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, 2]."""
