@@ -36,8 +36,8 @@ SPLITS = ("fluid", "multimaterial", "cavity", "curl-noise")
 @pytest.mark.parametrize(
     ("split", "interval", "expected"),
     [
-        ("fluid", 1 / 60, (2500, 128, 20, 22_800, 28, 8, 16)),
-        ("multimaterial", 1 / 60, (2500, 64, 20, 43_200, 48, 8, 16)),
+        ("fluid", 1 / 60, (2500, 128, 60, 22_800, 28, 8, 16)),
+        ("multimaterial", 1 / 60, (2500, 64, 108, 43_200, 48, 8, 16)),
         ("cavity", 0.1, (8192, 40, 50, 45_600, 48, 8, 20)),
         ("curl-noise", 0.1, (8096, 40, 50, 43_200, 48, 8, 16)),
     ],
@@ -172,7 +172,7 @@ def test_unknown_names_offer_the_nearest() -> None:
         load().size("fluid", "full").value("liqid_modulus")
     assert caught.value.where == "datasets.yaml, fluid full"
     with pytest.raises(UsageError) as caught:
-        load().size("multimaterial", "full").subset_of(87)
+        load().size("multimaterial", "full").subset_of(95)
     assert caught.value.where == "multimaterial full"
 
 

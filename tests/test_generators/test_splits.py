@@ -88,10 +88,10 @@ def test_kinds_are_spread_evenly_over_test(split: str, kind: str, size: str) -> 
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_boxes_of_all_sizes_are_one(split: str) -> None:
-    """Walls lie at 1/16 in the cavity and 1/32 on the free surface, whatever the grid,
-    and bounds say so.
+    """Walls lie at 1/16 in the cavity and on the free surface, whatever the grid, and
+    bounds say so.
     """
-    place = {"cavity": 1 / 16, "fluid": 1 / 32, "multimaterial": 1 / 32}.get(split)
+    place = {"cavity": 1 / 16, "fluid": 1 / 16, "multimaterial": 1 / 16}.get(split)
     for name in SIZES:
         entry = registry.load().size(split, name)
         offset = 0.0 if split in ("fluid", "multimaterial") else 0.5

@@ -11,7 +11,17 @@ from types import ModuleType
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scenario_draws import SIZES, all_of, changed, digest, draw, neighbours, state_of
+from scenario_draws import (
+    SIZES,
+    all_of,
+    changed,
+    digest,
+    draw,
+    neighbours,
+    shifted,
+    state_of,
+    usual_ids,
+)
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -57,13 +67,17 @@ def test_every_parameter_decides_bits(split: str, name: str) -> None:
     """Another value in datasets.yaml gives another solver constant or another initial
     state.
     """
-    size = registry.load().size(split, "tiny")
+    # only the larger sizes have scenarios of shift
+    shift_only = registry.load().split(split).parameters[name].subset == "shift"
+    size_name = "mini" if shift_only else "tiny"
+    size = registry.load().size(split, size_name)
+    ids = size.subsets["shift"] if shift_only else size.scenarios
     other = changed(size, **{name: other_value(name, size.value(name))})
     constants = importlib.import_module(size.generator).solver_parameters
     if repr(constants(other)) != repr(constants(size)):
         return
-    before = [digest(state_of(split, "tiny", i)) for i in size.scenarios]
-    after = [digest(draw(other, i)) for i in size.scenarios]
+    before = [digest(state_of(split, size_name, i)) for i in ids]
+    after = [digest(draw(other, i)) for i in ids]
     assert after != before
 
 
@@ -91,7 +105,7 @@ def test_kinds_follow_the_id(split: str, kind: str, expected: list[str]) -> None
     for size in SIZES:
         entry = registry.load().size(split, size)
         kinds = {}
-        for i in entry.scenarios:
+        for i in usual_ids(entry):
             kinds[i] = state_of(split, size, i).parameters[kind]
             assert kinds[i] == expected[i % len(expected)]
         if (split, size) != ("fluid", "tiny"):
@@ -119,6 +133,41 @@ def test_fluid_bodies_are_within_their_ranges(size: str) -> None:
             assert state.position[:, 1].min() >= 0.35
         if family != "splash":
             assert (velocity == velocity[0]).all()
+
+
+@pytest.mark.parametrize("size", ["full", "mini"])
+def test_shifted_liquid_lies_outside_train(size: str) -> None:
+    """Half has about twice the liquid; half is a column on the floor beside a wall."""
+    (low, high), _ = registry.load().size("fluid", size).bounds
+    states = shifted("fluid", size)
+    for state in states[::2]:
+        assert 0.09 <= state.area <= 0.11
+    for state in states[1::2]:
+        assert state.parameters["family"] == "column"
+        assert 0.04 <= state.area <= 0.06
+        assert not state.velocity.any()
+        width, height = np.ptp(state.position, axis=0)
+        assert 1.4 <= height / width <= 2.6
+        assert state.position[:, 1].min() < low + 0.02
+        gaps = (state.position[:, 0].min() - low, high - state.position[:, 0].max())
+        assert 0.0 <= min(gaps) < 0.01
+        assert low <= state.position.min()
+        assert state.position.max() <= high
+
+
+def test_shifted_scenes_have_three_bodies_apart() -> None:
+    """Three bodies of three materials, each at least 0.04 from the others; together
+    they hold all particles.
+    """
+    for state in shifted("multimaterial"):
+        materials = np.unique(state.material)
+        assert len(materials) == 3
+        names = str(state.parameters["pair"]).split("-")
+        assert len(names) == 3
+        for kind in materials:
+            tree = cKDTree(state.position[state.material == kind])
+            distance, _ = tree.query(state.position[state.material != kind])
+            assert distance.min() >= 0.04 - 2 * 2.0**-20
 
 
 def test_fluid_bodies_cover_their_area_in_one_piece() -> None:
