@@ -6,6 +6,7 @@ twice, in three commits.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 from itertools import pairwise
@@ -13,7 +14,7 @@ from typing import cast
 
 import numpy as np
 import pytest
-from free_surface_scenarios import Part, parameters, scenario, start
+from free_surface_scenarios import Part, scenario, start
 from numpy.typing import NDArray
 from scenario_draws import of_this_turn, state_of
 from scipy.sparse import coo_matrix
@@ -25,11 +26,10 @@ from lagbench.generators.constants import solver_constants
 from lagbench.generators.free_surface import courant
 from lagbench.generators.shapes import Disc, Rectangle
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
+from validation import dam_break
 
 Array = NDArray[np.float64]
 
-FULL = parameters(particles=1250, grid=64, dt=1 / 1200, wall=3)
-FRAME = 20
 LIQUID_IDS = (0, 4, 1, 5, 2, 6, 3, 7)
 PAIR_IDS = (48, 54, 49, 55, 50, 56, 51, 57, 52, 58, 53, 59)
 # Equals stand side by side: families repeat with the id by 4, pairs by 6, and a commit
@@ -54,6 +54,9 @@ class History:
     position: Array
     ratio: Array
     largest_gap: float
+    mach: float  # exceeded by one particle and frame in a thousand
+    liquid_jacobian: float  # J above which 99.9 % of liquid particles and frames are
+    lowest: Array  # smallest J of liquid or Jp of snow at any substep, of each particle
 
 
 def constants(split: str, size: str) -> FreeSurfaceParameters:
@@ -61,6 +64,27 @@ def constants(split: str, size: str) -> FreeSurfaceParameters:
     return cast(
         "FreeSurfaceParameters", solver_constants(registry.load().size(split, size))
     )
+
+
+FULL = dataclasses.replace(constants("multimaterial", "full"), particles=1250, wall=3)
+"""The materials of the data in set pieces of their own."""
+
+FRAME = registry.load().size("multimaterial", "full").substeps_per_frame
+
+
+def wave_speeds(p: FreeSurfaceParameters) -> Array:
+    """Speed of sound by the number of the material: sqrt(M / rho), with the P-wave
+    modulus M = E (1 - nu) / ((1 + nu) (1 - 2 nu)) of a solid.
+    """
+    solids = (
+        (p.jelly_modulus, p.jelly_poisson),
+        (p.snow_modulus, p.snow_poisson),
+        (p.rope_modulus, p.rope_poisson),
+    )
+    moduli = [p.liquid_modulus]
+    for young, nu in solids:
+        moduli.append(young * (1.0 - nu) / ((1.0 + nu) * (1.0 - 2.0 * nu)))
+    return np.sqrt(np.array(moduli) / p.density)
 
 
 def spacing(state: InitialState) -> float:
@@ -79,6 +103,10 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
     total = []
     fastest = 0.0
     gap = 0.0
+    sound = wave_speeds(solver_parameters)[state.material]
+    is_liquid = state.material == Material.LIQUID
+    mach = []
+    jacobian = []
     energy = solver.energy()
     for _ in range(frames // 4):
         kinetic.append(energy.kinetic[0])
@@ -87,6 +115,8 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
         (health,) = solver.health()
         assert health.finite
         fastest = max(fastest, health.max_speed)
+        mach.append(np.linalg.norm(solver.velocity()[0], axis=1) / sound)
+        jacobian.append(solver.volume_ratio()[0, is_liquid])
         rope = solver.position()[0, state.material == Material.ROPE].astype(np.float64)
         if len(rope) and len(kinetic) % 15 == 0:
             gap = max(gap, longest_edge(rope))
@@ -100,6 +130,9 @@ def history(split: str, size: str, scenario_id: int, frames: int) -> History:
         position=solver.position()[0].astype(np.float64),
         ratio=solver.volume_ratio()[0].astype(np.float64),
         largest_gap=gap,
+        mach=float(np.quantile(mach, 0.999)),
+        liquid_jacobian=float(np.quantile(jacobian, 0.001)) if is_liquid.any() else 1.0,
+        lowest=solver.volume_ratio_extremes()[0][0].astype(np.float64),
     )
 
 
@@ -176,6 +209,16 @@ def test_scenarios_are_sound(split: str, scenario_id: int) -> None:
     """
     run = history(split, "full", scenario_id, 600)
     assert_sound(run)
+    assert run.mach <= 0.3
+    assert run.liquid_jacobian >= 0.9
+    p = run.parameters
+    material = run.state.material
+    assert (run.lowest[material == Material.LIQUID] > p.jacobian_min).all()
+    # neither Jp nor the hardening exp(xi (1 - Jp)) meets its numerical bound
+    least_plastic = max(
+        p.snow_jp_min, 1.0 - np.log(p.snow_hardening_max) / p.snow_hardening
+    )
+    assert (run.lowest[material == Material.SNOW] > least_plastic).all()
     assert run.kinetic[-1] <= 0.03 * run.kinetic.max()
     rope = run.state.material == Material.ROPE
     if rope.any():
@@ -223,7 +266,7 @@ def test_settled_liquid(split: str, scenario_id: int) -> None:
 @pytest.mark.parametrize("shape", [Rectangle(0.22, 0.22), Disc(0.125)])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
-    """Dropped by 0.45, 40 to 85 % of the snow is compacted and neighbours are torn
+    """Dropped by 0.45, 25 to 85 % of the snow is compacted and neighbours are torn
     apart.
     """
     height = 3 / 64 + 0.45 + shape.reach[1]
@@ -232,7 +275,7 @@ def test_snow_compacts_and_breaks(shape: Rectangle | Disc, seed: int) -> None:
     solver = start(FULL, [state])
     solver.advance(150 * FRAME)
     is_compacted = solver.volume_ratio()[0] < 1.0
-    assert 0.40 <= is_compacted.mean() <= 0.85
+    assert 0.25 <= is_compacted.mean() <= 0.85
 
     reach = 1.5 * spacing(state)
     tree = cKDTree(state.position)
@@ -274,23 +317,23 @@ def test_jelly_rebounds_and_keeps_its_shape(seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("material", "young"), [(Material.ROPE, 100.0), (Material.JELLY, 30.0)]
+    ("material", "young"), [(Material.ROPE, 150.0), (Material.JELLY, 90.0)]
 )
 def test_bar_rings_at_its_frequency(material: Material, young: float) -> None:
     """A free bar swings lengthwise at sqrt(E / (rho (1 - nu^2))) / 2L to 2 %."""
     length = 0.6
-    weightless = parameters(particles=900, grid=64, dt=1 / 1200, wall=3, gravity=0.0)
+    weightless = dataclasses.replace(FULL, particles=900, gravity=0.0)
     state = scenario(weightless, Part(material, Rectangle(length, 0.05), (0.5, 0.5)))
     mode = np.cos(np.pi * (state.position[:, 0] - 0.5 + 0.5 * length) / length)
     state.velocity[:, 0] = 0.05 * mode
     solver = start(weightless, [state])
     amplitude = []
     for _ in range(1200):
-        solver.advance(1)
+        solver.advance(5)
         amplitude.append(float((solver.velocity()[0, :, 0] * mode).mean()))
     a = np.array(amplitude)
     before = np.flatnonzero(np.diff(np.sign(a)))
-    crossing = (before + a[before] / (a[before] - a[before + 1])) * weightless.dt
+    crossing = (before + a[before] / (a[before] - a[before + 1])) * 5 * weightless.dt
     frequency = 0.5 * (len(crossing) - 1) / (crossing[-1] - crossing[0])
     expected = np.sqrt(young / (1.0 - 0.3**2)) / (2.0 * length)
     assert frequency == pytest.approx(expected, rel=0.02)
@@ -305,3 +348,13 @@ def test_small_sizes_are_sound(split: str, size: str, scenario_id: int) -> None:
     energy.
     """
     assert_sound(history(split, size, scenario_id, 300))
+
+
+@pytest.mark.slow
+def test_dam_break_follows_the_experiment() -> None:
+    """The front of a breaking column is within 10 % of Martin and Moyce (1952), and it
+    never recedes.
+    """
+    result = dam_break.run("full")
+    assert result.deviation <= 0.10
+    assert (np.diff(result.front) > 0.0).all()
