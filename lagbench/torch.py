@@ -79,7 +79,7 @@ class WindowDataset(WindowReader, Dataset[TensorWindow]):
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.
@@ -328,7 +328,7 @@ def predict(
         step: the model.
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: how many of the last given frames the model sees; all by default.
         registry: description of the data sets; ours by default.

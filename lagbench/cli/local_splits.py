@@ -16,7 +16,7 @@ from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
 from .options import JsonFlag, QuietFlag, option
-from .output import print_result, print_warning
+from .output import print_result
 from .progress import progress_bar
 
 OutputOption = Annotated[
@@ -37,7 +37,7 @@ IntervalOption = Annotated[
     float | None, option("--frame-interval SECONDS", "Time between two frames.")
 ]
 BoundsOption = Annotated[
-    str | None, option("--bounds X0,X1,Y0,Y1", "Positions of the walls.")
+    str | None, option("--bounds X0,X1,Y0,Y1[,Z0,Z1]", "Ends of the box.")
 ]
 PeriodicOption = Annotated[
     str | None,
@@ -184,18 +184,20 @@ def _data_options(parameters: Mapping[str, Any]) -> Any:  # noqa: ANN401 (a Data
     return {**read_options(parameters["describe"]), **options}
 
 
-def _parse_bounds(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lowest and the highest position along x and along y."""
+def _parse_bounds(text: str) -> tuple[tuple[float, float], ...]:
+    """Return the lowest and the highest position along each axis."""
     try:
-        left, right, bottom, top = map(float, text.split(","))
+        ends = [float(part) for part in text.split(",")]
+        if len(ends) not in (4, 6):
+            raise ValueError
     except ValueError:
         raise UsageError(
             "bad bounds",
             where="--bounds",
-            expected="x0,x1,y0,y1, as in 0,2,0,1",
+            expected="x0,x1,y0,y1, as in 0,2,0,1; and z0,z1 in three dimensions",
             got=text,
         ) from None
-    return (left, right), (bottom, top)
+    return tuple(zip(ends[::2], ends[1::2], strict=True))
 
 
 def _parse_axes(text: str) -> tuple[str, ...]:
@@ -222,5 +224,3 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
         f"  use it  lagbench template --split {local_split.folder}/",
     ]
     print_result(local_split, lines, as_json=as_json, quiet=quiet)
-    for note in local_split.notes:
-        print_warning(note)

@@ -238,6 +238,17 @@ UNIT_SQUARE = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)])
 """The box of side 1 with four walls."""
 
 
+UNIT_CUBE = Box.from_bounds([(0.0, 1.0), (0.0, 1.0), (0.0, 1.0)])
+"""The box of side 1 with six walls."""
+
+
+def unit_box(dimension: int) -> Box:
+    """Return the box of side 1 with walls on every side, of 2 or 3 dimensions."""
+    if dimension == 2:
+        return UNIT_SQUARE
+    return UNIT_CUBE
+
+
 def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:
     """Return for each axis whether it is named, shape [axis].
 

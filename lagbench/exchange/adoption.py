@@ -53,11 +53,13 @@ def adopt(
 ) -> LocalSplit:
     """Make a local split of trajectories in .npy, .npz or netCDF files.
 
-    A .npy file holds positions [frame, particle, 2], or several trajectories
-    [trajectory, frame, particle, 2]; .npz and netCDF files hold ``position`` and, if
-    they like, ``velocity`` of the same shape, ``material`` [particle] (0 liquid, 1
-    jelly, 2 snow, 3 rope; liquid when absent) and ``wall_velocity`` [4, 2] or [frame,
-    4, 2] (left, right, bottom, top). Nothing is unpickled.
+    A .npy file holds positions [frame, particle, axis], or several trajectories
+    [trajectory, frame, particle, axis], in two or three dimensions; .npz and netCDF
+    files hold ``position`` and, if they like, ``velocity`` of the same shape,
+    ``material`` [particle] (0 liquid, 1 jelly, 2 snow, 3 rope; liquid when absent) and
+    ``wall_velocity`` [wall, axis] or [frame, wall, axis] (left, right, bottom, top,
+    and front, back in three dimensions). Trajectories may differ in their numbers of
+    frames and of particles. Nothing is unpickled.
 
     Args:
         sources: a folder with subfolders ``train``, ``valid`` and ``test``; or files,
@@ -74,7 +76,7 @@ def adopt(
         UsageError: no radius or frame interval, too few trajectories or one named
             twice, a folder that is there, a task that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
-        DataError: positions are not plane, not finite, or outside the unit box, or
+        DataError: positions are not finite, or outside the unit box, or
             particles jump by more than half the box along an axis with walls.
         WorkFailedError: the disk is full or not writable.
     """
@@ -202,7 +204,7 @@ def import_split(
         UnreadableFileError: a file is missing, damaged or laid out otherwise, holds a
             pickle of more than arrays, or particles of a kind that no material is
             known for.
-        DataError: positions are not plane, not finite, or outside the unit box, or
+        DataError: positions are not finite, or outside the unit box, or
             particles jump by more than half the box along an axis with walls.
         WorkFailedError: the disk is full or not writable.
     """
@@ -329,7 +331,7 @@ def _parse_group(
         user_kinds=kinds,
         where=name,
     )
-    origin = np.asarray(metadata.lagbench.origin, np.float32)
+    origin = np.asarray(metadata.lagbench.origin, np.float32)[: shape[2]]
 
     def read() -> Iterator[Frame]:
         for number in range(shape[0]):
@@ -339,4 +341,10 @@ def _parse_group(
                 frame = frame + origin
             yield frame, None
 
-    return Trajectory(name=name, frames=shape[0], material=material, read=read)
+    return Trajectory(
+        name=name,
+        frames=shape[0],
+        material=material,
+        read=read,
+        dimension=shape[2],
+    )

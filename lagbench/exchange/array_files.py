@@ -143,7 +143,7 @@ def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Traje
     position = arrays[POSITION]
     shape = tuple(position.shape)
     check_array(name, shape, _dtype_of(position))
-    frame_count, particle_count, _ = shape
+    frame_count, particle_count, dimension = shape
     velocity = arrays.get(VELOCITY)
     if velocity is not None:
         where = f"{name}, {VELOCITY}"
@@ -162,7 +162,10 @@ def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Traje
         frames=frame_count,
         material=_parse_material(name, arrays.get(MATERIAL), particle_count),
         read=read,
-        wall_velocity=_parse_walls(name, arrays.get(WALLS), frame_count),
+        dimension=dimension,
+        wall_velocity=_parse_walls(
+            name, arrays.get(WALLS), frame_count, dimension=dimension
+        ),
     )
 
 
@@ -188,12 +191,18 @@ def _parse_walls(
     name: str,
     array: Any,  # noqa: ANN401 (arrays, also netCDF's)
     frame_count: int,
+    *,
+    dimension: int,
 ) -> NDArray[np.float64] | None:
-    """Return velocities of walls [length/s], [wall, 2] or [frame, wall, 2], if any."""
+    """Return velocities of walls [length/s], if any.
+
+    The shape is [wall, axis] or [frame, wall, axis], with two walls for each axis.
+    """
     if array is None:
         return None
     where = f"{name}, {WALLS}"
-    _check_numbers(array, "walls", (4, 2), (frame_count, 4, 2), where=where)
+    shape = (2 * dimension, dimension)
+    _check_numbers(array, "walls", shape, (frame_count, *shape), where=where)
     walls = np.asarray(array[...], np.float64)
     with np.errstate(over="ignore"):  # they are stored as float32
         is_finite = np.isfinite(walls.astype(np.float32)).all()

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
-from lagbench.data.box import AXES, UNIT_SQUARE, Box
+from lagbench.data.box import AXES, Box, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
 from lagbench.data.layout import ScenarioKey, expand_path, scenario_path
@@ -89,7 +89,6 @@ class LocalSplit:
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
-    notes: tuple[str, ...] = ()  # what a user should know
 
 
 def output_name(output: str | Path) -> str:
@@ -163,22 +162,12 @@ def _summarise(
 ) -> LocalSplit:
     """Return what is told of a local split that was made."""
     particle_counts = []
-    test_counts = []
     frame_count = 0
     byte_count = 0
     for entry in manifest.files:
         particle_counts.append(entry.particles)
         frame_count += entry.frames
         byte_count += entry.bytes
-        if entry.subset == "test":
-            test_counts.append(entry.particles)
-    notes = []
-    if len(set(test_counts)) > 1:
-        notes.append(
-            f"test scenarios have {min(test_counts)} to {max(test_counts)} particles: "
-            f"the split can be opened and trained on; predictions and scores need one "
-            f"number for all"
-        )
     return LocalSplit(
         folder=folder,
         name=size.split,
@@ -191,7 +180,6 @@ def _summarise(
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=tuple(notes),
     )
 
 
@@ -230,8 +218,9 @@ class SplitBuilder:
     # of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
     # extent of the positions of all particles [length]
-    low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
-    high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
+    low: NDArray[np.float64] = field(default_factory=lambda: np.full(1, np.inf))
+    high: NDArray[np.float64] = field(default_factory=lambda: np.full(1, -np.inf))
+    dimension: int = 0  # components of a position; 0 before the first scenario
     # whether trajectories have velocities of walls; None before the first
     has_walls: bool | None = None
 
@@ -244,6 +233,7 @@ class SplitBuilder:
                 where=trajectory.name,
                 expected=f"at most {MAX_ID + 1}",
             )
+        self._check_dimension(trajectory)
         self._check_walls(trajectory)
         if not self.spacing:
             self.spacing = self._measure_spacing(trajectory)
@@ -267,17 +257,34 @@ class SplitBuilder:
             frames=trajectory.frames,
             frame_interval=1.0 / description.rate,
             material=trajectory.material,
-            particle_mass=description.density * self.spacing**2,
+            particle_mass=description.density * self.spacing**self.dimension,
             wall_velocity=wall_velocity,
             parameters=parameters,
             seed=NO_GENERATOR,
             device=DEVICE,
             generator=NO_GENERATOR,
             licence=description.licence,
+            dimension=self.dimension,
+            periodic=description.periodic,
         ) as writer:
             for position, velocity in self._read_frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
+
+    def _check_dimension(self, trajectory: Trajectory) -> None:
+        """Refuse positions with other components than the bounds or those before."""
+        bounds = self.description.bounds
+        if not self.dimension:
+            self.dimension = trajectory.dimension if bounds is None else len(bounds)
+        if trajectory.dimension == self.dimension:
+            return
+        raise DataError(
+            "positions have another number of components",
+            where=trajectory.name,
+            expected=f"{self.dimension}, as of the bounds or of trajectories before",
+            got=trajectory.dimension,
+            fix="give --bounds with a pair for each axis",
+        )
 
     def _check_walls(self, trajectory: Trajectory) -> None:
         """Refuse trajectories of which only some have velocities of walls."""
@@ -305,7 +312,9 @@ class SplitBuilder:
         self._check_positions(position, where=f"{trajectory.name}, frame 0")
         spacing = description.spacing
         if not spacing:
-            spacing = estimate_spacing(raw_position, description.radius)
+            spacing = estimate_spacing(
+                raw_position, description.radius, description.source_box
+            )
         return spacing / description.transform.scale
 
     def _key(self, scenario: int, subset: str) -> ScenarioKey:
@@ -346,7 +355,7 @@ class SplitBuilder:
     @property
     def _box(self) -> Box:
         """The stated box in the unit box, else the unit box itself."""
-        return self.description.box or UNIT_SQUARE
+        return self.description.box or unit_box(self.dimension)
 
     def _transform_positions(
         self, raw_position: NDArray[np.floating]
@@ -399,7 +408,7 @@ class SplitBuilder:
             raise DataError(
                 "particles lie outside the unit box",
                 where=where,
-                expected="[0, 1] x [0, 1]",
+                expected=" x ".join(["[0, 1]"] * self.dimension),
                 got=format_box(low, high),
                 fix="fit the box of the data into the unit box: --rescale, and "
                 "--bounds if none are stated",
@@ -426,7 +435,7 @@ class SplitBuilder:
             excess = max(excess, left - low[axis], high[axis] - right)
         if excess <= self.spacing:
             return
-        corner = np.asarray(transform.corner)
+        corner = np.asarray(transform.corner[: self.dimension])
         source_low = low * transform.scale + corner
         source_high = high * transform.scale + corner
         raise UsageError(
@@ -493,6 +502,7 @@ class SplitBuilder:
             "frames": self._describe_frames(),
             "bounds": self._bounds(),
             **self._describe_periodic(),
+            **self._describe_particle_counts(),
             "parameters": {},
             "task": task,
         }
@@ -519,7 +529,7 @@ class SplitBuilder:
                 "particles",
                 self._particle_count(),
                 "1",
-                "particles in one test scenario; the most of any where they differ",
+                "particles in one scenario; the most of any where they differ",
             ),
             (
                 "grid",
@@ -534,7 +544,7 @@ class SplitBuilder:
                 "solver steps between recorded frames, 1 where they are unknown",
             ),
             ("frame_rate", description.rate, "1/s", "recorded frames per second"),
-            ("density", description.density, "mass/length^2", "rest density"),
+            ("density", description.density, self._density_unit, "rest density"),
             (
                 "spacing",
                 self.spacing,
@@ -547,19 +557,21 @@ class SplitBuilder:
                 "length of the source",
                 "what a unit of length is in the source",
             ),
-            (
-                "source_x",
-                transform.corner[0],
-                "length of the source",
-                "x in the source of the lower left corner",
-            ),
-            (
-                "source_y",
-                transform.corner[1],
-                "length of the source",
-                "y in the source of the lower left corner",
-            ),
+            *self._list_corner(),
         ]
+
+    def _list_corner(self) -> list[tuple[str, object, str, str]]:
+        """Return name, value, unit and meaning of the corner's place in the source."""
+        rows: list[tuple[str, object, str, str]] = []
+        corner = self.description.transform.corner
+        for axis, place in zip(AXES[: self.dimension], corner, strict=False):
+            meaning = f"{axis} in the source of the lower left corner"
+            rows.append((f"source_{axis}", place, "length of the source", meaning))
+        return rows
+
+    @property
+    def _density_unit(self) -> str:
+        return f"mass/length^{self.dimension}"
 
     def _test_entries(self) -> list[FileEntry]:
         test_entries = []
@@ -569,18 +581,13 @@ class SplitBuilder:
         return test_entries
 
     def _particle_count(self) -> int:
-        """Return the particles of a test scenario; the most of any if they differ."""
-        test_counts = {entry.particles for entry in self._test_entries()}
-        if len(test_counts) == 1:
-            return test_counts.pop()
+        """Return the particles of a scenario; the most of any if they differ."""
         return max(entry.particles for entry in self.entries)
 
     def _bounds(self) -> list[list[float]]:
         """Return the stated walls [length], else the extent of the positions."""
         description = self.description
-        left, bottom = self.low
-        right, top = self.high
-        sides: Bounds = ((left, right), (bottom, top))
+        sides: Bounds = tuple(zip(self.low, self.high, strict=True))
         if description.bounds:
             sides = description.transform.transform_box(description.bounds)
         return [[float(low), float(high)] for low, high in sides]
@@ -590,6 +597,18 @@ class SplitBuilder:
         if not self.description.periodic:
             return {}
         return {"periodic": list(self.description.periodic)}
+
+    def _describe_particle_counts(self) -> dict[str, object]:
+        """Return the key of the numbers of particles; none where all are alike."""
+        scenarios_of: dict[int, list[int]] = {}
+        for entry in self.entries:
+            scenarios_of.setdefault(entry.particles, []).append(entry.scenario)
+        if len(scenarios_of) == 1:
+            return {}
+        counts = {}
+        for count in sorted(scenarios_of):
+            counts[count] = format_ids(scenarios_of[count])
+        return {"particle_counts": counts}
 
     def _describe_frames(self) -> int | dict[int, str]:
         """Return the number of frames; by scenario ids where it differs."""
@@ -677,7 +696,7 @@ class SplitBuilder:
             with read_scenario(scenario_path(self.root, key)) as file:
                 for frame in frames:
                     position = file.read("position", slice(frame, frame + 1))[0]
-                    area = len(position) * self.spacing**2
+                    area = len(position) * self.spacing**self.dimension
                     yield Cloud(position, area)
 
 

@@ -378,6 +378,13 @@ class Score:
     values: Floats  # over the horizon, shape [scenario]
     undefined: tuple[int, ...]  # measured frames without a value, shape [scenario]
 
+    def __repr__(self) -> str:
+        """Return metric, mean and counts; the values are too many."""
+        return (
+            f"<{type(self).__name__}: {self.metric.name} {self.mean:.4g}, "
+            f"{len(self.scenarios)} scenarios, {len(self.frames)} frames>"
+        )
+
     @property
     def mean(self) -> float:
         """Mean over the scenarios that have a value."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
-from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
@@ -20,13 +20,19 @@ from lagbench.references.table import CLASSICAL, NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
-from lagbench.submission.validation import validate
+from lagbench.submission.validation import require_split, validate
 from lagbench.work.machine import available_cores
 from lagbench.work.progress import Meter, Progress
 from lagbench.work.run import run_all
 
 from .card import JSON_NAME, SUBMISSION, ScoreCard, format_scores
 from .flags import Flag, judge_copying, judge_physics, judge_predictability
+from .package_metrics import (
+    PackageMetricError,
+    describe_failure,
+    drop_metric,
+    package_metric_errors,
+)
 from .published_scores import read_scores
 from .references import measurable
 from .scenario import ScenarioJob, ScenarioScores, score_scenario
@@ -40,9 +46,6 @@ from .skill import (
 )
 from .task import ScoredTask, load_scored_task
 
-PREDICTIONS = "predictions.nc"
-"""The usual name of a submission; its scores lie beside it."""
-
 WORTH_WORKERS = 1_000_000
 """Least particles times predicted frames for which worker processes are worth it."""
 
@@ -50,6 +53,7 @@ WORTH_WORKERS = 1_000_000
 def score(
     predictions: str | Path,
     *,
+    split: str | Path | None = None,
     root: str | Path | None = None,
     output_dir: str | Path | None = None,
     workers: int | None = None,
@@ -65,9 +69,11 @@ def score(
 
     Args:
         predictions: a predictions.nc.
+        split: the split to which they must belong, or the path of a local split's
+            folder; the one that they name when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
-        output_dir: folder for the two files; by default that of a predictions.nc, and
-            beside a file of another name the folder of that name.
+        output_dir: folder for the two files; by default the folder of the predictions'
+            name beside them, see :func:`scores_folder`.
         workers: worker processes; by default one per core where the work is worth it.
         scheduler: address of a Dask scheduler that takes the scenarios instead.
         extras: extras whose metrics are measured too, as in ("transport",).
@@ -80,11 +86,12 @@ def score(
             this very file and root; the file is then not validated again.
 
     Returns:
-        The score card; ``files`` names the written files.
+        The score card; ``files`` names the written files. A metric of another package
+        that fails is left out, and ``warnings`` says why.
 
     Raises:
-        UsageError: an extra that brings no metrics, or that is not installed; scores of
-            another method lie where these would go.
+        UsageError: predictions for another split; an extra that brings no metrics, or
+            that is not installed; scores of another method lie where these would go.
         UnreadableFileError: the predictions cannot be read.
         ChecksFailedError: they are not valid.
         DataError: they were made from another data set, or the test subset is missing
@@ -94,6 +101,9 @@ def score(
     """
     metrics = _select_metrics(extras)
     path = Path(predictions).absolute()
+    expected_split = None
+    if split is not None:
+        expected_split, root, _ = locate_split(split, root=root, registry=registry)
     data_root = resolve_root(root)
     splits = load_rooted_registry(data_root, registry)
     folder = scores_folder(Path(predictions))
@@ -109,6 +119,7 @@ def score(
         raise UsageError(
             "the validation is of another file", where=str(path), got=result.path
         )
+    require_split(result, expected_split)
     if examined is not None:
         examined(result)
     result.check()
@@ -131,27 +142,26 @@ def score(
     references: tuple[str, ...] = ()
     if not shipped_references:
         references = measurable(size, data_root)
-    outcomes = score_scenarios(
-        task,
-        path,
-        info,
-        metrics=tuple(metric.name for metric in metrics),
-        references=references,
-        workers=workers,
-        scheduler=scheduler,
-        meter=Meter(progress),
-    )
-
-    # aggregation
-    tallies = {}
-    for row in outcomes[0].tallies:
-        tallies_of_row = {}
-        for outcome in outcomes:
-            tallies_of_row[outcome.scenario] = outcome.tallies[row]
-        tallies[row] = tallies_of_row
-    scores: dict[str, Mapping[str, Score]] = {}
-    for row, row_tallies in tallies.items():
-        scores[row] = aggregate(metrics, row_tallies)
+    warnings = list(result.warnings)
+    meter = Meter(progress)
+    while True:
+        try:
+            outcomes = score_scenarios(
+                task,
+                path,
+                info,
+                metrics=tuple(metric.name for metric in metrics),
+                references=references,
+                workers=workers,
+                scheduler=scheduler,
+                meter=meter,
+            )
+            tallies, scores = _aggregate(outcomes, metrics)
+            break
+        except PackageMetricError as error:
+            # measured again without it: its column is left out, the others are whole
+            metrics = drop_metric(metrics, error.metric)
+            warnings.append(describe_failure(error))
     for name, reference in shipped_references.items():
         scores[name] = reference.scores
 
@@ -172,12 +182,28 @@ def score(
             header, size, scores[SUBMISSION][ranking], shipped_references
         ),
         flags=_judge(task, outcomes, scores),
-        warnings=(*result.warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
+        warnings=(*warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
         preview=next(one.preview for one in outcomes if one.preview is not None),
     )
     if write:
         return _write(card, folder)
     return card
+
+
+def _aggregate(
+    outcomes: Sequence[ScenarioScores], metrics: Sequence[Metric]
+) -> tuple[dict[str, dict[int, Tally]], dict[str, Mapping[str, Score]]]:
+    """Return tallies by row and scenario, and scores by row and metric."""
+    tallies: dict[str, dict[int, Tally]] = {}
+    for row in outcomes[0].tallies:
+        tallies[row] = {}
+        for outcome in outcomes:
+            tallies[row][outcome.scenario] = outcome.tallies[row]
+    scores: dict[str, Mapping[str, Score]] = {}
+    with package_metric_errors():
+        for row, row_tallies in tallies.items():
+            scores[row] = aggregate(metrics, row_tallies)
+    return tallies, scores
 
 
 def _compare_with_solvers(
@@ -210,16 +236,16 @@ def _compare_with_solvers(
 
 
 def scores_folder(predictions: Path) -> Path:
-    """Return the default folder of the scores of a file.
+    """Return the default folder of the scores of a file: beside it, with its name.
 
-    >>> scores_folder(Path("runs/predictions.nc")).as_posix()
-    'runs'
     >>> scores_folder(Path("runs/gns.nc")).as_posix()
     'runs/gns'
+    >>> scores_folder(Path("runs/gns")).as_posix()
+    'runs/gns-scores'
     """
-    if predictions.name == PREDICTIONS:
-        return predictions.parent
-    return predictions.parent / predictions.stem
+    if predictions.suffix:
+        return predictions.parent / predictions.stem
+    return predictions.parent / f"{predictions.name}-scores"
 
 
 def _check_overwriting(path: Path, header: Header) -> None:
@@ -238,7 +264,7 @@ def _check_overwriting(path: Path, header: Header) -> None:
             where=str(path),
             expected=f"no such file, or the scores of {expected}",
             got=present,
-            fix="keep them: --output FOLDER; or remove them first",
+            fix="keep them: --output FOLDER",
         )
 
 

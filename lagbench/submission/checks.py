@@ -176,7 +176,7 @@ def scan_positions(
     for scenario in known_scenarios:
         scan = ScenarioScan(scenario)
         for first, block in predictions.blocks(scenario):
-            hasher.update("position", block)
+            hasher.update("position", predictions.pad(block))
             scan.add(first, block, size)
         scans.append(scan)
 

@@ -274,7 +274,8 @@ def _check_headers(
 ) -> bool:
     """Make the checks that need no positions; return whether positions can be read."""
     has_format = check_format(info, issues)
-    has_dims = check_dims(info, issues)
+    dimension = None if size is None else size.dimension
+    has_dims = check_dims(info, issues, dimension=dimension)
     has_dtype = check_dtype(info, issues)
     check_diverged_at(info, issues)
     if size is None:
@@ -384,4 +385,23 @@ def _without_truth(result: ValidationResult, error: DataError) -> ValidationResu
         skipped[check] = f"{error.what}: {error.where}"
     return dataclasses.replace(
         result, findings=sort_issues(issues), passed=tuple(passed), skipped=skipped
+    )
+
+
+def require_split(result: ValidationResult, expected_split: str | None) -> None:
+    """Refuse predictions for another split than the expected one.
+
+    Predictions that name no split pass here; their validation rejects them.
+
+    Raises:
+        UsageError: the predictions are for another split.
+    """
+    if expected_split is None or result.split in (None, expected_split):
+        return
+    raise UsageError(
+        "the predictions are for another split",
+        where=str(result.path),
+        expected=expected_split,
+        got=ascii(result.split),
+        fix="name that split, or leave --split out",
     )

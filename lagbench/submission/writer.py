@@ -23,11 +23,15 @@ from .format import (
     FORMAT,
     NEVER,
     OPTIONAL,
-    SPACE,
     require_valid_attribute,
 )
 from .issues import quote
-from .task_checks import HASH, dataset_hash_of, frames_to_predict
+from .task_checks import (
+    HASH,
+    dataset_hash_of,
+    frames_to_predict,
+    max_test_particles,
+)
 from .truth import Truth
 
 CHUNK_CACHE_BYTES = 1 << 20
@@ -49,7 +53,7 @@ class PredictionsWriter:
     Args:
         path: file to write.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what makes the predictions.
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
@@ -98,10 +102,16 @@ class PredictionsWriter:
         self._labels: dict[str, Label] = {"method": method}
         self.label(**labels)
 
+    def shape_of(self, scenario: int) -> tuple[int, int, int]:
+        """Return the shape of a scenario: frames to predict, particles, components."""
+        particles = self.size.particle_count(scenario)
+        return self.size.task.horizon, particles, self.size.dimension
+
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape of one scenario: frames to predict, particles, components."""
-        return self.size.task.horizon, self.size.particles, SPACE
+    def _stored_shape(self) -> tuple[int, int, int]:
+        """Shape of a scenario in the file, which may end in padding."""
+        particles = max_test_particles(self.size)
+        return self.size.task.horizon, particles, self.size.dimension
 
     def label(self, **labels: Label) -> None:
         """Set optional attributes, at any time before the exit.
@@ -146,12 +156,15 @@ class PredictionsWriter:
 
     def _write_headers(self) -> None:
         """Create dimensions, coordinates, empty variables and required attributes."""
-        lengths = (len(self._row_of), *self.shape)
+        lengths = (len(self._row_of), *self._stored_shape)
         for name, length in zip(DIMS, lengths, strict=True):
             self._file.createDimension(name, length)
 
         self._create_coordinate("scenario", "scenario", list(self._row_of))
         self._create_coordinate("frame", "frame", frames_to_predict(self.size))
+        particle_counts = [self.size.particle_count(number) for number in self._row_of]
+        if len(set(particle_counts)) > 1:
+            self._create_coordinate("particle_count", "scenario", particle_counts)
         for name in self._variables:
             self._create_variable(name)
         self._file.setncatts(
@@ -211,7 +224,10 @@ class PredictionsWriter:
         row = self._row_of[scenario]
         with self._writing():
             for name, array in values.items():
-                self._file[name][row] = array
+                # Particles that the scenario does not have are padding.
+                padded = np.full(self._stored_shape, np.nan, np.float32)
+                padded[:, : array.shape[1]] = array
+                self._file[name][row] = padded
         if diverged_at is not None:
             self._diverged_at[row] = diverged_at
         self._written.add(scenario)
@@ -297,14 +313,15 @@ class PredictionsWriter:
         numbers = _numbers_of(values, where)
         with np.errstate(over="ignore"):
             array = numbers.astype(np.float32)
-        if array.shape != self.shape:
+        expected_shape = self.shape_of(scenario)
+        if array.shape != expected_shape:
             fix = None
-            if sorted(array.shape) == sorted(self.shape):
+            if sorted(array.shape) == sorted(expected_shape):
                 fix = "transpose it: frame, particle, space"
             raise UsageError(
                 "the shape is another",
                 where=where,
-                expected=self.shape,
+                expected=expected_shape,
                 got=array.shape,
                 fix=fix,
             )
@@ -341,7 +358,7 @@ class PredictionsWriter:
             endian="little",
             fill_value=False,
             fletcher32=True,
-            chunksizes=(1, 1, *self.shape[1:]),
+            chunksizes=(1, 1, *self._stored_shape[1:]),
             chunk_cache=CHUNK_CACHE_BYTES,
         )
         variable.setncatts(ATTRIBUTES[name])
@@ -429,7 +446,7 @@ def write(
             one array [scenario, frame, particle, space] with the test scenarios by
             ascending id.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what made the predictions.
         velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
@@ -538,7 +555,7 @@ def template(
 
     Args:
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         output: file to write.
         overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
@@ -567,7 +584,7 @@ def template(
     with writer:
         for scenario in scenarios:
             last_given = truth.given_frames(scenario)[-1]
-            writer.add(scenario, np.broadcast_to(last_given, writer.shape))
+            writer.add(scenario, np.broadcast_to(last_given, writer.shape_of(scenario)))
     frames = frames_to_predict(entry)
     return TemplateResult(
         path=writer.path,

@@ -32,6 +32,7 @@ from lagbench.exchange import adopt, import_split, local_split
 from lagbench.exchange.adoption import _divide_into_subsets
 from lagbench.exchange.local_split import LocalSplit
 from lagbench.exchange.trajectory import BoxTransform, estimate_spacing
+from lagbench.submission.predictions import open_predictions
 from lagbench.work.progress import Progress
 
 BASIC: dict[str, Any] = {"radius": 0.1, "frame_interval": 0.25}
@@ -307,16 +308,19 @@ def test_scenarios_may_differ_in_length_and_particles(tmp_path: Path) -> None:
     assert lagbench.validate(tmp_path / "p.nc", root=tmp_path).valid
 
 
-def test_unequal_test_scenarios_are_told(tmp_path: Path) -> None:
-    """Test scenarios of different particle numbers can be opened, and a note says what
-    cannot be.
-    """
+def test_unequal_test_scenarios_are_predicted_without_padding(tmp_path: Path) -> None:
+    """Each scenario has as many particles in its predictions as in its file."""
     ragged = [straight_runs(1, particles=p)[0] for p in (40, 40, 30, 20)]
     made = adopted(tmp_path, ragged, test=2, valid=1)
-    assert "20 to 30 particles" in made.notes[0]
-    with pytest.raises(DataError) as caught:
-        lagbench.template(str(made.folder), output=tmp_path / "p.nc")
-    assert caught.value.where.endswith("mine/full/v1/test/0002.nc")
+    path = tmp_path / "p.nc"
+    lagbench.template(str(made.folder), output=path)
+    assert lagbench.validate(path, root=tmp_path).valid
+    with open_predictions(path) as predictions:
+        first = predictions.header.frames[0]
+        for scenario, count in ((2, 30), (3, 20)):
+            frames = predictions.frames(scenario, first, 1)
+            assert frames.shape == (1, count, 2)
+            assert np.isfinite(frames).all()
 
 
 def test_a_wide_box_is_fitted_without_losing_a_bit(tmp_path: Path) -> None:
@@ -391,9 +395,9 @@ BROKEN: dict[
 ] = {
     "flat": (lambda run: run[0], UnreadableFileError, "no positions"),
     "space": (
-        lambda run: np.concatenate([run, run[..., :1]], axis=-1),
+        lambda run: np.concatenate([run, run], axis=-1),
         DataError,
-        "3 components",
+        "4 components",
     ),
     "transposed": (lambda run: run.swapaxes(1, 2), DataError, "40 components"),
     "integer": (lambda run: run.astype(np.int32), UnreadableFileError, "no positions"),
@@ -603,7 +607,7 @@ def test_numbers_may_be_spelled_otherwise(tmp_path: Path, spelled: str) -> None:
             "title",
         ),
         (
-            {"bounds": ((0.0, 1.0),) * 3},
+            {"bounds": ((0.0, 1.0),) * 4},
             "bounds",
         ),
         (

@@ -136,6 +136,15 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
     assert number == WINDOWS
 
 
+def test_windows_say_what_they_hold(train: Open) -> None:
+    """In a terminal and in a notebook."""
+    data = train(history=2, future=1)
+    for text in (repr(data), data._repr_html_()):
+        assert data.size.split in text
+        assert str(len(data)) in text
+        assert "2 given + 1 to predict" in text
+
+
 def test_windows_have_the_first_frame_on_request(train: Open) -> None:
     data = train()
     with_origin = train(origin=True)

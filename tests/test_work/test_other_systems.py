@@ -110,7 +110,7 @@ def test_training_and_predicting(commands: Run, tmp_path: Path) -> None:
         "predict run/weights.pt --no-bench",
         "score predictions.nc",
     )
-    assert (tmp_path / "scores.json").is_file()
+    assert (tmp_path / "predictions/scores.json").is_file()
 
 
 def test_systems_without_some_limits(monkeypatch: pytest.MonkeyPatch) -> None:
