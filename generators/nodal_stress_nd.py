@@ -695,7 +695,9 @@ class NodalStressND:
         ti.loop_config(serialize=ti.static(not self.atomic))
         for s, p in ti.ndrange(self.scenarios, particles):
             now = self.carried[s, p]
-            reached = ti.Vector([ti.abs(now[0]), ti.abs(now[1]), ti.abs(now[2]), now[3]])
+            reached = ti.Vector(
+                [ti.abs(now[0]), ti.abs(now[1]), ti.abs(now[2]), now[3]]
+            )
             self.extremes[s, p] = reached
             self.x[s, p][3] = -now[3]
         ti.loop_config(serialize=ti.static(not self.atomic))

@@ -78,6 +78,8 @@ class ReferenceFullBox:
         momentum = np.zeros((*self.shape, self.dimension))
         count = np.zeros(self.shape)
         volume = np.zeros(self.shape)
+        # what moving walls add; across two walls it keeps its sign
+        drag = np.zeros_like(momentum)
         for node, w, apart in self.stencil():
             flow = self.v + np.einsum("pab,pb->pa", self.c, apart)
             np.add.at(momentum, node, w[:, None] * flow)
@@ -87,23 +89,24 @@ class ReferenceFullBox:
             for side in (0, 1):
                 ghost, edge, far = self.ends(axis, side)
                 if self.box.periodic[axis]:
-                    for q in (momentum, count, volume):
+                    for q in (momentum, count, volume, drag):
                         q[far] += q[ghost]
                         q[ghost] = 0.0
                     continue
                 sign = np.full(self.dimension, self.tangential)
                 sign[axis] = -1.0
-                drag = 2.0 * self.walls[2 * axis + side] * count[ghost][..., None]
-                momentum[edge] += sign * momentum[ghost] + drag
+                speed = self.walls[2 * axis + side]
+                drag[edge] += drag[ghost] + 2.0 * speed * count[ghost][..., None]
+                momentum[edge] += sign * momentum[ghost]
                 count[edge] += count[ghost]
                 volume[edge] += volume[ghost]
-                for q in (momentum, count, volume):
+                for q in (momentum, count, volume, drag):
                     q[ghost] = 0.0
         inner = (slice(1, -1),) * self.dimension
         v = np.zeros_like(momentum)
         r = np.zeros_like(count)
         jbar = np.ones_like(count)
-        v[inner] = momentum[inner] / count[inner][..., None]
+        v[inner] = (momentum + drag)[inner] / count[inner][..., None]
         r[inner] = count[inner] * self.mass
         jbar[inner] = volume[inner] / count[inner]
         return v, r, jbar

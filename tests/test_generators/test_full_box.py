@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -68,18 +69,22 @@ def solid_state() -> InitialState:
     )
 
 
+@functools.cache
+def solid_solver() -> FullBox:
+    """Return a solver of the mixed box; its kernels take seconds to compile."""
+    return FullBox(SOLID)
+
+
 def advanced(state: InitialState, substeps: int) -> dict[str, NDArray[np.float32]]:
     """Return position, velocity and J in the solid box after some substeps."""
-    solver = FullBox(SOLID)
+    solver = solid_solver()
     solver.load([state])
     solver.advance(substeps)
-    values = {
+    return {
         "position": solver.position()[0],
         "velocity": solver.velocity()[0],
         "jacobian": solver.jacobian()[0],
     }
-    solver.close()
-    return values
 
 
 def test_a_square_with_four_walls_has_the_bits_of_the_fast_solver() -> None:
@@ -128,5 +133,5 @@ def test_walls_that_cannot_move_are_refused(wall: int) -> None:
     walls[wall, 1] = 0.1
     state = dataclasses.replace(solid_state(), wall_velocity=walls)
     with pytest.raises(UsageError) as caught:
-        FullBox(SOLID).load([state])
+        solid_solver().load([state])
     assert "wall_velocity" in str(caught.value.where)
