@@ -154,9 +154,9 @@ class BoxTables:
         wall_across = 2 * np.arange(self.dimension) + is_high
 
         subsets = []
-        for subset in itertools.product((False, True), repeat=self.dimension):
-            if any(subset):
-                subsets.append(np.array(subset))
+        for crossed in itertools.product((False, True), repeat=self.dimension):
+            if any(crossed):
+                subsets.append(np.array(crossed))
         ghost = np.full((len(node), len(subsets)), -1, np.int32)
         sign = np.ones((len(subsets), LANES), np.int64)
         wall = np.full((len(node), len(subsets), self.dimension), -1, np.int32)

@@ -190,7 +190,7 @@ def _list_texts(size: Size) -> str:
     return f"; parameters that are no numbers: {', '.join(texts)}"
 
 
-Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
+Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters, FullBoxParameters)
 
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:

@@ -38,14 +38,24 @@ class Kernels(Protocol):
 
     x: _Field  # particle positions [length], filled up with zeros
     carried: _Field  # what particles spread, the velocity first
-    at_rest: tuple[float, ...]  # what a particle at rest spreads at first, shape [4]
-    # derivative of the velocity, first, at the particles, along each axis
-    slopes: Sequence[_Field]
     fill: _Field  # m / (rho dx^d), shape [scenario]
-    # smallest and largest coordinate of a particle; alike along all axes, or of each
-    least: float | Sequence[float]
-    most: float | Sequence[float]
     speed_bound: float  # the CFL bound dx/dt [length/s]
+
+    @property
+    def at_rest(self) -> Sequence[float]:
+        """What a particle at rest spreads at first, shape [4]."""
+
+    @property
+    def slopes(self) -> Sequence[_Field]:
+        """Derivative of the velocity, first, at the particles, along each axis."""
+
+    @property
+    def least(self) -> float | Sequence[float]:
+        """Smallest coordinate of a particle, along all axes or along each [length]."""
+
+    @property
+    def most(self) -> float | Sequence[float]:
+        """Largest coordinate of a particle, along all axes or along each [length]."""
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""

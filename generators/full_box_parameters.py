@@ -5,15 +5,11 @@ NumPy only: a split can be drawn, inspected and tested without Taichi.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 from lagbench.data.box import Box
 
-if TYPE_CHECKING:
-    from lagbench.data.registry import Size
-
-__all__ = ["FullBoxParameters", "full_box_constants"]
+__all__ = ["FullBoxParameters"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,17 +50,3 @@ class FullBoxParameters:
         """Coordinate of the ghost nodes below each axis [cells], shape [axis]."""
         # twelve digits: a sum of halves and whole cells is exact
         return tuple(round(low * self.grid - 0.5, 12) for low in self.box.low)
-
-
-def full_box_constants(size: Size, **fixed: Any) -> FullBoxParameters:  # noqa: ANN401
-    """Return the solver constants that a size names; others keep their defaults."""
-    from .constants import check_constants
-
-    values: dict[str, Any] = {"dt": size.dt}
-    for field in fields(FullBoxParameters):
-        if field.name in size.parameters:
-            values[field.name] = size.value(field.name)
-    values["box"] = size.box
-    values.update(fixed)
-    check_constants(FullBoxParameters, values, size)
-    return FullBoxParameters(**values)
