@@ -110,8 +110,8 @@ def run(size: str) -> DamBreak:
     solver.load([state])
 
     time_unit = math.sqrt(WIDTH / (2.0 * constants.gravity))  # of T [s]
-    times = []
-    fronts = []
+    times: list[float] = []
+    fronts: list[float] = []
     substep = 0
     stride = max(1, tier.substeps_per_frame // 4)
     while not times or times[-1] < EXPERIMENT_TIME[-1]:
