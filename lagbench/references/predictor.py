@@ -232,7 +232,9 @@ def fitted_field(points: Floats, values: Floats) -> Field:
     tree = KDTree(points)
 
     def field(at: Floats) -> Floats:
-        distance, nearest = tree.query(at, k=min(NEAREST, len(points)))
+        neighbours = tree.query(at, k=min(NEAREST, len(points)))
+        distance = np.asarray(neighbours[0])
+        nearest = np.asarray(neighbours[1])
         way = points[nearest] - at[:, None]  # shape [place, neighbour, axis]
         basis = np.concatenate([np.ones((*way.shape[:2], 1)), way], axis=2)
         floor = np.finfo(np.float64).tiny
