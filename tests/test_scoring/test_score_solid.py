@@ -14,6 +14,8 @@ from lagbench.data.local import locate
 from lagbench.data.scenario import read_scenario
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.figures.plot import KINDS, plot_frame
+from lagbench.figures.report.report import write_report
 from lagbench.references.predictor import given_in
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.score_file_checks import find_unreadable
@@ -125,3 +127,21 @@ def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
         error = given.box.displacement(truth, last.astype(np.float64))
         errors[name] = float(np.sqrt(np.mean(error**2)))
     assert errors["projection-2x"] < 0.6 * errors["constant-velocity"]
+
+
+@pytest.mark.slow
+def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None:
+    """Particles, slices and arrows, of the files of a set without walls."""
+    path = tmp_path / "predictions.nc"
+    root = made.folder.parent
+    lagbench.template(made.folder, output=path)
+    validated = lagbench.validate(path, root=root, isolated=False)
+    card = lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+    page = write_report(tmp_path / "report", [card], [path], root=root)
+    text = page.read_text("utf-8")
+    assert "a slice across z" in text
+    assert "arrows" in text
+    scenario = locate(made.folder).size.path(root, 2)
+    for kind in KINDS:
+        picture = plot_frame(scenario, 3, tmp_path / f"{kind}.png", kind=kind)
+        assert picture.stat().st_size > 2000
