@@ -31,6 +31,12 @@ from lagbench.errors import (
 )
 
 TIMEOUT = 30.0  # how long a store may be silent [s]
+
+# An S3 store that accepts and never answers is given up after the product, a minute.
+S3_TIMEOUT = 10.0  # how long one answer is waited for [s]
+S3_ATTEMPTS = 2  # of botocore, also where the store is busy
+S3_ROUNDS = 3  # of s3fs, each with so many attempts
+
 HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")
@@ -270,9 +276,13 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         ) from None
     except Exception as error:  # file systems raise what their libraries raise
         store_error = _translate_error(error, url)
-        # botocore has tried its own errors again by itself, and no permission comes
-        # with time.
+        # botocore has tried its own errors again by itself, as those of a silent store,
+        # and no permission comes with time.
         may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
+        if may_pass and url.startswith(S3):
+            from botocore.exceptions import HTTPClientError
+
+            may_pass = not isinstance(error, HTTPClientError)
         if may_pass and isinstance(store_error, WorkFailedError):
             raise BrokenError(store_error) from error
         raise store_error from error
@@ -393,11 +403,29 @@ def _file_system(url: str) -> tuple[Any, str]:
     key = (scheme, *settings)
     if key not in _systems:
         system, _ = fsspec.core.url_to_fs(
-            url, use_listings_cache=False, skip_instance_cache=True
+            url,
+            use_listings_cache=False,
+            skip_instance_cache=True,
+            **_client_options(url),
         )
+        if url.startswith(S3):
+            system.retries = S3_ROUNDS
         _systems[key] = system
     system = _systems[key]
     return system, system._strip_protocol(url)
+
+
+def _client_options(url: str) -> dict[str, Any]:
+    """Return how long a client of S3 waits, and how often; nothing for other stores."""
+    if not url.startswith(S3):
+        return {}
+    return {
+        "config_kwargs": {
+            "connect_timeout": S3_TIMEOUT,
+            "read_timeout": S3_TIMEOUT,
+            "retries": {"total_max_attempts": S3_ATTEMPTS},
+        }
+    }
 
 
 @contextmanager
