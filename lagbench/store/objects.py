@@ -8,6 +8,7 @@ wrong answer of the store is a DataError, a fault of the connection a WorkFailed
 from __future__ import annotations
 
 import http.client
+import ipaddress
 import os
 import re
 import shutil
@@ -50,6 +51,9 @@ _BUSY_STATUSES = {408, 425, 429, 500, 502, 503, 504}
 # No object has more bytes, and Python refuses to read an endless number.
 _LENGTH = re.compile(r"\d{1,18}")
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
+
+# A last label of digits, or of hexadecimal ones, makes a resolver read numbers.
+_NUMBER = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 
 _systems: dict[tuple[object, ...], Any] = {}
 
@@ -143,6 +147,7 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
             where=url,
             expected="http://host/path",
             got=str(error),
+            fix="name a store: --from URL or --root URL",
         ) from error
     except (OSError, http.client.HTTPException) as error:
         unreachable = StoreUnreachableError(
@@ -179,11 +184,32 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
     parts = urllib.parse.urlsplit(url)
-    if not parts.hostname:
-        raise ValueError("it names no host")
+    _check_host(parts.hostname)
     path = urllib.parse.quote(parts.path, safe=string.punctuation)
     query = urllib.parse.quote(parts.query, safe=string.punctuation)
     return parts._replace(path=path, query=query).geturl()
+
+
+def _check_host(host: str | None) -> None:
+    """Refuse a number that stands for an IP address in another spelling.
+
+    ``0x7f.1`` and ``2130706433`` are this machine to a resolver, and no host to a
+    reader.
+
+    Raises:
+        ValueError: there is no host, or it is such a number.
+    """
+    if not host:
+        raise ValueError("it names no host")
+    last_label = host.rstrip(".").rpartition(".")[2]
+    if not _NUMBER.fullmatch(last_label):
+        return
+    try:
+        ipaddress.IPv4Address(host)
+    except ValueError:
+        raise ValueError(
+            "its host is a number, but no address as in 192.0.2.1"
+        ) from None
 
 
 def _parse_length(text: str | None) -> int | None:
@@ -226,6 +252,18 @@ def _status_error(
 
 class _Redirections(urllib.request.HTTPRedirectHandler):
     """Refuses a redirection to no address, as a fault of the store."""
+
+    def redirect_request(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> urllib.request.Request | None:
+        _check_host(urllib.parse.urlsplit(newurl).hostname)
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
 
     def http_error_302(
         self,
