@@ -168,7 +168,7 @@ def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copie
 
 def _command_words(context: Any) -> str:  # noqa: ANN401 (two copies of click)
     """Return the words of a command below the program's name."""
-    words = []
+    words: list[str] = []
     while context.parent is not None:
         words.insert(0, str(context.info_name))
         context = context.parent
@@ -179,9 +179,9 @@ def _parameter_name(error: Any) -> str:  # noqa: ANN401 (two copies of click)
     """Return how the user writes a parameter, as in --size or FILE."""
     if error.param is None:
         return str(error.param_hint or "an argument")
-    names = [name for name in error.param.opts if name.startswith("--")]
-    if names:
-        return names[0]
+    for name in error.param.opts:
+        if name.startswith("--"):
+            return str(name)
     return str(error.param.metavar or error.param.name)
 
 

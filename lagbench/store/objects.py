@@ -318,9 +318,9 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         # and no permission comes with time.
         may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
         if may_pass and url.startswith(S3):
-            from botocore.exceptions import HTTPClientError
+            from botocore import exceptions
 
-            may_pass = not isinstance(error, HTTPClientError)
+            may_pass = not isinstance(error, exceptions.HTTPClientError)
         if may_pass and isinstance(store_error, WorkFailedError):
             raise BrokenError(store_error) from error
         raise store_error from error
