@@ -156,7 +156,7 @@ def predict(
     side_by_side = _choose_batch(batch, machine, scenarios=len(paths))
 
     with use_threads(threads), explain_memory_errors("lower --batch"):
-        model = _restore_model(
+        model = restore_for_size(
             trained, info, settings, known_splits, where=str(checkpoint)
         ).to(machine)
         rollouts = _TimedRollouts(
@@ -399,7 +399,7 @@ class _TimedRollouts:
         return time.perf_counter()
 
 
-def _restore_model(
+def restore_for_size(
     checkpoint: Checkpoint,
     info: DatasetInfo,
     settings: Sequence[str],

@@ -13,6 +13,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from lagbench.exchange.adoption import adopt
+    from lagbench.figures.pictures import animate, plot
     from lagbench.make.generate import generate
     from lagbench.make.verify import verify
     from lagbench.scoring.compare import compare
@@ -25,11 +27,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "__version__",
+    "adopt",
+    "animate",
     "compare",
     "generate",
     "list_splits",
     "load_manifest",
     "open_split",
+    "plot",
     "score",
     "submission",
     "template",
@@ -49,6 +54,9 @@ _MODULES = {
     "validate": "submission",
     "score": "scoring.score",
     "compare": "scoring.compare",
+    "plot": "figures.pictures",
+    "animate": "figures.pictures",
+    "adopt": "exchange.adoption",
 }
 
 __version__: str

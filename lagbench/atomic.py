@@ -121,9 +121,9 @@ def _process_token() -> str:
 def _write_error(target: Path, option: str, error: OSError) -> WorkFailedError:
     hint = "free disk space"
     if isinstance(error, (FileExistsError, NotADirectoryError)):
-        hint = "a file is where a folder has to be: remove it"
+        hint = "a file is where a folder has to be: move it"
     if isinstance(error, IsADirectoryError):
-        hint = "a folder is where the file has to be: remove it"
+        hint = "a folder is where the file has to be: move it"
     return WorkFailedError(
         "cannot write there",
         where=str(target),

@@ -80,7 +80,7 @@ class WindowDataset(WindowReader, Dataset[TensorWindow]):
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.
@@ -329,7 +329,7 @@ def predict(
         step: the model.
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: how many of the last given frames the model sees; all by default.
         registry: description of the data sets; ours by default.
@@ -340,9 +340,9 @@ def predict(
         [frame, particle, 2].
 
     Raises:
-        UsageError: unknown split, size or subset, history beyond the given frames, or a
-            scenario with fewer frames than the task. All errors are raised when the
-            first scenario is asked for.
+        UsageError: unknown split, size or subset, history beyond the given frames, a
+            scenario with fewer frames than the task, or a model that returns positions
+            that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
     data = WindowDataset(
@@ -381,5 +381,26 @@ def predict(
         with torch.no_grad():
             positions = roll_out(step, given, task.horizon)
         # from [particle, frame, 2] to [frame, particle, 2]
-        by_frame = positions.transpose(0, 1)
-        yield scenario, by_frame.float().cpu().numpy()
+        by_frame = positions.transpose(0, 1).float().cpu().numpy()
+        _check_finite(by_frame, scenario, first_frame=task.input_frames)
+        yield scenario, by_frame
+
+
+def _check_finite(
+    positions: NDArray[np.float32], scenario: int, *, first_frame: int
+) -> None:
+    """Refuse a rollout with positions that no file of predictions may hold."""
+    bad_places = np.argwhere(~np.isfinite(positions))
+    if not len(bad_places):
+        return
+    step, particle, axis = bad_places[0].tolist()
+    raise UsageError(
+        "the model returned positions that are not finite",
+        where=f"predict, scenario {scenario}, frame {first_frame + step}, "
+        f"particle {particle}",
+        expected="finite positions in every frame",
+        got=positions[step, particle, axis],
+        fix="set the network to eval() and check its input scaling; a rollout that "
+        "diverges is frozen at its last finite frame and stored with "
+        "PredictionsWriter.add(..., diverged_at=FRAME)",
+    )

@@ -64,8 +64,9 @@ class ScoreBench:
         )
 
     def score(self, path: Path, **options: Any) -> ScoreCard:
-        """Score a submission and write the card."""
-        return score(path, root=self.root, registry=self.registry, **options)
+        """Score a submission and write the card beside it."""
+        folder = {"output_dir": path.parent}
+        return score(path, root=self.root, registry=self.registry, **(folder | options))
 
 
 def bench_of(generated: GenerationResult, registry: Registry) -> ScoreBench:

@@ -18,6 +18,7 @@ from lagbench.submission.issues import ValidationIssue
 from .entry_file import MAX_ENTRY_BYTES
 from .folder import DEPTH, REFERENCES, SCORES, SUBMISSIONS, VERIFIED, WEIGHTS, Folder
 from .issues import make_issue
+from .verified import MOST_LIST_BYTES
 
 STATUS_KEYS = ("status", "superseded_by")
 """Keys of an entry that decide whether and how it stands on the board."""
@@ -122,7 +123,7 @@ def _lost_own_lines_only(
         return False
     now = None
     if folder.link_in(Path(VERIFIED)) is None:
-        now = _read_small(folder.path / VERIFIED)
+        now = _read_small(folder.path / VERIFIED, longest=MOST_LIST_BYTES)
     if not isinstance(before, dict) or not isinstance(now, dict):
         return False
 
@@ -161,9 +162,9 @@ def _describe_change(folder: Folder, start: str, entry: Path) -> str:
     return "; ".join(clauses) or "another wording"
 
 
-def _read_small(path: Path) -> Any:  # noqa: ANN401
+def _read_small(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: ANN401
     """Return the content of a YAML file; None where it is missing or too long."""
-    if not path.is_file() or path.stat().st_size > MAX_ENTRY_BYTES:
+    if not path.is_file() or path.stat().st_size > longest:
         return None
     return _parse(path.read_bytes())
 

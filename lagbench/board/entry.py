@@ -234,14 +234,110 @@ class ScoreBlock(Strict):
     metrics: Annotated[dict[str, Summary], Field(max_length=500)]
 
 
+class Level(enum.StrEnum):
+    """How far the maintainers followed the scores of an entry, lowest first."""
+
+    AS_SUBMITTED = "as submitted"
+    SCORED_AGAIN = "scored again"  # the submitter's predictions gave the same scores
+    REPRODUCED = "reproduced"  # its model, run by the maintainers, gave them
+    BLIND = "blind"  # its model was also scored on data drawn after it was frozen
+
+    @property
+    def rank(self) -> int:
+        """0 for the lowest level."""
+        return list(Level).index(self)
+
+
+class Reproduction(Strict):
+    """The scores of one model of an entry, predicted anew by the maintainers."""
+
+    seed: Seed | None = None
+    model: Hash = Field(description="of the file of the model")
+    metric: Label = Field(description="the metric that ranks")
+    scenarios: Annotated[int, Field(ge=1)] = Field(description="predicted anew")
+    of: Annotated[int, Field(ge=1)] = Field(description="scenarios of the test subset")
+    submitted: Number = Field(description="mean over these scenarios, as submitted")
+    reproduced: Number = Field(description="mean over them, predicted anew")
+    difference: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        description="of the two, relative to the submitted one"
+    )
+    tolerance: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    greatest: Annotated[float, Field(ge=0, allow_inf_nan=False)] = Field(
+        default=0.0, description="greatest relative difference of one scenario"
+    )
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the scores are the same within the tolerance."""
+        return self.difference <= self.tolerance
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all test scenarios were predicted anew."""
+        return self.scenarios == self.of
+
+
+class MeasuredCost(Strict):
+    """Processor time of a frame on one core, all rows measured in one run."""
+
+    machine: Short
+    date: Date
+    repeats: Annotated[int, Field(ge=1)] = Field(description="the least counts")
+    seconds_per_frame: Seconds = Field(description="of the model [s]")
+    solver: Seconds | None = Field(default=None, description="of our solver [s]")
+    classical: Annotated[dict[str, Seconds], Field(max_length=50)] = Field(
+        default_factory=dict, description="of the classical reference predictors [s]"
+    )
+    naive: Annotated[dict[str, Seconds], Field(max_length=50)] = Field(
+        default_factory=dict, description="of the naive reference predictors [s]"
+    )
+
+    @property
+    def speed_up(self) -> float | None:
+        """Solver time over model time; None without the former."""
+        if self.solver is None:
+            return None
+        return self.solver / self.seconds_per_frame
+
+
+class BlindScore(Strict):
+    """The skill of an entry on a season's data, beside that on the public data."""
+
+    season: Name
+    public: Number
+    blind: Number
+    low: Number = Field(description="lower bound of the 95 % interval of the gap")
+    high: Number
+
+    @property
+    def gap(self) -> float:
+        """Public skill minus blind skill."""
+        return self.public - self.blind
+
+
 class Verification(Strict):
-    """A line of verified.yaml: the maintainers scored these predictions again."""
+    """A line of verified.yaml: what the maintainers found out about an entry."""
 
     scores: Annotated[
         tuple[Hash, ...], Field(min_length=1, max_length=MOST_SEEDS, strict=False)
     ]
     lagbench: Short
     date: Date
+    level: Annotated[Level, Field(strict=False)] = Level.SCORED_AGAIN
+    reproduced: Annotated[
+        tuple[Reproduction, ...], Field(max_length=MOST_SEEDS, strict=False)
+    ] = ()
+    cost: MeasuredCost | None = None
+    blind: BlindScore | None = None
+
+    @model_validator(mode="after")
+    def _check_level(self) -> Self:
+        has_models = bool(self.reproduced)
+        if self.level.rank >= Level.REPRODUCED.rank and not has_models:
+            raise ValueError(f"level: {self.level} needs models that were predicted")
+        if self.level is Level.BLIND and self.blind is None:
+            raise ValueError("level: blind needs a season")
+        return self
 
 
 class About(Strict):

@@ -56,8 +56,12 @@ class SchemaIssue:
         return line
 
 
-def load_plain(path: Path) -> Any:  # noqa: ANN401
+def load_plain(path: Path, *, longest: int = MAX_ENTRY_BYTES) -> Any:  # noqa: ANN401
     """Return the content of a submitter's YAML file as plain values.
+
+    Args:
+        path: the file.
+        longest: the most that it may have [bytes].
 
     Raises:
         UnreadableFileError: no regular file, too long, or no plain YAML.
@@ -70,7 +74,7 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
             "cannot read the YAML file", where=str(path), got=error.strerror
         ) from error
 
-    if is_regular and length <= MAX_ENTRY_BYTES:
+    if is_regular and length <= longest:
         return read_yaml(path)
     if is_regular:
         got = f"{length} bytes"
@@ -79,7 +83,7 @@ def load_plain(path: Path) -> Any:  # noqa: ANN401
     raise UnreadableFileError(
         "not a YAML file of an entry",
         where=str(path),
-        expected=f"a regular file of at most {MAX_ENTRY_BYTES} bytes",
+        expected=f"a regular file of at most {longest} bytes",
         got=got,
         fix="describe the method in a few lines; predictions go elsewhere",
     )

@@ -1,6 +1,8 @@
 """Rescoring: score predictions of entries again, and compare with the leaderboard.
 
-Scoring again is the proof of a score.
+Scoring again is the proof of a score. Predictions that were submitted have equal
+statistics; predictions that the same model made anew have the same score within the
+tolerance of a reproduction.
 """
 
 from __future__ import annotations
@@ -19,12 +21,14 @@ from lagbench.metrics.table import METRICS, STATISTICS
 from lagbench.scoring.card import SUBMISSION, ScoreCard
 from lagbench.scoring.score_file import FILM_RANGE, LEVELS, write_statistics
 from lagbench.scoring.score_file_checks import ScoreFile, read_score_file
+from lagbench.submission.format import Header
 from lagbench.submission.issues import ValidationIssue
 
 from .entry import Entry, EntryFlag, Prediction, ScoredFile
 from .folder import Folder
 from .issues import REFERENCES_ANEW, make_issue
 from .ranking import TOLERANCE, scored_file
+from .reproduce import compare
 
 # step of packed film positions [length]
 FILM_STEP = (FILM_RANGE[1] - FILM_RANGE[0]) / LEVELS
@@ -43,7 +47,10 @@ class Confirmation:
     predictions: Path
     entry: Path  # relative to the leaderboard's folder
     score_file: Path  # likewise
-    difference: float  # greatest relative difference of any statistic
+    # greatest relative difference of any statistic; of predictions made anew, of the
+    # ranking metric
+    difference: float
+    is_anew: bool = False  # whether the positions are not those that were submitted
 
 
 @dataclass(frozen=True)
@@ -84,12 +91,7 @@ class Rescoring:
         yield from self._compare_references(card)
         files = self._files_with(card.predictions_sha256)
         if not files:
-            yield make_issue(
-                "rescored",
-                path,
-                card.predictions_sha256,
-                expected="an entry with these predictions",
-            )
+            yield from self._compare_anew(Path(path), card)
         for file in files:
             # the checks of score files report files that cannot be read
             if file.score_path in self.readable_score_files:
@@ -103,6 +105,69 @@ class Rescoring:
             )
             for prediction, score_path, file in parts:
                 if file.predictions_sha256 == predictions_sha256:
+                    files.append(EntryFile(entry, prediction, score_path, file))
+        return files
+
+    def _compare_anew(self, path: Path, card: ScoreCard) -> Iterator[ValidationIssue]:
+        """Compare predictions made anew by the method and seed of an entry.
+
+        Positions differ in the last digits from processor to processor, so the ranking
+        metric is compared within the tolerance of a reproduction.
+        """
+        files = self._files_of_method(card.header)
+        if not files:
+            yield make_issue(
+                "rescored",
+                path,
+                card.predictions_sha256,
+                expected="an entry with these predictions, or of this method and seed",
+            )
+        for file in files:
+            if file.score_path not in self.readable_score_files:
+                continue
+            stored = read_score_file(self.folder.path / file.score_path).scores
+            reproduction = compare(
+                file.entry.score.ranking_metric,
+                stored.tallies,
+                card.tallies[SUBMISSION],
+                seed=file.prediction.seed,
+                model=card.predictions_sha256,
+                of=len(stored.tallies),
+            )
+            if reproduction.agrees:
+                confirmation = Confirmation(
+                    path,
+                    file.entry.yaml_path,
+                    file.score_path,
+                    reproduction.difference,
+                    is_anew=True,
+                )
+                self.confirmations.append(confirmation)
+                continue
+            yield make_issue(
+                "rescored",
+                path,
+                f"{reproduction.metric} {reproduction.reproduced}",
+                expected=f"{reproduction.submitted} of {file.score_path}, within "
+                f"{reproduction.tolerance:.1%}",
+            )
+
+    def _files_of_method(self, header: Header) -> list[EntryFile]:
+        """Return the files of entries that have the method and seed of a header."""
+        files = []
+        for entry in self.entries:
+            is_same_data = (entry.split, entry.size, entry.dataset.sha256) == (
+                header.split,
+                header.size,
+                header.dataset_sha256,
+            )
+            if not is_same_data or header.method not in (entry.method, entry.name):
+                continue
+            parts = zip(
+                entry.predictions, entry.score_paths, entry.score.files, strict=True
+            )
+            for prediction, score_path, file in parts:
+                if (prediction.seed or 0) == (header.seed or 0):
                     files.append(EntryFile(entry, prediction, score_path, file))
         return files
 

@@ -159,6 +159,12 @@ LEADERBOARD_COMMANDS = (
         example="leaderboard picture cavity --size mini -o cost.svg",
     ),
     CommandEntry(
+        name="reproduce",
+        target="leaderboard:reproduce_command",
+        summary="Run the models of entries again, compare scores, measure costs.",
+        example="leaderboard reproduce cavity/mini/gns --scenarios 2",
+    ),
+    CommandEntry(
         name="show",
         target="leaderboard:show_command",
         summary="Print the tables of the leaderboard.",

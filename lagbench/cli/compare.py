@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from lagbench.scoring.compare import compare
+from lagbench.scoring.tables import LEGEND as ARROW_LEGEND
 from lagbench.scoring.tables import comparison_tables
 
 from .options import JsonFlag, QuietFlag, RootOption, WorkersOption, option
 from .output import print_json, print_line, print_tables
+
+LEGEND = (
+    f"{ARROW_LEGEND}; †: so many frames without a value; "
+    "open: the test finds no difference at 5 %"
+)
 
 
 def compare_command(
@@ -19,17 +26,27 @@ def compare_command(
         typer.Argument(
             metavar="A",
             help="scores.json, scores.nc, predictions.nc, or a folder of a method's "
-            "scores, of one or of several seeds.",
+            "scores, of one or of several seeds; or an entry of the leaderboard, as in "
+            "cavity/mini/gns.",
         ),
     ],
     second: Annotated[
         str,
         typer.Argument(
-            metavar="B", help="The same, or the name of a reference predictor."
+            metavar="B",
+            help="The same, or the name of a reference predictor or of an entry of the "
+            "leaderboard.",
         ),
     ],
     metric: Annotated[
         list[str] | None, option("--metric NAME", "Metric to compare by; repeatable.")
+    ] = None,
+    board: Annotated[
+        Path | None,
+        option(
+            "--board FOLDER",
+            "Folder of the leaderboard; by default leaderboard, or that of the clone.",
+        ),
     ] = None,
     root: RootOption = None,
     workers: WorkersOption = None,
@@ -41,7 +58,9 @@ def compare_command(
 
     The comparison runs over the test scenarios, and over seeds where there are several.
     """
-    result = compare(first, second, metrics=metric or (), root=root, workers=workers)
+    result = compare(
+        first, second, metrics=metric or (), board=board, root=root, workers=workers
+    )
     if as_json:
         print_json(result.as_json())
     elif not quiet:
@@ -49,4 +68,5 @@ def compare_command(
             print_line(f"{result.first}: {first}")
             print_line(f"{result.second}: {second}")
         print_tables(comparison_tables(result, every=every or bool(metric)))
+        print_line(LEGEND)
         print_line(result.verdict)

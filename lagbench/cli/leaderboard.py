@@ -1,4 +1,4 @@
-"""The commands of the group leaderboard: build, check, picture, show."""
+"""The commands of the group leaderboard: build, check, picture, reproduce, show."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from lagbench.board.build import build, collect
 from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
+from lagbench.board.reproduce import ReproduceResult, reproduce
 from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
-from lagbench.errors import DataError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError, format_count
 from lagbench.scoring.references import measured_sizes
 
 from .options import (
@@ -25,6 +26,7 @@ from .options import (
     JsonFlag,
     NewSizeOption,
     QuietFlag,
+    RootOption,
     SplitArgument,
     SplitOption,
     accept_split,
@@ -34,13 +36,14 @@ from .options import (
 )
 from .output import (
     format_bytes,
-    format_count,
     print_json,
     print_line,
     print_result,
     print_tables,
+    print_warning,
 )
 from .progress import progress_bar
+from .solver_bench import bench_apart
 
 
 def build_command(
@@ -162,6 +165,8 @@ def _describe_check(result: CheckResult, *, recording: bool) -> Iterator[str]:
         precision = "exactly"
         if confirmation.difference != 0.0:
             precision = f"to {confirmation.difference:.1e}, relative"
+        if confirmation.is_anew:
+            precision += ", predicted anew"
         yield (
             f"{confirmation.predictions}: confirms {confirmation.score_file} of "
             f"{confirmation.entry} {precision}"
@@ -209,6 +214,122 @@ def picture_command(
     svg = picture(model, tier)
     write_atomically(output, svg.encode(), option="--output")
     print_line(str(output), quiet=quiet)
+
+
+def reproduce_command(
+    entries: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENTRY]...", help="SPLIT/SIZE/METHOD, as in cavity/mini/gns."
+        ),
+    ] = None,
+    every: Annotated[
+        bool, option("--all", "Reproduce every entry that has a model.")
+    ] = False,
+    split: Annotated[
+        str | None, option("--split NAME", "With --all: of this split only.")
+    ] = None,
+    size: Annotated[
+        str | None, option("--size NAME", "With --all: of this size only.")
+    ] = None,
+    scenarios: Annotated[
+        int | None,
+        option("--scenarios N", "Predict a sample of N scenarios; all by default."),
+    ] = None,
+    costs: Annotated[
+        bool, option("--costs", "Measure costs only, on a quiet machine.")
+    ] = False,
+    no_costs: Annotated[bool, option("--no-costs", "Measure no costs.")] = False,
+    again: Annotated[
+        bool, option("--again", "Run again what is recorded already.")
+    ] = False,
+    recording: Annotated[
+        bool, option("--record/--no-record", "Write the result to verified.yaml.")
+    ] = True,
+    threads: Annotated[
+        int, option("--threads N", "Threads of a model on the CPU.", min=1)
+    ] = 1,
+    board: BoardOption = DEFAULT_BOARD,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Run the models of entries again, compare scores, measure costs.
+
+    Exit code 0: all scores agree; 1: some differ; 2: no such entry, or one without a
+    model; 3: a model cannot be read; 4: data are missing; 5: out of memory or disk.
+    """
+    if bool(entries) == every:
+        raise UsageError(
+            "name entries, or ask for all",
+            where="ENTRY or --all",
+            expected="one of the two",
+            got="both" if every else "neither",
+            fix="lagbench leaderboard reproduce cavity/mini/gns",
+        )
+    if (costs and no_costs) or (scenarios is not None and scenarios < 1):
+        raise UsageError(
+            "the options do not fit together",
+            where="--costs, --no-costs, --scenarios",
+            expected="--costs or --no-costs, and at least one scenario",
+        )
+    with progress_bar(quiet=quiet or as_json) as progress:
+        result = reproduce(
+            board,
+            entries or (),
+            split=split,
+            size=size,
+            scenarios=scenarios,
+            scores=not costs,
+            costs=not no_costs,
+            again=again,
+            recording=recording,
+            threads=threads,
+            root=root,
+            time_solver=_time_solver,
+            progress=progress,
+        )
+    if not as_json:
+        for failure in result.failures:
+            typer.echo(f"{failure.entry}: {failure.error}", err=True)
+    print_result(
+        result.to_plain(), _describe_reproduced(result), as_json=as_json, quiet=quiet
+    )
+    raise typer.Exit(result.exit_code)
+
+
+def _time_solver(split: str, size: str) -> float | None:
+    """Return the solver's time of a frame [s], None where it cannot run."""
+    try:
+        return bench_apart(split, size).seconds_per_frame
+    except LagbenchError as error:
+        print_warning(f"the solver is not timed: {error}")
+        return None
+
+
+def _describe_reproduced(result: ReproduceResult) -> Iterator[str]:
+    for path, line in result.lines.items():
+        name = path.removeprefix("submissions/").removesuffix(".yaml")
+        for one in line.reproduced:
+            seed = ""
+            if one.seed is not None:
+                seed = f", seed {one.seed}"
+            verdict = "reproduced"
+            if not one.agrees:
+                verdict = "NOT reproduced"
+            yield (
+                f"{name}{seed}: {verdict}, {one.metric} {one.reproduced:.6g} against "
+                f"{one.submitted:.6g} ({one.difference:.1e} relative, {one.scenarios} "
+                f"of {one.of} scenarios)"
+            )
+        if line.cost is not None:
+            milliseconds = 1e3 * line.cost.seconds_per_frame
+            yield f"{name}: {milliseconds:.3g} ms per frame, {line.cost.machine}"
+    yield (
+        f"{result.folder}: {format_count(len(result.lines), 'entry')}, "
+        f"{format_count(len(result.differing), 'difference')}, "
+        f"{format_count(len(result.failures), 'failure')}"
+    )
 
 
 def show_command(

@@ -23,6 +23,10 @@ OutputOption = Annotated[
     Path,
     option("--output -o FOLDER", "New folder; its last part is the split's name."),
 ]
+AdoptedOutputOption = Annotated[
+    Path | None,
+    option("--output -o FOLDER", "New folder; its last part is the split's name."),
+]
 DescribeOption = Annotated[
     Path | None,
     option(
@@ -37,7 +41,7 @@ IntervalOption = Annotated[
     float | None, option("--frame-interval SECONDS", "Time between two frames.")
 ]
 BoundsOption = Annotated[
-    str | None, option("--bounds X0,X1,Y0,Y1", "Positions of the walls.")
+    str | None, option("--bounds X0,X1,Y0,Y1[,Z0,Z1]", "Ends of the box.")
 ]
 PeriodicOption = Annotated[
     str | None,
@@ -124,7 +128,7 @@ def adopt_command(
             metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them."
         ),
     ],
-    output: OutputOption,
+    output: AdoptedOutputOption = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
@@ -132,7 +136,10 @@ def adopt_command(
         int | None, option("--valid N", "Trajectories of valid; a tenth by default.")
     ] = None,
     test: Annotated[
-        int | None, option("--test N", "Trajectories of test; a tenth by default.")
+        int | None,
+        option(
+            "--test N", "Trajectories of test; a tenth, but six of many, by default."
+        ),
     ] = None,
     bounds: BoundsOption = None,
     periodic: PeriodicOption = None,
@@ -184,18 +191,20 @@ def _data_options(parameters: Mapping[str, Any]) -> Any:  # noqa: ANN401 (a Data
     return {**read_options(parameters["describe"]), **options}
 
 
-def _parse_bounds(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the lowest and the highest position along x and along y."""
+def _parse_bounds(text: str) -> tuple[tuple[float, float], ...]:
+    """Return the lowest and the highest position along each axis."""
     try:
-        left, right, bottom, top = map(float, text.split(","))
+        ends = [float(part) for part in text.split(",")]
+        if len(ends) not in (4, 6):
+            raise ValueError
     except ValueError:
         raise UsageError(
             "bad bounds",
             where="--bounds",
-            expected="x0,x1,y0,y1, as in 0,2,0,1",
+            expected="x0,x1,y0,y1, as in 0,2,0,1; and z0,z1 in three dimensions",
             got=text,
         ) from None
-    return (left, right), (bottom, top)
+    return tuple(zip(ends[::2], ends[1::2], strict=True))
 
 
 def _parse_axes(text: str) -> tuple[str, ...]:
@@ -222,5 +231,6 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
         f"  use it  lagbench template --split {local_split.folder}/",
     ]
     print_result(local_split, lines, as_json=as_json, quiet=quiet)
-    for note in local_split.notes:
-        print_warning(note)
+    if not quiet:
+        for note in local_split.notes:
+            print_warning(note)

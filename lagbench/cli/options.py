@@ -48,7 +48,7 @@ PresentSizeOption = Annotated[
     str | None,
     option(
         "--size NAME",
-        "tiny, mini or full; by default the only size that has data here.",
+        "tiny, mini or full; by default the only one with data here, of several mini.",
     ),
 ]
 SubsetOption = Annotated[

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lagbench.data.local import locate, suggest_repair
-from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.figures.animate import animate, check_ending
-from lagbench.figures.plot import check_kind, contact_sheet, plot_frame
-from lagbench.figures.recording import open_recording
-from lagbench.store.copy import update_working_copy
+from lagbench.data.local import locate
+from lagbench.figures.pictures import (
+    SCENARIO_ENDING,
+    animate,
+    plot,
+    require_folder_of,
+)
+from lagbench.figures.plot import contact_sheet
 
 from .options import (
     JsonFlag,
@@ -74,17 +74,19 @@ def plot_command(
         split_name = choose_split(source, split)
         tier = locate(split_name, size, root=root).size
         page = output or Path(f"{tier.split}-{tier.name}-sheet.png")
-        _require_folder_of(page)
+        require_folder_of(page)
         path = contact_sheet(split_name, tier.name, page, root=root, dpi=dpi)
     else:
-        check_kind(kind)
-        file = _scenario_file(
-            source, split=split, size=size, scenario=scenario, root=root
+        path = plot(
+            _choose_source(source, split),
+            size=size,
+            scenario=scenario,
+            frame=frame,
+            kind=kind,
+            output=output,
+            dpi=dpi,
+            root=root,
         )
-        with _blame_named_files(source):
-            path = output or _frame_path(file, frame)
-            _require_folder_of(path)
-            plot_frame(file, frame, path, kind=kind, dpi=dpi)
     print_result({"output": path}, [str(path)], as_json=as_json, quiet=quiet)
 
 
@@ -114,116 +116,23 @@ def animate_command(
     quiet: QuietFlag = False,
 ) -> None:
     """Make an MP4 or GIF film of a scenario, or of two side by side."""
-    if output is not None:
-        check_ending(output)
-    file = _scenario_file(source, split=split, size=size, scenario=scenario, root=root)
-    second_file = None
-    if beside is not None:
-        second_file = _scenario_file(
-            source, split=split, size=size, scenario=beside, root=root
-        )
-    elif second:
-        second_file = Path(second)
-    path = output or Path(f"{_data_name(file)}.mp4")
-    _require_folder_of(path)
-    with _blame_named_files(source, second):
-        animate(
-            file,
-            path,
-            beside=second_file,
-            kind=kind,
-            frames_per_second=fps,
-            every=every,
-            quiet=quiet or as_json,
-        )
+    path = animate(
+        _choose_source(source, split),
+        size=size,
+        scenario=scenario,
+        beside=second if beside is None else beside,
+        kind=kind,
+        frames_per_second=fps,
+        every=every,
+        output=output,
+        root=root,
+        quiet=quiet or as_json,
+    )
     print_result({"output": path}, [str(path)], as_json=as_json, quiet=quiet)
 
 
-def _scenario_file(
-    source: str | None,
-    *,
-    split: str | None,
-    size: str | None,
-    scenario: int | None,
-    root: Path | None,
-) -> Path:
-    """Return the scenario file that a user names by its path, or by split and id.
-
-    Raises:
-        UsageError: no split, or no such split, size or scenario.
-        DataError: the scenario is not on this machine.
-    """
-    if source is not None and source.endswith(".nc"):
-        return Path(source)
-    tier, folder, _ = locate(choose_split(source, split), size, root=root)
-    if scenario is None:
-        scenario_id = tier.subsets["test"][0]
-        repair = "--subset test"
-    else:
-        scenario_id = scenario
-        repair = f"--scenarios {scenario}"
-    tier.subset_of(scenario_id)  # refuses an id that the size does not have
-    update_working_copy(tier, folder, [scenario_id])
-    path = tier.path(folder, scenario_id)
-    if not path.is_file():
-        raise DataError(
-            f"scenario {scenario_id} is not there",
-            where=str(path),
-            fix=suggest_repair(tier, repair, root=folder),
-        )
-    return path
-
-
-@contextmanager
-def _blame_named_files(*names: str | None) -> Iterator[None]:
-    """Turn errors of damaged data into errors of the files that the user named.
-
-    Raises:
-        UnreadableFileError: a named file cannot be read or is no scenario file.
-        DataError: a file of a data set is damaged.
-    """
-    try:
-        yield
-    except DataError as error:
-        place = error.where or ""
-        paths = [str(Path(name)) for name in names if name]
-        if not any(place.startswith(path) for path in paths):
-            raise
-        raise UnreadableFileError(
-            error.what,
-            where=error.where,
-            expected=error.expected
-            or "a scenario file, as lagbench generate writes it",
-            got=error.got,
-            fix="name another file, or a split: lagbench plot cavity --size tiny",
-        ) from error
-
-
-def _require_folder_of(path: Path) -> None:
-    """Refuse a path whose folder does not exist.
-
-    Raises:
-        UsageError: there is no such folder.
-    """
-    if not path.parent.is_dir():
-        raise UsageError(
-            "there is no such folder",
-            where="--output",
-            got=path.parent,
-            fix="create it first",
-        )
-
-
-def _frame_path(file: Path, frame: int) -> Path:
-    with open_recording(file) as recording:
-        frame_number = recording.frame_number(frame)
-    return Path(f"{_data_name(file)}-frame{frame_number}.png")
-
-
-def _data_name(file: Path) -> str:
-    """Return split-size-scenario where the path names them, else the file's name."""
-    parts = file.absolute().parts
-    # A file of a data set lies at ROOT/SPLIT/SIZE/v1/SUBSET/SCENARIO.nc.
-    if len(parts) > 5 and parts[-3].startswith("v"):
-        return f"{parts[-5]}-{parts[-4]}-{file.stem}"
-    return file.stem
+def _choose_source(source: str | None, split: str | None) -> str:
+    """Return the scenario file or the split that a user names."""
+    if source is not None and source.endswith(SCENARIO_ENDING):
+        return source
+    return choose_split(source, split)

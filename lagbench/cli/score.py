@@ -12,8 +12,13 @@ from lagbench.data.local import locate_split
 from lagbench.errors import UsageError
 from lagbench.figures.report.report import check_folder, write_report
 from lagbench.scoring.card import ScoreCard
-from lagbench.scoring.score import score
-from lagbench.scoring.tables import card_tables, flag_lines
+from lagbench.scoring.score import score, scores_folder
+from lagbench.scoring.tables import (
+    brief_lines,
+    brief_table,
+    card_tables,
+    flag_lines,
+)
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.validation import validate
 
@@ -27,7 +32,7 @@ from .options import (
 )
 from .output import print_errors, print_json, print_line, print_tables
 from .progress import progress_bar
-from .validate import ExpectedSplitOption, require_split
+from .validate import ExpectedSplitOption
 
 
 def score_command(
@@ -43,8 +48,8 @@ def score_command(
         Path | None,
         option(
             "--output -o FOLDER",
-            "Folder of the scores; by default that of predictions.nc. A file of "
-            "another name, and each of several files, gets a folder of its own name.",
+            "Folder of the scores; by default gns/ beside gns.nc. Each of several "
+            "files gets a folder of its own name in it.",
         ),
     ] = None,
     report: Annotated[
@@ -57,7 +62,9 @@ def score_command(
         str,
         option("--extras NAMES", "Extras whose metrics are added, as in transport."),
     ] = "",
-    every: Annotated[bool, option("--all", "Show every metric.")] = False,
+    every: Annotated[
+        bool, option("--all", "Show every metric, frame of interest and scenario.")
+    ] = False,
     all_references: Annotated[
         bool,
         option(
@@ -69,7 +76,8 @@ def score_command(
 ) -> None:
     """Score a predictions.nc; write scores.json and scores.nc.
 
-    The scores stand beside those of the reference predictors.
+    It shows the skill and the first metrics beside those of the best reference
+    predictor.
     """
     if len(predictions) > 1 and report is None:
         raise UsageError(
@@ -80,31 +88,27 @@ def score_command(
             fix="add --report FOLDER",
         )
     folders = _score_folders(predictions, output)
-    expected_split = None
     if split is not None:
-        expected_split, root, _ = locate_split(split, root=root)
+        root = locate_split(split, root=root).root
     validations: Sequence[ValidationResult | None] = [None]
     if len(predictions) > 1:
         validations = _validate_together(predictions, root)
     if report is not None:
         check_folder(report)
 
-    def examine(result: ValidationResult) -> None:
-        require_split(result, expected_split)
-        print_errors(result)
-
     cards = []
     for path, folder, validation in zip(predictions, folders, validations, strict=True):
         with progress_bar(quiet=quiet) as progress:
             card = score(
                 path,
+                split=split,
                 root=root,
                 output_dir=folder,
                 workers=workers,
                 scheduler=scheduler,
                 extras=tuple(name for name in extras.split(",") if name),
                 progress=progress,
-                examined=examine,
+                examined=print_errors,
                 validated=validation,
             )
         cards.append(card)
@@ -136,10 +140,17 @@ def _print_cards(
     cards: Sequence[ScoreCard], *, every: bool, all_references: bool
 ) -> None:
     for card in cards:
-        print_tables(card_tables(card, every=every, floors=all_references))
-        for line in flag_lines(card):
+        if every or all_references:
+            print_tables(card_tables(card, every=every, floors=all_references))
+            lines = flag_lines(card)
+        else:
+            print_tables([brief_table(card)])
+            lines = brief_lines(card)
+        for line in lines:
             print_line(line)
         print_line(f"written: {', '.join(map(str, card.files))}")
+    if not every:
+        print_line("more: --all shows every metric, frame of interest and scenario")
 
 
 def _score_folders(
@@ -155,7 +166,9 @@ def _score_folders(
     folders = []
     files_by_folder: dict[Path, Path] = {}
     for path in predictions:
-        folder = (output or path.parent) / path.stem
+        folder = scores_folder(path)
+        if output is not None:
+            folder = output / folder.name
         folders.append(folder)
         other_path = files_by_folder.setdefault(folder.resolve(), path)
         if other_path is not path:

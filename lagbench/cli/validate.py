@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from lagbench.data.local import locate_split
-from lagbench.errors import UsageError
+from lagbench.errors import format_count
 from lagbench.submission.issues import ValidationResult
-from lagbench.submission.validation import validate
+from lagbench.submission.validation import require_split, validate
 
 from .options import JsonFlag, QuietFlag, RootOption, option
-from .output import format_count, print_result
+from .output import print_result
 
 ExpectedSplitOption = Annotated[
     str | None,
@@ -41,25 +41,6 @@ def validate_command(
     require_split(result, expected_split)
     print_result(result, _describe(result), as_json=as_json, quiet=quiet)
     raise typer.Exit(result.exit_code)
-
-
-def require_split(result: ValidationResult, expected_split: str | None) -> None:
-    """Refuse predictions for another split than the expected one.
-
-    Predictions that name no split pass here; their validation rejects them.
-
-    Raises:
-        UsageError: the predictions are for another split.
-    """
-    if expected_split is None or result.split in (None, expected_split):
-        return
-    raise UsageError(
-        "the predictions are for another split",
-        where=str(result.path),
-        expected=expected_split,
-        got=ascii(result.split),
-        fix="name that split, or leave --split out",
-    )
 
 
 def _describe(result: ValidationResult) -> list[str]:

@@ -4,4 +4,4 @@ MATERIALS = ("liquid", "jelly", "snow", "rope")
 """Meaning of the values 0, 1, 2, 3 of ``material``."""
 
 WALLS = ("left", "right", "bottom", "top")
-"""Order of the walls wherever an array has a wall axis."""
+"""Order of the walls in two dimensions; :data:`lagbench.data.box.WALL_NAMES` in any."""

@@ -109,7 +109,7 @@ class Box:
         """Volume, or the area in two dimensions [length^dimension]."""
         return float(np.prod(self.lengths))
 
-    @property
+    @cached_property
     def centre(self) -> Floats:
         """Middle of the box [length], shape [axis]."""
         return np.asarray(np.mean(self.bounds, axis=1), np.float64)
@@ -124,7 +124,7 @@ class Box:
         """Upper wall of each axis [length], inf along periodic axes, shape [axis]."""
         return np.where(self.periodic, np.inf, self.high)
 
-    @property
+    @cached_property
     def is_periodic(self) -> bool:
         """Whether any axis repeats itself."""
         return any(self.periodic)
@@ -236,6 +236,17 @@ class Box:
 
 UNIT_SQUARE = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)])
 """The box of side 1 with four walls."""
+
+
+UNIT_CUBE = Box.from_bounds([(0.0, 1.0), (0.0, 1.0), (0.0, 1.0)])
+"""The box of side 1 with six walls."""
+
+
+def unit_box(dimension: int) -> Box:
+    """Return the box of side 1 with walls on every side, of 2 or 3 dimensions."""
+    if dimension == 2:
+        return UNIT_SQUARE
+    return UNIT_CUBE
 
 
 def parse_periodic(axes: Sequence[str], dimension: int) -> tuple[bool, ...]:

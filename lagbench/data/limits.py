@@ -171,6 +171,40 @@ def check_frames(
             )
 
 
+def check_particle_counts(
+    size: str,
+    counts: Mapping[int, Sequence[int]],
+    subsets: Mapping[str, Sequence[int]],
+    particles: Value | None,
+) -> None:
+    """Refuse impossible numbers of particles, and scenarios that no subset has.
+
+    Args:
+        size: name of the size.
+        counts: ids of the scenarios by their number of particles.
+        subsets: scenario ids of each subset.
+        particles: the parameter of that name, which is the largest of the numbers.
+
+    Raises:
+        ValueError: a number is impossible, or a scenario is unknown or stands twice.
+    """
+    if not counts:
+        return
+    key = f"sizes.{size}.particle_counts"
+    ids: list[int] = []
+    for count, scenarios in counts.items():
+        if not NEEDED["particles"].holds(count):
+            raise ValueError(f"{key}: expected {NEEDED['particles']}; got {count!r}")
+        ids += scenarios
+    if sorted(ids) != _all_ids(subsets):
+        raise ValueError(f"{key}: must name every scenario once")
+    if max(counts) != particles:
+        raise ValueError(
+            f"{key}: expected the parameter particles, {particles!r}, as the largest; "
+            f"got {max(counts)}"
+        )
+
+
 def _all_ids(subsets: Mapping[str, Sequence[int]]) -> list[int]:
     """Return the ids of all subsets, ascending."""
     ids: list[int] = []

@@ -333,18 +333,19 @@ def locate(
 
     Args:
         split: name or path, see :func:`locate_split`.
-        size: name of the size; the only one with data when None.
+        size: name of the size; when None the only one with data, of several mini, which
+            :func:`locate_new` would make.
         root: folder of all data sets.
         registry: the other splits; ours when None.
 
     Raises:
         UsageError: see :func:`locate_split`; the split has no such size, or none is
-            named where several sizes or no sizes have data.
+            named where no size has data, or several but not mini.
         UnreadableFileError: the description of the local split is not right.
     """
     location = locate_split(split, root=root, registry=registry)
     if size is None:
-        size = _only_size(location)
+        size = _size_with_data(location)
     tier = location.registry.size(location.name, size)
     return SizeLocation(tier, location.root, location.registry)
 
@@ -363,16 +364,21 @@ def locate_new(
     """
     location = locate_split(split, root=root, registry=registry)
     if size is None:
-        sizes = location.registry.split(location.name).sizes
-        size = DEFAULT_NEW_SIZE
-        if size not in sizes:
-            size = next(iter(sizes))
+        size = _size_to_make(location)
     tier = location.registry.size(location.name, size)
     return SizeLocation(tier, location.root, location.registry)
 
 
-def _only_size(location: SplitLocation) -> str:
-    """Return the only size of a split, or the only one with data."""
+def _size_to_make(location: SplitLocation) -> str:
+    """Return mini, or the first size of a split without mini."""
+    sizes = location.registry.split(location.name).sizes
+    if DEFAULT_NEW_SIZE in sizes:
+        return DEFAULT_NEW_SIZE
+    return next(iter(sizes))
+
+
+def _size_with_data(location: SplitLocation) -> str:
+    """Return the only size of a split, or the only one with data; of several mini."""
     split, root, registry = location
     sizes = []
     for name in registry.split(split).sizes:
@@ -386,6 +392,8 @@ def _only_size(location: SplitLocation) -> str:
         return sizes_with_data[0].name
     if len(sizes) == 1 and not sizes_with_data:
         return sizes[0].name
+    if any(size.name == DEFAULT_NEW_SIZE for size in sizes_with_data):
+        return DEFAULT_NEW_SIZE
     raise _size_error(location, sizes, sizes_with_data)
 
 
@@ -405,7 +413,8 @@ def _size_error(
     else:
         what = "no size is named, and none is there"
         data = f"no data of {location.name}"
-        hint = suggest_repair(sizes[-1], root=location.root)
+        size = location.registry.size(location.name, _size_to_make(location))
+        hint = suggest_repair(size, root=location.root)
     return UsageError(
         what,
         where="--size",

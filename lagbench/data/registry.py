@@ -41,7 +41,13 @@ from lagbench.errors import (
 
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
-from .limits import Value, check_frames, check_parameters, check_subsets
+from .limits import (
+    Value,
+    check_frames,
+    check_parameters,
+    check_particle_counts,
+    check_subsets,
+)
 from .limits import format_ids as format_ids
 from .limits import parse_ids as parse_ids
 
@@ -159,8 +165,11 @@ class _SizeEntry(_RegistryModel):
 
     subsets: dict[str, Ids]
     frames: int | dict[int, Ids]
-    bounds: tuple[Interval, Interval] = Field(strict=False)
+    # ends of the box along x, y and, in three dimensions, z [length]
+    bounds: tuple[Interval, ...] = Field(strict=False, min_length=2, max_length=3)
     periodic: tuple[str, ...] = Field((), strict=False)  # axes without walls, by name
+    # ids of the scenarios by their number of particles, where it differs
+    particle_counts: dict[int, Ids] = Field(default_factory=dict)
     parameters: dict[str, Value]
     task: Task
 
@@ -189,8 +198,10 @@ class Size(BaseModel):
     generator: str
     subsets: dict[str, tuple[int, ...]]
     frames: int | dict[int, tuple[int, ...]]
-    bounds: tuple[Interval, Interval]
+    bounds: tuple[Interval, ...]  # of x, y and, in three dimensions, z [length]
     periodic: tuple[str, ...] = ()  # names of the axes that have no walls
+    # ids of the scenarios by their number of particles; empty where all have as many
+    particle_counts: dict[int, tuple[int, ...]] = {}
     parameters: dict[str, Parameter]
     task: Task
     measured: Measured | None = None
@@ -253,9 +264,21 @@ class Size(BaseModel):
         return float(liquid_viscosity.value)
 
     @property
+    def dimension(self) -> int:
+        """Number of axes of the box: 2 or 3."""
+        return len(self.bounds)
+
+    @property
     def particles(self) -> int:
-        """Particles in one scenario."""
+        """Particles in one scenario; the most of any where scenarios differ."""
         return int(self.value("particles"))
+
+    def particle_count(self, scenario: int) -> int:
+        """Return how many particles a scenario has."""
+        for count, ids in self.particle_counts.items():
+            if scenario in ids:
+                return count
+        return self.particles
 
     @property
     def grid(self) -> int:
@@ -329,9 +352,11 @@ class Size(BaseModel):
 
     def file_bytes(self, scenario: int) -> int:
         """Return the most bytes of a scenario's file, on average over a data set."""
-        # Position and velocity are two float32 each; header, constants and chunk index
-        # take 64 KiB at most.
-        value_bytes = self.frame_count(scenario) * self.particles * 16
+        # Position and velocity are float32; header, constants and chunk index take
+        # 64 KiB at most.
+        particle_bytes = 8 * self.dimension
+        particles = self.particle_count(scenario)
+        value_bytes = self.frame_count(scenario) * particles * particle_bytes
         return value_bytes + 64 * 1024
 
     def longest_file(self, scenario: int) -> int:
@@ -370,6 +395,8 @@ class Split(_RegistryModel):
             check_subsets(name, size.subsets)
             task_frames = size.task.input_frames + size.task.horizon
             check_frames(name, size.frames, size.subsets, task_frames=task_frames)
+            particles = size.parameters.get("particles", declared.get("particles"))
+            check_particle_counts(name, size.particle_counts, size.subsets, particles)
         return self
 
 
@@ -416,6 +443,7 @@ class Registry:
             frames=entry.frames,
             bounds=entry.bounds,
             periodic=entry.periodic,
+            particle_counts=entry.particle_counts,
             parameters=parameters,
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),

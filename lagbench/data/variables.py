@@ -13,8 +13,6 @@ import numpy as np
 
 from . import MATERIALS
 
-AXES = ("x", "y")
-
 ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
     "frame": {
         "long_name": "frame number; 0 is the state when recording starts",
@@ -57,7 +55,7 @@ The hash is checked elsewhere, and a patch release may reword a name.
 MAX_VALUES_PER_FRAME = 20_000_000
 """Values of a variable in one frame, which is read at once.
 
-These are two for each of ten million particles.
+These are two for each of ten million particles, or three for each of 6.7 million.
 """
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -21,10 +21,10 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.errors import DataError, LagbenchError, WorkFailedError
 
-from . import WALLS
+from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
 from .layout import ScenarioKey
-from .variables import AXES, MAX_VALUES_PER_FRAME, expected_attributes
+from .variables import MAX_VALUES_PER_FRAME, expected_attributes
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
@@ -56,6 +56,7 @@ _RESERVED = {
     "hashed_parameters",
     "content_sha256",
     "facts",
+    "periodic",
 }
 """Attributes of the file that no parameter may be named like."""
 
@@ -75,10 +76,11 @@ class ScenarioWriter:
         frame_interval: time between frames [s].
         material: value of :data:`lagbench.data.MATERIALS` for each particle, shape
             [particle].
-        particle_mass: mass of a particle, rho L^2 / n.
-        wall_velocity: [length/s], shape [wall, 2] (constant) or [frame, wall, 2], entry
-            f acting from frame f-1 to f; walls left, right, bottom, top; None
-            where there are no moving walls (free surface).
+        particle_mass: mass of a particle, rho L^d / n.
+        wall_velocity: [length/s], shape [wall, axis] (constant) or [frame, wall, axis],
+            entry f acting from frame f-1 to f; walls left, right, bottom, top and, in
+            three dimensions, front, back, those of periodic axes too; None where there
+            are no moving walls (free surface).
         parameters: physical parameters by name: finite numbers and strings. Each
             becomes an attribute and enters the content hash. ``start_frame`` is one of
             them.
@@ -88,6 +90,10 @@ class ScenarioWriter:
         reynolds: Reynolds number, the parameter ``reynolds_number``; None where there
             is none.
         licence: licence of the data; not hashed.
+        dimension: number of axes of the box, 2 or 3.
+        periodic: names of the axes without walls. They are the hashed attribute
+            ``periodic``, which files without such axes do not have.
+        has_velocity: whether velocities of the solver are stored.
     """
 
     def __init__(
@@ -107,8 +113,11 @@ class ScenarioWriter:
         generator: str,
         reynolds: float | None = None,
         licence: str = "CC-BY-4.0",
+        dimension: int = 2,
+        periodic: Sequence[str] = (),
+        has_velocity: bool = True,
     ) -> None:
-        most_particles = MAX_VALUES_PER_FRAME // len(AXES)
+        most_particles = MAX_VALUES_PER_FRAME // dimension
         if particles > most_particles:
             raise DataError(
                 "too many particles",
@@ -123,6 +132,9 @@ class ScenarioWriter:
         if reynolds is not None:
             all_parameters["reynolds_number"] = reynolds
         self._parameters = _check_parameters(all_parameters, path)
+        if periodic:
+            parse_periodic(periodic, dimension)
+            self._parameters["periodic"] = " ".join(periodic)
         self._labels = {
             "seed": seed,
             "device": device,
@@ -130,7 +142,8 @@ class ScenarioWriter:
             "license": licence,
         }
 
-        self._lengths = {"frame": frames, "particle": particles, "space": len(AXES)}
+        self._moving_names = ("position", "velocity") if has_velocity else ("position",)
+        self._lengths = {"frame": frames, "particle": particles, "space": dimension}
         # dimensions and values by name of the variable
         self._constants: dict[str, tuple[tuple[str, ...], NDArray[Any]]] = {}
         self._add_constant("frame", ("frame",), np.arange(frames, dtype=np.int32))
@@ -138,7 +151,9 @@ class ScenarioWriter:
         self._add_constant("time", ("frame",), times)
         numbers = np.arange(particles, dtype=np.int32)
         self._add_constant("particle", ("particle",), numbers)
-        self._add_constant("space", ("space",), np.array(AXES, dtype=object))
+        self._add_constant(
+            "space", ("space",), np.array(AXES[:dimension], dtype=object)
+        )
         materials = np.asarray(material, dtype=np.int8)
         self._add_constant("material", ("particle",), materials)
         mass = np.asarray(particle_mass, dtype=np.float64)
@@ -155,9 +170,11 @@ class ScenarioWriter:
         self._constants[name] = (dims, values)
 
     def _add_walls(self, wall_velocity: NDArray[np.float32]) -> None:
-        self._lengths["wall"] = len(WALLS)
-        self._add_constant("wall", ("wall",), np.array(WALLS, dtype=object))
-        shape = (self._lengths["frame"], len(WALLS), len(AXES))
+        dimension = self._lengths["space"]
+        wall_names = WALL_NAMES[: 2 * dimension]
+        self._lengths["wall"] = len(wall_names)
+        self._add_constant("wall", ("wall",), np.array(wall_names, dtype=object))
+        shape = (self._lengths["frame"], len(wall_names), dimension)
         values = np.broadcast_to(wall_velocity, shape)
         self._add_constant("wall_velocity", ("frame", "wall", "space"), values)
 
@@ -173,7 +190,7 @@ class ScenarioWriter:
             self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
             stack.callback(self._file.close)
             self._write_constants()
-            for name in ("position", "velocity"):
+            for name in self._moving_names:
                 self._create(name, np.dtype(np.float32), ("frame", "particle", "space"))
             attributes = self._file_attributes(version("lagbench"))
             self._file.setncatts(attributes | self._parameter_attributes())
@@ -205,21 +222,34 @@ class ScenarioWriter:
         }
 
     def append(
-        self, position: NDArray[np.float32], velocity: NDArray[np.float32]
+        self,
+        position: NDArray[np.float32],
+        velocity: NDArray[np.float32] | None = None,
     ) -> None:
         """Add the next frame.
 
         Args:
-            position: particle positions [length], shape [particle, 2].
-            velocity: particle velocities of the solver [length/s], shape [particle, 2].
+            position: particle positions [length], shape [particle, axis].
+            velocity: particle velocities of the solver [length/s], of the same shape;
+                None in a file without velocities.
 
         Raises:
-            DataError: the arrays have the wrong shape or type, or all frames are
-                written.
+            DataError: the arrays have the wrong shape or type, all frames are written,
+                or there are velocities against what the writer was told.
             WorkFailedError: the disk is full or not writable.
         """
-        shape = (self._lengths["particle"], len(AXES))
-        for name, values in (("position", position), ("velocity", velocity)):
+        arrays = {"position": position}
+        if velocity is not None:
+            arrays["velocity"] = velocity
+        if len(arrays) != len(self._moving_names):
+            raise DataError(
+                "velocities come with every frame or with none",
+                where=str(self.path),
+                expected=", ".join(self._moving_names),
+                got=", ".join(arrays),
+            )
+        shape = (self._lengths["particle"], self._lengths["space"])
+        for name, values in arrays.items():
             if values.shape != shape:
                 raise DataError(
                     "a frame has the wrong shape",

@@ -138,7 +138,7 @@ def export(
         _check_walls(entry, is_closed=is_closed, has_unit_box=has_unit_box)
         walls = WallParticles(entry.bounds, spacing)
     wall_thickness = None if walls is None else walls.thickness
-    origin = (0.0, 0.0)
+    origin = (0.0,) * entry.dimension
     if form is Format.LAGRANGEBENCH_H5 and (is_measured_from_walls or walls):
         origin = _lower_corner(entry, wall_thickness or 0.0)
 
@@ -192,13 +192,12 @@ def export(
     )
 
 
-def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, float]:
+def _lower_corner(size: Size, wall_thickness: float) -> tuple[float, ...]:
     """Return what is taken off every position of lagrangebench-h5 [length].
 
     No position is below 0 then, where the bounds start.
     """
-    (left, _), (bottom, _) = size.bounds
-    return round_down(left - wall_thickness), round_down(bottom - wall_thickness)
+    return tuple(round_down(low - wall_thickness) for low, _ in size.bounds)
 
 
 def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
@@ -224,9 +223,9 @@ def _check_target(folder: Path, files: Sequence[Path], *, force: bool) -> None:
 
 def _check_walls(size: Size, *, is_closed: bool, has_unit_box: bool) -> None:
     """Refuse wall particles where no wall can move, or where they have no room."""
-    if not is_closed or size.box.is_periodic:
+    if not is_closed or size.box.is_periodic or size.dimension != 2:
         raise UsageError(
-            "the box has no walls that could move on every side",
+            "the box is no plane one with walls that could move on every side",
             where="--wall-particles",
             got=size.split,
         )
@@ -243,7 +242,10 @@ def _inspect_scenario(path: Path, size: Size) -> tuple[float, bool]:
     with read_scenario(path) as file:
         mass = float(file.read("particle_mass"))
         is_closed = "wall_velocity" in file.variables
-    return math.sqrt(mass / float(size.value("density"))), is_closed
+    volume = mass / float(size.value("density"))
+    if size.dimension == 2:
+        return math.sqrt(volume), is_closed
+    return math.cbrt(volume), is_closed
 
 
 def _is_free_slip(size: Size) -> bool:
@@ -336,7 +338,7 @@ def _wall_travel(
 
 
 def _write_h5(
-    path: Path, runs: Iterable[Run], *, length: int, origin: tuple[float, float]
+    path: Path, runs: Iterable[Run], *, length: int, origin: tuple[float, ...]
 ) -> list[tuple[int, int]]:
     """Write one subset for LagrangeBench, whole or not at all.
 
@@ -358,9 +360,9 @@ def _write_h5(
                 group = out.create_group(f"{len(shapes):05d}")
                 stored = group.create_dataset(
                     "position",
-                    shape=(length, particle_count, 2),
+                    shape=(length, particle_count, len(shift)),
                     dtype="<f4",
-                    chunks=(1, particle_count, 2),
+                    chunks=(1, particle_count, len(shift)),
                     compression="gzip",
                     compression_opts=1,
                     shuffle=True,

@@ -65,8 +65,10 @@ def write(path: Path, runs: Iterable[Run]) -> list[tuple[int, int]]:
         zipfile.ZipFile(temporary, "w") as archive,
     ):
         for frame_count, read_position, kinds in runs:
-            position = np.empty((frame_count, len(kinds), 2), np.float32)
-            for frame in range(frame_count):
+            first = read_position(0)
+            position = np.empty((frame_count, *first.shape), np.float32)
+            position[0] = first
+            for frame in range(1, frame_count):
                 position[frame] = read_position(frame)
             pair = np.empty(2, dtype=object)
             pair[0] = position
@@ -162,6 +164,7 @@ def _parse_trajectory(name: str, item: object, kinds: Mapping[int, str]) -> Traj
         frames=len(position),
         material=material,
         read=lambda: ((frame, None) for frame in position),
+        dimension=position.shape[2],
         parameters=parameters,
     )
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import temporary_name
-from lagbench.data.box import AXES, UNIT_SQUARE, Box
+from lagbench.data.box import AXES, Box, unit_box
 from lagbench.data.checksums import HASHED_SUBSETS
 from lagbench.data.grid import Placement
 from lagbench.data.layout import ScenarioKey, expand_path, scenario_path
@@ -47,8 +47,10 @@ from .trajectory import (
     Bounds,
     Description,
     Trajectory,
+    check_name,
     estimate_spacing,
 )
+from .velocities import MotionCheck
 
 SIZE = "full"
 """Size of every local split."""
@@ -97,6 +99,71 @@ def output_name(output: str | Path) -> str:
     return Path(os.path.abspath(expand_path(output, "--output"))).name
 
 
+def check_output(output: str | Path | None) -> Path:
+    """Return the folder to make.
+
+    Raises:
+        UsageError: none is named, its name cannot be that of a local split, or it is
+            there.
+    """
+    if output is None:
+        raise UsageError(
+            "no folder is named",
+            where="--output",
+            expected="a folder to make, whose last part names the split",
+            got="nothing",
+            fix="name one, as in -o own",
+        )
+    folder = Path(os.path.abspath(expand_path(output, "--output")))
+    check_name(folder.name)
+    if folder.name in load().splits:
+        raise UsageError(
+            f"{folder.name!r} is one of the splits of lagbench",
+            where="--output",
+            expected="another name",
+            got=str(folder),
+            fix="use another name, as in -o own",
+        )
+    if os.path.lexists(folder):
+        raise UsageError(
+            "the folder is there already",
+            where=str(folder),
+            expected="a folder to make",
+            got="a folder or file of that name",
+            fix="use another name: --output",
+        )
+    return folder
+
+
+def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
+    """Return the extent of all positions of trajectories, in their length.
+
+    Raises:
+        DataError: a position is not finite.
+    """
+    low: NDArray[np.float64] | None = None
+    high: NDArray[np.float64] | None = None
+    for trajectory in trajectories:
+        for number, (position, _) in enumerate(trajectory.read()):
+            frame_low = position.min(axis=0).astype(np.float64)
+            frame_high = position.max(axis=0).astype(np.float64)
+            if not (np.isfinite(frame_low).all() and np.isfinite(frame_high).all()):
+                raise DataError(
+                    "a position is not finite",
+                    where=f"{trajectory.name}, frame {number}",
+                    expected="numbers",
+                    fix="end the trajectory before this frame",
+                )
+            if low is None or high is None or len(low) != len(frame_low):
+                low = frame_low
+                high = frame_high
+            low = np.minimum(low, frame_low)
+            high = np.maximum(high, frame_high)
+    if low is None or high is None:
+        return ()
+    return tuple(zip(low.tolist(), high.tolist(), strict=True))
+
+
 def make_local_split(
     description: Description,
     subsets: Mapping[str, Iterable[Trajectory]],
@@ -121,20 +188,7 @@ def make_local_split(
         DataError: a subset is empty, or a trajectory cannot be used.
         WorkFailedError: the disk is full or not writable.
     """
-    folder = Path(os.path.abspath(expand_path(output, "--output")))
-    if description.name in load().splits:
-        raise UsageError(
-            f"{description.name!r} is one of the splits of lagbench",
-            where="--output",
-            fix="use another name",
-        )
-    if folder.exists():
-        raise UsageError(
-            "the folder is there already",
-            where=str(folder),
-            fix="remove it, or use another name",
-        )
-
+    folder = check_output(output)
     meter = Meter(progress)
     with _staging_folder(folder) as root:
         builder = SplitBuilder(description, root)
@@ -150,6 +204,8 @@ def make_local_split(
                     "a subset is empty",
                     where=subset,
                     expected="at least one trajectory",
+                    got="none",
+                    fix="put one there",
                 )
         manifest = builder.finish(command)
         built = root / description.name
@@ -163,22 +219,12 @@ def _summarise(
 ) -> LocalSplit:
     """Return what is told of a local split that was made."""
     particle_counts = []
-    test_counts = []
     frame_count = 0
     byte_count = 0
     for entry in manifest.files:
         particle_counts.append(entry.particles)
         frame_count += entry.frames
         byte_count += entry.bytes
-        if entry.subset == "test":
-            test_counts.append(entry.particles)
-    notes = []
-    if len(set(test_counts)) > 1:
-        notes.append(
-            f"test scenarios have {min(test_counts)} to {max(test_counts)} particles: "
-            f"the split can be opened and trained on; predictions and scores need one "
-            f"number for all"
-        )
     return LocalSplit(
         folder=folder,
         name=size.split,
@@ -191,7 +237,6 @@ def _summarise(
         spacing=spacing,
         bytes=byte_count,
         dataset_sha256=str(manifest.dataset_sha256),
-        notes=tuple(notes),
     )
 
 
@@ -230,8 +275,9 @@ class SplitBuilder:
     # of the scenarios written so far, by id
     entries: list[FileEntry] = field(default_factory=list)
     # extent of the positions of all particles [length]
-    low: NDArray[np.float64] = field(default_factory=lambda: np.full(2, np.inf))
-    high: NDArray[np.float64] = field(default_factory=lambda: np.full(2, -np.inf))
+    low: NDArray[np.float64] = field(default_factory=lambda: np.full(1, np.inf))
+    high: NDArray[np.float64] = field(default_factory=lambda: np.full(1, -np.inf))
+    dimension: int = 0  # components of a position; 0 before the first scenario
     # whether trajectories have velocities of walls; None before the first
     has_walls: bool | None = None
 
@@ -244,6 +290,7 @@ class SplitBuilder:
                 where=trajectory.name,
                 expected=f"at most {MAX_ID + 1}",
             )
+        self._check_dimension(trajectory)
         self._check_walls(trajectory)
         if not self.spacing:
             self.spacing = self._measure_spacing(trajectory)
@@ -267,17 +314,34 @@ class SplitBuilder:
             frames=trajectory.frames,
             frame_interval=1.0 / description.rate,
             material=trajectory.material,
-            particle_mass=description.density * self.spacing**2,
+            particle_mass=description.density * self.spacing**self.dimension,
             wall_velocity=wall_velocity,
             parameters=parameters,
             seed=NO_GENERATOR,
             device=DEVICE,
             generator=NO_GENERATOR,
             licence=description.licence,
+            dimension=self.dimension,
+            periodic=description.periodic,
         ) as writer:
             for position, velocity in self._read_frames(trajectory):
                 writer.append(position, velocity)
         self.entries.append(describe_file(self.root, key))
+
+    def _check_dimension(self, trajectory: Trajectory) -> None:
+        """Refuse positions with other components than the bounds or those before."""
+        bounds = self.description.bounds
+        if not self.dimension:
+            self.dimension = trajectory.dimension if bounds is None else len(bounds)
+        if trajectory.dimension == self.dimension:
+            return
+        raise DataError(
+            "positions have another number of components",
+            where=trajectory.name,
+            expected=f"{self.dimension}, as of the bounds or of trajectories before",
+            got=trajectory.dimension,
+            fix="give --bounds with a pair for each axis",
+        )
 
     def _check_walls(self, trajectory: Trajectory) -> None:
         """Refuse trajectories of which only some have velocities of walls."""
@@ -305,7 +369,9 @@ class SplitBuilder:
         self._check_positions(position, where=f"{trajectory.name}, frame 0")
         spacing = description.spacing
         if not spacing:
-            spacing = estimate_spacing(raw_position, description.radius)
+            spacing = estimate_spacing(
+                raw_position, description.radius, description.source_box
+            )
         return spacing / description.transform.scale
 
     def _key(self, scenario: int, subset: str) -> ScenarioKey:
@@ -327,6 +393,7 @@ class SplitBuilder:
         """
         description = self.description
         before: NDArray[np.float32] | None = None
+        motion = MotionCheck(rate=description.rate)
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
             position = self._transform_positions(raw_position)
@@ -335,18 +402,22 @@ class SplitBuilder:
                 step = self._box.displacement(before, position.astype(np.float64))
                 self._check_steps(step, where=where)
             if raw_velocity is not None:
-                yield position, self._transform_velocities(raw_velocity, where=where)
+                velocity = self._transform_velocities(raw_velocity, where=where)
+                if before is not None:
+                    motion.add(velocity, step)
+                yield position, velocity
             elif before is not None:
                 velocity = (step * description.rate).astype(np.float32)
                 if number == 1:
                     yield before, velocity
                 yield position, velocity
             before = position
+        motion.finish(where=f"{trajectory.name}, velocity")
 
     @property
     def _box(self) -> Box:
         """The stated box in the unit box, else the unit box itself."""
-        return self.description.box or UNIT_SQUARE
+        return self.description.box or unit_box(self.dimension)
 
     def _transform_positions(
         self, raw_position: NDArray[np.floating]
@@ -386,7 +457,12 @@ class SplitBuilder:
             velocity = raw_velocity / self.description.transform.scale
             velocity = velocity.astype(np.float32)
         if not np.isfinite(velocity).all():
-            raise DataError("a velocity is not finite", where=where)
+            raise DataError(
+                "a velocity is not finite",
+                where=where,
+                expected="numbers",
+                fix="leave velocities out: they are then differences of positions",
+            )
         return velocity
 
     def _check_positions(self, position: NDArray[np.float32], *, where: str) -> None:
@@ -394,15 +470,20 @@ class SplitBuilder:
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise DataError("a position is not finite", where=where)
+            raise DataError(
+                "a position is not finite",
+                where=where,
+                expected="numbers",
+                fix="end the trajectory before this frame",
+            )
         if (low < 0.0).any() or (high > 1.0).any():
             raise DataError(
                 "particles lie outside the unit box",
                 where=where,
-                expected="[0, 1] x [0, 1]",
+                expected=" x ".join(["[0, 1]"] * self.dimension),
                 got=format_box(low, high),
-                fix="fit the box of the data into the unit box: --rescale, and "
-                "--bounds if none are stated",
+                fix="fit the box of the data into the unit box: --rescale, with "
+                "--bounds if its walls are known",
             )
         self._check_stated_bounds(low, high, where=where)
         self.low = np.minimum(self.low, low)
@@ -426,7 +507,7 @@ class SplitBuilder:
             excess = max(excess, left - low[axis], high[axis] - right)
         if excess <= self.spacing:
             return
-        corner = np.asarray(transform.corner)
+        corner = np.asarray(transform.corner[: self.dimension])
         source_low = low * transform.scale + corner
         source_high = high * transform.scale + corner
         raise UsageError(
@@ -493,6 +574,7 @@ class SplitBuilder:
             "frames": self._describe_frames(),
             "bounds": self._bounds(),
             **self._describe_periodic(),
+            **self._describe_particle_counts(),
             "parameters": {},
             "task": task,
         }
@@ -519,7 +601,7 @@ class SplitBuilder:
                 "particles",
                 self._particle_count(),
                 "1",
-                "particles in one test scenario; the most of any where they differ",
+                "particles in one scenario; the most of any where they differ",
             ),
             (
                 "grid",
@@ -534,7 +616,7 @@ class SplitBuilder:
                 "solver steps between recorded frames, 1 where they are unknown",
             ),
             ("frame_rate", description.rate, "1/s", "recorded frames per second"),
-            ("density", description.density, "mass/length^2", "rest density"),
+            ("density", description.density, self._density_unit, "rest density"),
             (
                 "spacing",
                 self.spacing,
@@ -547,19 +629,21 @@ class SplitBuilder:
                 "length of the source",
                 "what a unit of length is in the source",
             ),
-            (
-                "source_x",
-                transform.corner[0],
-                "length of the source",
-                "x in the source of the lower left corner",
-            ),
-            (
-                "source_y",
-                transform.corner[1],
-                "length of the source",
-                "y in the source of the lower left corner",
-            ),
+            *self._list_corner(),
         ]
+
+    def _list_corner(self) -> list[tuple[str, object, str, str]]:
+        """Return name, value, unit and meaning of the corner's place in the source."""
+        rows: list[tuple[str, object, str, str]] = []
+        corner = self.description.transform.corner
+        for axis, place in zip(AXES[: self.dimension], corner, strict=False):
+            meaning = f"{axis} in the source of the lower left corner"
+            rows.append((f"source_{axis}", place, "length of the source", meaning))
+        return rows
+
+    @property
+    def _density_unit(self) -> str:
+        return f"mass/length^{self.dimension}"
 
     def _test_entries(self) -> list[FileEntry]:
         test_entries = []
@@ -569,18 +653,13 @@ class SplitBuilder:
         return test_entries
 
     def _particle_count(self) -> int:
-        """Return the particles of a test scenario; the most of any if they differ."""
-        test_counts = {entry.particles for entry in self._test_entries()}
-        if len(test_counts) == 1:
-            return test_counts.pop()
+        """Return the particles of a scenario; the most of any if they differ."""
         return max(entry.particles for entry in self.entries)
 
     def _bounds(self) -> list[list[float]]:
         """Return the stated walls [length], else the extent of the positions."""
         description = self.description
-        left, bottom = self.low
-        right, top = self.high
-        sides: Bounds = ((left, right), (bottom, top))
+        sides: Bounds = tuple(zip(self.low, self.high, strict=True))
         if description.bounds:
             sides = description.transform.transform_box(description.bounds)
         return [[float(low), float(high)] for low, high in sides]
@@ -590,6 +669,18 @@ class SplitBuilder:
         if not self.description.periodic:
             return {}
         return {"periodic": list(self.description.periodic)}
+
+    def _describe_particle_counts(self) -> dict[str, object]:
+        """Return the key of the numbers of particles; none where all are alike."""
+        scenarios_of: dict[int, list[int]] = {}
+        for entry in self.entries:
+            scenarios_of.setdefault(entry.particles, []).append(entry.scenario)
+        if len(scenarios_of) == 1:
+            return {}
+        counts = {}
+        for count in sorted(scenarios_of):
+            counts[count] = format_ids(scenarios_of[count])
+        return {"particle_counts": counts}
 
     def _describe_frames(self) -> int | dict[int, str]:
         """Return the number of frames; by scenario ids where it differs."""
@@ -677,7 +768,7 @@ class SplitBuilder:
             with read_scenario(scenario_path(self.root, key)) as file:
                 for frame in frames:
                     position = file.read("position", slice(frame, frame + 1))[0]
-                    area = len(position) * self.spacing**2
+                    area = len(position) * self.spacing**self.dimension
                     yield Cloud(position, area)
 
 

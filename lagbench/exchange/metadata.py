@@ -231,8 +231,10 @@ class LagbenchKeys(BaseModel):
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
-    origin: Pair = (0.0, 0.0)  # what was taken off every position [length]
-    bounds: tuple[Pair, Pair] | None = None  # walls before that [length]
+    # what was taken off every position [length], for each axis that there is
+    origin: tuple[FiniteFloat, ...] = (0.0, 0.0, 0.0)
+    # walls before that [length]
+    bounds: tuple[Pair, ...] | None = Field(None, min_length=2, max_length=3)
     # distance of neighbouring particles at first [length]
     spacing: Annotated[float, Field(gt=0)] | None = None
     density: Annotated[float, Field(gt=0)] | None = None  # rest density [mass/length^2]
@@ -251,20 +253,22 @@ class SourceMetadata(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    bounds: tuple[Pair, Pair]  # box of the source [its length]
+    # box of the source [its length]
+    bounds: tuple[Pair, ...] = Field(min_length=2, max_length=3)
     radius: Length = Field(alias="default_connectivity_radius")  # [its length]
     # time between frames [s]; None where none is stated
     frame_interval: Length | None = Field(alias="dt")
     # distance of neighbouring particles at first [its length]
     spacing: Length | None = Field(alias="dx")
-    # along x and y
-    periodic: tuple[bool, bool] = Field(alias="periodic_boundary_conditions")
+    # along each axis; what is said of further axes means nothing
+    periodic: tuple[bool, ...] = Field(alias="periodic_boundary_conditions")
     lagbench: LagbenchKeys  # what our own exports add
 
     @property
     def periodic_axes(self) -> tuple[str, ...]:
         """Names of the periodic axes."""
-        return tuple(itertools.compress(AXES, self.periodic))
+        axes = AXES[: len(self.bounds)]
+        return tuple(itertools.compress(axes, self.periodic))
 
 
 def round_down(value: float) -> float:
@@ -283,7 +287,7 @@ class ExportInfo:
     dataset_sha256: str  # hash of the data set
     statistics: Mapping[str, tuple[float, ...]]  # over train
     spacing: float  # distance of neighbouring particles at first [length]
-    origin: tuple[float, float]  # what was taken off every position [length]
+    origin: tuple[float, ...]  # what was taken off every position [length]
     from_walls: bool  # whether the bounds are the walls
     is_free_slip: bool  # whether liquid slides along the walls
     # layers of wall particles are so thick [length]; None without them
@@ -310,7 +314,7 @@ def _common_metadata(size: Size, info: ExportInfo) -> dict[str, object]:
     metadata: dict[str, object] = {
         "bounds": bounds,
         "default_connectivity_radius": size.task.radius,
-        "dim": 2,
+        "dim": size.dimension,
     }
     for prefix, name in SHORT_NAMES.items():
         metadata[f"{prefix}_mean"] = list(info.statistics[f"{name}_mean"])
@@ -426,12 +430,14 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
     block = values.get("train")
     if isinstance(block, dict):
         values = block
-    if values.get("dim", 2) != 2:
+    bounds = values.get("bounds")
+    dimension = values.get("dim", 2)
+    if isinstance(bounds, list) and dimension != len(bounds):
         raise UnreadableFileError(
-            "the data are not plane",
+            "the dimension is not that of the bounds",
             where=f"{path}, key dim",
-            expected=2,
-            got=repr(values["dim"]),
+            expected=len(bounds),
+            got=repr(dimension),
         )
     spacing = None
     substeps = 1
@@ -444,7 +450,7 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
         frame_interval = step * numbers.validate_python(substeps)
         return SourceMetadata.model_validate(
             {
-                "bounds": values.get("bounds"),
+                "bounds": bounds,
                 "default_connectivity_radius": values.get(
                     "default_connectivity_radius"
                 ),
@@ -453,7 +459,7 @@ def read_metadata(folder: Path, form: Format) -> SourceMetadata:
                 "periodic_boundary_conditions": values.get(
                     "periodic_boundary_conditions"
                 )
-                or (False, False),
+                or (),
                 OWN_KEY: values.get(OWN_KEY) or {},
             }
         )

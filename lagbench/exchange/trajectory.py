@@ -37,10 +37,11 @@ The number of frames, a function that returns the positions of one of them, and 
 of each particle.
 """
 
-Bounds = tuple[tuple[float, float], tuple[float, float]]
-"""Low and high walls along x and y."""
+Bounds = tuple[tuple[float, float], ...]
+"""Low and high walls along x, y and, in three dimensions, z."""
 
-COMPONENTS = 2
+DIMENSIONS = (2, 3)
+"""Numbers of components that positions may have."""
 
 HARMLESS_BYTES = 1 << 28
 """Length that an array may always unpack to [bytes]."""
@@ -76,7 +77,8 @@ class Trajectory:
     # value of ``lagbench.data.MATERIALS`` of each particle, [particle]
     material: NDArray[np.int8]
     read: Callable[[], Iterator[Frame]]  # returns the frames in order, one at a time
-    # [length/s], [wall, 2] or [frame, wall, 2]; None without walls
+    dimension: int = 2  # components of a position
+    # [length/s], [wall, axis] or [frame, wall, axis]; None without walls
     wall_velocity: Array | None = None
     # parameters that the file states and hashes
     parameters: Mapping[str, object] = field(default_factory=dict)
@@ -90,7 +92,7 @@ class BoxTransform:
     """
 
     scale: float = 1.0
-    corner: tuple[float, float] = (0.0, 0.0)
+    corner: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the axes that there are
 
     @classmethod
     def fit(cls, bounds: Bounds) -> BoxTransform:
@@ -102,26 +104,27 @@ class BoxTransform:
         corner = low
         scale_from_origin = power_of_two(float(high.max()))
         if (low >= 0.0).all() and (high <= scale_from_origin).all():
-            corner = np.zeros(COMPONENTS)
+            corner = np.zeros(len(bounds))
         return cls(
             scale=power_of_two(float((high - corner).max())),
-            corner=(float(corner[0]), float(corner[1])),
+            corner=tuple(float(value) for value in corner),
         )
 
     def transform_positions(self, position: Array) -> NDArray[np.float32]:
         """Return positions in the unit box, float32."""
         if self.scale != 1.0 or any(self.corner):
-            position = (position.astype(np.float64) - self.corner) / self.scale
+            corner = np.asarray(self.corner[: position.shape[-1]])
+            position = (position.astype(np.float64) - corner) / self.scale
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
             return position.astype(np.float32, copy=False)
 
     def transform_box(self, bounds: Bounds) -> Bounds:
         """Return a box of the source in the unit box."""
         sides = []
-        for (low, high), corner in zip(bounds, self.corner, strict=True):
+        for (low, high), corner in zip(bounds, self.corner, strict=False):
             side = ((low - corner) / self.scale, (high - corner) / self.scale)
             sides.append(side)
-        return sides[0], sides[1]
+        return tuple(sides)
 
 
 def power_of_two(length: float) -> float:
@@ -145,11 +148,12 @@ class DataOptions(TypedDict, total=False):
     licence: str
     radius: float
     frame_interval: float
-    bounds: Bounds
+    bounds: Annotated[Bounds, Field(min_length=2, max_length=3)]
     periodic: Sequence[str]
     rescale: bool
     density: float
     spacing: float
+    axes: Sequence[str]
     input_frames: Count
     horizon: Count
     frames_of_interest: Sequence[Count]
@@ -199,6 +203,25 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
     )
 
 
+def check_name(name: str) -> None:
+    """Refuse a name that no split can have.
+
+    Raises:
+        UsageError: the message has a name like it that one can.
+    """
+    if is_split_name(name):
+        return
+    plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower())
+    proposal = plain.strip("-_0123456789") or "own"
+    raise UsageError(
+        "a split cannot have that name",
+        where="--output, its last part",
+        expected="small letters, digits, - and _, a letter first",
+        got=name,
+        fix=f"--output {proposal}",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Description:
     """What is known of data from elsewhere; lengths are those of the source.
@@ -219,7 +242,7 @@ class Description:
     bounds: Bounds | None = None
     periodic: Sequence[str] = ()  # names of the axes without walls; needs bounds
     rescale: bool = False  # whether to fit the bounds into the unit box
-    density: float = 1.0  # rest density [mass/length^2]
+    density: float = 1.0  # rest density [mass/length^d]
     # distance of neighbouring particles at first; None to estimate it
     spacing: float | None = None
     input_frames: int = 6  # frames given to a model
@@ -235,7 +258,7 @@ class Description:
 
     def __post_init__(self) -> None:
         """Check what the user said, and fit the box where that is asked."""
-        self._check_name()
+        check_name(self.name)
         self._check_quantities()
         self._check_counts()
         self._check_bounds()
@@ -245,22 +268,10 @@ class Description:
                 raise UsageError(
                     "there are no bounds to fit into the unit box",
                     where="--rescale",
+                    expected="bounds of the data",
                     fix="add --bounds",
                 )
             object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
-
-    def _check_name(self) -> None:
-        if is_split_name(self.name):
-            return
-        plain = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower())
-        proposal = plain.strip("-_0123456789") or "own"
-        raise UsageError(
-            "a split cannot have that name",
-            where="--output, its last part",
-            expected="small letters, digits, - and _, a letter first",
-            got=self.name,
-            fix=f"--output {proposal}",
-        )
 
     def _check_quantities(self) -> None:
         for option, value in (
@@ -305,14 +316,16 @@ class Description:
                 )
 
     def _check_periodic(self) -> None:
-        if self.periodic and self.bounds is None:
+        if not self.periodic:
+            return
+        if self.bounds is None:
             raise UsageError(
                 "a periodic axis needs bounds: they are its period",
                 where="--periodic",
                 fix="add --bounds",
             )
         try:
-            parse_periodic(self.periodic, COMPONENTS)
+            parse_periodic(self.periodic, len(self.bounds))
         except UsageError as error:
             raise UsageError(
                 error.what,
@@ -327,7 +340,15 @@ class Description:
         if self.bounds is None:
             return None
         sides = self.transform.transform_box(self.bounds)
-        return Box.from_bounds(sides, parse_periodic(self.periodic, COMPONENTS))
+        return Box.from_bounds(sides, parse_periodic(self.periodic, len(sides)))
+
+    @cached_property
+    def source_box(self) -> Box | None:
+        """The box that holds the particles, in the lengths of the source."""
+        if self.bounds is None:
+            return None
+        periodic = parse_periodic(self.periodic, len(self.bounds))
+        return Box.from_bounds(self.bounds, periodic)
 
     @property
     def rate(self) -> float:
@@ -335,16 +356,22 @@ class Description:
         return round_digits(1.0 / self.frame_interval, 12)
 
 
-def estimate_spacing(position: Array, radius: float) -> float:
+def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> float:
     """Return the distance of neighbouring particles in one frame.
 
-    It is ``sqrt(area / particles)``, counted around particles inside the material.
+    It is ``(volume / particles)^(1/d)``, counted around particles inside the material.
+    A box with periodic axes has the lengths of the positions.
     """
     from scipy.spatial import cKDTree
 
     points = position.astype(np.float64)
     reach = NEIGHBOUR_RADII * radius
-    counts = cKDTree(points).query_ball_point(points, reach, return_length=True)
+    period = None
+    if box is not None and box.is_periodic:
+        points = np.asarray(box.wrap(points) - box.low)
+        period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
+    tree = cKDTree(points, boxsize=period)
+    counts = tree.query_ball_point(points, reach, return_length=True)
     # This quantile leaves surfaces out.
     inside_count = float(np.quantile(counts, INTERIOR_QUANTILE))
     if inside_count < 2.0 and len(points) > 1:  # a particle counts itself
@@ -356,7 +383,9 @@ def estimate_spacing(position: Array, radius: float) -> float:
             fix="a larger --radius, or say in a file how far particles are apart: "
             "--describe, key spacing",
         )
-    return math.sqrt(math.pi * reach**2 / inside_count)
+    if points.shape[1] == 2:
+        return math.sqrt(math.pi * reach**2 / inside_count)
+    return math.cbrt(4.0 / 3.0 * math.pi * reach**3 / inside_count)
 
 
 def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) -> None:
@@ -364,22 +393,24 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
 
     Raises:
         UnreadableFileError: no floats of three dimensions.
-        DataError: not two components, too few or too many frames or particles.
+        DataError: not two or three components, too few or too many frames or particles.
     """
     if len(shape) != 3 or dtype.kind != "f":
         raise UnreadableFileError(
             "these are no positions",
             where=name,
-            expected="floats of shape (frame, particle, 2)",
+            expected="floats of shape (frame, particle, 2 or 3)",
             got=f"{dtype} of shape {shape}",
         )
     frame_count, particle_count, component_count = shape
-    if component_count != COMPONENTS:
+    if component_count not in DIMENSIONS:
         raise DataError(
             f"positions have {component_count} components",
             where=name,
-            expected="shape (frame, particle, 2): lagbench holds plane data only",
+            expected="shape (frame, particle, 2) or (frame, particle, 3)",
             got=f"shape {shape}",
+            fix="bring the axes into this order, or state theirs: --describe, key "
+            "axes: [frame, space, particle]",
         )
     if frame_count < 2 or particle_count < 1:
         raise DataError(
@@ -387,6 +418,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             where=name,
             expected="2 frames, 1 particle",
             got=shape,
+            fix="give all frames of a run in one array",
         )
     for kind, limit, count in (
         ("frames", FRAMES, frame_count),

@@ -254,6 +254,8 @@ class Metric:
     def raise_named(self, error: Exception | SystemExit, place: str) -> NoReturn:
         """Raise an error of the metric's functions again, with name and place added.
 
+        The name is also the error's attribute ``metric_name``.
+
         Raises:
             WorkFailedError: the error would end the program.
         """
@@ -262,6 +264,7 @@ class Metric:
             failure = self._failure(what, place, expected="a number", got=error)
             raise failure from error
         error.add_note(f"in metric {self.name}, {place}")
+        error.metric_name = self.name  # type: ignore[attr-defined]
         raise error
 
     def _failure(
@@ -270,13 +273,15 @@ class Metric:
         """Return the error for a function of the metric that does not work."""
         function = self.series if self.statistic is None else self.statistic
         package = getattr(function, "__module__", "?")
-        return WorkFailedError(
+        error = WorkFailedError(
             what,
             where=f"{package}, {self.name}, {place}",
             expected=expected,
             got=f"{type(got).__name__}: {got!r:.60}",
             fix="mend or uninstall the package that adds it",
         )
+        error.metric_name = self.name  # type: ignore[attr-defined]
+        return error
 
     def loss(self, value: float) -> float:
         """Return the value turned so that smaller is better.

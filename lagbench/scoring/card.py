@@ -12,27 +12,35 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.checksums import round_digits
 from lagbench.errors import UnreadableFileError
+from lagbench.figures.html import tag
 from lagbench.metrics.aggregate import Score, Tally, bootstrap_interval
 from lagbench.metrics.frame import TaskConfig
 from lagbench.metrics.metric import Metric, mean
 from lagbench.metrics.significance import Comparison, compare
+from lagbench.metrics.table import CHOSEN
 from lagbench.submission.format import MAX_NAME, Header
 from lagbench.submission.issues import ValidationIssue
 
 from .flags import Flag
 from .skill import AgainstClassical, Skill
 
+if TYPE_CHECKING:
+    import pandas as pd
+
 FORMAT = 1
 """Number of the layout of scores.json and scores.nc; stored as ``lagbench_scores``."""
 
 JSON_NAME = "scores.json"
+
+BRIEF_ROWS = 5
+"""Metrics that a short table shows."""
 
 IDENTITY = ("split", "size", "dataset_version", "dataset_sha256", "method")
 """Fields that identify the predicted data set and the method."""
@@ -92,6 +100,8 @@ class ScoreCard:
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
+    # why there is no `against_classical`; None where there is one
+    why_not_classical: str | None = None
 
     def __repr__(self) -> str:
         """Return method, ranking metric and skill; the values are too many."""
@@ -99,6 +109,58 @@ class ScoreCard:
         subject = f"{header.method!r} on {header.split} {header.size}"
         ranking = f"{self.ranking} {self.submission[self.ranking].mean:.4g}"
         return f"<{type(self).__name__}: {subject}, {ranking}, skill {self.skill}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the skill and the first metrics, for notebooks; escaped."""
+        header = self.header
+        lines = [("skill", "-" if self.skill is None else str(self.skill))]
+        for name in self.chosen_metrics[:BRIEF_ROWS]:
+            score = self.submission[name]
+            low, high = score.interval
+            cell = f"{score.mean:.4g}"
+            if not math.isnan(low):
+                cell += f" [{low:.3g}, {high:.3g}]"
+            lines.append((f"{name} [{score.metric.unit}]", cell))
+        rows = [tag("tr", *(tag("td", cell) for cell in line)) for line in lines]
+        caption = f"{header.method} on {header.split} {header.size}"
+        return str(tag("table", tag("caption", caption), *rows))
+
+    @property
+    def chosen_metrics(self) -> list[str]:
+        """Names of the most important metrics, the ranking one first."""
+        names = []
+        for name in dict.fromkeys((self.ranking, *CHOSEN)):
+            if name in self.submission:
+                names.append(name)
+        return names
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return all values over the horizon as a table with a line for each.
+
+        Columns: ``row`` (``submission``, or the name of a reference), ``metric``,
+        ``unit``, ``direction`` (``lower``, ``higher``, ``target`` or ``none``),
+        ``scenario``, ``value`` (NaN where undefined), ``undefined`` (frames without a
+        value). References have their ranking metric at least.
+        """
+        import pandas as pd
+
+        lines = []
+        for row, scores in self.scores.items():
+            for name, score in scores.items():
+                for scenario, value, undefined in zip(
+                    score.scenarios, score.values.tolist(), score.undefined, strict=True
+                ):
+                    line = {
+                        "row": row,
+                        "metric": name,
+                        "unit": score.metric.unit,
+                        "direction": str(score.metric.direction),
+                        "scenario": scenario,
+                        "value": value,
+                        "undefined": undefined,
+                    }
+                    lines.append(line)
+        return pd.DataFrame(lines)
 
     @property
     def scenarios(self) -> tuple[int, ...]:

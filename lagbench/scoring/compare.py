@@ -7,9 +7,10 @@ are reported. With one seed of each method these weights are compared, not metho
 
 from __future__ import annotations
 
+import math
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     check_regular,
+    format_count,
     suggest_name,
 )
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
@@ -31,6 +33,7 @@ from lagbench.metrics.significance import FEWEST_SCENARIOS, Comparison
 from lagbench.metrics.significance import compare as compare_scores
 from lagbench.references.table import REFERENCES
 from lagbench.submission.format import MAX_NAME
+from lagbench.submission.issues import ValidationResult
 
 from .card import JSON_NAME, SUBMISSION, digits, number_methods
 from .published_scores import PublishedScores, parse_scores, read_scores
@@ -44,6 +47,19 @@ from .score_file_checks import (
 
 SAME = ("split", "size", "dataset_sha256")
 """Fields in which two submissions must be equal."""
+
+SCORES = "scores"
+SUBMISSIONS = "submissions"
+"""Folders of a leaderboard, see :mod:`lagbench.board.folder`."""
+
+DEFAULT_BOARDS = (
+    Path("leaderboard"),
+    Path(__file__).resolve().parents[2] / "leaderboard",
+)
+"""The leaderboard in the working folder, and that of a clone."""
+
+Place = tuple[str, ...]
+"""Split, size and method of an entry."""
 
 AGAIN = "score the predictions again: lagbench score predictions.nc"
 
@@ -71,6 +87,21 @@ class MetricComparison:
     # frames of each method without a value, which are left out of its mean
     undefined: tuple[int, int]
     test: Comparison  # difference, interval and p-value, in the metric's loss
+
+    @property
+    def side(self) -> str:
+        """How the first compares with the second by the means of the loss.
+
+        ``better``, ``worse``, ``same``, or ``unknown`` without a common value.
+        """
+        difference = self.test.difference
+        if math.isnan(difference):
+            return "unknown"
+        if difference == 0.0:
+            return "same"
+        if difference < 0.0:
+            return "better"
+        return "worse"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -115,8 +146,8 @@ class ComparisonResult:
     def _verdict_of_few(self) -> str:
         """The verdict of too few scenarios for a p-value."""
         verdict = (
-            f"{self.scenarios} scenarios: no significance is claimed under "
-            f"{FEWEST_SCENARIOS}"
+            f"{format_count(self.scenarios, 'scenario')}: no significance is claimed "
+            f"under {FEWEST_SCENARIOS}"
         )
         if self.scenarios < FEWEST_FOR_INTERVAL:
             return f"{verdict}, no interval under {FEWEST_FOR_INTERVAL}"
@@ -126,7 +157,8 @@ class ComparisonResult:
     def _sample(self) -> str:
         """The p-value with the number of scenarios and seeds behind it."""
         p = self.metrics[self.ranking].test.p
-        return f"p = {p:.3g}, {self.scenarios} scenarios, {self._seeds_in_words}"
+        scenarios = format_count(self.scenarios, "scenario")
+        return f"p = {p:.3g}, {scenarios}, {self._seeds_in_words}"
 
     @property
     def _seeds_in_words(self) -> str:
@@ -166,6 +198,7 @@ def _metric_as_json(comparison: MetricComparison) -> dict[str, Any]:
     test = comparison.test
     return {
         "unit": comparison.metric.unit,
+        "side": comparison.side,
         "first": digits(comparison.first),
         "second": digits(comparison.second),
         "undefined": list(comparison.undefined),
@@ -184,6 +217,8 @@ class _ScoringOptions:
     root: str | Path | None
     workers: int | None
     registry: Registry | None
+    # called with split and size of predictions before they are scored
+    examine: Callable[[str, str], None] | None = None
 
 
 def compare(
@@ -191,6 +226,7 @@ def compare(
     second: str | Path,
     *,
     metrics: Collection[str] = (),
+    board: str | Path | None = None,
     root: str | Path | None = None,
     workers: int | None = None,
     registry: Registry | None = None,
@@ -201,24 +237,32 @@ def compare(
         first: a scores.json, a folder that holds one, a folder whose folders hold those
             of the seeds of a method; a scores.nc, or a leaderboard's score file, of
             several seeds without their numbers, as in
-            ``leaderboard/scores/cavity/full/neuralmpm.nc``; or a predictions.nc, which
+            ``leaderboard/scores/cavity/full/neuralmpm.nc``; an entry of the
+            leaderboard, as in ``cavity/full/neuralmpm``; or a predictions.nc, which
             is then scored.
-        second: another; or the name of a reference in the first's scores: in a
-            scores.nc the best one, in the ranking metric.
+        second: another; the name of a reference in the first's scores (in a scores.nc
+            the best one, in the ranking metric); or the name of an entry that the
+            leaderboard has for the first's data set. A reference goes before an entry
+            of its name.
         metrics: metrics to compare; by default all that judge.
+        board: folder of the leaderboard; ``leaderboard`` in the working folder when
+            None, else that of the clone.
         root: folder of all data sets, where predictions are to be scored.
         workers: worker processes for that.
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: an unknown metric or reference, or the two belong to different
-            splits or sizes.
+        UsageError: an unknown metric, reference or entry, no leaderboard where one is
+            named, or the two belong to different splits or sizes.
         DataError: they belong to data sets of different hashes.
         UnreadableFileError: a file is neither scores nor predictions.
     """
-    scoring = _ScoringOptions(root=root, workers=workers, registry=registry)
+    entries = list_entries(board)
     is_bare = _is_bare_name(second)
     _check_order(first, second, is_bare=is_bare)
+    first = _find_entry(first, entries)
+    if not is_bare:
+        second = _find_entry(second, entries)
 
     # before anything is scored
     for path in _seed_files(Path(first)):
@@ -227,12 +271,22 @@ def compare(
         for path in _seed_files(Path(second)):
             check_regular(path)
 
+    def require_second(split: str, size: str) -> None:
+        if is_bare and str(second) not in REFERENCES:
+            _require_entry(str(second), split, size, entries=entries)
+
+    scoring = _ScoringOptions(
+        root=root, workers=workers, registry=registry, examine=require_second
+    )
     one = _load_contestant(first, scoring)
     is_reference = is_bare and str(second) in one.references
     if is_reference:
         two = _reference_beside(one, str(second))
     elif is_bare:
-        raise _no_reference(one, first, str(second))
+        place = (one.identity["split"], one.identity["size"], str(second))
+        if place not in entries:
+            raise _no_such_name(one, first, str(second), entries)
+        two = _load_contestant(entries[place], scoring)
     else:
         two = _load_contestant(second, scoring)
 
@@ -275,6 +329,85 @@ def _is_bare_name(second: str | Path) -> bool:
     return is_plain and not os.path.lexists(second)
 
 
+def list_entries(board: str | Path | None) -> dict[Place, Path]:
+    """Return the entries of a leaderboard that have score files.
+
+    A path without the number of a seed stands for all seeds of an entry, as
+    :func:`_seed_files` reads it.
+
+    Args:
+        board: its folder; ``leaderboard`` in the working folder when None, else that of
+            the clone, else none.
+
+    Raises:
+        UsageError: the named folder is no leaderboard.
+    """
+    folders: tuple[Path, ...] = DEFAULT_BOARDS
+    if board is not None:
+        folders = (Path(board),)
+    for folder in folders:
+        if (folder / SCORES).is_dir():
+            break
+    else:
+        if board is not None and not (folder / SUBMISSIONS).is_dir():
+            raise UsageError(
+                "no leaderboard here",
+                where=f"--board {board}",
+                expected=f"a folder that holds {SCORES}/",
+                fix="name the folder of a leaderboard, or leave the option out",
+            )
+        return {}
+
+    entries: dict[Place, Path] = {}
+    for path in sorted((folder / SCORES).glob("*/*/*.nc")):
+        split, size = path.parts[-3:-1]
+        method = re.sub(r"_[0-9]+$", "", path.stem)
+        entries[split, size, method] = path.with_name(f"{method}.nc")
+    return entries
+
+
+def _find_entry(source: str | Path, entries: Mapping[Place, Path]) -> str | Path:
+    """Return the score file of an entry named as split/size/method, else the source.
+
+    Raises:
+        UsageError: the name of an entry without its data set.
+    """
+    if os.path.lexists(source):
+        return source
+    place = Path(source).parts
+    if len(place) == 3 and place in entries:
+        return entries[place]
+    data_sets = []
+    for split, size, method in entries:
+        if (method,) == place:
+            data_sets.append(f"{split}/{size}/{method}")
+    if data_sets:
+        raise UsageError(
+            "an entry of the leaderboard is named without its data set",
+            where=str(source),
+            expected="a file, or split/size/method",
+            got=str(source),
+            fix=f"name one of {', '.join(data_sets)}",
+        )
+    return source
+
+
+def _require_entry(
+    name: str, split: str, size: str, *, entries: Mapping[Place, Path]
+) -> None:
+    """Refuse a name that is no entry of a data set."""
+    if (split, size, name) in entries:
+        return
+    methods = [place[2] for place in entries if place[:2] == (split, size)]
+    raise UsageError(
+        "no reference predictor and no entry of that name",
+        where=f"{split} {size}",
+        expected="a reference predictor, an entry of the leaderboard, or a file",
+        got=ascii(name),
+        fix=suggest_name(name, {*methods, *REFERENCES}),
+    )
+
+
 def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> None:
     """Refuse a reference as the first of the two."""
     if str(first) not in REFERENCES or os.path.lexists(first):
@@ -289,8 +422,13 @@ def _check_order(first: str | Path, second: str | Path, *, is_bare: bool) -> Non
     )
 
 
-def _no_reference(contestant: Contestant, first: str | Path, second: str) -> UsageError:
-    """Return the error for a name that is no reference in the first's scores."""
+def _no_such_name(
+    contestant: Contestant,
+    first: str | Path,
+    second: str,
+    entries: Mapping[Place, Path],
+) -> UsageError:
+    """Return the error for a name that is neither a reference nor an entry."""
     if second in REFERENCES:
         present = ", ".join(contestant.references) or "no reference"
         return UsageError(
@@ -301,11 +439,18 @@ def _no_reference(contestant: Contestant, first: str | Path, second: str) -> Usa
             fix="a scores.nc has the best reference only: compare predictions.nc or "
             "scores.json",
         )
+    split = contestant.identity["split"]
+    size = contestant.identity["size"]
+    names = set(contestant.references)
+    for place in entries:
+        if place[:2] == (split, size):
+            names.add(place[2])
     hint = ""
-    if contestant.references:
-        hint = f"{suggest_name(second, contestant.references)}; or "
+    if names:
+        hint = f"{suggest_name(second, names)}; or "
     return UsageError(
-        "neither a reference nor a file",
+        "neither a reference, nor an entry of the leaderboard, nor a file",
+        where=f"{split} {size}",
         got=ascii(second),
         fix=f"{hint}name scores, predictions or a folder of them",
     )
@@ -460,6 +605,10 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
     if not reason:
         return read_published_scores(real)
 
+    def examine(result: ValidationResult) -> None:
+        if scoring.examine and result.split and result.size:
+            scoring.examine(result.split, result.size)
+
     try:
         card = score(
             path,
@@ -467,6 +616,7 @@ def _load_scores(path: Path, scoring: _ScoringOptions) -> PublishedScores:
             workers=scoring.workers,
             registry=scoring.registry,
             write=False,
+            examined=examine,
         )
     except (UnreadableFileError, ChecksFailedError) as error:
         with real.open("rb") as stream:

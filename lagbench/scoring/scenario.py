@@ -34,6 +34,7 @@ from lagbench.work.pool import Report
 
 from .card import FRAMES, PARTICLES, SUBMISSION, Preview
 from .flags import Trace, Tracer
+from .package_metrics import package_metric_errors
 from .task import ScoredTask
 
 POSITION_LIMIT = 1e6
@@ -149,6 +150,7 @@ def score_scenario(job: ScenarioJob, report: Report) -> ScenarioScores:
     recorder = None
     try:
         with (
+            package_metric_errors(),
             job.task.opened(number) as truth,
             open_predictions(job.predictions, info=job.info) as predictions,
         ):

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
+from lagbench.errors import format_count
 from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
 from lagbench.references.shipped import DIGITS
 
-from .card import SUBMISSION, ScoreCard
+from .card import BRIEF_ROWS, SUBMISSION, ScoreCard
 from .compare import ComparisonResult, MetricComparison
+from .flags import Flag
 
 SHOWN_AT_FRAMES = (
     "vorticity_mse",
@@ -37,6 +39,8 @@ ARROWS = {
 }
 """Marks of the better side of a metric, behind its name."""
 
+LEGEND = "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
+
 FLAG_STATES = {True: "raised", False: "not raised", None: "unknown"}
 
 
@@ -51,6 +55,7 @@ def card_tables(
         floors: whether all references are shown beside the submission, not only the
             best one.
     """
+    names = card.chosen_metrics
     if every:
         names = list(card.submission)
         frame_names = []
@@ -58,28 +63,45 @@ def card_tables(
             if card.submission[name].metric.per_frame:
                 frame_names.append(name)
     else:
-        chosen = dict.fromkeys((card.ranking, *CHOSEN))
-        names = []
-        for name in chosen:
-            if name in card.submission:
-                names.append(name)
         frame_names = []
         for name in SHOWN_AT_FRAMES:
             if name in card.submission:
                 frame_names.append(name)
 
-    references = []
-    for row in card.scores:
-        if row != SUBMISSION:
-            references.append(row)
-    if not floors and card.skill:
-        references = [card.skill.reference]
-    elif not floors:
-        references = references[:1]
+    references = _best_reference(card)
+    if floors:
+        references = [row for row in card.scores if row != SUBMISSION]
 
     yield _over_horizon(card, names, references)
     yield _at_frames(card, frame_names)
     yield _per_scenario(card, [SUBMISSION, *references])
+
+
+def _best_reference(card: ScoreCard) -> list[str]:
+    """Return the reference of the skill, else the first one, else none."""
+    if card.skill:
+        return [card.skill.reference]
+    references = [row for row in card.scores if row != SUBMISSION]
+    return references[:1]
+
+
+def brief_table(card: ScoreCard) -> Table:
+    """Return skill and the first metrics, beside the best reference."""
+    names = card.chosen_metrics[:BRIEF_ROWS]
+    return _over_horizon(card, names, _best_reference(card))
+
+
+def brief_lines(card: ScoreCard) -> Iterator[str]:
+    """Yield the lines below the brief table: comparison, raised flags, warnings."""
+    yield LEGEND
+    yield from _undefined_lines(card, card.chosen_metrics[:BRIEF_ROWS])
+    for row in _best_reference(card):
+        yield f"against {row}: {_against(card, row)}"
+    yield from _classical_lines(card)
+    for flag in card.flags:
+        if flag.raised:
+            yield _flag_line(flag)
+    yield from _warning_lines(card)
 
 
 def _over_horizon(
@@ -164,25 +186,43 @@ def _break_name(name: str) -> str:
 
 def flag_lines(card: ScoreCard) -> Iterator[str]:
     """Yield the legend, undefined frames, comparisons, flags and warnings, by line."""
-    yield "↑ more is better, ↓ less is, ◎ nearer to the perfect value is"
+    yield LEGEND
+    yield from _undefined_lines(card, CHOSEN)
+    for row in card.scores:
+        if row != SUBMISSION:
+            yield f"against {row}: {_against(card, row)}"
+    yield from _classical_lines(card)
+    for flag in card.flags:
+        yield _flag_line(flag)
+    yield from _warning_lines(card)
 
+
+def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
+    """Yield the line that counts frames without a value, if there are any."""
     undefined = []
     for name, score in card.submission.items():
         count = sum(score.undefined)
-        if name in CHOSEN and count:
+        if name in names and count:
             undefined.append(f"{name} {count}")
     if undefined:
         frames = len(card.scenarios) * card.config.horizon
         yield f"† frames without a value, of {frames}: {', '.join(undefined)}"
 
-    for row in card.scores:
-        if row != SUBMISSION:
-            yield f"against {row}: {_against(card, row)}"
-    for flag in card.flags:
-        line = f"flag {flag.name}: {FLAG_STATES[flag.raised]}"
-        if flag.reasons:
-            line += f": {'; '.join(flag.reasons)}"
-        yield line
+
+def _classical_lines(card: ScoreCard) -> Iterator[str]:
+    """Yield the reason why no classical solver stands beside the score, if so."""
+    if card.against_classical is None and card.why_not_classical is not None:
+        yield f"against_classical: none, because {card.why_not_classical}"
+
+
+def _flag_line(flag: Flag) -> str:
+    line = f"flag {flag.name}: {FLAG_STATES[flag.raised]}"
+    if flag.reasons:
+        line += f": {'; '.join(flag.reasons)}"
+    return line
+
+
+def _warning_lines(card: ScoreCard) -> Iterator[str]:
     for warning in card.warnings:
         yield f"warning [{warning.check}] {warning.what}: {warning.got}"
         if warning.fix:
@@ -210,7 +250,7 @@ def _against(card: ScoreCard, row: str) -> str:
     interval = ""
     if not math.isnan(low):
         interval = f"{_number(low)} to {_number(high)}, "
-    p = f"{len(comparison.scenarios)} scenarios: no p-value"
+    p = f"{format_count(len(comparison.scenarios), 'scenario')}: no p-value"
     if not math.isnan(comparison.p):
         p = f"p = {comparison.p:.3g}"
     return f"{card.ranking} {word} by {_number(abs(difference))} ({interval}{p})"
@@ -219,10 +259,11 @@ def _against(card: ScoreCard, row: str) -> str:
 def comparison_tables(
     result: ComparisonResult, *, every: bool = False
 ) -> Iterator[Table]:
-    """Yield differences in the loss, then means.
+    """Yield which method is better, then means.
 
-    A negative difference favours the first method, also where more of the metric is
-    better. With ``every`` all metrics are shown, not only the chosen ones.
+    The difference is that of the loss: below 0 where the first method is better, also
+    where more of the metric is better. With ``every`` all metrics are shown, not only
+    the chosen ones.
     """
     chosen = (result.ranking, *CHOSEN)
     shown = []
@@ -232,8 +273,8 @@ def comparison_tables(
 
     title = f"{result.first} against {result.second} on {result.split} {result.size}"
     yield Table(
-        f"{title}; below 0 the first is better",
-        ("metric", "loss difference [95 %]", "p"),
+        title,
+        ("metric", "first is", "loss difference [95 %]", "p"),
         tuple(_difference_row(comparison) for comparison in shown),
     )
     yield Table(
@@ -249,7 +290,15 @@ def _difference_row(comparison: MetricComparison) -> tuple[str, ...]:
     if not math.isnan(test.p):
         p = f"{test.p:.3g}"
     difference = _with_interval(test.difference, test.interval)
-    return (_label(comparison.metric), difference, p)
+    return (_label(comparison.metric), _side(comparison), difference, p)
+
+
+def _side(comparison: MetricComparison) -> str:
+    """Return whether the first method is better, and whether that may be chance."""
+    side = comparison.side
+    if side in ("better", "worse") and not comparison.test.significant:
+        return f"{side}, open"
+    return side
 
 
 def _means_row(comparison: MetricComparison) -> tuple[str, ...]:
@@ -264,7 +313,7 @@ def _means_row(comparison: MetricComparison) -> tuple[str, ...]:
 def _with_undefined(value: float, undefined: int) -> str:
     """Return a mean with the number of frames that are left out of it."""
     if undefined:
-        return f"{_number(value)} ({undefined} frames undefined)"
+        return f"{_number(value)} †{undefined}"
     return _number(value)
 
 

@@ -40,7 +40,7 @@ def load_manifest(
 
     Args:
         split: name of the split, or path of a local split's folder.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Raises:
@@ -76,7 +76,7 @@ def open_split(
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
 
     Returns:

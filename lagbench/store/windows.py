@@ -9,6 +9,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from html import escape
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,7 +96,7 @@ class FrameStore:
         self.__init__(**state)  # type: ignore[misc]
 
     def frames(self, scenario: int, start: int, stop: int) -> list[Floats]:
-        """Return positions of consecutive frames [length], each of shape [particle, 2].
+        """Return positions of consecutive frames [length], each [particle, axis].
 
         The arrays are those of the cache: copy them, never write to them.
         """
@@ -134,7 +135,7 @@ class FrameStore:
         """Return material, shape [particle], and wall velocity [length/s].
 
         Material is 0, liquid, in files without it. Wall velocity has the shape [frame,
-        wall, 2]; it is None where no wall moves.
+        wall, axis]; it is None where no wall moves.
         """
         self._reset_after_fork()
         opened = self._open(scenario)
@@ -280,15 +281,15 @@ def _read_text(file: h5py.File, name: str) -> str:
 class Window(NamedTuple):
     """Consecutive frames of one scenario."""
 
-    # particle positions [length], shape [particle, frame, 2]
+    # particle positions [length], shape [particle, frame, axis]
     position: NDArray[np.float32]
     material: NDArray[np.int8]  # 0 liquid, 1 jelly, 2 snow, 3 rope, shape [particle]
-    # velocity of the walls [length/s], shape [frame, wall, 2]: the forcing on the way
-    # to each frame, those to predict included; None in a split without moving walls
+    # velocity of the walls [length/s], shape [frame, wall, axis]: the forcing on the
+    # way to each frame, those to predict included; None in a split without moving walls
     wall_velocity: NDArray[np.float32] | None
     scenario: int  # scenario id
     frame: int  # absolute number of the first frame
-    # particle positions in the scenario's first frame [length], shape [particle, 2];
+    # particle positions in the scenario's first frame [length], shape [particle, axis];
     # None unless asked for
     origin: NDArray[np.float32] | None = None
     # kinematic viscosity [length^2/s]: the scenario's, else that of the data set; None
@@ -327,9 +328,11 @@ class WindowReader:
         self.history = history  # given frames of a model
         self.future = future  # frames after them
         self.length = history + future  # frames in a window
+        self.subsets = subsets  # names of the subsets
         self.origin = origin  # whether windows hold the scenario's first frame too
         self.scenarios = tuple(paths)
-        self.frame_bytes = 8 * tier.particles
+        # float32 for every component
+        self.frame_bytes = 4 * tier.dimension * tier.particles
         frame_counts = [tier.frame_count(scenario) for scenario in paths]
         window_counts = [max(0, count - self.length + 1) for count in frame_counts]
         # number of the first window of each scenario, and the number of all windows
@@ -364,6 +367,31 @@ class WindowReader:
     def __len__(self) -> int:
         """Return the number of windows."""
         return self.starts[-1]
+
+    def __repr__(self) -> str:
+        """Return data set, subsets, number and length of the windows."""
+        facts = ", ".join(f"{name} {value}" for name, value in self._facts.items())
+        return f"<{type(self).__name__}: {facts}>"
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, for notebooks; escaped."""
+        rows = []
+        for name, value in self._facts.items():
+            rows.append(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>")
+        caption = escape(type(self).__name__)
+        return f"<table><caption>{caption}</caption>{''.join(rows)}</table>"
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """What the windows are, by name."""
+        return {
+            "data set": f"{self.size.split} {self.size.name}",
+            "subsets": "+".join(self.subsets),
+            "scenarios": str(len(self.scenarios)),
+            "windows": str(len(self)),
+            "frames": f"{self.history} given + {self.future} to predict",
+            "particles": str(self.size.particles),
+        }
 
     @property
     def gravity(self) -> float:
@@ -427,16 +455,16 @@ def windows(
 ) -> Windows:
     """Open all windows of consecutive frames as NumPy arrays, without PyTorch.
 
-    ``data[i]`` has ``position`` [length], float32, shape [particle, frame, 2];
+    ``data[i]`` has ``position`` [length], float32, shape [particle, frame, axis];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
-    [frame, wall, 2], or None; the ids ``scenario`` and ``frame``; ``viscosity``
+    [frame, wall, axis], or None; the ids ``scenario`` and ``frame``; ``viscosity``
     [length^2/s]. ``data.size`` is the description of the data set.
     `lagbench.torch.WindowDataset` gives the same windows as tensors.
 
     Args:
         split: name of the split, or path of a local split's folder.
         subset: train, valid, test or, for multimaterial, extra; or several of them.
-        size: name of the size; the only one with data when None.
+        size: name of the size; the only one with data, of several mini, when None.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
         history: given frames of the model; those of the task by default.
         future: frames after them.
@@ -470,14 +498,20 @@ def copy_window(
     scenario: int,
     frame: int,
 ) -> Window:
-    """Copy frames, each of shape [particle, 2], to a window."""
-    # x and y of a particle travel as one number of 8 bytes: six times faster.
-    pairs = np.stack([positions.view(np.int64)[:, 0] for positions in frames], axis=1)
+    """Copy frames, each of shape [particle, axis], to a window."""
+    dimension = frames[0].shape[1]
+    if dimension == 2:
+        # x and y of a particle travel as one number of 8 bytes: six times faster.
+        numbers = [positions.view(np.int64)[:, 0] for positions in frames]
+        pairs = np.stack(numbers, axis=1)
+        position = pairs.view(np.float32).reshape(*pairs.shape, dimension)
+    else:
+        position = np.stack(frames, axis=1)
     wall_velocity = None
     if walls is not None:
         wall_velocity = walls.copy()
     return Window(
-        position=pairs.view(np.float32).reshape(*pairs.shape, 2),
+        position=position,
         material=material.copy(),
         wall_velocity=wall_velocity,
         scenario=scenario,

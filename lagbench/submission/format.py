@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,8 @@ FORMAT = 1
 DIMS = ("scenario", "frame", "particle", "space")
 """Dimensions of ``position``, in this order."""
 
-SPACE = 2
-"""Components of a position."""
+SPACES = (2, 3)
+"""Numbers of components that a position may have."""
 
 OTHERS: Mapping[str, str] = {
     "measured": "scores.nc, which `lagbench score` writes of predictions",
@@ -73,7 +73,7 @@ MAX_COORDINATE = 20_000
 MAX_COORDINATE_CHUNK = 1 << 26
 """Largest chunk of a coordinate that is read [bytes]."""
 
-INTEGERS = ("scenario", "frame", "diverged_at")
+INTEGERS = ("scenario", "frame", "diverged_at", "particle_count")
 PACKING = ("scale_factor", "add_offset")
 
 ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
@@ -89,6 +89,10 @@ ATTRIBUTES: Mapping[str, Mapping[str, str]] = {
     },
     "diverged_at": {
         "long_name": "first frame of a frozen rollout, -1 where none is",
+        "units": "1",
+    },
+    "particle_count": {
+        "long_name": "particles of the scenario; entries behind them are padding",
         "units": "1",
     },
 }
@@ -124,7 +128,7 @@ class Header:
     method: str  # what made the predictions
     scenarios: tuple[int, ...]  # ids in the order in which they are stored
     frames: tuple[int, ...]  # absolute numbers of the predicted frames
-    particles: int  # particles in every frame
+    particles: int  # particles in every frame; the most of any scenario
     seconds_per_frame: float | None  # cost of one predicted frame [s]
     device: str | None  # machine that predicted
     seed: int | None  # seed of the training
@@ -137,6 +141,13 @@ class Header:
     budget: Budget | None = None  # what the training took
     # the training that made the model; of older files read from the words
     provenance: TrainingProvenance | None = None
+    # scenario id to its number of particles; empty where all have as many
+    particle_counts: Mapping[int, int] = field(default_factory=dict)
+    space: int = 2  # components of a position
+
+    def particle_count(self, scenario: int) -> int:
+        """Return how many particles a scenario has."""
+        return self.particle_counts.get(scenario, self.particles)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -240,8 +251,11 @@ def require_valid_attribute(name: str, value: object) -> None:
     if not is_attribute_valid(name, value):
         raise UsageError(
             f"the label {name!r} does not fit",
+            where=f"label {name!r}",
             expected=describe_kind(name),
             got=quote(value),
+            fix="docs/predictions.md describes the labels; leave one out that is not "
+            "known",
         )
 
 
@@ -323,12 +337,16 @@ def header_of(info: FileInfo) -> Header:
     for scenario, frame in zip(scenarios, frozen_from, strict=False):
         if frame >= 0:
             diverged_at[scenario] = frame
+    counts = info.integers.get("particle_count", ())
+    particle_counts = dict(zip(scenarios, counts, strict=False))
     position_shape = info.arrays["position"].shape or ()
     return Header(
         **labels,
         scenarios=scenarios,
         frames=info.integers["frame"],
         particles=position_shape[2],
+        particle_counts=particle_counts,
+        space=position_shape[3],
         diverged_at=diverged_at,
     )
 
@@ -472,8 +490,13 @@ def describe_value(value: object) -> str:
     return quote(value)
 
 
-def check_dims(info: FileInfo, issues: IssueCollector) -> bool:
-    """Check names, order and lengths of the dimensions of ``position``."""
+def check_dims(
+    info: FileInfo, issues: IssueCollector, *, dimension: int | None = None
+) -> bool:
+    """Check names, order and lengths of the dimensions of ``position``.
+
+    The box has ``dimension`` axes; 2 or 3 where it is not known.
+    """
     array = info.arrays.get("position")
     if array is None or array.shape is None:
         issues.skip("'position' cannot be read", "dims")
@@ -494,15 +517,17 @@ def check_dims(info: FileInfo, issues: IssueCollector) -> bool:
         )
         return False
 
+    if dimension is None:
+        dimension = array.shape[3] if array.shape[3] in SPACES else SPACES[0]
     lengths = (
         _length_of("scenario", info),
         _length_of("frame", info),
         array.shape[2],
-        SPACE,
+        dimension,
     )
     if array.shape != lengths:
         fix = USE_TEMPLATE
-        if array.shape[2] == SPACE and array.shape[3] > SPACE:
+        if array.shape[2] == dimension and array.shape[3] > dimension:
             fix = "particle and space seem to be swapped: transpose them"
         issues.error(
             "dims",
@@ -513,7 +538,30 @@ def check_dims(info: FileInfo, issues: IssueCollector) -> bool:
             fix=fix,
         )
         return False
-    return True
+    return _check_particle_counts(info, array.shape, issues)
+
+
+def _check_particle_counts(
+    info: FileInfo, shape: tuple[int, ...], issues: IssueCollector
+) -> bool:
+    """Check that ``particle_count``, if any, fits into ``position``, shape given."""
+    array = info.arrays.get("particle_count")
+    if array is None:
+        return True
+    counts = info.integers.get("particle_count", ())
+    is_per_scenario = array.dims == ("scenario",) and len(counts) == shape[0]
+    if is_per_scenario and all(1 <= count <= shape[2] for count in counts):
+        return True
+    issues.error(
+        "dims",
+        "the numbers of particles do not fit",
+        where="variable 'particle_count'",
+        expected=f"one number from 1 to {shape[2]} per scenario, on the dimension "
+        f"'scenario'",
+        got=f"{list(counts[:5])} on {', '.join(map(quote, array.dims)) or 'none'}",
+        fix="leave it out where all scenarios have as many particles",
+    )
+    return False
 
 
 def _hint_for_dims(dims: tuple[str, ...]) -> str:

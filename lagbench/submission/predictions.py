@@ -20,7 +20,6 @@ from lagbench.errors import UsageError
 from .format import (
     DIMS,
     REQUIRED,
-    SPACE,
     WRITE,
     FileInfo,
     Header,
@@ -76,7 +75,7 @@ class Predictions:
 
         Returns:
             Positions [length], shape [frame, particle, space], in the machine's byte
-            order.
+            order, without padding.
 
         Raises:
             UsageError: the file has no such scenario or frames.
@@ -84,8 +83,10 @@ class Predictions:
         """
         first = self._index_of(scenario, start, count)
         row = self._row[scenario]
+        particles = self.header.particle_count(scenario)
         with hdf5_errors(self.path, "position"):
             values: NDArray[Any] = self._position[row, first : first + count]
+            values = values[:, :particles]
             return np.ascontiguousarray(values, dtype=np.float32)
 
     def _index_of(self, scenario: int, start: int, count: int) -> int:
@@ -111,7 +112,7 @@ class Predictions:
             UnreadableFileError: the file is damaged.
         """
         numbers = self.header.frames
-        frame_bytes = FLOAT_BYTES * SPACE * max(1, self.header.particles)
+        frame_bytes = FLOAT_BYTES * self.header.space * max(1, self.header.particles)
         block_frames = max(1, BLOCK_BYTES // frame_bytes)
         for first in range(0, len(numbers), block_frames):
             count = min(block_frames, len(numbers) - first)
@@ -128,8 +129,20 @@ class Predictions:
         hasher = self.start_hash()
         for scenario in sorted(self.header.scenarios):
             for _, block in self.blocks(scenario):
-                hasher.update("position", block)
+                hasher.update("position", self.pad(block))
         return hasher.hexdigest()
+
+    def pad(self, block: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return positions with NaN for the particles that a scenario does not have.
+
+        The shape is [frame, particle, space]; the hash is that of padded positions,
+        whatever the file holds there.
+        """
+        missing = self.header.particles - block.shape[1]
+        if not missing:
+            return block
+        widths = ((0, 0), (0, missing), (0, 0))
+        return np.pad(block, widths, constant_values=np.float32(np.nan))
 
     def start_hash(self) -> ContentHasher:
         """Return a content hash of the header.
@@ -143,8 +156,11 @@ class Predictions:
             identity[name] = getattr(header, name)
         identity["scenarios"] = scenarios
         identity["frames"] = list(header.frames)
+        if header.particle_counts:
+            counts = [header.particle_count(scenario) for scenario in scenarios]
+            identity["particle_counts"] = counts
         hasher = ContentHasher(identity)
-        shape = (len(scenarios), len(header.frames), header.particles, SPACE)
+        shape = (len(scenarios), len(header.frames), header.particles, header.space)
         hasher.declare("position", np.dtype(np.float32), DIMS, shape)
         return hasher
 

@@ -11,6 +11,7 @@ from lagbench.data.layout import major_of, quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Size, format_ids
+from lagbench.errors import format_count
 
 from .format import FileInfo
 from .issues import IssueCollector, quote
@@ -133,10 +134,9 @@ def check_scenarios(info: FileInfo, size: Size, issues: IssueCollector) -> None:
     ):
         if not scenarios:
             continue
-        plural = "s" if len(scenarios) > 1 else ""
         issues.error(
             "scenarios",
-            f"{len(scenarios)} {kind} scenario{plural}",
+            format_count(len(scenarios), f"{kind} scenario"),
             where="coordinate 'scenario'",
             expected=format_ranges(expected),
             got=f"{kind}: {format_numbers(scenarios)}",
@@ -181,19 +181,42 @@ def check_particles(info: FileInfo, size: Size, issues: IssueCollector) -> bool:
         issues.skip("the dimensions are not known", "particles")
         return False
     issues.complete("particles")
-    particle_count = array.shape[2]
-    if particle_count == size.particles:
-        return True
-    issues.error(
-        "particles",
-        "the number of particles is another",
-        where="variable 'position', dimension 'particle'",
-        expected=size.particles,
-        got=particle_count,
-        fix=f"predict every particle of {size.split} {size.name}, in the order of "
-        f"the given frames",
+    fix = (
+        f"predict every particle of {size.split} {size.name}, in the order of the given"
+        f" frames"
     )
-    return False
+    most = max_test_particles(size)
+    if array.shape[2] != most:
+        issues.error(
+            "particles",
+            "the number of particles is another",
+            where="variable 'position', dimension 'particle'",
+            expected=most,
+            got=array.shape[2],
+            fix=fix,
+        )
+        return False
+    stored = info.integers.get("scenario", ())
+    counts = info.integers.get("particle_count", (most,) * len(stored))
+    for scenario, count in zip(stored, counts, strict=False):
+        is_known = scenario in size.subsets["test"]
+        if not is_known or count == size.particle_count(scenario):
+            continue
+        issues.error(
+            "particles",
+            "the number of particles of a scenario is another",
+            where=f"variable 'particle_count', scenario {scenario}",
+            expected=size.particle_count(scenario),
+            got=count,
+            fix=f"{fix}; lagbench.submission.write stores the numbers of particles",
+        )
+        return False
+    return True
+
+
+def max_test_particles(size: Size) -> int:
+    """Return the most particles of a test scenario."""
+    return max(size.particle_count(scenario) for scenario in size.subsets["test"])
 
 
 def format_numbers(numbers: Sequence[int]) -> str:

@@ -200,12 +200,14 @@ class Truth:
     def _frames(self, scenario: int, start: int, stop: int) -> NDArray[np.float32]:
         with self.open(scenario) as file:
             frames: NDArray[np.float32] = file.read("position", slice(start, stop))
-        if len(frames) != stop - start or frames.shape[1] != self.size.particles:
+        particles = self.size.particle_count(scenario)
+        if frames.shape != (stop - start, particles, self.size.dimension):
             raise DataError(
                 f"a {self.subset} scenario has other frames or particles than the "
                 f"registry says",
                 where=str(self.path(scenario)),
-                expected=f"at least {stop} frames of {self.size.particles} particles",
+                expected=f"at least {stop} frames of {particles} particles and "
+                f"{self.size.dimension} components",
                 got=frames.shape,
             )
         return frames

@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size, format_ids
-from lagbench.errors import DataError, UsageError, WorkFailedError, suggest_name
+from lagbench.errors import (
+    DataError,
+    UsageError,
+    WorkFailedError,
+    format_count,
+    suggest_name,
+)
 
 from .format import (
     ATTRIBUTES,
@@ -23,11 +29,15 @@ from .format import (
     FORMAT,
     NEVER,
     OPTIONAL,
-    SPACE,
     require_valid_attribute,
 )
 from .issues import quote
-from .task_checks import HASH, dataset_hash_of, frames_to_predict
+from .task_checks import (
+    HASH,
+    dataset_hash_of,
+    frames_to_predict,
+    max_test_particles,
+)
 from .truth import Truth
 
 CHUNK_CACHE_BYTES = 1 << 20
@@ -49,7 +59,7 @@ class PredictionsWriter:
     Args:
         path: file to write.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what makes the predictions.
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
@@ -83,8 +93,11 @@ class PredictionsWriter:
         if not isinstance(dataset_sha256, str) or not HASH.fullmatch(dataset_sha256):
             raise UsageError(
                 "dataset_sha256 does not fit",
+                where="dataset_sha256",
                 expected="64 hex digits",
                 got=quote(dataset_sha256),
+                fix="copy it from `lagbench info`, or leave it out where the data set "
+                "has a recorded hash",
             )
         require_valid_attribute("method", method)
         self._dataset_sha256 = dataset_sha256
@@ -98,10 +111,16 @@ class PredictionsWriter:
         self._labels: dict[str, Label] = {"method": method}
         self.label(**labels)
 
+    def shape_of(self, scenario: int) -> tuple[int, int, int]:
+        """Return the shape of a scenario: frames to predict, particles, components."""
+        particles = self.size.particle_count(scenario)
+        return self.size.task.horizon, particles, self.size.dimension
+
     @property
-    def shape(self) -> tuple[int, int, int]:
-        """Shape of one scenario: frames to predict, particles, components."""
-        return self.size.task.horizon, self.size.particles, SPACE
+    def _stored_shape(self) -> tuple[int, int, int]:
+        """Shape of a scenario in the file, which may end in padding."""
+        particles = max_test_particles(self.size)
+        return self.size.task.horizon, particles, self.size.dimension
 
     def label(self, **labels: Label) -> None:
         """Set optional attributes, at any time before the exit.
@@ -118,7 +137,12 @@ class PredictionsWriter:
             if isinstance(value, np.generic):
                 value = value.item()
             if name not in OPTIONAL:
-                raise UsageError(f"no label {name!r}", fix=suggest_name(name, OPTIONAL))
+                raise UsageError(
+                    f"no label {name!r}",
+                    where=f"label {quote(name)}",
+                    expected=", ".join(OPTIONAL),
+                    fix=suggest_name(name, OPTIONAL),
+                )
             require_valid_attribute(name, value)
             self._labels[name] = value
 
@@ -130,6 +154,8 @@ class PredictionsWriter:
             raise UsageError(
                 "the file is being written",
                 where=str(self.path),
+                expected="a writer that is not open",
+                got="an open one",
                 fix="enter a writer once",
             )
         self._written.clear()
@@ -146,12 +172,15 @@ class PredictionsWriter:
 
     def _write_headers(self) -> None:
         """Create dimensions, coordinates, empty variables and required attributes."""
-        lengths = (len(self._row_of), *self.shape)
+        lengths = (len(self._row_of), *self._stored_shape)
         for name, length in zip(DIMS, lengths, strict=True):
             self._file.createDimension(name, length)
 
         self._create_coordinate("scenario", "scenario", list(self._row_of))
         self._create_coordinate("frame", "frame", frames_to_predict(self.size))
+        particle_counts = [self.size.particle_count(number) for number in self._row_of]
+        if len(set(particle_counts)) > 1:
+            self._create_coordinate("particle_count", "scenario", particle_counts)
         for name in self._variables:
             self._create_variable(name)
         self._file.setncatts(
@@ -201,6 +230,10 @@ class PredictionsWriter:
             raise UsageError(
                 "velocities come for every scenario or for none",
                 where=f"scenario {scenario}",
+                expected=" and ".join(self._variables),
+                got=" and ".join(arrays),
+                fix="leave velocities out: they are not scored; or give velocity=True "
+                "to the writer and velocities of every scenario",
             )
         values = {}
         for name, array in arrays.items():
@@ -211,21 +244,32 @@ class PredictionsWriter:
         row = self._row_of[scenario]
         with self._writing():
             for name, array in values.items():
-                self._file[name][row] = array
+                # Particles that the scenario does not have are padding.
+                padded = np.full(self._stored_shape, np.nan, np.float32)
+                padded[:, : array.shape[1]] = array
+                self._file[name][row] = padded
         if diverged_at is not None:
             self._diverged_at[row] = diverged_at
         self._written.add(scenario)
 
     def _check_scenario(self, scenario: int) -> None:
         """Refuse a scenario that is unknown or written already."""
+        where = f"scenario {scenario!r}"
         expected = f"whole numbers: {format_ids(self._row_of)}"
         if scenario in self._written:
             raise UsageError(
-                f"scenario {scenario!r} is written twice", expected=expected
+                "a scenario is written twice",
+                where=where,
+                expected=expected,
+                fix="add every scenario once, with all of its frames",
             )
         if scenario not in self._row_of:
             raise UsageError(
-                f"scenario {scenario!r} is no test scenario", expected=expected
+                "no such test scenario",
+                where=where,
+                expected=expected,
+                fix="name scenarios by id, not by row; predictions for other subsets "
+                "are not stored",
             )
 
     def _check_frozen(
@@ -240,6 +284,8 @@ class PredictionsWriter:
                 where=where,
                 expected=format_ids(frames),
                 got=repr(diverged_at),
+                fix="give the absolute number of the first frozen frame; frame 0 is "
+                "the first given one",
             )
         first_frozen = frames.index(diverged_at)
         frozen = position[first_frozen:]
@@ -270,10 +316,12 @@ class PredictionsWriter:
             missing = sorted(set(self._row_of) - self._written)
             if missing:
                 raise UsageError(
-                    f"{len(missing)} test scenarios are missing",
+                    f"{format_count(len(missing), 'test scenario')} missing",
                     where=str(self.path),
                     expected=format_ids(self._row_of),
                     got=f"missing: {format_ids(missing)}",
+                    fix="predict every test scenario; `lagbench template` writes a "
+                    "file to fill",
                 )
             with self._writing():
                 if (self._diverged_at != NEVER).any():
@@ -297,14 +345,18 @@ class PredictionsWriter:
         numbers = _numbers_of(values, where)
         with np.errstate(over="ignore"):
             array = numbers.astype(np.float32)
-        if array.shape != self.shape:
-            fix = None
-            if sorted(array.shape) == sorted(self.shape):
+        expected_shape = self.shape_of(scenario)
+        if array.shape != expected_shape:
+            fix = (
+                "predict all frames and all particles of the scenario: "
+                "frame, particle, space"
+            )
+            if sorted(array.shape) == sorted(expected_shape):
                 fix = "transpose it: frame, particle, space"
             raise UsageError(
                 "the shape is another",
                 where=where,
-                expected=self.shape,
+                expected=expected_shape,
                 got=array.shape,
                 fix=fix,
             )
@@ -313,8 +365,9 @@ class PredictionsWriter:
             step, particle, axis = bad_places[0].tolist()
             frame = self.size.task.input_frames + step
             raise UsageError(
-                f"{len(bad_places)} values are not finite as float32",
+                f"{format_count(len(bad_places), 'value')} not finite as float32",
                 where=f"{where}, frame {frame}, particle {particle}",
+                expected="finite positions",
                 got=array[step, particle, axis],
                 fix="freeze a diverging rollout at its last finite frame and give "
                 "diverged_at",
@@ -341,7 +394,7 @@ class PredictionsWriter:
             endian="little",
             fill_value=False,
             fletcher32=True,
-            chunksizes=(1, 1, *self.shape[1:]),
+            chunksizes=(1, 1, *self._stored_shape[1:]),
             chunk_cache=CHUNK_CACHE_BYTES,
         )
         variable.setncatts(ATTRIBUTES[name])
@@ -397,6 +450,8 @@ def _no_positions(where: str, got: str) -> UsageError:
         where=where,
         expected="an array of numbers without a mask",
         got=got[:MAX_REASON],
+        fix="convert it to one NumPy array of float32; of a tensor: "
+        "tensor.detach().cpu().numpy()",
     )
 
 
@@ -429,7 +484,7 @@ def write(
             one array [scenario, frame, particle, space] with the test scenarios by
             ascending id.
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         method: what made the predictions.
         velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
@@ -486,6 +541,7 @@ def _by_scenario(
     if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
             "the array does not hold one entry per test scenario",
+            where="positions or velocities",
             expected=f"{len(scenarios)} scenarios ({format_ids(scenarios)}) first, "
             f"{len(DIMS)} dimensions",
             got=f"shape {array.shape}",
@@ -538,7 +594,7 @@ def template(
 
     Args:
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one with data, of several mini, when None.
         output: file to write.
         overwrite: whether to replace a file of that name.
         root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
@@ -567,7 +623,7 @@ def template(
     with writer:
         for scenario in scenarios:
             last_given = truth.given_frames(scenario)[-1]
-            writer.add(scenario, np.broadcast_to(last_given, writer.shape))
+            writer.add(scenario, np.broadcast_to(last_given, writer.shape_of(scenario)))
     frames = frames_to_predict(entry)
     return TemplateResult(
         path=writer.path,

@@ -176,7 +176,9 @@ def _predict(plan: Plan, weights: Path, *, folder: Path, name: str) -> None:
 def _score(plan: Plan, folder: Path) -> None:
     from lagbench.scoring.score import score
 
-    score(folder / PREDICTIONS, root=plan.root, registry=plan.registry)
+    score(
+        folder / PREDICTIONS, root=plan.root, output_dir=folder, registry=plan.registry
+    )
 
 
 def make_training(

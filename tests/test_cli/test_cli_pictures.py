@@ -10,6 +10,8 @@ import pytest
 from conftest import SIZE, SPLIT
 from typer.testing import Result
 
+import lagbench
+from lagbench.errors import UsageError
 from lagbench.make.generate import GenerationResult
 
 Run = Callable[..., Result]
@@ -30,6 +32,24 @@ def test_a_picture_is_named_after_its_data(
     assert picture.read_bytes()[:4] == b"\x89PNG"
     assert run(*words).exit_code == 0
     assert (tmp_path / "curl-noise-tiny-0003-frame25.png").is_file()
+
+
+def test_python_draws_the_same_picture(
+    run: Run, generated: GenerationResult, tmp_path: Path
+) -> None:
+    """Named by its split or by its file, it has the bytes of the command's picture."""
+    pictures = [tmp_path / "split.png", tmp_path / "file.png", tmp_path / "command.png"]
+    options = {"frame": 5, "kind": "speed"}
+    lagbench.plot(
+        SPLIT, size=SIZE, root=generated.root, output=pictures[0], scenario=4, **options
+    )
+    file = generated.folder / "test" / "0004.nc"
+    lagbench.plot(file, output=pictures[1], **options)
+    words = ("plot", file, "--frame", 5, "--kind", "speed", "-o", pictures[2])
+    assert run(*words).exit_code == 0
+    assert len({picture.read_bytes() for picture in pictures}) == 1
+    with pytest.raises(UsageError):
+        lagbench.animate(file, beside=4, output=tmp_path / "none" / "film.gif")
 
 
 def test_two_files_become_one_film(

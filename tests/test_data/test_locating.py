@@ -139,12 +139,13 @@ def test_ours_are_found_as_before(tmp_path: Path) -> None:
 
 
 def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
-    """One size there: that one. None or several: an error that names them. What is to
-    be made: mini.
+    """One size there: that one; of several mini. None, or several without mini: an
+    error that names them. What is to be made: mini.
     """
     with pytest.raises(UsageError) as none:
         lagbench.open_split("cavity", root=tmp_path)
     assert none.value.where == "--size"
+    assert "--size mini" in str(none.value.fix)
     for size in ("tiny", "full"):
         folder = (
             dataset_folder(tmp_path, "cavity", size, load().size("cavity", size).major)
@@ -165,6 +166,11 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
         assert several.value.where == "--size"
         assert several.value.fix == "--size full"
     assert locate_new("cavity", root=tmp_path).size.name == "mini"
+    mini = load().size("cavity", "mini")
+    mini_folder = dataset_folder(tmp_path, "cavity", "mini", mini.major) / "test"
+    mini_folder.mkdir(parents=True)
+    (mini_folder / "0000.nc").touch()
+    assert locate("cavity", root=tmp_path).size.name == "mini"
     # Where a split has no mini, its only size is the default.
     assert (
         locate_new("own", root=own.parent).size.name

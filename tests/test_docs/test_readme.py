@@ -61,7 +61,7 @@ def test_the_readme_program_beats_the_best_floor(tmp_path: Path) -> None:
     printed = run_program(program, tmp_path, tmp_path)
     assert printed.strip().endswith("over persistence")
     assert "\r" not in printed
-    scores = json.loads((tmp_path / "scores.json").read_text())
+    scores = json.loads((tmp_path / "predictions" / "scores.json").read_text())
     assert scores["skill"]["interval"][0] > 0.1
 
 
@@ -80,7 +80,7 @@ def test_the_notebook_runs(tmp_path: Path) -> None:
     client.execute()
     shown = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     assert "True" in [output.get("data", {}).get("text/plain") for output in shown]
-    assert (tmp_path / "scores.json").is_file()
+    assert (tmp_path / "predictions" / "scores.json").is_file()
     assert (tmp_path / "truth.gif").read_bytes().startswith(b"GIF89a")
 
 

@@ -339,7 +339,7 @@ def test_numbers_that_do_not_compute(
         (
             "3D",
             UnreadableFileError,
-            "not plane",
+            "dimension",
         ),
         (
             "no test",

@@ -46,13 +46,14 @@ def predictions(run: Run, tmp_path: Path) -> Path:
 def test_a_template_validates_and_scores(run: Run, predictions: Path) -> None:
     """The output names references, undefined frames, flags and files."""
     assert run("validate", predictions).exit_code == 0
-    result = run("score", predictions)
+    result = run("score", predictions, "--all")
     assert result.exit_code == 0
     words = (
         "persistence",
         "vorticity_rmse",
         "vorticity_pearson 40",
         "1/frame",
+        "against_classical: none",
         "flag copy_suspect",
         "scores.nc",
     )
@@ -60,6 +61,25 @@ def test_a_template_validates_and_scores(run: Run, predictions: Path) -> None:
         assert word in result.stdout
     for line in result.stderr.splitlines():
         assert "scenarios" in line  # progress, on a slow machine
+
+
+def test_the_short_output_has_the_skill_and_five_rows(
+    run: Run, predictions: Path
+) -> None:
+    """It also says where the files are and how to see more."""
+    result = run("score", predictions)
+    lines = result.stdout.splitlines()
+    rule = next(number for number, line in enumerate(lines) if line[:3] == "───")
+    end = next(
+        number for number in range(rule, len(lines)) if not lines[number].strip()
+    )
+    rows = lines[rule + 1 : end]
+    assert [row.split()[0] for row in rows][:2] == ["skill", "vorticity_nrmse"]
+    assert len(rows) == 6
+    assert "against " in result.stdout
+    assert str(predictions.with_suffix("") / "scores.json") in result.stdout
+    assert "--all" in lines[-1]
+    assert "not raised" not in result.stdout
 
 
 def test_json_is_the_file(run: Run, predictions: Path) -> None:
@@ -104,24 +124,27 @@ def test_a_template_without_data_names_the_command_that_makes_them(
 
 
 def test_scores_are_called_as_their_predictions(run: Run, predictions: Path) -> None:
-    """Scores of gns.nc lie in gns/."""
-    other = predictions.with_name("gns.nc")
-    shutil.copy(predictions, other)
-    assert run("score", other).exit_code == 0
-    assert (predictions.parent / "gns" / "scores.nc").is_file()
+    """Scores of gns.nc lie in gns/; a file without suffix keeps its place."""
+    for name, folder in (("gns.nc", "gns"), ("gat", "gat-scores")):
+        other = predictions.with_name(name)
+        shutil.copy(predictions, other)
+        result = run("score", other)
+        assert result.exit_code == 0, result.stderr
+        assert (predictions.parent / folder / "scores.nc").is_file()
+        assert other.is_file()
 
 
 def test_scores_of_another_method_are_not_replaced(run: Run, predictions: Path) -> None:
     """Those of the same method are."""
     assert run("score", predictions).exit_code == 0
     assert run("score", predictions).exit_code == 0
-    scores = predictions.with_name("scores.json")
+    scores = predictions.with_suffix("") / "scores.json"
     before = scores.read_bytes()
     other = predictions.with_name("gns.nc")
     shutil.copy(predictions, other)
     with h5py.File(other, "a") as file:
         file.attrs["method"] = "gns"
-    result = run("score", other, "--output", predictions.parent)
+    result = run("score", other, "--output", scores.parent)
     assert result.exit_code == 2
     assert "persistence" in result.stderr
     assert scores.read_bytes() == before
@@ -220,7 +243,7 @@ def test_other_files_of_lagbench_are_no_predictions(
 ) -> None:
     """The validation says so in one finding."""
     run("score", predictions)
-    scores = predictions.with_name("scores.nc")
+    scores = predictions.with_suffix("") / "scores.nc"
     scenario = next(generated.folder.glob("test/*.nc"))
     for path in (scores, scenario):
         findings = submission.validate(path).findings
@@ -291,20 +314,22 @@ METRICS = (
 """
 
 
-def test_a_failing_metric_of_a_package_is_located(
-    run: Run, predictions: Path, package: Callable[..., Path]
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_failing_metric_of_a_package_costs_its_column(
+    run: Run, predictions: Path, package: Callable[..., Path], workers: int
 ) -> None:
-    """The message has the line, the metric, the frame and the scenario."""
+    """The warning has the line, the metric and the frame; the rest is as without."""
+    assert run("score", predictions, "-o", predictions.parent).exit_code == 0
+    expected = json.loads((predictions.parent / "scores.json").read_text())
     module = package("metrics", "failing_metric:METRICS", FAILING)
-    with h5py.File(predictions) as file:
-        first_scenario = min(file["scenario"][:])
-    result = run("score", predictions)
-    assert result.exit_code == 5
-    assert f"{module}, line 6" in result.stderr
-    assert "my_enstrophy" in result.stderr
-    assert "frame 10" in result.stderr
-    assert f"scenario {first_scenario}" in result.stderr
-    assert not predictions.with_name("scores.json").exists()
+    result = run("score", predictions, "--workers", workers)
+    assert result.exit_code == 0, result.stderr
+    for word in (f"{module}, line 6", "my_enstrophy", "frame 10"):
+        assert word in result.stdout
+    content = json.loads((predictions.parent / "predictions/scores.json").read_text())
+    assert [warning["check"] for warning in content.pop("warnings")] == ["metric"]
+    assert not expected.pop("warnings")
+    assert content == expected
 
 
 def test_several_files_keep_their_scores(
@@ -415,7 +440,7 @@ def test_foreign_text_does_not_reach_the_terminal(
 ) -> None:
     """Control characters or endless text make a scores.json unreadable."""
     run("score", predictions, "--quiet")
-    path = predictions.parent / "scores.json"
+    path = predictions.with_suffix("") / "scores.json"
     content = json.loads(path.read_text()) | {"method": method}
     path.write_text(json.dumps(content))
     result = run("compare", path, "persistence")

@@ -189,8 +189,8 @@ def test_the_table_of_means_counts_undefined_frames(tmp_path: Path) -> None:
     assert result.metrics["mse_avg"].undefined == (19, 0)
     (means,) = [table for table in comparison_tables(result) if table.title == "means"]
     ((_, first_cell, second_cell, *_),) = means.rows
-    assert "19 frames undefined" in first_cell
-    assert "undefined" not in second_cell
+    assert first_cell.endswith("†19")
+    assert "†" not in second_cell
 
 
 @pytest.mark.parametrize(
@@ -276,6 +276,69 @@ def test_seeds_of_a_leaderboard_go_by_their_common_name(
     result = compare(board / "moving.nc", "constant-velocity")
     assert result.first == "moving"
     assert result.seeds == (2, 1)
+
+
+@pytest.fixture
+def entries(scored: dict[str, Path], bench: ScoreBench, tmp_path: Path) -> Path:
+    """A leaderboard with one entry, named ``moving``, for the data of the bench."""
+    folder = tmp_path / "board" / "scores" / bench.size.split / bench.size.name
+    folder.mkdir(parents=True)
+    shutil.copy(scored["straight"] / "scores.nc", folder / "moving.nc")
+    return tmp_path / "board"
+
+
+def test_an_entry_of_the_leaderboard_goes_by_its_name(
+    scored: dict[str, Path], entries: Path, bench: ScoreBench
+) -> None:
+    """On the right its name is enough; on the left the data set belongs to it."""
+    result = compare(scored["still"], "moving", board=entries)
+    assert result.second == "straight"
+    assert result.metrics[result.ranking].side == "worse"
+    name = f"{bench.size.split}/{bench.size.name}/moving"
+    swapped = compare(name, scored["still"], board=entries)
+    assert swapped.metrics[swapped.ranking].side == "better"
+    with pytest.raises(UsageError, match=name):
+        compare("moving", "persistence", board=entries)
+
+
+def test_an_unknown_entry_is_refused_before_predictions_are_scored(
+    scored: dict[str, Path],
+    entries: Path,
+    bench: ScoreBench,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def score_nothing(*_: object, **__: object) -> None:
+        pytest.fail("the predictions were scored")
+
+    monkeypatch.setattr("lagbench.scoring.score.score_scenarios", score_nothing)
+    with pytest.raises(UsageError) as caught:
+        compare(
+            scored["still"] / "predictions.nc",
+            "movin",
+            board=entries,
+            root=bench.root,
+            registry=bench.registry,
+        )
+    assert "'moving'" in str(caught.value.fix)
+
+
+def test_a_named_board_must_be_one(scored: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        compare(scored["still"], "moving", board=tmp_path)
+    assert str(tmp_path) in str(caught.value.where)
+
+
+def test_a_column_says_which_method_is_better(tmp_path: Path) -> None:
+    """A difference that may be chance is open."""
+    a = publish(tmp_path, [1.0] * 6, method="a")
+    b = publish(tmp_path, [2.0] * 6, method="b")
+    c = publish(tmp_path, [0.5, 1.5, 1.5, 1.5, 1.5, 1.5], method="c")
+    sides = []
+    for first, second in ((a, b), (b, a), (a, c), (a, a)):
+        table = next(iter(comparison_tables(compare(first, second))))
+        column = table.columns.index("first is")
+        sides.append(table.rows[0][column])
+    assert sides == ["better", "worse", "better, open", "same"]
 
 
 def test_scores_nc_has_the_best_reference(scored: dict[str, Path]) -> None:

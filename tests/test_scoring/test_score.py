@@ -319,3 +319,33 @@ def test_optional_metrics_need_their_extra(
     else:
         card = bench.evaluate(predictions, extras=("transport",))
         assert card.submission["sinkhorn_pot"].mean > 0.0
+
+
+def test_a_card_becomes_a_table_of_values(bench: ScoreBench, tmp_path: Path) -> None:
+    """Each value of a row, a metric and a scenario has a line."""
+    card = bench.evaluate(bench.submit(tmp_path / "predictions.nc", half_right))
+    table = card.to_dataframe()
+    lines = table[(table.row == "submission") & (table.metric == card.ranking)]
+    assert lines.scenario.tolist() == list(card.scenarios)
+    assert lines.value.mean() == pytest.approx(card.submission[card.ranking].mean)
+    assert set(table.row) == set(card.scores)
+
+
+def test_a_card_in_a_notebook_is_escaped(bench: ScoreBench, tmp_path: Path) -> None:
+    """The name of the method comes from strangers."""
+    method = "<img src=x>"
+    path = bench.submit(tmp_path / "predictions.nc", half_right, method=method)
+    page = bench.evaluate(path)._repr_html_()
+    assert "&lt;img src=x&gt;" in page
+    assert "<img" not in page
+    assert bench.evaluate(path).ranking in page
+
+
+def test_predictions_for_another_split_are_refused(
+    bench: ScoreBench, tmp_path: Path
+) -> None:
+    path = bench.submit(tmp_path / "predictions.nc", half_right)
+    with pytest.raises(UsageError) as caught:
+        bench.evaluate(path, split="fluid")
+    assert caught.value.expected == "fluid"
+    assert bench.evaluate(path, split=bench.size.split).skill is not None

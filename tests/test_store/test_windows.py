@@ -136,6 +136,15 @@ def test_every_window_is_the_stored_frames(train: Open) -> None:
     assert number == WINDOWS
 
 
+def test_windows_say_what_they_hold(train: Open) -> None:
+    """In a terminal and in a notebook."""
+    data = train(history=2, future=1)
+    for text in (repr(data), data._repr_html_()):
+        assert data.size.split in text
+        assert str(len(data)) in text
+        assert "2 given + 1 to predict" in text
+
+
 def test_windows_have_the_first_frame_on_request(train: Open) -> None:
     data = train()
     with_origin = train(origin=True)
@@ -872,6 +881,27 @@ def test_predictions_are_rollouts_of_the_task(
         expected = roll_out(extrapolate, window, task.horizon).transpose(0, 1)
         assert predictions[scenario].dtype == np.float32
         np.testing.assert_array_equal(predictions[scenario], expected.numpy())
+
+
+def test_predictions_that_are_no_numbers_are_refused(
+    root: Path, registry: Registry
+) -> None:
+    """The scenario, the first such frame and the particle are named."""
+
+    def step(batch: Batch) -> torch.Tensor:
+        position = extrapolate(batch)
+        if batch.frame.tolist() != [0]:
+            position[3, 1] = torch.nan
+        return position
+
+    with pytest.raises(UsageError) as caught:
+        next(
+            predict(
+                step, "cavity", size="tiny", root=root, registry=registry, history=2
+            )
+        )
+    assert "scenario 4" in str(caught.value.where)
+    assert "particle 3" in str(caught.value.where)
 
 
 @pytest.mark.parametrize("history", [0, 7])

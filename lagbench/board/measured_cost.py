@@ -1,0 +1,130 @@
+"""Measure what a frame costs: models, our solver and reference predictors in one run.
+
+Every row takes its turn in every repeat, on one core, and the least of the repeats
+counts: other work on the machine can only add. The times are processor times, so
+waiting does not count.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lagbench.data.checksums import round_digits
+from lagbench.references.predictor import Given, Kind, ReferencePredictor, given_in
+from lagbench.references.table import references_of
+from lagbench.scoring.task import ScoredTask
+from lagbench.work.progress import Meter
+
+from .entry import Entry, MeasuredCost
+from .verified import today
+
+if TYPE_CHECKING:
+    from .reproduce import Runner
+
+REPEATS = 3
+TIMED_FRAMES = 10
+DIGITS = 4  # of a time
+
+TimeSolver = Callable[[str, str], float | None]
+"""From a split and size to the solver's processor time of a frame [s]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimedEntry:
+    """An entry with its model, ready to be timed."""
+
+    entry: Entry
+    runner: Runner
+
+
+def measure_costs(
+    timed: Sequence[TimedEntry],
+    task: ScoredTask,
+    *,
+    root: Path,
+    time_solver: TimeSolver | None,
+    meter: Meter,
+    repeats: int = REPEATS,
+) -> list[tuple[Entry, MeasuredCost]]:
+    """Return the cost of a frame for entries of one data set.
+
+    Args:
+        timed: entries of one split and size, with their models.
+        task: the test subset of that data set; its first scenario is predicted.
+        root: folder of all data sets.
+        time_solver: function that returns the solver's time; None leaves it out.
+        meter: counts the rows that are timed.
+        repeats: turns of every row.
+    """
+    size = task.size
+    first_scenario = task.scenarios[0]
+    path = task.truth.path(first_scenario)
+    with task.opened(first_scenario) as truth:
+        given = given_in(truth.file, size, root)
+    # those that read train take minutes, and lie in files of the package already
+    references = []
+    for reference in references_of(size):
+        if not reference.reads_train:
+            references.append(reference)
+
+    rounds: list[dict[str, float]] = []
+    row_count = len(timed) + len(references) + 1
+    meter.begin(
+        f"costs of {size.split} {size.name}", total=row_count * repeats, scenarios=0
+    )
+    for _ in range(repeats):
+        seconds: dict[str, float] = {}
+        if time_solver is not None:
+            solver_seconds = time_solver(size.split, size.name)
+            if solver_seconds is not None:
+                seconds["solver"] = solver_seconds
+        meter.count(1)
+        for reference in references:
+            seconds[f"reference {reference.name}"] = time_reference(reference, given)
+            meter.count(1)
+        for one in timed:
+            frames = min(TIMED_FRAMES, task.config.horizon)
+            seconds[one.entry.method] = one.runner.time(path, frames)
+            meter.count(1)
+        rounds.append(seconds)
+
+    least = {}
+    for name in rounds[0]:
+        least[name] = round_digits(min(row[name] for row in rounds), DIGITS)
+    kinds: dict[Kind, dict[str, float]] = {Kind.CLASSICAL: {}, Kind.NAIVE: {}}
+    for reference in references:
+        kinds[reference.kind][reference.name] = max(
+            least[f"reference {reference.name}"], 1e-7
+        )
+    costs = []
+    for one in timed:
+        cost = MeasuredCost(
+            machine=describe_processor(),
+            date=today(),
+            repeats=repeats,
+            seconds_per_frame=least[one.entry.method],
+            solver=least.get("solver"),
+            classical=kinds[Kind.CLASSICAL],
+            naive=kinds[Kind.NAIVE],
+        )
+        costs.append((one.entry, cost))
+    return costs
+
+
+def time_reference(reference: ReferencePredictor, given: Given) -> float:
+    """Return the processor time of a frame, mean over the first frames [s]."""
+    started = time.process_time()
+    frames = list(itertools.islice(reference.predict(given), TIMED_FRAMES))
+    return (time.process_time() - started) / len(frames)
+
+
+def describe_processor() -> str:
+    """Return the processor and that one thread ran on it."""
+    from lagbench.baselines.machine import hardware
+
+    return f"{hardware()['processor']}, 1 thread"

@@ -1,0 +1,590 @@
+"""Reproduce entries: run their models again, and compare the scores.
+
+``lagbench leaderboard reproduce`` predicts test scenarios with the model that lies
+beside an entry, scores the prediction, and compares it with the score file, scenario by
+scenario. Then it measures what a frame costs (`measured_cost`). Results go to
+verified.yaml after every model, so an interrupted run goes on where it stopped.
+
+The same model does not give the same bits on every processor. docs/reproduce.md says
+how far two processors differ; :data:`TOLERANCE` follows from that.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.checksums import file_sha256, round_digits
+from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.registry import Registry, Size
+from lagbench.errors import (
+    ChecksFailedError,
+    LagbenchError,
+    UsageError,
+    check_installed,
+    suggest_name,
+)
+from lagbench.metrics.aggregate import Tally, score
+from lagbench.metrics.frame import snapshots
+from lagbench.metrics.table import METRICS, select
+from lagbench.scoring.card import SUBMISSION
+from lagbench.scoring.scenario import measure_rows
+from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.task import ScoredTask, load_scored_task
+from lagbench.work.progress import Meter, Progress
+
+from .entry import (
+    Entry,
+    Level,
+    MeasuredCost,
+    Prediction,
+    Reproduction,
+    Status,
+    Verification,
+)
+from .entry_file import read_entry
+from .folder import Folder
+from .measured_cost import TimedEntry, TimeSolver, measure_costs
+from .ranking import is_current
+from .verified import read_verified, record, verification_of
+
+TOLERANCE = 1e-3
+"""Relative difference of the ranking metric, its mean over scenarios, up to which a
+score counts as reproduced.
+"""
+
+DIGITS = 9  # of scores in a record
+DIFFERENCE_DIGITS = 2
+
+
+class Runner(Protocol):
+    """A model that predicts scenarios one by one."""
+
+    def predict(
+        self, scenario_file: Path, frames: int | None = None
+    ) -> NDArray[np.float32]:
+        """Return positions of the next frames, [frame, particle, axis] [length]."""
+        ...
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Return the processor time of a frame [s]."""
+        ...
+
+    def close(self) -> None:
+        """Free what the model holds."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class Failure:
+    """An entry that could not be run."""
+
+    entry: str  # path of its YAML file in the leaderboard's folder
+    error: LagbenchError
+
+
+@dataclass(kw_only=True)
+class ReproduceResult:
+    """What came of running the models of entries again."""
+
+    folder: Path
+    # lines of verified.yaml by path of the entry, those of earlier runs among them
+    lines: dict[str, Verification] = field(default_factory=dict)
+    # predicted in this run, as in "cavity/mini/gns, seed 0"
+    predicted: list[str] = field(default_factory=list)
+    failures: list[Failure] = field(default_factory=list)
+
+    @property
+    def differing(self) -> list[str]:
+        """Entries with a model that gives other scores."""
+        names = []
+        for path, line in self.lines.items():
+            if not all(one.agrees for one in line.reproduced):
+                names.append(path)
+        return names
+
+    def to_plain(self) -> dict[str, object]:
+        """Return plain values, which JSON can hold."""
+        lines = {}
+        for path, line in self.lines.items():
+            lines[path] = line.model_dump(mode="json", exclude_none=True)
+        failures = {}
+        for failure in self.failures:
+            failures[failure.entry] = str(failure.error)
+        return {
+            "folder": str(self.folder),
+            "entries": lines,
+            "predicted": self.predicted,
+            "differing": self.differing,
+            "failures": failures,
+        }
+
+    @property
+    def exit_code(self) -> int:
+        """0 where all scores agree, 1 where some differ, else that of a failure."""
+        if self.differing:
+            return ChecksFailedError.exit_code
+        if self.failures:
+            return self.failures[0].error.exit_code
+        return 0
+
+
+def reproduce(
+    board: str | Path,
+    entries: Sequence[str] = (),
+    *,
+    split: str | None = None,
+    size: str | None = None,
+    scenarios: int | None = None,
+    scores: bool = True,
+    costs: bool = True,
+    again: bool = False,
+    recording: bool = True,
+    threads: int = 1,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+    time_solver: TimeSolver | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> ReproduceResult:
+    """Run the models of entries, compare their scores, measure their costs.
+
+    Entries that are recorded for the same models and scores, with as many scenarios,
+    are not run again.
+
+    Args:
+        board: the leaderboard's folder.
+        entries: entries, as in ``cavity/mini/gns``; by default all that have models.
+        split: only entries of this split.
+        size: only entries of this size.
+        scenarios: predict only so many scenarios of each; by default all.
+        scores: whether to predict and compare scores.
+        costs: whether to measure costs.
+        again: whether to run also what is recorded.
+        recording: whether to write verified.yaml.
+        threads: threads of a model while it predicts; costs are those of one.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        registry: where splits are described; ours when None.
+        time_solver: function that returns the solver's processor time of a frame [s].
+            The caller gives it, because a board does not import the solver.
+        progress: called as the work advances.
+
+    Raises:
+        UsageError: there is no leaderboard, no such entry, or one without a model; or
+            torch is missing.
+        DataError: the data of a named entry are missing or others.
+        UnreadableFileError: a model of a named entry cannot be read.
+        WorkFailedError: the disk or the memory is full.
+    """
+    folder = Folder(board)
+    folder.require()
+    check_installed("torch", extra="baselines")
+    data_root = resolve_root(root)
+    described = load_rooted_registry(data_root, registry)
+    chosen = choose_entries(folder, entries, described, split=split, size=size)
+
+    run = _Run(
+        folder=folder,
+        root=data_root,
+        registry=described,
+        scenarios=scenarios,
+        again=again,
+        recording=recording,
+        threads=threads,
+        meter=Meter(progress),
+        result=ReproduceResult(folder=folder.path),
+    )
+    is_named = bool(entries)
+    if scores:
+        for entry in chosen:
+            try:
+                run.reproduce(entry)
+            except LagbenchError as error:
+                if is_named:
+                    raise
+                path = entry.yaml_path.as_posix()
+                run.result.failures.append(Failure(entry=path, error=error))
+    if costs:
+        run.measure_costs(chosen, time_solver)
+    for entry in chosen:
+        line = run.line_of(entry)
+        if line is not None:
+            run.result.lines[entry.yaml_path.as_posix()] = line
+    return run.result
+
+
+def choose_entries(
+    folder: Folder,
+    names: Sequence[str],
+    registry: Registry,
+    *,
+    split: str | None = None,
+    size: str | None = None,
+) -> list[Entry]:
+    """Return entries by name, or all active ones of the present data with models.
+
+    Raises:
+        UsageError: no such entry, or one that has no model.
+    """
+    known = {}
+    for path in folder.entries():
+        name = "/".join(path.with_suffix("").parts[1:])
+        known[name] = path
+    if names:
+        chosen = []
+        for name in names:
+            key = name.removesuffix(".yaml").rpartition("submissions/")[2]
+            if key not in known:
+                raise UsageError(
+                    "no such entry",
+                    where=str(folder.path),
+                    expected="SPLIT/SIZE/METHOD, as in cavity/mini/gns",
+                    got=name,
+                    fix=suggest_name(key, known),
+                )
+            entry = read_entry(folder.path / known[key])
+            if not has_models(entry):
+                raise UsageError(
+                    "the entry has no model to run",
+                    where=key,
+                    fix="its submitter may add one: lagbench submit --weights",
+                )
+            chosen.append(entry)
+        return chosen
+
+    chosen = []
+    for path in known.values():
+        _, entry_split, entry_size, _ = path.parts
+        if split not in (None, entry_split) or size not in (None, entry_size):
+            continue
+        entry = read_entry(folder.path / path)
+        is_present = is_current(entry.dataset, registry.size(entry_split, entry_size))
+        if entry.status is Status.ACTIVE and has_models(entry) and is_present:
+            chosen.append(entry)
+    return chosen
+
+
+def has_models(entry: Entry) -> bool:
+    """Return whether a model lies beside an entry."""
+    return any(prediction.weights is not None for prediction in entry.predictions)
+
+
+def sample_scenarios(
+    scenarios: Collection[int], model_sha256: str, count: int | None
+) -> tuple[int, ...]:
+    """Return the scenarios to predict anew, ascending.
+
+    A sample follows from the model, so it is the same in every run.
+    """
+    if count is None or count >= len(scenarios):
+        return tuple(sorted(scenarios))
+
+    def digest(scenario: int) -> bytes:
+        return hashlib.sha256(f"{model_sha256} {scenario}".encode()).digest()
+
+    return tuple(sorted(sorted(scenarios, key=digest)[:count]))
+
+
+def open_model(
+    folder: Folder,
+    entry: Entry,
+    prediction: Prediction,
+    *,
+    root: Path,
+    registry: Registry,
+    threads: int = 1,
+) -> Runner:
+    """Return the model of a seed, ready to predict.
+
+    Raises:
+        UsageError: the seed has no model, or its architecture is not installed.
+        UnreadableFileError: the file is damaged, or not the one that the entry names.
+        DataError: it was trained on other data.
+    """
+    if prediction.weights is None:
+        raise UsageError("the seed has no model", where=str(entry.yaml_path))
+    path = folder.path / prediction.weights.path
+    if folder.link_in(Path(prediction.weights.path)) is not None or (
+        not path.is_file() or file_sha256(path) != prediction.weights.sha256
+    ):
+        raise ChecksFailedError(
+            "the model is not the one that the entry names",
+            where=str(path),
+            expected=f"SHA-256 {prediction.weights.sha256[:16]}",
+            fix="lagbench leaderboard check",
+        )
+    from lagbench.baselines.runner import WeightsRunner
+
+    provenance = prediction.provenance or entry.provenance
+    settings: tuple[str, ...] = ()
+    if provenance is not None:
+        settings = provenance.prediction_overrides
+    return WeightsRunner(
+        path,
+        size=entry.size,
+        root=root,
+        registry=registry,
+        settings=settings,
+        threads=threads,
+    )
+
+
+def score_positions(
+    task: ScoredTask, scenario: int, position: NDArray[np.float32], metric: str
+) -> Tally:
+    """Return the statistics of a predicted scenario that a metric needs."""
+    with task.opened(scenario) as truth:
+        rows = {SUBMISSION: snapshots(truth.scenario, position)}
+        tallies, _ = measure_rows(
+            truth.scenario, truth.snapshots(), rows, metrics=select([metric])
+        )
+    return tallies[SUBMISSION]
+
+
+@dataclass(kw_only=True)
+class _Run:
+    """One run of the command: its choices, and what it has loaded."""
+
+    folder: Folder
+    root: Path
+    registry: Registry
+    scenarios: int | None
+    again: bool
+    recording: bool
+    threads: int
+    meter: Meter
+    result: ReproduceResult
+    _tasks: dict[tuple[str, str], ScoredTask] = field(default_factory=dict)
+    # lines that are not written where the run records nothing
+    _lines: dict[str, Verification] = field(default_factory=dict)
+
+    def line_of(self, entry: Entry) -> Verification | None:
+        """Return the line of an entry: of this run, else the recorded one."""
+        line = self._lines.get(entry.yaml_path.as_posix())
+        if line is None:
+            line = verification_of(entry, read_verified(self.folder))
+        return line
+
+    def reproduce(self, entry: Entry) -> None:
+        """Predict with every model of an entry, and record how the scores compare."""
+        for index, prediction in enumerate(entry.predictions):
+            if prediction.weights is None:
+                continue
+            task = self._task(entry)
+            chosen = sample_scenarios(
+                task.scenarios, prediction.weights.sha256, self.scenarios
+            )
+            if not self.again and self._is_recorded(entry, prediction, len(chosen)):
+                continue
+            reproduction = self._predict(entry, index, task, chosen)
+            self._record(entry, reproduction)
+            self.result.predicted.append(_name_seed(entry, prediction))
+
+    def _is_recorded(self, entry: Entry, prediction: Prediction, count: int) -> bool:
+        line = self.line_of(entry)
+        if line is None:
+            return False
+        for one in line.reproduced:
+            if one.seed == prediction.seed and one.scenarios >= count:
+                return True
+        return False
+
+    def _task(self, entry: Entry) -> ScoredTask:
+        size = self._size(entry)
+        key = (entry.split, entry.size)
+        if key not in self._tasks:
+            self._tasks[key] = load_scored_task(size, self.root)
+        return self._tasks[key]
+
+    def _size(self, entry: Entry) -> Size:
+        return self.registry.size(entry.split, entry.size)
+
+    def _predict(
+        self, entry: Entry, index: int, task: ScoredTask, chosen: Sequence[int]
+    ) -> Reproduction:
+        """Predict scenarios with a model and compare the ranking metric."""
+        prediction = entry.predictions[index]
+        metric = entry.score.ranking_metric
+        stored = read_score_file(self.folder.path / entry.score_paths[index])
+        model = open_model(
+            self.folder,
+            entry,
+            prediction,
+            root=self.root,
+            registry=self.registry,
+            threads=self.threads,
+        )
+        self.meter.begin(
+            _name_seed(entry, prediction), total=len(chosen), scenarios=len(chosen)
+        )
+        tallies = {}
+        stored_tallies = {}
+        try:
+            for scenario in chosen:
+                position = model.predict(task.truth.path(scenario))
+                tallies[scenario] = score_positions(task, scenario, position, metric)
+                stored_tallies[scenario] = stored.scores.tallies[scenario]
+                self.meter.count(1, scenarios=1)
+        finally:
+            model.close()
+        return compare(
+            metric,
+            stored_tallies,
+            tallies,
+            seed=prediction.seed,
+            model=str(prediction.weights and prediction.weights.sha256),
+            of=len(task.scenarios),
+        )
+
+    def _record(self, entry: Entry, reproduction: Reproduction) -> None:
+        def change(line: Verification) -> Verification:
+            return with_reproduction(line, reproduction, seeds=len(entry.predictions))
+
+        self._change(entry, change)
+
+    def _change(
+        self, entry: Entry, change: Callable[[Verification], Verification]
+    ) -> None:
+        if self.recording:
+            record(self.folder, entry, change)
+            return
+        line = self.line_of(entry)
+        if line is None:
+            line = Verification.model_construct(
+                scores=(), level=Level.AS_SUBMITTED, reproduced=(), cost=None
+            )
+        self._lines[entry.yaml_path.as_posix()] = change(line)
+
+    def measure_costs(
+        self, entries: Sequence[Entry], time_solver: TimeSolver | None
+    ) -> None:
+        """Measure the costs of entries, all of a data set in one run."""
+        by_data_set: dict[tuple[str, str], list[Entry]] = {}
+        for entry in entries:
+            line = self.line_of(entry)
+            has_cost = line is not None and line.cost is not None
+            if self.again or not has_cost:
+                by_data_set.setdefault((entry.split, entry.size), []).append(entry)
+        for group in by_data_set.values():
+            self._measure_costs_of_data_set(group, time_solver)
+
+    def _measure_costs_of_data_set(
+        self, entries: Sequence[Entry], time_solver: TimeSolver | None
+    ) -> None:
+        timed = []
+        opened: list[Runner] = []
+        try:
+            for entry in entries:
+                runner = self._open_first_model(entry)
+                if runner is not None:
+                    opened.append(runner)
+                    timed.append(TimedEntry(entry=entry, runner=runner))
+            if not timed:
+                return
+            task = self._task(entries[0])
+            costs = measure_costs(
+                timed, task, root=self.root, time_solver=time_solver, meter=self.meter
+            )
+        finally:
+            for runner in opened:
+                runner.close()
+        for entry, cost in costs:
+            self._change(entry, partial(_with_cost, cost=cost))
+
+    def _open_first_model(self, entry: Entry) -> Runner | None:
+        """Return the model of the first seed that has one; None where it fails."""
+        for prediction in entry.predictions:
+            if prediction.weights is None:
+                continue
+            try:
+                return open_model(
+                    self.folder,
+                    entry,
+                    prediction,
+                    root=self.root,
+                    registry=self.registry,
+                )
+            except LagbenchError as error:
+                path = entry.yaml_path.as_posix()
+                failed = {failure.entry for failure in self.result.failures}
+                if path not in failed:
+                    self.result.failures.append(Failure(entry=path, error=error))
+        return None
+
+
+def _with_cost(line: Verification, cost: MeasuredCost) -> Verification:
+    return line.model_copy(update={"cost": cost})
+
+
+def compare(
+    metric: str,
+    submitted: Mapping[int, Tally],
+    reproduced: Mapping[int, Tally],
+    *,
+    seed: int | None,
+    model: str,
+    of: int,
+) -> Reproduction:
+    """Return how a metric of the same scenarios compares.
+
+    Raises:
+        ChecksFailedError: one side has no value.
+    """
+    before = score(METRICS[metric], submitted)
+    after = score(METRICS[metric], reproduced)
+    if before is None or after is None:
+        raise ChecksFailedError("the ranking metric has no value", where=metric)
+    scale = np.maximum(np.abs(before.values), np.finfo(np.float32).tiny)
+    relative = np.abs(after.values - before.values) / scale
+    difference = abs(after.mean - before.mean) / max(
+        abs(before.mean), float(np.finfo(np.float32).tiny)
+    )
+    return Reproduction(
+        seed=seed,
+        model=model,
+        metric=metric,
+        scenarios=len(reproduced),
+        of=of,
+        submitted=round_digits(before.mean, DIGITS),
+        reproduced=round_digits(after.mean, DIGITS),
+        difference=round_digits(difference, DIFFERENCE_DIGITS),
+        tolerance=TOLERANCE,
+        greatest=round_digits(float(np.max(relative)), DIFFERENCE_DIGITS),
+    )
+
+
+def with_reproduction(
+    line: Verification, reproduction: Reproduction, *, seeds: int
+) -> Verification:
+    """Return a line with one more reproduction, at the level that follows.
+
+    Args:
+        line: the line of an entry.
+        reproduction: the result of one of its models.
+        seeds: number of predictions of the entry.
+    """
+    others = []
+    for one in line.reproduced:
+        if one.seed != reproduction.seed:
+            others.append(one)
+    reproduced = sorted([*others, reproduction], key=lambda one: one.seed or 0)
+    is_reproduced = len(reproduced) == seeds and all(one.agrees for one in reproduced)
+    level = line.level
+    if is_reproduced and level.rank < Level.REPRODUCED.rank:
+        level = Level.REPRODUCED
+    elif not is_reproduced and level is Level.REPRODUCED:
+        level = Level.AS_SUBMITTED
+    return line.model_copy(update={"reproduced": tuple(reproduced), "level": level})
+
+
+def _name_seed(entry: Entry, prediction: Prediction) -> str:
+    name = "/".join(entry.place)
+    if prediction.seed is None:
+        return name
+    return f"{name}, seed {prediction.seed}"

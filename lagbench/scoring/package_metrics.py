@@ -1,0 +1,82 @@
+"""Metrics of other packages that fail: they cost their own column, not the score."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+from lagbench.errors import WorkFailedError, find_faulty_package
+from lagbench.metrics.metric import Metric
+from lagbench.metrics.table import METRICS
+from lagbench.submission.issues import Severity, ValidationIssue, quote
+
+FIX = "mend or uninstall the package that adds it"
+
+
+class PackageMetricError(WorkFailedError):
+    """A metric of another package failed."""
+
+    def __init__(self, metric: str, *, where: str, got: str) -> None:
+        self.metric = metric  # its name
+        super().__init__(
+            f"the metric {metric} of another package failed",
+            where=where,
+            expected="a number",
+            got=got,
+            fix=FIX,
+        )
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Rebuild with keyword arguments, so that errors cross process borders."""
+        rebuild: Callable[..., PackageMetricError] = functools.partial(
+            type(self), self.metric, where=str(self.where), got=str(self.got)
+        )
+        return rebuild, ()
+
+
+@contextmanager
+def package_metric_errors() -> Iterator[None]:
+    """Name the metric of another package that raises an error, and its line.
+
+    Raises:
+        PackageMetricError: such a metric failed. Errors of ours go on as they are.
+    """
+    try:
+        yield
+    except Exception as error:
+        name = getattr(error, "metric_name", None)
+        if name is None or name in METRICS:
+            raise
+        notes = ", ".join(getattr(error, "__notes__", ()))
+        places = [
+            find_faulty_package(error),
+            getattr(error, "where", None),
+            notes or None,
+        ]
+        where = ", ".join(place for place in places if place)
+        raise PackageMetricError(
+            name, where=where, got=quote(f"{type(error).__name__}: {error}")
+        ) from error
+
+
+def drop_metric(metrics: Sequence[Metric], name: str) -> tuple[Metric, ...]:
+    """Return the metrics without one, and without those that follow from it."""
+    rest = []
+    for metric in metrics:
+        if name not in (metric.name, *metric.of):
+            rest.append(metric)
+    return tuple(rest)
+
+
+def describe_failure(error: PackageMetricError) -> ValidationIssue:
+    """Return the warning for a metric that was left out of a score."""
+    return ValidationIssue(
+        check="metric",
+        severity=Severity.WARNING,
+        what=f"{error.what}; its column is left out",
+        where=str(error.where),
+        expected=str(error.expected),
+        got=f"{error.got} in {error.where}",
+        fix=FIX,
+    )
