@@ -160,7 +160,14 @@ def predict(
         model = restore_for_size(
             trained, info, settings, known_splits, where=str(checkpoint)
         ).to(machine)
-        rollouts = _TimedRollouts(model, info, paths, side_by_side, machine)
+        rollouts = _TimedRollouts(
+            model,
+            info,
+            paths,
+            side_by_side,
+            machine,
+            viscosity=known_splits.size(info.split, info.size).viscosity(),
+        )
         label = method or model.method
         _check_method(output_path, label)
         parameters = count_parameters(model)
@@ -354,6 +361,8 @@ class _TimedRollouts:
         paths: list[Path],
         side_by_side: int,
         machine: str,
+        *,
+        viscosity: float | None,
     ) -> None:
         self.seconds = 0.0  # time of the rollouts [s]
         self.clock = "wall"  # clock of the times, 'processor' or 'wall'
@@ -367,6 +376,8 @@ class _TimedRollouts:
         self._model = model
         self._info = info
         self._machine = machine
+        # of scenarios whose files state none [length^2/s]
+        self._viscosity = viscosity
         self._groups = []
         for first in range(0, len(paths), side_by_side):
             self._groups.append(paths[first : first + side_by_side])
@@ -376,7 +387,9 @@ class _TimedRollouts:
         """Yield the rollout of every scenario."""
         input_frames = slice(0, self._info.input_frames)
         for number, group in enumerate(self._groups):
-            given_frames = scenario_batch(group, input_frames).to(self._machine)
+            given_frames = scenario_batch(
+                group, input_frames, viscosity=self._viscosity
+            ).to(self._machine)
             if number == 0:
                 roll_out(self._model, given_frames, 1)  # to warm up
             started = self._read_clock()

@@ -69,6 +69,37 @@ class ScenarioHeader:
     # simulation diagnostics by name; no hash covers them
     facts: Mapping[str, float]
 
+    @property
+    def viscosity(self) -> float | None:
+        """Kinematic viscosity that the file states [length^2/s]; None without one."""
+        stated = self.parameters.get("viscosity")
+        return parse_viscosity(stated, where=f"{self.key}")
+
+
+def parse_viscosity(stated: object, *, where: str) -> float | None:
+    """Return the kinematic viscosity in a file's attribute; None without one.
+
+    Args:
+        stated: the attribute ``viscosity``.
+        where: the file.
+
+    Raises:
+        DataError: it is no finite number from 0.
+    """
+    if stated is None:
+        return None
+    values = np.asarray(stated)
+    is_number = values.size == 1 and values.dtype.kind in "iuf"
+    viscosity = float(values.item()) if is_number else math.nan
+    if not 0.0 <= viscosity < math.inf:
+        raise DataError(
+            "the viscosity is no viscosity",
+            where=f"{where}, attribute viscosity",
+            expected="a finite number from 0 [length^2/s]",
+            got=stated,
+        )
+    return viscosity
+
 
 class ScenarioFile:
     """An open scenario file: its header, and arrays that are read when asked for.
