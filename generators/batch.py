@@ -24,7 +24,7 @@ from lagbench.errors import UsageError, WorkFailedError
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
 from .solver import Device, Health, Solver, build
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import InitialState, SolverParameters
 
 # particle-substeps between two reports: about a tenth of a second on a core
 STRIDE = 4_000_000
@@ -184,13 +184,13 @@ class ScenarioBatch:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return position [length] and velocity [length/s], shape [particle, 2], at the
-        last recording.
+        """Return position [length] and velocity [length/s], shape [particle, axis],
+        at the last recording.
         """
         return self._position[index], self._velocity[index]
 
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]."""
+        """Add an offset to the positions [length], shape [scenario, particle, axis]."""
         self.solver.displace(offset)
         self._displacements.append((self._substep, offset.copy()))
 
@@ -266,7 +266,7 @@ class ScenarioBatch:
 
 @functools.lru_cache(maxsize=1)
 def _solver(
-    parameters: ClosedBoxParameters | FreeSurfaceParameters,
+    parameters: SolverParameters,
     device: Device,
     scenarios: int,
 ) -> Solver:

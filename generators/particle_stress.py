@@ -111,9 +111,11 @@ class ParticleStress:
         self.x = ti.Vector.field(4, ti.f32)
         # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
         self.carried = ti.Vector.field(4, ti.f32)
+        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # of a particle at rest
         # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        self.slopes = (self.slope_x, self.slope_y)
         # deformation gradients of the solids [1]
         self.f = ti.Matrix.field(2, 2, ti.f32)
         # Material, J of liquid or plastic Jp of snow (1 in other solids), and two zeros

@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import Box
 from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Size, Task
 from lagbench.data.scenario import read_scenario
@@ -34,8 +35,14 @@ from lagbench.data.writer import ScenarioWriter
 from .batch import Report, ScenarioBatch, SimulationJob, substep_count
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
+from .full_box_parameters import FullBoxParameters
 from .solver import Health
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    InitialState,
+    SolverParameters,
+)
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
@@ -110,8 +117,8 @@ def scenario_writer(
     frame_count = size.frame_count(scenario)
 
     wall_velocity = None
-    if isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters):
-        # of each wall towards each recorded frame [length/s], shape [frame, 4, 2]
+    if _has_driving_walls(split_module(size).solver_parameters(size)):
+        # of each wall towards each recorded frame [length/s], shape [frame, wall, axis]
         first_frame = state.start_frame
         frames = range(first_frame, first_frame + frame_count)
         wall_velocity = np.stack([state.walls_towards(frame) for frame in frames])
@@ -129,7 +136,24 @@ def scenario_writer(
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
+        dimension=size.box.dimension,
+        periodic=size.periodic,
+        has_velocity=stores_velocity(size),
     )
+
+
+def stores_velocity(size: Size) -> bool:
+    """Tell whether files hold the solver's velocities: those in three dimensions do
+    not, they would be half of the bytes.
+    """
+    return size.box.dimension == 2
+
+
+def _has_driving_walls(parameters: SolverParameters) -> bool:
+    """Tell whether a full box ends at walls along some axis."""
+    if isinstance(parameters, FullBoxParameters):
+        return not all(parameters.box.periodic)
+    return isinstance(parameters, ClosedBoxParameters)
 
 
 def active_frames(energies: Sequence[float], task: Task) -> int:
@@ -171,7 +195,8 @@ def simulate(
 
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
-            writers[index].append(position, velocity)
+            stored_velocity = velocity if stores_velocity(size) else None
+            writers[index].append(position, stored_velocity)
             energies[index].append(_kinetic_energy(velocity, masses[index]))
             if frame == COMPILING - 1:
                 started = clock()
@@ -235,11 +260,12 @@ def _diagnose(
 
 
 def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
-    """Return the displacement of a perturbed run [length], shape [particle, 2]."""
+    """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
     seed = (*entropy(size.split, size.name, size.major, scenario), 1)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
-    signs = np.where(rng.random((size.particles, 2)) < 0.5, -1.0, 1.0)
+    shape = (size.particles, size.box.dimension)
+    signs = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
     return (QUANTUM * signs).astype(np.float32)
 
 
@@ -262,8 +288,9 @@ def measure_predictability(
     input_frames = size.task.input_frames
     frame_counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
     batch = ScenarioBatch(job, report, frames=frame_counts)
-    # displacements of the batch [length], shape [scenario, particle, 2]
-    offsets = np.zeros((len(frame_counts), size.particles, 2), dtype=np.float32)
+    # displacements of the batch [length], shape [scenario, particle, axis]
+    shape = (len(frame_counts), size.particles, size.box.dimension)
+    offsets = np.zeros(shape, dtype=np.float32)
     limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
         truths = []
@@ -279,7 +306,7 @@ def measure_predictability(
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                limits[index].append(_root_mean_square_error(position, truth))
+                limits[index].append(_root_mean_square_error(position, truth, size.box))
     return {
         scenario: tuple(limit)
         for scenario, limit in zip(job.scenarios, limits, strict=True)
@@ -287,7 +314,7 @@ def measure_predictability(
 
 
 def _root_mean_square_error(
-    position: NDArray[np.float32], truth: NDArray[np.float32]
+    position: NDArray[np.float32], truth: NDArray[np.float32], box: Box
 ) -> float:
-    error = position.astype(np.float64) - truth.astype(np.float64)
+    error = box.displacement(truth.astype(np.float64), position.astype(np.float64))
     return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

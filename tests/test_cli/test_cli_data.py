@@ -84,7 +84,7 @@ def test_generate_and_verify_one_scenario(run: Run, tmp_path: Path) -> None:
     options = [*data_set, "--scenarios", "2"]
     plan = run("generate", *options, "--dry-run").stdout
     assert re.search(
-        r"(?s)1 scenarios to simulate.*disk .*bytes.*free.*time +about \d+ s", plan
+        r"(?s)1 scenario to simulate.*disk .*bytes.*free.*time +about \d+ s", plan
     )
     first = run("generate", *options)
     assert first.exit_code == 0, first.output
