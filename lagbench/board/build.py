@@ -14,8 +14,10 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
+from lagbench.data.box import Box
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
     ChecksFailedError,
@@ -23,6 +25,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
+from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -310,8 +313,8 @@ def _read_method(
     if scope.has_pictures:
         curves = _make_curves(plain_scores, ranking)
         residuals = residual_histograms(preview)
-        true_pictures = _make_pictures(preview, TRUTH)
-        pictures = _make_pictures(preview, PREDICTION)
+        true_pictures = _make_pictures(preview, TRUTH, size.box)
+        pictures = _make_pictures(preview, PREDICTION, size.box)
     seeds = []
     for seed in scores[ranking].seeds:
         seeds.append(replace(seed, per_frame=np.empty((len(seed.values), 0))))
@@ -669,7 +672,17 @@ def make_curve(score: Score) -> Curve:
     return Curve(frames=frames, mean=middle, low=low, high=high)
 
 
-def _make_pictures(preview: Preview, side: int) -> Pictures:
+def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
+    """Return where particles stand in the picture, shape [film frame, particle, 2].
+
+    Those of two dimensions stand where they are.
+    """
+    if box.dimension == 2:
+        return film
+    return np.asarray(View(box).place(film), np.float32)
+
+
+def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
     histograms = []
     ranges = preview.histogram_range.astype(np.float64).tolist()
     shares = preview.histogram[side].astype(np.float64)
@@ -686,7 +699,7 @@ def _make_pictures(preview: Preview, side: int) -> Pictures:
         histograms=tuple(histograms),
         film_frames=preview.film_frames,
         material=preview.material,
-        film=preview.film[side],
+        film=_flatten_film(preview.film[side], box),
     )
 
 
