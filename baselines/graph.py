@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import KDTree, cKDTree
 from torch import Tensor, nn
 
 from lagbench.data.box import UNIT_SQUARE, Box
@@ -278,14 +278,13 @@ def tree_edges(
 
 
 def _nearest_in_tree(
-    tree: KDTree, members: NDArray[np.int64], radius: float, most: int
+    tree: cKDTree, members: NDArray[np.int64], radius: float, most: int
 ) -> NDArray[np.int64]:
     """Return the edges to the nearest neighbours of each particle of a tree."""
     ranks = np.arange(1, min(most + 1, len(members)) + 1)
     reach = math.nextafter(radius, math.inf)  # the tree leaves out what is as far
-    _, neighbours = tree.query(
-        np.asarray(tree.data), k=ranks, distance_upper_bound=reach
-    )
+    answer = tree.query(np.asarray(tree.data), k=ranks, distance_upper_bound=reach)
+    neighbours = np.asarray(answer[1])
     receiver = np.arange(len(members))[:, None]
     is_neighbour = (neighbours < len(members)) & (neighbours != receiver)
     is_heard = is_neighbour & (is_neighbour.cumsum(axis=1) <= most)

@@ -1,4 +1,4 @@
-"""Graph networks in three dimensions and in boxes with periodic axes."""
+"""Models in three dimensions and in boxes with periodic axes."""
 
 from __future__ import annotations
 
@@ -111,13 +111,13 @@ def test_images_of_the_cube_keep_distances_and_walls(symmetry: Symmetry) -> None
         torch.testing.assert_close(image.wall_velocity[number, 0, wall], velocity)
 
 
-def drifting(count: int) -> NDArray[np.float32]:
+def drifting(count: int, pace: float = 1.0) -> NDArray[np.float32]:
     """Return particles that drift through the ends of a periodic cube."""
     axis = (np.arange(5) + 0.5) / 5
     grid = np.meshgrid(axis, axis, axis, indexing="ij")
     lattice = np.stack(grid, axis=-1).reshape(-1, 3)[:count]
     frames = np.arange(12)[:, None, None]
-    return np.asarray((lattice + frames * [0.03, 0.0, -0.02]) % 1.0, np.float32)
+    return np.asarray((lattice + pace * frames * [0.03, 0.01, -0.02]) % 1.0, np.float32)
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +166,52 @@ def test_gns_is_trained_and_predicts_through_the_ends(
     assert lagbench.validate(path, root=made.folder.parent, isolated=False).valid
 
 
-@pytest.mark.parametrize("baseline", ["mlp", "neuralmpm"])
+@pytest.mark.parametrize(
+    ("baseline", "settings"),
+    [
+        ("mlp", ("model.widths=[8]",)),
+        ("lstm", ("model.encoder=[8]", "model.latent=8", "model.decoder=[8]")),
+    ],
+)
+def test_networks_of_whole_frames_train_on_equal_scenarios(
+    tmp_path: Path, baseline: str, settings: tuple[str, ...]
+) -> None:
+    """Their weights belong to places of a frame; positions stay in the period."""
+    paths = []
+    for number in range(4):
+        paths.append(tmp_path / f"run{number}.npy")
+        np.save(paths[-1], drifting(125, pace=1.0 + 0.1 * number))
+    made = adopt(
+        paths,
+        output=tmp_path / "drift",
+        valid=1,
+        test=1,
+        radius=0.3,
+        frame_interval=0.1,
+        bounds=((0.0, 1.0),) * 3,
+        periodic=("x", "y", "z"),
+    )
+    recipe = tmp_path / "recipe.yaml"
+    recipe.write_text(RECIPE)
+    run = tmp_path / "run"
+    train(
+        baseline,
+        str(made.folder),
+        output=run,
+        recipe=str(recipe),
+        settings=settings,
+        device="cpu",
+    )
+    path = tmp_path / "predictions.nc"
+    predict(run / "weights.pt", path, root=tmp_path, device="cpu")
+    with open_predictions(path) as predictions:
+        position = predictions.frames(3, 6, 6)
+    assert position.shape == (6, 125, 3)
+    assert position.min() >= 0.0
+    assert position.max() < 1.0
+
+
+@pytest.mark.parametrize("baseline", ["var", "neuralmpm"])
 def test_other_models_say_that_they_know_no_such_box(
     made: LocalSplit, tmp_path: Path, baseline: str
 ) -> None:
