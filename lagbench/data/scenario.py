@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -386,6 +387,14 @@ def damage_error(
     where = str(path)
     if variable is not None:
         where = f"{path}, variable {variable!r}"
+    if path.exists() and not os.access(path, os.R_OK):
+        return DataError(
+            "a scenario file may not be read",
+            where=where,
+            expected="permission to read it",
+            got="permission denied",
+            fix="see who owns it: ls -l; chmod +r lets others read it",
+        )
     return DataError(
         "a scenario file is damaged or not one of lagbench",
         where=where,
