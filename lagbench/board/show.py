@@ -27,7 +27,7 @@ from .entry import EntryCost, Level
 from .model import Board, BoardRow, ReferenceRow, Tab, Value
 
 NOTHING = "-"
-REMARK_WIDTH = 14  # the whole table fits a terminal of 80 characters
+REMARK_WIDTH = 16  # the whole table fits a terminal of 80 characters
 
 
 def choose_data_sets(
@@ -225,7 +225,11 @@ def _format_row(
         row.id if wide else _format_name(tab, row),
         *values,
         seconds,
-        textwrap.fill(", ".join(_remarks_on(row, wide=wide)), REMARK_WIDTH),
+        textwrap.fill(
+            ", ".join(_remarks_on(row, wide=wide)),
+            REMARK_WIDTH,
+            break_long_words=False,
+        ),
     )
 
 
