@@ -4,7 +4,7 @@
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
-    verified.yaml, schema.json, index.html, README.md
+    verified.yaml, gates.json, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
 """
@@ -28,6 +28,7 @@ WEIGHTS = "weights"
 PAGE = "index.html"
 SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
+GATES = "gates.json"  # what weights do in single steps (python -m studies.gates)
 README = "README.md"
 LOCK = ".lock"  # held while the folder is written
 STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
@@ -191,7 +192,7 @@ class Folder:
         self, expected_paths: Collection[Path]
     ) -> Iterator[tuple[Path, str]]:
         """Yield the files that should not lie in the folder, and why."""
-        names = (PAGE, SCHEMA, VERIFIED, README)
+        names = (PAGE, SCHEMA, VERIFIED, GATES, README)
         known_paths = {Path(name) for name in names} | set(expected_paths)
         for path in self._files(""):
             if path in known_paths:
