@@ -131,6 +131,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         material=np.full(size.particles, Material.LIQUID, dtype=np.int8),
         area=box.volume,
         viscosity=viscosity,
+        wall_velocity=np.zeros((6, 3)),
         parameters={
             "kind": kind,
             "frequency": frequency,

@@ -1,8 +1,8 @@
-"""Gradient noise that repeats itself, and flows made of it, in two and three dimensions.
+"""Gradient noise that repeats itself, and flows made of it, in two or three dimensions.
 
-Perlin's noise on a lattice that is wrapped around the unit box: a polynomial within each
-cell of the lattice, with continuous second derivatives. Every operation is + - * or
-floor, so that bits are the same on every machine.
+Perlin's noise on a lattice that is wrapped around the unit box: a polynomial within
+each cell of the lattice, with continuous second derivatives. Every operation is + - *
+or floor, so that bits are the same on every machine.
 
 A :class:`Smooth` carries a function with its gradient and Hessian by the product rule,
 

@@ -1,4 +1,4 @@
-"""Reverse Poiseuille flow: a periodic square whose halves are driven against each other.
+"""Reverse Poiseuille flow: a periodic square, its halves driven against each other.
 
 The fluid below the middle, y < 1/2, is accelerated by f(t) along x, that above it by
 -f(t). Steady, each half would be a parabola, with the speed f H^2 / (8 nu) at its
