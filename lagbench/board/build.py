@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
+from lagbench.data.box import Box
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
     ChecksFailedError,
@@ -22,6 +24,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
+from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
@@ -301,7 +304,7 @@ def _make_tab(
         columns=tuple(columns),
         curves=tuple(curves),
         energy=make_curve(reference_entry.scores[TRUE_ENERGY].score),
-        truth=_make_pictures(reference_entry.preview, TRUTH),
+        truth=_make_pictures(reference_entry.preview, TRUTH, size.box),
         rows=tuple(rows),
         references=tuple(reference_rows),
         solver_seconds=solver_seconds(size),
@@ -358,7 +361,7 @@ def _make_row(
         seed_means=method.scores[method.ranking].means,
         curves=_make_curves(scores, method.ranking),
         energy=make_curve(scores[PREDICTED_ENERGY]),
-        pictures=_make_pictures(method.preview, PREDICTION),
+        pictures=_make_pictures(method.preview, PREDICTION, size.box),
         residuals=residual_histograms(method.preview),
     )
 
@@ -521,7 +524,17 @@ def make_curve(score: Score) -> Curve:
     return Curve(frames=frames, mean=middle, low=low, high=high)
 
 
-def _make_pictures(preview: Preview, side: int) -> Pictures:
+def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
+    """Return where particles stand in the picture, shape [film frame, particle, 2].
+
+    Those of two dimensions stand where they are.
+    """
+    if box.dimension == 2:
+        return film
+    return np.asarray(View(box).place(film), np.float32)
+
+
+def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
     histograms = []
     ranges = preview.histogram_range.astype(np.float64).tolist()
     shares = preview.histogram[side].astype(np.float64)
@@ -534,7 +547,7 @@ def _make_pictures(preview: Preview, side: int) -> Pictures:
         histograms=tuple(histograms),
         film_frames=preview.film_frames,
         material=preview.material,
-        film=preview.film[side],
+        film=_flatten_film(preview.film[side], box),
     )
 
 

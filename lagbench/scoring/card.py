@@ -74,7 +74,7 @@ class Preview:
     film_frames: tuple[int, ...]
     particles: tuple[int, ...]  # numbers of the particles in the film
     material: NDArray[np.int8]  # their materials, shape [film particle]
-    # their positions [length], shape [side, film frame, film particle, 2]
+    # their positions [length], shape [side, film frame, film particle, axis]
     film: NDArray[np.float32]
 
 

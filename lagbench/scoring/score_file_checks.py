@@ -184,12 +184,13 @@ def _check_shapes(preview: Preview) -> None:
     film_count = len(preview.film_frames)
     particle_count = len(preview.particles)
     nodes = preview.vorticity.shape[2:4]
+    space = preview.film.shape[-1]
     shapes = {
         "vorticity": (preview.vorticity.shape, (2, map_count, *nodes)),
         "histogram": (preview.histogram.shape, (2, map_count, BINS)),
         "histogram_range": (preview.histogram_range.shape, (map_count, 2)),
         "material": (preview.material.shape, (particle_count,)),
-        "film": (preview.film.shape, (2, film_count, particle_count, 2)),
+        "film": (preview.film.shape, (2, film_count, particle_count, space)),
     }
     for name, (got, expected) in shapes.items():
         if got != expected:
@@ -217,7 +218,10 @@ def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> N
     if scores.ranking != ranking_metric(size) or preview.scenario != ids[0]:
         raise ValueError("another ranking metric or another pictured scenario")
 
-    has_other_grid = preview.vorticity.shape[2:] != size.field_grid.shape
+    grid = size.field_grid.section
+    has_other_grid = preview.vorticity.shape[2:] != grid.shape
+    if preview.film.shape[-1] != size.dimension:
+        raise ValueError("a film of another dimension")
     if has_other_grid or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
     film_frames = preview.film_frames

@@ -44,7 +44,8 @@ class OpenScenario:
 
     def _frames(self) -> Iterator[NDArray[np.float32]]:
         numbers = self.scenario.config.predicted_frames
-        frame_bytes = 8 * len(self.scenario.material)
+        particle_bytes = 4 * self.scenario.config.box.dimension
+        frame_bytes = particle_bytes * len(self.scenario.material)
         step = max(1, BLOCK_BYTES // frame_bytes)
         for first in numbers[::step]:
             last = min(first + step, numbers.stop)
