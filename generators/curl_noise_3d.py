@@ -44,7 +44,13 @@ from .split import InitialState, Material
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
 
-__all__ = ["has_rings", "initial_state", "ring_potential", "solver_parameters"]
+__all__ = [
+    "draw_noise",
+    "has_rings",
+    "initial_state",
+    "ring_potential",
+    "solver_parameters",
+]
 
 Array = NDArray[np.float64]
 
@@ -97,7 +103,7 @@ def _draw_rings(size: Size, rng: RandomSource, position: Array) -> Flow:
     return curl(potential)
 
 
-def _draw_noise(rng: RandomSource, position: Array, frequency: int) -> Flow:
+def draw_noise(rng: RandomSource, position: Array, frequency: int) -> Flow:
     """Draw the vector potential of curl noise."""
     lattices = [draw_lattice(rng, frequency, 3) for _ in range(3)]
     return curl([noise(position, lattice) for lattice in lattices])
@@ -119,7 +125,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         kind = "noise"
         count = size.value("frequency_count")
         frequency = size.value("frequency_min") + scenario % count
-        flow = _draw_noise(rng, position, frequency)
+        flow = draw_noise(rng, position, frequency)
         speed = uniform(rng, *interval(size, "speed"))
     flow = scaled_to(flow, speed)
     reynolds = log_uniform(rng, *interval(size, "reynolds"))
