@@ -142,7 +142,7 @@ class Task(_RegistryModel):
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
-    # kinematic viscosity of classical solvers where scenarios state none [length^2/s]
+    # kinematic viscosity that is given where scenarios state none [length^2/s]
     effective_viscosity: float | None = Field(None, gt=0, allow_inf_nan=False)
 
 
@@ -243,6 +243,25 @@ class Size(BaseModel):
                 fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
+
+    def viscosity(self, stated: float | None = None) -> float | None:
+        """Return the kinematic viscosity that a model is given [length^2/s].
+
+        It is the scenario's own; else the effective one of the data set; else that of
+        its liquid. None where none is known.
+
+        Args:
+            stated: viscosity in the scenario's file [length^2/s]; None where it has
+                none.
+        """
+        if stated is not None:
+            return stated
+        if self.task.effective_viscosity is not None:
+            return self.task.effective_viscosity
+        liquid_viscosity = self.parameters.get("liquid_viscosity")
+        if liquid_viscosity is None or liquid_viscosity.value is None:
+            return None
+        return float(liquid_viscosity.value)
 
     @property
     def dimension(self) -> int:

@@ -2,8 +2,7 @@
 
 A *naive* predictor learns nothing and knows no equation; it may look things up in
 train. A *classical* one integrates the equations. Both get what a model gets of a test
-scenario: its first frames, its materials and the motion of its walls. A classical one
-also knows the viscosity.
+scenario: its first frames, its materials, the motion of its walls and its viscosity.
 
 Some predictors carry the particles of a full box by a velocity field that is known at
 scattered points. Between the points the field is linear on their Delaunay triangles.
