@@ -173,7 +173,8 @@ class StaggeredGrid:
         row = np.minimum(np.arange(row_count), self.cells[1] - 1)
         shape = [1] * self.dimension
         shape[1] = row_count
-        return layers[row * len(layers) // self.cells[1]].reshape(shape)
+        at_rows = layers[row * len(layers) // self.cells[1]]
+        return np.asarray(at_rows.reshape(shape))
 
     def _with_ghosts(
         self, values: Floats, component: int, wall_velocity: Floats
