@@ -83,6 +83,7 @@ def predict(
     *,
     root: str | Path | None = None,
     size: str | None = None,
+    subset: str = "test",
     settings: Sequence[str] = (),
     device: str = "auto",
     threads: int | None = None,
@@ -108,6 +109,7 @@ def predict(
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         size: size of the split to predict; that of the training when None.
+        subset: the subset to predict: test, or shift, which lies outside train.
         settings: changes of options that have no weights, as in ``model.average=true``.
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
@@ -148,7 +150,7 @@ def predict(
     bound_memory()
     tests = scenario_paths(
         info.split,
-        subset="test",
+        subset=subset,
         size=info.size,
         root=root_folder,
         registry=known_splits,
@@ -177,7 +179,9 @@ def predict(
             split=info.split,
             size=info.size,
             method=label,
+            subset=subset,
             dataset_sha256=info.dataset_sha256,
+            root=root_folder,
             registry=known_splits,
             device=hardware_label,
             parameters=parameters,
@@ -419,7 +423,13 @@ class _TimedRollouts:
         stride = max(1, len(positions) // TIMED_SEARCHES)
         for frame in range(0, len(positions), stride):
             started = self._read_clock()
-            radius_graph(positions[frame], float(radius), given.sample, most=most)
+            radius_graph(
+                positions[frame],
+                float(radius),
+                given.sample,
+                most=most,
+                box=self._info.box,
+            )
             elapsed = self._read_clock() - started
             self._search_seconds.append(elapsed / len(rollouts))
 

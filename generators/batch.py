@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,10 @@ from lagbench.errors import UsageError, WorkFailedError
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
 from .solver import Device, Health, Solver, build
-from .split import InitialState, SolverParameters
+from .split import FreeSurfaceParameters, InitialState, SolverParameters
+
+if TYPE_CHECKING:
+    from .free_surface import FreeSurface
 
 # particle-substeps between two reports: about a tenth of a second on a core
 STRIDE = 4_000_000
@@ -152,6 +156,9 @@ class ScenarioBatch:
         )
         self.extremes = [unseen] * scenario_count
         self.solver = _solver(solver_constants(size), job.device, scenario_count)
+        self._is_free_surface = isinstance(
+            self.solver.parameters, FreeSurfaceParameters
+        )
         with self._scenario_names():
             self.solver.load(self.states)
 
@@ -180,6 +187,8 @@ class ScenarioBatch:
             self._advance_to(substep)
             self._position = self.solver.position()
             self._velocity = self.solver.velocity()
+            if self._is_free_surface:
+                self._volume_ratio = cast("FreeSurface", self.solver).volume_ratio()
             for _, index, frame in due:
                 yield index, frame
 
@@ -188,6 +197,13 @@ class ScenarioBatch:
         at the last recording.
         """
         return self._position[index], self._velocity[index]
+
+    def volume_ratio(self, index: int) -> NDArray[np.float32]:
+        """Return J of liquid and Jp of snow at the last recording [1], shape
+        [particle]; free surfaces only.
+        """
+        ratio: NDArray[np.float32] = self._volume_ratio[index]
+        return ratio
 
     def displace(self, offset: NDArray[np.float32]) -> None:
         """Add an offset to the positions [length], shape [scenario, particle, axis]."""

@@ -37,6 +37,7 @@ __all__ = [
     "free_surface_walls",
     "interval",
     "ranges",
+    "shift_number",
     "solver_constants",
     "split_module",
 ]
@@ -219,6 +220,14 @@ def free_surface_walls(size: Size) -> tuple[float, float]:
 def interval(size: Size, name: str) -> tuple[float, float]:
     """Return the parameters ``<name>_min`` and ``<name>_max``."""
     return float(size.value(f"{name}_min")), float(size.value(f"{name}_max"))
+
+
+def shift_number(size: Size, scenario: int) -> int | None:
+    """Return the place of a scenario in the subset ``shift``; None in other subsets."""
+    shifted = sorted(size.subsets.get("shift", ()))
+    if scenario not in shifted:
+        return None
+    return shifted.index(scenario)
 
 
 def ranges(size: Size, name: str) -> Region:

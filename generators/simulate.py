@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +38,16 @@ from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
 from .full_box_parameters import FullBoxParameters
 from .solver import Health
+from .soundness import SoundnessRecorder
 from .split import (
     ClosedBoxParameters,
     FreeSurfaceParameters,
     InitialState,
     SolverParameters,
 )
+
+if TYPE_CHECKING:
+    from .free_surface import FreeSurface
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
@@ -95,13 +100,19 @@ def _particle_mass(size: Size, state: InitialState) -> float:
     return float(size.value("density")) * state.area / size.particles
 
 
-def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
+def file_parameters(
+    size: Size, scenario: int, state: InitialState
+) -> dict[str, object]:
     """Return what a scenario's file states and hashes: constants, then what was
     drawn.
+
+    Constants of one subset stand in its files only.
     """
+    subset = size.subset_of(scenario)
     parameters: dict[str, object] = {}
     for name, parameter in size.parameters.items():
-        parameters[name] = parameter.value
+        if parameter.subset in (None, subset):
+            parameters[name] = parameter.value
     for name, value in state.parameters.items():
         parameters[_FILE_NAMES.get(name, name)] = value
     parameters["start_frame"] = state.start_frame
@@ -138,7 +149,7 @@ def scenario_writer(
         particle_mass=_particle_mass(size, state),
         wall_velocity=wall_velocity,
         body_force=body_force,
-        parameters=file_parameters(size, state),
+        parameters=file_parameters(size, scenario, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
@@ -199,25 +210,32 @@ def simulate(
             writer = scenario_writer(job, scenario, state)
             writers.append(stack.enter_context(writer))
 
+        recorders = _soundness_recorders(batch)
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
             stored_velocity = velocity if stores_velocity(size) else None
             writers[index].append(position, stored_velocity)
             energies[index].append(_kinetic_energy(velocity, masses[index]))
+            if recorders:
+                recorders[index].add(velocity, batch.volume_ratio(index))
             if frame == COMPILING - 1:
                 started = clock()
 
-        is_free_surface = isinstance(batch.solver.parameters, FreeSurfaceParameters)
         for index, writer in enumerate(writers):
-            if is_free_surface:
-                writer.state(active_frames=active_frames(energies[index], size.task))
             diagnostics = _diagnose(
                 size,
                 batch.states[index],
                 energies=energies[index],
                 extremes=batch.extremes[index],
             )
-            writer.state_facts(asdict(diagnostics))
+            facts = asdict(diagnostics)
+            if recorders:
+                writer.state(active_frames=active_frames(energies[index], size.task))
+                solver = cast("FreeSurface", batch.solver)
+                least, greatest = solver.volume_ratio_extremes()
+                soundness = recorders[index].summary(least[index], greatest[index])
+                facts |= asdict(soundness)
+            writer.state_facts(facts)
     seconds = clock() - started
 
     pace = None
@@ -234,6 +252,14 @@ def simulate(
         )
         for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
+
+
+def _soundness_recorders(batch: ScenarioBatch) -> list[SoundnessRecorder]:
+    """Return a recorder for each scenario of a free surface, none for a full box."""
+    parameters = batch.solver.parameters
+    if not isinstance(parameters, FreeSurfaceParameters):
+        return []
+    return [SoundnessRecorder(parameters, state.material) for state in batch.states]
 
 
 def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:

@@ -42,6 +42,7 @@ from lagbench.errors import (
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
 from .limits import (
+    SCORED_SUBSETS,
     Value,
     check_frames,
     check_parameters,
@@ -122,6 +123,9 @@ class Parameter(_RegistryModel):
     value: Value | None = None
     unit: str
     description: str
+    # the only subset whose scenarios it concerns and whose files state it; all by
+    # default
+    subset: str | None = None
 
 
 class ScoreGrid(_RegistryModel):
@@ -206,6 +210,28 @@ class Size(BaseModel):
     task: Task
     measured: Measured | None = None
     file: Path = Path("datasets.yaml")  # the file that describes it
+    scored_subset: str = "test"  # subset that is predicted and scored
+
+    @property
+    def scored_scenarios(self) -> tuple[int, ...]:
+        """Ids of the scenarios that are predicted and scored."""
+        return self.subsets[self.scored_subset]
+
+    def scored_on(self, subset: str) -> Size:
+        """Return the same size with another subset to predict and to score.
+
+        Raises:
+            UsageError: the size has no such subset, or it is not one to be scored.
+        """
+        choices = [name for name in SCORED_SUBSETS if name in self.subsets]
+        if subset not in choices:
+            raise UsageError(
+                f"no scored subset {subset!r}",
+                where=f"{self.split} {self.name}",
+                expected=" or ".join(choices),
+                fix=suggest_name(subset, choices),
+            )
+        return self.model_copy(update={"scored_subset": subset})
 
     @property
     def major(self) -> int:

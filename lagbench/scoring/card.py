@@ -191,6 +191,8 @@ class ScoreCard:
         content: dict[str, Any] = {"lagbench_scores": FORMAT}
         for name in IDENTITY:
             content[name] = getattr(self.header, name)
+        if self.header.subset != "test":
+            content["subset"] = self.header.subset
         content["predictions_sha256"] = self.predictions_sha256
         for name in LABELS:
             label = getattr(self.header, name)

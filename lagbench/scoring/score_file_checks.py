@@ -80,6 +80,8 @@ def reported_frames(size: Size) -> tuple[int, ...]:
 def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
     """Read a score file; with a size it must have the shape of that task.
 
+    The scores are those of the subset that the size scores, see ``Size.scored_on``.
+
     Raises:
         UnreadableFileError: it is no score file, or of another task.
     """
@@ -210,7 +212,7 @@ def _check_shapes(preview: Preview) -> None:
 def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:
     """Refuse a file that is not of the task of a split and size."""
     frames = tuple(frames_to_predict(size))
-    ids = tuple(sorted(size.subsets["test"]))
+    ids = tuple(sorted(size.scored_scenarios))
     scored_ids = tuple(sorted(scores.tallies))
     scored_frames = next(iter(scores.tallies.values())).frames
     if scored_ids != ids or scored_frames != frames:
