@@ -57,6 +57,7 @@ from .columns import PRESETS
 from .entry import Entry, EntryCost, Status, Verification
 from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
+from .identity import find_impossible_values
 from .issues import CHECKS
 from .model import (
     Board,
@@ -291,7 +292,9 @@ def _read_method(
     try:
         stored = []
         for score_path in entry.score_paths:
-            stored.append(read_score_file(board.path / score_path, size))
+            score_file = read_score_file(board.path / score_path, size)
+            _require_possible(board, score_path, score_file)
+            stored.append(score_file)
     except UnreadableFileError:
         if current:
             raise
@@ -336,6 +339,20 @@ def _read_method(
         pictures=true_pictures,
     )
     return method, truth
+
+
+def _require_possible(board: Folder, path: Path, score_file: ScoreFile) -> None:
+    """Refuse a score file with values that no prediction can have."""
+    impossible = next(find_impossible_values(score_file), None)
+    if impossible is not None:
+        raise UnreadableFileError(
+            "impossible scores",
+            where=str(board.path / path),
+            expected="scores that a prediction can have",
+            got=impossible,
+            fix=f"lagbench leaderboard check --board {board.path} names all that is "
+            "wrong; submit the predictions again",
+        )
 
 
 def _form_scores(

@@ -9,6 +9,7 @@ import re
 import shutil
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 from board_bench import PLACE, BoardBench, copied, master, noisy
@@ -30,7 +31,13 @@ from lagbench.board.ranking import combine
 from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.board.variants import find_variants
 from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
+from lagbench.errors import (
+    ChecksFailedError,
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+)
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
@@ -374,18 +381,22 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
         "rank",
         "method",
         "skill",
-        "vorticity_nrmse",
+        "score",
         "position_rmse",
     )
     rows = {row[1]: row for row in table.rows}
     for reference in board.tabs[0].references:
         row = rows[reference.name]
         assert row[0] == "-"
-        assert row[-1] == f"{reference.kind} reference"
+        assert row[-1] == reference.kind
     damped = rows["damped"]
     assert damped[0] == str(row_of(board, "damped").rank)
-    assert " ± " in damped[3]
-    assert damped[5:7] == ("0.5", "4")
+    assert damped[5] == "0.5"
+    for row in table.rows:
+        assert max(map(len, row[-1].split("\n"))) <= 17
+    (wide,) = tables(board, wide=True)
+    spread = {row[1]: row for row in wide.rows}["damped"]
+    assert " ± " in spread[3]
 
 
 def test_json_has_the_numbers_of_the_board(board: Board) -> None:
@@ -423,3 +434,24 @@ def test_boards_without_an_entry_are_named(
     assert set(board.empty) <= set(empty.empty)
     assert choose_data_sets([], None, None) == ()
     assert build(tmp_path, registry=bench.registry).rows == 0
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan])
+def test_impossible_scores_name_their_file(own: BoardBench, value: float) -> None:
+    """Negative errors stop the page, which names the file; a method without any value
+    comes last and has no skill.
+    """
+    path = own.folder / "scores/cavity/tiny/noisy.nc"
+    with netCDF4.Dataset(path, "a") as file:
+        file.set_auto_maskandscale(False)
+        file["value"][:] = value
+    if math.isnan(value):
+        tab = collect(own.folder, registry=own.registry).tabs[0]
+        ranked = [row for row in tab.rows if row.rank is not None]
+        assert ranked[-1].id == "noisy"
+        assert ranked[-1].skill is None
+        return
+    with pytest.raises(UnreadableFileError) as caught:
+        collect(own.folder, registry=own.registry)
+    assert caught.value.where == str(path)
+    assert "leaderboard check" in str(caught.value.fix)
