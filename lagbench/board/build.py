@@ -57,6 +57,7 @@ from .columns import PRESETS
 from .entry import Entry, EntryCost, Status, Verification
 from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
+from .gates import gates_failed_by, read_failed_gates
 from .identity import find_impossible_values
 from .issues import CHECKS
 from .model import (
@@ -239,6 +240,7 @@ def collect(
         truths[data_set] = min(finest, truth, key=lambda pictured: pictured.order)
 
     verified = read_verified(board)
+    failed_gates = read_failed_gates(board)
     tabs = []
     empty = []
     for split, description in described.splits.items():
@@ -256,6 +258,7 @@ def collect(
                     scope=scope,
                     references=read_references(board, size),
                     verified=verified,
+                    failed_gates=failed_gates,
                 )
                 tabs.append(tab)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
@@ -415,6 +418,7 @@ def _make_tab(
     scope: Scope,
     references: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
+    failed_gates: Mapping[str, tuple[str, ...]],
 ) -> Tab:
     ranking = methods[0].ranking
     variants = _find_variants(methods)
@@ -439,7 +443,8 @@ def _make_tab(
             verified=verification_of(method.entry, verified),
             references=references,
         )
-        rows.append(row)
+        failed = gates_failed_by(method.entry, failed_gates)
+        rows.append(replace(row, failed_gates=failed))
 
     columns = []
     for name in dict.fromkeys((ranking, *COLUMNS)):

@@ -119,6 +119,7 @@ class Folder:
                 "no leaderboard here",
                 where=str(self.path),
                 expected=f"a folder that holds {SUBMISSIONS}/",
+                got="no such folder",
                 fix=fix,
             )
 

@@ -276,6 +276,8 @@ def _remarks_on(row: BoardRow, *, wide: bool) -> Iterator[str]:
         yield str(entry.kind)
     if wide and len(entry.predictions) > 1:
         yield f"{len(entry.predictions)} seeds"
+    if row.failed_gates:
+        yield "under-trained"
     if row.diverged:
         yield f"{row.diverged} diverged"
     for flag in row.flags:

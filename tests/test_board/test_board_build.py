@@ -4,6 +4,7 @@ pictures.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import shutil
@@ -25,7 +26,9 @@ from lagbench.board.build import (
     make_curve,
     residual_histograms,
 )
+from lagbench.board.entry import Weights
 from lagbench.board.folder import Folder
+from lagbench.board.gates import gates_failed_by, read_failed_gates
 from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
 from lagbench.board.show import choose_data_sets, tables, to_plain
@@ -455,3 +458,20 @@ def test_impossible_scores_name_their_file(own: BoardBench, value: float) -> Non
         collect(own.folder, registry=own.registry)
     assert caught.value.where == str(path)
     assert "leaderboard check" in str(caught.value.fix)
+
+
+def test_weights_that_fail_a_gate_are_marked(tmp_path: Path) -> None:
+    """They are found by the hash of the weights; a broken list is named."""
+    weights = Weights(path="x", sha256="a" * 64)
+    entry = make_entry("GNS", 1, "cavity", "mini", None)
+    prediction = entry.predictions[0].model_copy(update={"weights": weights})
+    entry = entry.model_copy(update={"predictions": (prediction,)})
+    path = tmp_path / "gates.json"
+    row = {"weights_sha256": "a" * 64, "failed": ["one_step"]}
+    path.write_text(json.dumps({"weights": [row]}))
+    failed = read_failed_gates(Folder(tmp_path))
+    assert gates_failed_by(entry, failed) == ("one_step",)
+    assert gates_failed_by(make_entry("GNS", 1, "cavity", "mini", None), failed) == ()
+    path.write_text("{}")
+    with pytest.raises(UnreadableFileError):
+        read_failed_gates(Folder(tmp_path))
