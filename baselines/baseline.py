@@ -42,7 +42,7 @@ __all__ = [
 
 
 LARGEST_OPTION = 1e12
-"""Greatest number that an option may have: counts, steps and rates are far below."""
+"""Greatest whole number that an option may have: counts and steps are far below."""
 
 
 class Settings(BaseModel):
@@ -62,8 +62,8 @@ class Settings(BaseModel):
         parsed: object = handler(value)
         if _has_boolean_number(value, parsed):
             raise ValueError("a number, not yes or no")
-        if isinstance(parsed, int | float) and abs(parsed) > LARGEST_OPTION:
-            raise ValueError(f"a number up to {LARGEST_OPTION:g}")
+        if isinstance(parsed, int) and abs(parsed) > LARGEST_OPTION:
+            raise ValueError(f"a whole number up to {LARGEST_OPTION:g}")
         return parsed
 
 

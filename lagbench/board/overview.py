@@ -202,7 +202,7 @@ def conclude(tab: Tab) -> str:
         return ""
     ratio = best.against_classical
     measure = f"{text(ratio.mean, 2)}× the error of {best.solver}"
-    if ratio.mean >= 1.0:
+    if ratio.low > 1.0:
         return (
             f"Learning does not pay on {name}: no learned entry is more accurate than "
             "the best classical solver that costs no more per frame (nearest: "

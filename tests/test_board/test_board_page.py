@@ -203,19 +203,20 @@ def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ratio", "high", "beginning"),
+    ("low", "ratio", "high", "beginning"),
     [
-        (1.5, 1.9, "Learning does not pay on cavity full"),
-        (0.9, 1.1, "Whether learning pays on cavity full is open"),
-        (0.5, 0.6, "Learning pays on cavity full"),
+        (1.1, 1.5, 1.9, "Learning does not pay on cavity full"),
+        (0.8, 1.5, 1.9, "Whether learning pays on cavity full is open"),
+        (0.8, 0.9, 1.1, "Whether learning pays on cavity full is open"),
+        (0.4, 0.5, 0.6, "Learning pays on cavity full"),
     ],
 )
 def test_a_sentence_says_whether_learning_pays(
-    board: Board, ratio: float, high: float, beginning: str
+    board: Board, low: float, ratio: float, high: float, beginning: str
 ) -> None:
     """It follows from the best ratio of any active entry that learns."""
     row = board.tabs[0].rows[0]
-    value = replace(row.values["position_rmse"], mean=ratio, low=0.1, high=high)
+    value = replace(row.values["position_rmse"], mean=ratio, low=low, high=high)
     worse = replace(value, mean=9.0, high=10.0)
     rows = (
         replace(row, against_classical=worse, solver="projection"),
