@@ -205,6 +205,7 @@ LATER_OPTIONS: Mapping[str, Mapping[str, object]] = {
         "shape": [],
         "density": [],
         "neighbours": None,
+        "viscosity": False,
     },
 }
 """Options that the logs of earlier trainings lack, with the values of that time.
