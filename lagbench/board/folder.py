@@ -4,6 +4,7 @@
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
+    weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
     verified.yaml, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
@@ -30,11 +31,14 @@ SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
 README = "README.md"
 
+MODEL_ENDINGS = (".pt", ".onnx")
+"""Endings of models: weights of `lagbench train`, and ONNX files."""
+
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
     SCORES: (".nc",),
     REFERENCES: (".nc",),
-    WEIGHTS: (".pt", ".json"),
+    WEIGHTS: (*MODEL_ENDINGS, ".json"),
 }
 PLACEHOLDER = ".gitkeep"  # keeps an empty folder in git
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -73,14 +77,22 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-def weights_path(place: Place, seed: int | None) -> Path:
-    """Return the path of the weights of a seed, relative to the folder.
+def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Path:
+    """Return the path of the model of a seed, relative to the folder.
+
+    Args:
+        place: split, size and method of the entry.
+        seed: the seed.
+        like: a file name; if it ends as an ONNX file, so does the path.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
     'weights/cavity/mini/gns_3.pt'
     """
     split, size, method = place
-    return Path(WEIGHTS, split, size, f"{method}_{seed or 0}.pt")
+    ending = ".pt"
+    if str(like).endswith(".onnx"):
+        ending = ".onnx"
+    return Path(WEIGHTS, split, size, f"{method}_{seed or 0}{ending}")
 
 
 class Folder:
