@@ -144,8 +144,8 @@ class RunFolder:
         return UsageError(
             "the folder holds a training",
             where=str(self.path),
-            fix="go on with --resume, train anew with --fresh, or name another "
-            "--output",
+            fix="go on with the recipe of the folder, train anew with --fresh, or name "
+            "another --output",
         )
 
     def _without_checkpoint(self, recipe: Recipe) -> UsageError:

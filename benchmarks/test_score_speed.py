@@ -47,10 +47,13 @@ def cpu_seconds():
     return sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN))
 
 def peak_kib():
+    children = getrusage(RUSAGE_CHILDREN).ru_maxrss
     # getrusage's maximum of this process is that of its parent before exec
-    status = Path("/proc/self/status").read_text()
-    peak = int(status.split("VmHWM:")[1].split()[0])
-    return max(peak, getrusage(RUSAGE_CHILDREN).ru_maxrss)
+    status = Path("/proc/self/status")
+    if not status.is_file() or "VmHWM:" not in status.read_text():
+        return max(getrusage(RUSAGE_SELF).ru_maxrss, children)
+    peak = int(status.read_text().split("VmHWM:")[1].split()[0])
+    return max(peak, children)
 
 folder = Path(sys.argv[1])
 registry = load(folder / "datasets.yaml")

@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
+from .addresses import REPOSITORY, describe
 from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS
 from .cli.lazy_group import LazyGroup
 from .errors import (
@@ -84,7 +85,8 @@ def _unexpected_error_message(error: Exception) -> str:
     place = find_faulty_package(error)
     if place is None:
         advice = "this is a fault of lagbench; please report it with the output of"
-        fix = f"{advice}\n       {debug_command}"
+        place = f"the repository's address is {describe(REPOSITORY)}"
+        fix = f"{advice}\n       {debug_command}\n       ({place})"
     else:
         advice = f"mend or uninstall the package of {place};"
         fix = f"{advice}\n       {debug_command} has the whole trace"
@@ -164,7 +166,6 @@ def _short_warnings() -> Iterator[None]:
 app = typer.Typer(
     cls=_Program,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Start with: lagbench generate --split cavity --size tiny",

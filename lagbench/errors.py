@@ -218,6 +218,19 @@ def check_regular(
     return status.st_size
 
 
+def format_count(number: int, noun: str) -> str:
+    """Return a number with its noun.
+
+    >>> format_count(1, "error"), format_count(2, "entry")
+    ('1 error', '2 entries')
+    """
+    if number == 1:
+        return f"1 {noun}"
+    if noun.endswith("y"):
+        return f"{number} {noun[:-1]}ies"
+    return f"{number} {noun}s"
+
+
 def suggest_name(name: str, known_names: Iterable[str]) -> str:
     """Return a hint that names the known word nearest to a wrong one.
 

@@ -339,9 +339,9 @@ def predict(
         [frame, particle, 2].
 
     Raises:
-        UsageError: unknown split, size or subset, history beyond the given frames, or a
-            scenario with fewer frames than the task. All errors are raised when the
-            first scenario is asked for.
+        UsageError: unknown split, size or subset, history beyond the given frames, a
+            scenario with fewer frames than the task, or a model that returns positions
+            that are not finite.
         DataError: scenarios are missing; the message has the command that makes them.
     """
     data = WindowDataset(
@@ -380,5 +380,26 @@ def predict(
         with torch.no_grad():
             positions = roll_out(step, given, task.horizon)
         # from [particle, frame, 2] to [frame, particle, 2]
-        by_frame = positions.transpose(0, 1)
-        yield scenario, by_frame.float().cpu().numpy()
+        by_frame = positions.transpose(0, 1).float().cpu().numpy()
+        _check_finite(by_frame, scenario, first_frame=task.input_frames)
+        yield scenario, by_frame
+
+
+def _check_finite(
+    positions: NDArray[np.float32], scenario: int, *, first_frame: int
+) -> None:
+    """Refuse a rollout with positions that no file of predictions may hold."""
+    bad_places = np.argwhere(~np.isfinite(positions))
+    if not len(bad_places):
+        return
+    step, particle, axis = bad_places[0].tolist()
+    raise UsageError(
+        "the model returned positions that are not finite",
+        where=f"predict, scenario {scenario}, frame {first_frame + step}, "
+        f"particle {particle}",
+        expected="finite positions in every frame",
+        got=positions[step, particle, axis],
+        fix="set the network to eval() and check its input scaling; a rollout that "
+        "diverges is frozen at its last finite frame and stored with "
+        "PredictionsWriter.add(..., diverged_at=FRAME)",
+    )

@@ -18,7 +18,7 @@ PACKAGE = Path(lagbench.__file__).parent
 STUDIES = PACKAGE.parent / "studies"
 
 LAYERS = (
-    ("errors", "atomic"),
+    ("addresses", "errors", "atomic"),
     ("work",),
     ("data",),
     ("store",),

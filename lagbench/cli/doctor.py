@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from lagbench.addresses import REPOSITORY, describe
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import load
 from lagbench.errors import ChecksFailedError, LagbenchError
@@ -17,7 +18,10 @@ from lagbench.make.plan import free_bytes
 from lagbench.work.machine import available_cores
 
 from .options import JsonFlag, RootOption
-from .output import print_json, print_table
+from .output import print_json, print_line, print_table
+
+CONSTRAINTS = "constraints.txt"
+"""File of a clone that pins the versions of all libraries."""
 
 REQUIRED_LIBRARIES = (
     "numpy",
@@ -40,10 +44,27 @@ OPTIONAL_LIBRARIES = {
     "matplotlib": "plots",
     "imageio": "plots",
     "torch": "baselines",
+    "torch-geometric": "baselines",
+    "pytorch-lightning": "baselines",
+    "statsmodels": "baselines",
+    "tensorboard": "baselines",
     "distributed": "cluster",
     "s3fs": "s3",
+    "pot": "transport",
 }
 """Libraries of our extras, each with the name of its extra."""
+
+PURPOSES = {
+    "generate": "simulate data",
+    "plots": "draw pictures and films",
+    "baselines": "train reference models and predict with them",
+    "cluster": "work on a Dask cluster",
+    "s3": "keep data in S3",
+    "transport": "measure the Sinkhorn divergence",
+}
+"""What each extra is for."""
+
+REPOSITORY_NAME = "repository"  # of the check of its address
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,6 +87,15 @@ class Diagnosis:
         """Names of the parts that are broken."""
         return [check.name for check in self.checks if check.state == "broken"]
 
+    @property
+    def missing_extras(self) -> list[str]:
+        """Names of the extras of which a library is missing, in their order."""
+        missing = set()
+        for check in self.checks:
+            if check.state == "missing" and check.name in OPTIONAL_LIBRARIES:
+                missing.add(OPTIONAL_LIBRARIES[check.name])
+        return [extra for extra in PURPOSES if extra in missing]
+
 
 def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     """Check this machine: libraries, cores, disk, registry."""
@@ -75,12 +105,32 @@ def doctor_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     else:
         rows = [(check.name, check.state, check.detail) for check in diagnosis.checks]
         print_table("", ("check", "state", "detail"), rows)
+        for line in _describe_missing(diagnosis.missing_extras):
+            print_line(line)
     broken_parts = diagnosis.broken_parts
     if broken_parts:
         raise ChecksFailedError(
             "this machine cannot run lagbench",
             got=f"broken: {', '.join(broken_parts)}",
         )
+
+
+def _describe_missing(extras: Sequence[str]) -> Iterator[str]:
+    """Yield what cannot be done, and the one command that installs all of it."""
+    if not extras:
+        yield "all optional libraries are installed"
+        return
+    for extra in extras:
+        yield f"missing to {PURPOSES[extra]}: the extra {extra}"
+    yield f"install: {install_command(','.join(extras))}"
+
+
+def install_command(extras: str) -> str:
+    """Return the command that installs extras, in a clone from the clone."""
+    clone = Path(__file__).resolve().parents[2]
+    if (clone / CONSTRAINTS).is_file():
+        return f"cd {clone} && pip install -c {CONSTRAINTS} -e '.[{extras}]'"
+    return f"pip install 'lagbench[{extras}]'"
 
 
 def diagnose(root: str | Path | None = None) -> Diagnosis:
@@ -99,6 +149,9 @@ def diagnose(root: str | Path | None = None) -> Diagnosis:
         checks.append(_check_library(library))
     for library, extra in OPTIONAL_LIBRARIES.items():
         checks.append(_check_library(library, extra))
+    checks.append(
+        InstallationCheck(name=REPOSITORY_NAME, state="ok", detail=describe(REPOSITORY))
+    )
     checks.append(_check_part("registry", _describe_registry))
     checks.append(_check_part("data folder", lambda: _describe_folder(folder)))
     return Diagnosis(checks=tuple(checks))
@@ -120,10 +173,10 @@ def _check_library(name: str, extra: str | None = None) -> InstallationCheck:
     except PackageNotFoundError:
         if extra is None:
             state = "broken"
-            detail = "not installed: pip install lagbench"
+            detail = f"not installed: pip install {name}"
         else:
             state = "missing"
-            detail = f"pip install 'lagbench[{extra}]'"
+            detail = install_command(extra)
         return InstallationCheck(name=name, state=state, detail=detail)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from lagbench.data.layout import url_of
 from lagbench.data.registry import format_ids
+from lagbench.errors import format_count
 from lagbench.make.generate import GenerationResult, generate
 
 from .options import (
@@ -89,8 +90,9 @@ def _describe_plan(result: GenerationResult) -> list[str]:
     free = format_bytes(result.bytes_free)
     duration = format_seconds(result.seconds_expected)
     return [
-        f"{result.split} {result.size}: {len(result.simulated)} scenarios to simulate, "
-        f"{len(result.kept)} are there",
+        f"{result.split} {result.size}: "
+        f"{format_count(len(result.simulated), 'scenario')} to simulate, "
+        f"{len(result.kept)} kept",
         f"  disk    at most {needed} ({result.bytes_needed} bytes); "
         f"{free} free in {result.root}",
         f"  time    about {duration} with {result.workers} workers ({source})",
@@ -102,10 +104,11 @@ def _describe_result(result: GenerationResult) -> list[str]:
     simulated_count = len(result.simulated)
     kept_count = len(result.kept)
     if simulated_count:
-        work = f"{simulated_count} scenarios simulated in {duration}, {kept_count} kept"
+        simulated = format_count(simulated_count, "scenario")
+        work = f"{simulated} simulated in {duration}, {kept_count} kept"
     else:
         work = (
-            f"nothing to simulate, {kept_count} scenarios are there; "
+            f"nothing to simulate, {format_count(kept_count, 'scenario')} kept; "
             f"checked in {duration}"
         )
     lines = [

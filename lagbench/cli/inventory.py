@@ -35,6 +35,13 @@ COLUMNS = (
 )
 """Columns of a table of sizes."""
 
+LEGEND = (
+    "scenarios: of train/valid/test, then of extra; particles: of one scenario",
+    "frames: of all scenarios; disk <=: space that they need at most",
+    "here: whether the scenarios are on this machine",
+)
+"""Lines that say what the columns mean."""
+
 
 def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     """List all splits and sizes, their cost, and the data on this machine."""
@@ -44,6 +51,8 @@ def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
         print_json({"root": folder, "sizes": overviews})
         return
     print_table("", COLUMNS, map(_format_row, overviews))
+    for line in LEGEND:
+        print_line(line)
     for line in _describe_times(overviews):
         print_line(line)
     print_line(f"data sets live in {url_of(folder) or folder}")

@@ -17,7 +17,7 @@ from lagbench.board.reproduce import ReproduceResult, reproduce
 from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
-from lagbench.errors import DataError, LagbenchError, UsageError
+from lagbench.errors import DataError, LagbenchError, UsageError, format_count
 from lagbench.scoring.references import measured_sizes
 
 from .options import (
@@ -36,7 +36,6 @@ from .options import (
 )
 from .output import (
     format_bytes,
-    format_count,
     print_json,
     print_line,
     print_result,
@@ -255,7 +254,7 @@ def reproduce_command(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Run the models of entries again, compare their scores, measure their costs.
+    """Run the models of entries again, compare scores, measure costs.
 
     Exit code 0: all scores agree; 1: some differ; 2: no such entry, or one without a
     model; 3: a model cannot be read; 4: data are missing; 5: out of memory or disk.

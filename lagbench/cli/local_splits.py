@@ -16,11 +16,15 @@ from lagbench.exchange.metadata import parse_kinds
 from lagbench.exchange.trajectory import DataOptions, read_options
 
 from .options import JsonFlag, QuietFlag, option
-from .output import print_result
+from .output import print_result, print_warning
 from .progress import progress_bar
 
 OutputOption = Annotated[
     Path,
+    option("--output -o FOLDER", "New folder; its last part is the split's name."),
+]
+AdoptedOutputOption = Annotated[
+    Path | None,
     option("--output -o FOLDER", "New folder; its last part is the split's name."),
 ]
 DescribeOption = Annotated[
@@ -124,7 +128,7 @@ def adopt_command(
             metavar="FILE...", help=".npy, .npz or .nc files, or a folder of them."
         ),
     ],
-    output: OutputOption,
+    output: AdoptedOutputOption = None,
     describe: DescribeOption = None,
     radius: RadiusOption = None,
     frame_interval: IntervalOption = None,
@@ -132,7 +136,10 @@ def adopt_command(
         int | None, option("--valid N", "Trajectories of valid; a tenth by default.")
     ] = None,
     test: Annotated[
-        int | None, option("--test N", "Trajectories of test; a tenth by default.")
+        int | None,
+        option(
+            "--test N", "Trajectories of test; a tenth, but six of many, by default."
+        ),
     ] = None,
     bounds: BoundsOption = None,
     periodic: PeriodicOption = None,
@@ -224,3 +231,6 @@ def _print_local_split(local_split: LocalSplit, *, as_json: bool, quiet: bool) -
         f"  use it  lagbench template --split {local_split.folder}/",
     ]
     print_result(local_split, lines, as_json=as_json, quiet=quiet)
+    if not quiet:
+        for note in local_split.notes:
+            print_warning(note)

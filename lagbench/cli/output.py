@@ -25,19 +25,6 @@ GAP = 3  # characters between two columns
 LAST_COLUMN = 24  # characters to which the last column, which wraps, may shrink
 
 
-def format_count(number: int, noun: str) -> str:
-    """Return a number with its noun.
-
-    >>> format_count(1, "error"), format_count(2, "entry")
-    ('1 error', '2 entries')
-    """
-    if number == 1:
-        return f"1 {noun}"
-    if noun.endswith("y"):
-        return f"{number} {noun[:-1]}ies"
-    return f"{number} {noun}s"
-
-
 def format_bytes(count: float) -> str:
     """Return a number of bytes with a decimal unit.
 

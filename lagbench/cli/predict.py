@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, UsageError
+from lagbench.errors import LagbenchError, UsageError, format_count
 
 from .model_options import (
     PREDICTION_LIBRARIES,
@@ -189,7 +189,8 @@ def _describe(
         method_parts.append(f"trained at {result.trained_size}")
     method_parts += result.settings
     yield (
-        f"{result.path}: {', '.join(method_parts)}, {result.scenarios} scenarios, "
+        f"{result.path}: {', '.join(method_parts)}, "
+        f"{format_count(result.scenarios, 'scenario')}, "
         f"{result.frames} frames"
     )
     if is_replaced:

@@ -1,4 +1,4 @@
-"""Progress on stderr: a bar where a person watches, else a line per minute."""
+"""Progress on stderr: a bar where a person watches, else a line now and then."""
 
 from __future__ import annotations
 
@@ -28,22 +28,28 @@ Listener = Callable[[Progress], None]
 
 
 @contextmanager
-def progress_bar(*, quiet: bool, unit: str = "scenarios") -> Iterator[Listener | None]:
+def progress_bar(
+    *,
+    quiet: bool,
+    unit: str = "scenarios",
+    seconds_per_line: float = SECONDS_PER_LINE,
+) -> Iterator[Listener | None]:
     """Yield a function that shows progress: the share done, the rate and the time left.
 
-    A terminal shows a bar. A file or a pipe gets a line per minute, so that short work
-    prints none.
+    A terminal shows a bar. A file or a pipe gets a line per minute by default, so that
+    short work prints none.
 
     Args:
         quiet: whether to show nothing; None is yielded then.
         unit: what the work is counted in.
+        seconds_per_line: time between two lines that go to a file or a pipe [s].
     """
     if quiet:
         with silence_fetching():
             yield None
         return
     if not watched():
-        yield _print_lines(unit)
+        yield _print_lines(unit, seconds_per_line)
         return
 
     columns = (
@@ -69,14 +75,14 @@ def progress_bar(*, quiet: bool, unit: str = "scenarios") -> Iterator[Listener |
         yield update_bar
 
 
-def _print_lines(unit: str) -> Listener:
-    """Return a function that prints a line, at most one a minute."""
+def _print_lines(unit: str, seconds_per_line: float) -> Listener:
+    """Return a function that prints a line, at most one in some seconds."""
     last_time = time.monotonic()
 
     def print_progress(progress: Progress) -> None:
         nonlocal last_time
         now = time.monotonic()
-        if now - last_time < SECONDS_PER_LINE:
+        if now - last_time < seconds_per_line:
             return
         last_time = now
 

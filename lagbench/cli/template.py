@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from lagbench.errors import format_count
 from lagbench.submission.writer import template
 
 from .options import (
@@ -35,8 +36,9 @@ def template_command(
     """Write a valid predictions.nc, the persistence prediction, to fill in."""
     result = template(split, size, output=output, overwrite=overwrite, root=root)
     first, last = result.frames
+    scenarios = format_count(len(result.scenarios), "scenario")
     line = (
-        f"{result.path}: {len(result.scenarios)} scenarios, frames {first} to {last}, "
+        f"{result.path}: {scenarios}, frames {first} to {last}, "
         f"{result.particles} particles, {format_bytes(result.bytes)}"
     )
     print_result(result, [line], as_json=as_json, quiet=quiet)

@@ -36,6 +36,8 @@ from .progress import progress_bar
 if TYPE_CHECKING:
     from lagbench.baselines.train import TrainingResult
 
+SECONDS_PER_LINE = 10.0  # time between two lines of progress that go to a file [s]
+
 
 @accept_split
 def train_command(
@@ -75,10 +77,6 @@ def train_command(
             "seed.",
         ),
     ] = None,
-    resume: Annotated[
-        bool,
-        option("--resume/--no-resume", "Continue an earlier training of the folder."),
-    ] = True,
     fresh: Annotated[
         bool, option("--fresh", "Start anew and replace an earlier training.")
     ] = False,
@@ -87,9 +85,6 @@ def train_command(
         int, option("--processes N", "Processes, each with a device (DDP).", min=1)
     ] = 1,
     threads: ThreadsOption = None,
-    workers: Annotated[
-        int, option("--workers N", "Processes that read windows ahead.", min=0)
-    ] = 0,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -102,13 +97,6 @@ def train_command(
             "no model is named",
             where="--baseline",
             fix="name one, as in --baseline gns",
-        )
-    if fresh and not resume:
-        raise UsageError(
-            "two options that exclude each other",
-            where="--fresh and --no-resume",
-            fix="give --fresh to replace an earlier training, or --no-resume to keep "
-            "it and stop",
         )
     require_libraries(TRAINING_LIBRARIES)
     # Torch takes seconds to load, so the data are looked for before. Of several
@@ -131,7 +119,9 @@ def train_command(
         )
     with (
         _errors_of_one_process(is_helper=is_helper_process),
-        progress_bar(quiet=quiet, unit="steps") as progress,
+        progress_bar(
+            quiet=quiet, unit="steps", seconds_per_line=SECONDS_PER_LINE
+        ) as progress,
     ):
         result = train(
             baseline,
@@ -143,12 +133,10 @@ def train_command(
             start=start,
             root=root,
             output=output,
-            resume=resume,
             fresh=fresh,
             device=device,
             processes=processes,
             threads=threads,
-            workers=workers,
             progress=progress,
         )
     lines = _describe(result, root_option(split, root))

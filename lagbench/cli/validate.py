@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from lagbench.data.local import locate_split
+from lagbench.errors import format_count
 from lagbench.submission.issues import ValidationResult
 from lagbench.submission.validation import require_split, validate
 
 from .options import JsonFlag, QuietFlag, RootOption, option
-from .output import format_count, print_result
+from .output import print_result
 
 ExpectedSplitOption = Annotated[
     str | None,

@@ -109,7 +109,7 @@ class Box:
         """Volume, or the area in two dimensions [length^dimension]."""
         return float(np.prod(self.lengths))
 
-    @property
+    @cached_property
     def centre(self) -> Floats:
         """Middle of the box [length], shape [axis]."""
         return np.asarray(np.mean(self.bounds, axis=1), np.float64)
@@ -124,7 +124,7 @@ class Box:
         """Upper wall of each axis [length], inf along periodic axes, shape [axis]."""
         return np.where(self.periodic, np.inf, self.high)
 
-    @property
+    @cached_property
     def is_periodic(self) -> bool:
         """Whether any axis repeats itself."""
         return any(self.periodic)

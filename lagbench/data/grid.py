@@ -91,7 +91,7 @@ class Grid:
         """Number of axes: 2 or 3."""
         return self.box.dimension
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, ...]:
         """Nodes along each axis."""
         node_counts = []
@@ -391,8 +391,9 @@ def differentiable_nodes(
     inner = np.ones_like(counted)
     for axis, is_periodic in enumerate(periodic):
         place = axis - len(periodic)
-        neighbour = np.moveaxis(counted, place, -1)
-        along = np.moveaxis(inner, place, -1)  # a view
+        # Views with that axis last; np.moveaxis would take as long as the differences.
+        neighbour = counted.swapaxes(place, -1)
+        along = inner.swapaxes(place, -1)
         along[..., 1:-1] &= neighbour[..., 2:] & neighbour[..., :-2]
         if is_periodic:
             along[..., 0] &= neighbour[..., 1] & neighbour[..., -1]
@@ -417,8 +418,9 @@ def slope_along(
         is_periodic: whether the last node has the first one beside it.
     """
     slope = np.zeros(field.shape)
-    value = np.moveaxis(field, axis, -1)
-    along = np.moveaxis(slope, axis, -1)  # a view
+    # Views with that axis last; np.moveaxis would take as long as the differences.
+    value = field.swapaxes(axis, -1)
+    along = slope.swapaxes(axis, -1)
     along[..., 1:-1] = (value[..., 2:] - value[..., :-2]) / (2.0 * spacing)
     if is_periodic:
         along[..., 0] = (value[..., 1] - value[..., -1]) / (2.0 * spacing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -14,12 +15,20 @@ import numpy as np
 from lagbench.data.checksums import HASHED_SUBSETS, file_sha256
 from lagbench.data.hdf5 import hdf5_errors, open_hdf5
 from lagbench.data.structure import Structure, check_structure
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import ErrorCollector, UnreadableFileError, UsageError
+from lagbench.metrics.significance import FEWEST_SCENARIOS
 from lagbench.work.progress import Progress
 
 from . import gns_npz
 from .array_files import Row, list_trajectories, open_trajectory, sort_naturally
-from .local_split import LocalSplit, make_local_split, output_name
+from .axis_order import parse_order
+from .local_split import (
+    LocalSplit,
+    check_output,
+    find_bounds,
+    make_local_split,
+    output_name,
+)
 from .metadata import (
     DROP,
     ENDINGS,
@@ -38,6 +47,12 @@ from .trajectory import (
     check_options,
 )
 
+NEEDED_OPTIONS = {
+    "radius": "the connectivity radius of graph models, in the length of the data",
+    "frame_interval": "the time between two frames [s]",
+}
+"""Options without which nothing is adopted, and their meanings."""
+
 MOST_TRAJECTORIES = 100_000
 """Most trajectories of an HDF5 file that are looked at."""
 
@@ -45,7 +60,7 @@ MOST_TRAJECTORIES = 100_000
 def adopt(
     sources: str | Path | Sequence[str | Path],
     *,
-    output: str | Path,
+    output: str | Path | None = None,
     valid: int | None = None,
     test: int | None = None,
     progress: Callable[[Progress], None] | None = None,
@@ -65,54 +80,97 @@ def adopt(
         sources: a folder with subfolders ``train``, ``valid`` and ``test``; or files,
             or a folder of files, which are sorted by name and of which the last are
             taken for test, those before for valid.
-        output: folder to make; its last part is the name of the split.
+        output: folder to make, which must be given; its last part is the name of the
+            split.
         valid: trajectories for valid; a tenth, at least one, when None.
-        test: trajectories for test; a tenth, at least one, when None.
+        test: trajectories for test; when None a tenth, at least six (with fewer no
+            p-value can reach 5 %), at most a third.
         progress: called as the work advances.
-        **options: ``radius`` and ``frame_interval``, which must be given, and what else
-            is known, see :class:`lagbench.exchange.trajectory.Description`.
+        **options: ``radius`` and ``frame_interval``, which must be given; ``axes``, the
+            order of the axes of arrays, as in ("particle", "frame", "space"); and what
+            else is known, see :class:`lagbench.exchange.trajectory.Description`. With
+            ``rescale`` and without ``bounds``, the extent of all positions is the box.
 
     Raises:
         UsageError: no radius or frame interval, too few trajectories or one named
-            twice, a folder that is there, a task that does not fit the data.
+            twice, a folder that is there (all that is missing is told at once), a task
+            that does not fit the data.
         UnreadableFileError: a file is damaged, pickled, or holds no positions.
         DataError: positions are not finite, or outside the unit box, or
             particles jump by more than half the box along an axis with walls.
         WorkFailedError: the disk is full or not writable.
     """
     options = check_options(options)
-    for name in ("radius", "frame_interval"):
-        if name not in options:
-            raise UsageError(
-                f"the {name.replace('_', ' ')} is not known",
-                fix=f"--{name.replace('_', '-')}",
-            )
-
     if isinstance(sources, str | Path):
         paths = [Path(sources)]
     else:
         paths = [Path(source) for source in sources]
-    rows_of = _divide_into_subsets(paths, valid=valid, test=test)
+
+    rows_of: Mapping[str, list[Row]] = {}
+    mistakes = ErrorCollector()
+    for name, meaning in NEEDED_OPTIONS.items():
+        with mistakes:
+            _require_option(options, name, meaning)
+    folder = Path()
+    with mistakes:
+        folder = check_output(output)
+    stated_order = None
+    if "axes" in options:
+        with mistakes:
+            stated_order = parse_order(options["axes"])
+    with mistakes:
+        rows_of = _divide_into_subsets(paths, valid=valid, test=test)
+    mistakes.raise_errors()
     _refuse_duplicates(list(chain(*rows_of.values())))
 
+    open_row = partial(open_trajectory, order=stated_order)
     counts = {}
     subsets = {}
     for subset, rows in rows_of.items():
         counts[subset] = len(rows)
-        subsets[subset] = map(open_trajectory, rows)
+        subsets[subset] = map(open_row, rows)
+    facts: dict[str, Any] = {**options}
+    facts.pop("axes", None)
+    if options.get("rescale") and "bounds" not in options:
+        facts["bounds"] = find_bounds(map(open_row, chain(*rows_of.values())))
     description = Description(
-        name=output_name(output),
+        name=folder.name,
         source=f"{sum(counts.values())} trajectories of the user's own",
-        **options,
+        **facts,
     )
-    return make_local_split(
+    local_split = make_local_split(
         description,
         subsets,
-        output,
+        folder,
         command="adopt",
         counts=counts,
         progress=progress,
     )
+    return replace(local_split, notes=tuple(_notes_of_counts(counts)))
+
+
+def _require_option(options: DataOptions, name: str, meaning: str) -> None:
+    """Refuse to go on without an option that no data state."""
+    if name in options:
+        return
+    words = name.replace("_", " ")
+    option = name.replace("_", "-")
+    raise UsageError(
+        f"the {words} is not known",
+        where=f"--{option}",
+        expected=meaning,
+        got="nothing",
+        fix=f"add --{option} NUMBER, or the key {name} of a --describe file",
+    )
+
+
+def _notes_of_counts(counts: Mapping[str, int]) -> Iterator[str]:
+    """Yield what a user should know of the number of test trajectories."""
+    if counts["test"] < FEWEST_SCENARIOS:
+        yield (
+            f"{counts['test']} trajectories for test: under {FEWEST_SCENARIOS} no "
+            "difference between methods can be significant; --test takes more"
+        )
 
 
 def _divide_into_subsets(
@@ -122,7 +180,10 @@ def _divide_into_subsets(
     if len(paths) == 1 and (paths[0] / HASHED_SUBSETS[0]).is_dir():
         if valid is not None or test is not None:
             raise UsageError(
-                "the folders say what is valid and test", where="--valid and --test"
+                "the folders say what is valid and test",
+                where="--valid and --test",
+                expected="no such option beside the folders train, valid and test",
+                fix="leave them out, or name the files",
             )
         return {
             subset: list_trajectories(paths[0] / subset) for subset in HASHED_SUBSETS
@@ -135,17 +196,23 @@ def _divide_into_subsets(
     rows = []
     for path in paths:
         rows += list_trajectories(path)
-    tenth = max(1, len(rows) // 10)
-    valid_count = tenth if valid is None else valid
-    test_count = tenth if test is None else test
+    valid_count = valid
+    if valid_count is None:
+        valid_count = max(1, len(rows) // 10)
+    test_count = test
+    if test_count is None:
+        # enough for a p-value, but no more than train can spare
+        test_count = max(1, len(rows) // 10, min(FEWEST_SCENARIOS, len(rows) // 3))
     train_count = len(rows) - valid_count - test_count
     if min(train_count, valid_count, test_count) < 1:
         raise UsageError(
             "each subset needs a trajectory",
             where="--valid and --test",
-            expected="at least one each, and one left for train",
+            expected="at least 3 trajectories: one each, and one left for train",
             got=f"{len(rows)} trajectories, {valid_count} for valid, {test_count} for "
             f"test",
+            fix="name more files, or a .npy of shape [trajectory, frame, particle, "
+            "axis]",
         )
     first_test = train_count + valid_count
     return {
@@ -169,6 +236,7 @@ def _refuse_duplicates(rows: Sequence[Row]) -> None:
                 where=str(path),
                 expected="each once",
                 got=f"{path_of[row]} before",
+                fix="leave it out once: it could be trained on and tested",
             )
         path_of[row] = path
 
@@ -209,6 +277,13 @@ def import_split(
         WorkFailedError: the disk is full or not writable.
     """
     options = check_options(options)
+    if "axes" in options:
+        raise UsageError(
+            "a format states the order of its axes",
+            where="axes",
+            expected="no such key",
+            fix="leave it out; adopt takes it",
+        )
     form = parse_format(format)
     folder = Path(source)
     names = _file_names(form)

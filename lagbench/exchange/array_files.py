@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,6 +25,7 @@ from lagbench.data.registry import MAX_ID
 from lagbench.data.structure import Structure, check_structure
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
+from .axis_order import ORDER, OrderedArray, check_order
 from .trajectory import Frame, Trajectory, check_array, check_inflation, read_header
 
 READABLE = (".npy", ".npz", ".nc")
@@ -113,8 +115,14 @@ def list_trajectories(path: Path) -> list[Row]:
     return [(path, number) for number in range(shape[0])]
 
 
-def open_trajectory(row: Row) -> Trajectory:
-    """Return a trajectory, after a look at types and shapes of its arrays."""
+def open_trajectory(row: Row, order: tuple[str, ...] | None = None) -> Trajectory:
+    """Return a trajectory, after a look at types and shapes of its arrays.
+
+    Args:
+        row: the file, and the number of the trajectory in it.
+        order: names of the axes of positions and velocities in their order; when None,
+            frame, particle, space, and arrays that look otherwise are refused.
+    """
     path, number = row
     name = str(path)
     if number is not None:
@@ -128,10 +136,15 @@ def open_trajectory(row: Row) -> Trajectory:
         else:
             array = _read_npy(path)
             arrays = {POSITION: array if number is None else array[number]}
-        return _parse_trajectory(path, name, arrays)
+        return _parse_trajectory(path, name, arrays, order)
 
 
-def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Trajectory:
+def _parse_trajectory(
+    path: Path,
+    name: str,
+    arrays: Mapping[str, Any],
+    order: tuple[str, ...] | None,
+) -> Trajectory:
     """Return the trajectory of named arrays."""
     if POSITION not in arrays:
         raise UnreadableFileError(
@@ -140,12 +153,15 @@ def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Traje
             expected=f"an array {POSITION!r}",
             got=", ".join(arrays) or f"none of {', '.join(ARRAYS)}",
         )
-    position = arrays[POSITION]
-    shape = tuple(position.shape)
-    check_array(name, shape, _dtype_of(position))
+    position = OrderedArray(arrays[POSITION], order or ORDER)
+    shape = position.shape
+    check_array(name, shape, position.dtype)
+    if order is None:
+        check_order(position, where=name)
     frame_count, particle_count, dimension = shape
-    velocity = arrays.get(VELOCITY)
-    if velocity is not None:
+    velocity = None
+    if VELOCITY in arrays:
+        velocity = OrderedArray(arrays[VELOCITY], order or ORDER)
         where = f"{name}, {VELOCITY}"
         _check_numbers(velocity, "velocities", shape, where=where)
 
@@ -154,8 +170,8 @@ def _parse_trajectory(path: Path, name: str, arrays: Mapping[str, Any]) -> Traje
             for frame in range(frame_count):
                 frame_velocity = None
                 if velocity is not None:
-                    frame_velocity = np.asarray(velocity[frame])
-                yield np.asarray(position[frame]), frame_velocity
+                    frame_velocity = velocity[frame]
+                yield position[frame], frame_velocity
 
     return Trajectory(
         name=name,
@@ -277,6 +293,16 @@ def _check_header(name: str, stream: IO[bytes], length: int) -> None:
 
 def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(path) as archive:
+        names = Counter(member.filename for member in archive.infolist())
+        repeated_names = [name for name, count in names.items() if count > 1]
+        if repeated_names:
+            raise UnreadableFileError(
+                "an archive holds two arrays of one name",
+                where=str(path),
+                expected="each name once",
+                got=", ".join(map(ascii, repeated_names[:5])),
+                fix="write it again with numpy.savez",
+            )
         for member in archive.infolist():
             name = f"{path}, {member.filename}"
             check_inflation(

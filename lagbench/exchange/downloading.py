@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from lagbench.addresses import ARCHIVES, describe
 from lagbench.data.layout import MANIFEST_NAME, scenario_path
 from lagbench.data.local import locate_new
 from lagbench.data.lock import dataset_lock
@@ -33,7 +34,6 @@ from lagbench.make.inventory import (
 )
 from lagbench.make.plan import Scenarios, Selection, check_disk, select
 from lagbench.store.archive import (
-    RELEASES,
     RELEASES_VARIABLE,
     fetch_archive,
     list_releases,
@@ -248,13 +248,13 @@ class DownloadJob:
                 "datasets.yaml has no hash to check downloads against",
                 where=f"{place}, scenarios {format_ids(unknown)}",
             )
-        placeholder = None
+        archives = None
         if self.size.simulated:
-            placeholder = f"{RELEASES}, a placeholder"
+            archives = f"the address of released archives: {describe(ARCHIVES)}"
         reason: Reason = UsageError(
             "no store is known to download from",
             where=place,
-            got=placeholder,
+            got=archives,
             fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out "
             f"--no-generate",
         )

@@ -47,8 +47,10 @@ from .trajectory import (
     Bounds,
     Description,
     Trajectory,
+    check_name,
     estimate_spacing,
 )
+from .velocities import MotionCheck
 
 SIZE = "full"
 """Size of every local split."""
@@ -89,11 +91,77 @@ class LocalSplit:
     spacing: float  # distance of neighbouring particles at first [length]
     bytes: int  # length of the scenario files [bytes]
     dataset_sha256: str  # hash of the data set
+    notes: tuple[str, ...] = ()  # what a user should know
 
 
 def output_name(output: str | Path) -> str:
     """Return the name of the split that a folder to make stands for: its last part."""
     return Path(os.path.abspath(expand_path(output, "--output"))).name
+
+
+def check_output(output: str | Path | None) -> Path:
+    """Return the folder to make.
+
+    Raises:
+        UsageError: none is named, its name cannot be that of a local split, or it is
+            there.
+    """
+    if output is None:
+        raise UsageError(
+            "no folder is named",
+            where="--output",
+            expected="a folder to make, whose last part names the split",
+            got="nothing",
+            fix="name one, as in -o own",
+        )
+    folder = Path(os.path.abspath(expand_path(output, "--output")))
+    check_name(folder.name)
+    if folder.name in load().splits:
+        raise UsageError(
+            f"{folder.name!r} is one of the splits of lagbench",
+            where="--output",
+            expected="another name",
+            got=str(folder),
+            fix="use another name, as in -o own",
+        )
+    if os.path.lexists(folder):
+        raise UsageError(
+            "the folder is there already",
+            where=str(folder),
+            expected="a folder to make",
+            got="a folder or file of that name",
+            fix="use another name: --output",
+        )
+    return folder
+
+
+def find_bounds(trajectories: Iterable[Trajectory]) -> Bounds:
+    """Return the extent of all positions of trajectories, in their length.
+
+    Raises:
+        DataError: a position is not finite.
+    """
+    low: NDArray[np.float64] | None = None
+    high: NDArray[np.float64] | None = None
+    for trajectory in trajectories:
+        for number, (position, _) in enumerate(trajectory.read()):
+            frame_low = position.min(axis=0).astype(np.float64)
+            frame_high = position.max(axis=0).astype(np.float64)
+            if not (np.isfinite(frame_low).all() and np.isfinite(frame_high).all()):
+                raise DataError(
+                    "a position is not finite",
+                    where=f"{trajectory.name}, frame {number}",
+                    expected="numbers",
+                    fix="end the trajectory before this frame",
+                )
+            if low is None or high is None or len(low) != len(frame_low):
+                low = frame_low
+                high = frame_high
+            low = np.minimum(low, frame_low)
+            high = np.maximum(high, frame_high)
+    if low is None or high is None:
+        return ()
+    return tuple(zip(low.tolist(), high.tolist(), strict=True))
 
 
 def make_local_split(
@@ -120,20 +188,7 @@ def make_local_split(
         DataError: a subset is empty, or a trajectory cannot be used.
         WorkFailedError: the disk is full or not writable.
     """
-    folder = Path(os.path.abspath(expand_path(output, "--output")))
-    if description.name in load().splits:
-        raise UsageError(
-            f"{description.name!r} is one of the splits of lagbench",
-            where="--output",
-            fix="use another name",
-        )
-    if folder.exists():
-        raise UsageError(
-            "the folder is there already",
-            where=str(folder),
-            fix="remove it, or use another name",
-        )
-
+    folder = check_output(output)
     meter = Meter(progress)
     with _staging_folder(folder) as root:
         builder = SplitBuilder(description, root)
@@ -149,6 +204,8 @@ def make_local_split(
                     "a subset is empty",
                     where=subset,
                     expected="at least one trajectory",
+                    got="none",
+                    fix="put one there",
                 )
         manifest = builder.finish(command)
         built = root / description.name
@@ -336,6 +393,7 @@ class SplitBuilder:
         """
         description = self.description
         before: NDArray[np.float32] | None = None
+        motion = MotionCheck(rate=description.rate)
         for number, (raw_position, raw_velocity) in enumerate(trajectory.read()):
             where = f"{trajectory.name}, frame {number}"
             position = self._transform_positions(raw_position)
@@ -344,13 +402,17 @@ class SplitBuilder:
                 step = self._box.displacement(before, position.astype(np.float64))
                 self._check_steps(step, where=where)
             if raw_velocity is not None:
-                yield position, self._transform_velocities(raw_velocity, where=where)
+                velocity = self._transform_velocities(raw_velocity, where=where)
+                if before is not None:
+                    motion.add(velocity, step)
+                yield position, velocity
             elif before is not None:
                 velocity = (step * description.rate).astype(np.float32)
                 if number == 1:
                     yield before, velocity
                 yield position, velocity
             before = position
+        motion.finish(where=f"{trajectory.name}, velocity")
 
     @property
     def _box(self) -> Box:
@@ -395,7 +457,12 @@ class SplitBuilder:
             velocity = raw_velocity / self.description.transform.scale
             velocity = velocity.astype(np.float32)
         if not np.isfinite(velocity).all():
-            raise DataError("a velocity is not finite", where=where)
+            raise DataError(
+                "a velocity is not finite",
+                where=where,
+                expected="numbers",
+                fix="leave velocities out: they are then differences of positions",
+            )
         return velocity
 
     def _check_positions(self, position: NDArray[np.float32], *, where: str) -> None:
@@ -403,15 +470,20 @@ class SplitBuilder:
         low = position.min(axis=0)
         high = position.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
-            raise DataError("a position is not finite", where=where)
+            raise DataError(
+                "a position is not finite",
+                where=where,
+                expected="numbers",
+                fix="end the trajectory before this frame",
+            )
         if (low < 0.0).any() or (high > 1.0).any():
             raise DataError(
                 "particles lie outside the unit box",
                 where=where,
                 expected=" x ".join(["[0, 1]"] * self.dimension),
                 got=format_box(low, high),
-                fix="fit the box of the data into the unit box: --rescale, and "
-                "--bounds if none are stated",
+                fix="fit the box of the data into the unit box: --rescale, with "
+                "--bounds if its walls are known",
             )
         self._check_stated_bounds(low, high, where=where)
         self.low = np.minimum(self.low, low)

@@ -153,6 +153,7 @@ class DataOptions(TypedDict, total=False):
     rescale: bool
     density: float
     spacing: float
+    axes: Sequence[str]
     input_frames: Count
     horizon: Count
     frames_of_interest: Sequence[Count]
@@ -202,6 +203,25 @@ def _validate_options(options: object, *, where: str) -> DataOptions:
     )
 
 
+def check_name(name: str) -> None:
+    """Refuse a name that no split can have.
+
+    Raises:
+        UsageError: the message has a name like it that one can.
+    """
+    if is_split_name(name):
+        return
+    plain = re.sub(r"[^a-z0-9_-]+", "-", name.lower())
+    proposal = plain.strip("-_0123456789") or "own"
+    raise UsageError(
+        "a split cannot have that name",
+        where="--output, its last part",
+        expected="small letters, digits, - and _, a letter first",
+        got=name,
+        fix=f"--output {proposal}",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class Description:
     """What is known of data from elsewhere; lengths are those of the source.
@@ -238,7 +258,7 @@ class Description:
 
     def __post_init__(self) -> None:
         """Check what the user said, and fit the box where that is asked."""
-        self._check_name()
+        check_name(self.name)
         self._check_quantities()
         self._check_counts()
         self._check_bounds()
@@ -248,22 +268,10 @@ class Description:
                 raise UsageError(
                     "there are no bounds to fit into the unit box",
                     where="--rescale",
+                    expected="bounds of the data",
                     fix="add --bounds",
                 )
             object.__setattr__(self, "transform", BoxTransform.fit(self.bounds))
-
-    def _check_name(self) -> None:
-        if is_split_name(self.name):
-            return
-        plain = re.sub(r"[^a-z0-9_-]+", "-", self.name.lower())
-        proposal = plain.strip("-_0123456789") or "own"
-        raise UsageError(
-            "a split cannot have that name",
-            where="--output, its last part",
-            expected="small letters, digits, - and _, a letter first",
-            got=self.name,
-            fix=f"--output {proposal}",
-        )
 
     def _check_quantities(self) -> None:
         for option, value in (
@@ -401,6 +409,8 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             where=name,
             expected="shape (frame, particle, 2) or (frame, particle, 3)",
             got=f"shape {shape}",
+            fix="bring the axes into this order, or state theirs: --describe, key "
+            "axes: [frame, space, particle]",
         )
     if frame_count < 2 or particle_count < 1:
         raise DataError(
@@ -408,6 +418,7 @@ def check_array(name: str, shape: tuple[int, ...], dtype: np.dtype[np.generic]) 
             where=name,
             expected="2 frames, 1 particle",
             got=shape,
+            fix="give all frames of a run in one array",
         )
     for kind, limit, count in (
         ("frames", FRAMES, frame_count),

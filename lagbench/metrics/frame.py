@@ -459,9 +459,10 @@ class FramePair:
         """Share of predicted particles that are past a wall [1]."""
         position = self.prediction.position
         box = self.scenario.config.box
-        corners = np.stack([position.min(axis=0), position.max(axis=0)])
-        # Nearly always: where both corners lie inside, all particles do.
-        if box.contains(corners, tolerance=WALL_TOLERANCE).all():
+        # Nearly always: where the extremes lie inside, all particles do.
+        is_above = position.min(axis=0) >= box.lower_walls - WALL_TOLERANCE
+        is_below = position.max(axis=0) <= box.upper_walls + WALL_TOLERANCE
+        if is_above.all() and is_below.all():
             return 0.0
         is_inside = box.contains(position, tolerance=WALL_TOLERANCE)
         return np.count_nonzero(~is_inside) / len(position)

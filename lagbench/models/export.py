@@ -153,11 +153,12 @@ def _sums_of_index_add() -> Iterator[None]:
             "ScatterElements", total, index, source, axis_i=number, reduction_s="add"
         )
 
-    torch.onnx.register_custom_op_symbolic("aten::index_add", translate, LEAST_OPSET)
+    exporter: Any = torch.onnx
+    exporter.register_custom_op_symbolic("aten::index_add", translate, LEAST_OPSET)
     try:
         yield
     finally:
-        torch.onnx.unregister_custom_op_symbolic("aten::index_add", LEAST_OPSET)
+        exporter.unregister_custom_op_symbolic("aten::index_add", LEAST_OPSET)
 
 
 def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:

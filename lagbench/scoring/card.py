@@ -100,6 +100,8 @@ class ScoreCard:
     warnings: tuple[ValidationIssue, ...]  # of the validation; they do not reject
     preview: Preview  # pictures of the first scenario
     files: tuple[Path, ...] = ()  # scores.json and scores.nc, where they were written
+    # why there is no `against_classical`; None where there is one
+    why_not_classical: str | None = None
 
     def __repr__(self) -> str:
         """Return method, ranking metric and skill; the values are too many."""

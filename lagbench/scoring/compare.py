@@ -24,6 +24,7 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
     check_regular,
+    format_count,
     suggest_name,
 )
 from lagbench.metrics.aggregate import FEWEST_FOR_INTERVAL, Score, mean_over_seeds
@@ -145,8 +146,8 @@ class ComparisonResult:
     def _verdict_of_few(self) -> str:
         """The verdict of too few scenarios for a p-value."""
         verdict = (
-            f"{self.scenarios} scenarios: no significance is claimed under "
-            f"{FEWEST_SCENARIOS}"
+            f"{format_count(self.scenarios, 'scenario')}: no significance is claimed "
+            f"under {FEWEST_SCENARIOS}"
         )
         if self.scenarios < FEWEST_FOR_INTERVAL:
             return f"{verdict}, no interval under {FEWEST_FOR_INTERVAL}"
@@ -156,7 +157,8 @@ class ComparisonResult:
     def _sample(self) -> str:
         """The p-value with the number of scenarios and seeds behind it."""
         p = self.metrics[self.ranking].test.p
-        return f"p = {p:.3g}, {self.scenarios} scenarios, {self._seeds_in_words}"
+        scenarios = format_count(self.scenarios, "scenario")
+        return f"p = {p:.3g}, {scenarios}, {self._seeds_in_words}"
 
     @property
     def _seeds_in_words(self) -> str:

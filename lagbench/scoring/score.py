@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lagbench.atomic import atomic_path, check_writable
 from lagbench.data.local import load_rooted_registry, locate_split, resolve_root
-from lagbench.data.registry import Registry, Size
+from lagbench.data.registry import Registry
 from lagbench.errors import UnreadableFileError, UsageError, suggest_name
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.metric import Metric
 from lagbench.metrics.table import available, ranking_metric, select
 from lagbench.references import extrapolation
-from lagbench.references.shipped import ReferenceScores, shipped, solver_seconds
-from lagbench.references.table import CLASSICAL, NAIVE
+from lagbench.references.shipped import ReferenceScores, shipped
+from lagbench.references.table import NAIVE
 from lagbench.submission.format import FileInfo, Header
 from lagbench.submission.issues import ValidationIssue, ValidationResult
 from lagbench.submission.predictions import open_predictions
@@ -39,10 +41,8 @@ from .scenario import ScenarioJob, ScenarioScores, score_scenario
 from .scorability import OF_NODES, few_nodes_warning
 from .score_file import NETCDF_NAME, write_statistics
 from .skill import (
-    AgainstClassical,
-    compute_against_classical,
+    compare_with_solvers,
     compute_skill,
-    seconds_where_measured,
 )
 from .task import ScoredTask, load_scored_task
 
@@ -110,11 +110,9 @@ def score(
     if output_dir is not None:
         folder = Path(output_dir)
 
-    # validation
-    if validated is None:
+    result = validated
+    if result is None:
         result = validate(path, root=data_root, require_truth=True, registry=splits)
-    else:
-        result = validated
     if result.path != path:
         raise UsageError(
             "the validation is of another file", where=str(path), got=result.path
@@ -133,7 +131,6 @@ def score(
     if write:
         _check_overwriting(folder / JSON_NAME, header)
 
-    # measurement
     size = splits.size(header.split, header.size)
     # a validation that compares with the truth has hashed it
     is_hashed = validated is None and "discontinuous_start" not in result.skipped
@@ -142,52 +139,117 @@ def score(
     references: tuple[str, ...] = ()
     if not shipped_references:
         references = measurable(size, data_root)
-    warnings = list(result.warnings)
-    meter = Meter(progress)
-    while True:
-        try:
-            outcomes = score_scenarios(
-                task,
-                path,
-                info,
-                metrics=tuple(metric.name for metric in metrics),
-                references=references,
-                workers=workers,
-                scheduler=scheduler,
-                meter=meter,
-            )
-            tallies, scores = _aggregate(outcomes, metrics)
-            break
-        except PackageMetricError as error:
-            # measured again without it: its column is left out, the others are whole
-            metrics = drop_metric(metrics, error.metric)
-            warnings.append(describe_failure(error))
-    for name, reference in shipped_references.items():
-        scores[name] = reference.scores
-
-    ranking = ranking_metric(size)
-    counting = {}
-    for row, row_scores in scores.items():
-        if row in NAIVE and ranking in row_scores:
-            counting[row] = row_scores[ranking]
-    card = ScoreCard(
-        header=header,
-        predictions_sha256=sha256,
-        config=task.config,
-        ranking=ranking,
-        tallies=tallies,
-        scores=scores,
-        skill=compute_skill([scores[SUBMISSION][ranking]], counting),
-        against_classical=_compare_with_solvers(
-            header, size, scores[SUBMISSION][ranking], shipped_references
+    measurement = _measure(
+        functools.partial(
+            score_scenarios,
+            task,
+            path,
+            info,
+            references=references,
+            workers=workers,
+            scheduler=scheduler,
+            meter=Meter(progress),
         ),
-        flags=_judge(task, outcomes, scores),
-        warnings=(*warnings, *_warn_of_few_nodes(task, tallies[SUBMISSION])),
-        preview=next(one.preview for one in outcomes if one.preview is not None),
+        metrics,
+    )
+    card = _make_card(
+        measurement,
+        task=task,
+        header=header,
+        sha256=sha256,
+        shipped_references=shipped_references,
+        warnings=result.warnings,
     )
     if write:
         return _write(card, folder)
     return card
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Measurement:
+    """What was measured of a submission and of the references beside it."""
+
+    outcomes: Sequence[ScenarioScores]  # by ascending id of the scenario
+    tallies: Mapping[str, Mapping[int, Tally]]  # statistics by row and scenario
+    scores: Mapping[str, Mapping[str, Score]]  # by row and metric
+    failures: Sequence[ValidationIssue]  # of metrics of other packages
+
+
+def _measure(
+    score_all: Callable[..., list[ScenarioScores]], metrics: tuple[Metric, ...]
+) -> Measurement:
+    """Score all scenarios; a metric of another package that fails is left out.
+
+    Args:
+        score_all: :func:`score_scenarios` without its metrics.
+        metrics: the metrics to measure.
+    """
+    failures = []
+    while True:
+        try:
+            outcomes = score_all(metrics=tuple(metric.name for metric in metrics))
+            tallies, scores = _aggregate(outcomes, metrics)
+        except PackageMetricError as error:
+            # measured again without it: its column is left out, the others are whole
+            metrics = drop_metric(metrics, error.metric)
+            failures.append(describe_failure(error))
+            continue
+        return Measurement(
+            outcomes=outcomes, tallies=tallies, scores=scores, failures=failures
+        )
+
+
+def _make_card(
+    measurement: Measurement,
+    *,
+    task: ScoredTask,
+    header: Header,
+    sha256: str,
+    shipped_references: Mapping[str, ReferenceScores],
+    warnings: Sequence[ValidationIssue],
+) -> ScoreCard:
+    """Return the score card: measured scores beside those of the references.
+
+    Args:
+        measurement: what was measured.
+        task: the test subset.
+        header: what the predictions say about themselves.
+        sha256: content hash of the predicted positions.
+        shipped_references: scores of the references that were not measured.
+        warnings: of the validation.
+    """
+    scores = dict(measurement.scores)
+    for name, reference in shipped_references.items():
+        scores[name] = reference.scores
+    ranking = ranking_metric(task.size)
+    submission = scores[SUBMISSION][ranking]
+    counting = {}
+    for row, row_scores in scores.items():
+        if row in NAIVE and ranking in row_scores:
+            counting[row] = row_scores[ranking]
+
+    against_classical, why_not = compare_with_solvers(
+        header, task.size, submission, shipped_references
+    )
+    few_nodes = _warn_of_few_nodes(task, measurement.tallies[SUBMISSION])
+    return ScoreCard(
+        header=header,
+        predictions_sha256=sha256,
+        config=task.config,
+        ranking=ranking,
+        tallies=measurement.tallies,
+        scores=scores,
+        skill=compute_skill([submission], counting),
+        against_classical=against_classical,
+        why_not_classical=why_not,
+        flags=_judge(task, measurement.outcomes, scores),
+        warnings=(*warnings, *measurement.failures, *few_nodes),
+        preview=next(
+            outcome.preview
+            for outcome in measurement.outcomes
+            if outcome.preview is not None
+        ),
+    )
 
 
 def _aggregate(
@@ -204,35 +266,6 @@ def _aggregate(
         for row, row_tallies in tallies.items():
             scores[row] = aggregate(metrics, row_tallies)
     return tallies, scores
-
-
-def _compare_with_solvers(
-    header: Header,
-    size: Size,
-    submission: Score,
-    references: Mapping[str, ReferenceScores],
-) -> AgainstClassical | None:
-    """Return the submission's score over that of the best classical solver of its cost.
-
-    None where the predictions do not state what a frame costs the model and our solver.
-    """
-    seconds = seconds_where_measured(
-        seconds_per_frame=header.seconds_per_frame,
-        solver_seconds=header.solver_seconds_per_frame,
-        solver_seconds_here=solver_seconds(size),
-    )
-    if seconds is None:
-        return None
-    solvers = {}
-    costs = {}
-    for name in CLASSICAL.intersection(references):
-        reference = references[name]
-        if submission.metric.name in reference.scores:
-            solvers[name] = reference.scores[submission.metric.name]
-            costs[name] = reference.seconds_per_frame
-    return compute_against_classical(
-        [submission], solvers, seconds=costs, seconds_per_frame=seconds
-    )
 
 
 def scores_folder(predictions: Path) -> Path:

@@ -21,9 +21,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lagbench.data.registry import Size
 from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
+from lagbench.references.shipped import ReferenceScores, solver_seconds
+from lagbench.references.table import CLASSICAL
+from lagbench.submission.format import Header
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,6 +170,57 @@ def seconds_where_measured(
     if not seconds_per_frame or not solver_seconds or not solver_seconds_here:
         return None
     return seconds_per_frame * solver_seconds_here / solver_seconds
+
+
+def compare_with_solvers(
+    header: Header,
+    size: Size,
+    submission: Score,
+    references: Mapping[str, ReferenceScores],
+) -> tuple[AgainstClassical | None, str | None]:
+    """Return the submission's score over that of the best classical solver of its cost.
+
+    Where there is no such ratio, the reason comes instead.
+
+    Args:
+        header: what the predictions say about themselves, its costs among it.
+        size: the data set.
+        submission: score of the submission in the ranking metric.
+        references: shipped scores and costs of the reference predictors.
+    """
+    solvers = {}
+    costs = {}
+    for name in CLASSICAL.intersection(references):
+        reference = references[name]
+        if submission.metric.name in reference.scores:
+            solvers[name] = reference.scores[submission.metric.name]
+            costs[name] = reference.seconds_per_frame
+    seconds_here = solver_seconds(size)
+    if not solvers or seconds_here is None:
+        return None, "no classical solver was timed on this data set"
+
+    seconds = seconds_where_measured(
+        seconds_per_frame=header.seconds_per_frame,
+        solver_seconds=header.solver_seconds_per_frame,
+        solver_seconds_here=seconds_here,
+    )
+    if seconds is None:
+        missing = []
+        for label in ("seconds_per_frame", "solver_seconds_per_frame"):
+            if getattr(header, label) is None:
+                missing.append(label)
+        return None, (
+            f"the predictions do not state {' and '.join(missing)}; `lagbench bench "
+            f"solver` measures our solver on the machine of the model"
+        )
+    ratio = compute_against_classical(
+        [submission], solvers, seconds=costs, seconds_per_frame=seconds
+    )
+    if ratio is not None:
+        return ratio, None
+    if min(costs.values()) > seconds:
+        return None, "every classical solver costs more per frame than the model"
+    return None, "the classical solvers have no score in these scenarios"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 
+from lagbench.errors import format_count
 from lagbench.figures.tables import Table
 from lagbench.metrics.metric import Direction, Metric, mean
 from lagbench.metrics.table import CHOSEN
@@ -96,6 +97,7 @@ def brief_lines(card: ScoreCard) -> Iterator[str]:
     yield from _undefined_lines(card, card.chosen_metrics[:BRIEF_ROWS])
     for row in _best_reference(card):
         yield f"against {row}: {_against(card, row)}"
+    yield from _classical_lines(card)
     for flag in card.flags:
         if flag.raised:
             yield _flag_line(flag)
@@ -189,6 +191,7 @@ def flag_lines(card: ScoreCard) -> Iterator[str]:
     for row in card.scores:
         if row != SUBMISSION:
             yield f"against {row}: {_against(card, row)}"
+    yield from _classical_lines(card)
     for flag in card.flags:
         yield _flag_line(flag)
     yield from _warning_lines(card)
@@ -204,6 +207,12 @@ def _undefined_lines(card: ScoreCard, names: Collection[str]) -> Iterator[str]:
     if undefined:
         frames = len(card.scenarios) * card.config.horizon
         yield f"† frames without a value, of {frames}: {', '.join(undefined)}"
+
+
+def _classical_lines(card: ScoreCard) -> Iterator[str]:
+    """Yield the reason why no classical solver stands beside the score, if so."""
+    if card.against_classical is None and card.why_not_classical is not None:
+        yield f"against_classical: none, because {card.why_not_classical}"
 
 
 def _flag_line(flag: Flag) -> str:
@@ -241,7 +250,7 @@ def _against(card: ScoreCard, row: str) -> str:
     interval = ""
     if not math.isnan(low):
         interval = f"{_number(low)} to {_number(high)}, "
-    p = f"{len(comparison.scenarios)} scenarios: no p-value"
+    p = f"{format_count(len(comparison.scenarios), 'scenario')}: no p-value"
     if not math.isnan(comparison.p):
         p = f"p = {comparison.p:.3g}"
     return f"{card.ranking} {word} by {_number(abs(difference))} ({interval}{p})"

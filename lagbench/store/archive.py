@@ -20,6 +20,7 @@ from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
 
+from lagbench.addresses import ARCHIVES
 from lagbench.atomic import atomic_path
 from lagbench.data.layout import MANIFEST_NAME
 from lagbench.data.local import locate, suggest_repair
@@ -54,23 +55,17 @@ from .objects import (
     open_object,
 )
 
-RELEASES = "https://lagbench.invalid/releases"
-"""Folder of the released archives.
-
-It is a placeholder as long as its host is .invalid (RFC 2606).
-"""
-
 RELEASES_VARIABLE = "LAGBENCH_RELEASES"
-"""Environment variable that names another such folder."""
+"""Environment variable that names another folder of released archives."""
 
 ARCHIVE_ORDER = attrgetter("path")
 """Key of the order of scenario files in an archive."""
 
 
 def list_releases(size: Size) -> tuple[str, ...]:
-    """Return the addresses of releases: one; none for local splits and placeholders."""
-    url = os.environ.get(RELEASES_VARIABLE) or RELEASES
-    if size.simulated and ".invalid/" not in url:
+    """Return the addresses of releases: one; none for local splits, or if not set."""
+    url = os.environ.get(RELEASES_VARIABLE) or ARCHIVES
+    if size.simulated and url:
         return (url,)
     return ()
 

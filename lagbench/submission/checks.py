@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from lagbench.data.box import AXES, Box
 from lagbench.data.checksums import round_digits
 from lagbench.data.registry import Size
+from lagbench.errors import format_count
 
 from .issues import IssueCollector
 from .predictions import Predictions
@@ -20,6 +21,9 @@ from .truth import Truth, squared_lengths
 
 MAX_DISTANCE = 10.0
 """Farthest outside the walls that a position may be [length]; the box has length 1."""
+
+MAX_PERIODS = 1.0
+"""Farthest outside the box along a periodic axis without a warning [period]."""
 
 FILL = np.float32(9.969209968386869e36)
 """What netCDF puts where a float32 was never written."""
@@ -45,6 +49,9 @@ class ScenarioScan:
     first_outside: tuple[int, int] | None = None  # frame and particle
     # frame and particle of the first position beyond MAX_DISTANCE
     first_lost: tuple[int, int] | None = None
+    most_periods: float = 0.0  # largest distance outside along a periodic axis [period]
+    # frame, particle and axis of that distance
+    most_periods_at: tuple[int, int, int] | None = None
     # frame and particle of the largest jump
     jump_at: tuple[int, int] | None = None
     last_moving_frame: int = 0  # frame that is repeated from there to the end
@@ -62,6 +69,8 @@ class ScenarioScan:
         block = self._mask_bad_values(first, block)
         box = size.box
         self._add_places(first, block, box=box, cell=1.0 / size.grid)
+        if box.is_periodic:
+            self._add_periods(first, block, box)
         if self._last_frame is None:
             self._first_frame = (first, block[:1].copy())
             self.last_moving_frame = first
@@ -117,6 +126,17 @@ class ScenarioScan:
         if self.first_lost is None and self.farthest > MAX_DISTANCE:
             frame, particle = first_index(beyond > MAX_DISTANCE)
             self.first_lost = (first + frame, particle)
+
+    def _add_periods(self, first: int, block: Block, box: Box) -> None:
+        """Take in how many periods outside of the box the positions lie."""
+        outside = np.fmax(box.low - block, block - box.high) / box.lengths
+        periods = np.where(box.periodic, outside, 0.0)
+        periods = np.nan_to_num(periods, copy=False)
+        farthest = float(periods.max(initial=0.0))
+        if farthest > self.most_periods:
+            frame, particle, axis = first_index(periods == farthest)
+            self.most_periods = farthest
+            self.most_periods_at = (first + frame, particle, axis)
 
     def _add_steps(self, first: int, frames: Block, box: Box) -> None:
         """Take in steps; the first of them leads to the frame ``first``."""
@@ -199,14 +219,15 @@ def check_finite(scans: list[ScenarioScan], issues: IssueCollector) -> None:
     value_count = sum(scan.value_count for scan in scans)
     frame, particle, axis = bad_scans[0].first_bad or (0, 0, 0)
 
-    what = f"{bad_values} values are no numbers"
+    what = "values are no numbers"
     fix = (
         "freeze a diverging rollout at its last finite frame and name it in diverged_at"
     )
     if unwritten_values == bad_values:
-        what = f"{bad_values} values were never written"
+        what = "values were never written"
         fix = "write every frame of every scenario"
-    got = f"{bad_values} of {value_count} values in {len(bad_scans)} scenarios"
+    scenarios = format_count(len(bad_scans), "scenario")
+    got = f"{bad_values} of {value_count} values in {scenarios}"
     if unwritten_values:
         got += f", {unwritten_values} of them netCDF's fill value"
     issues.error(
@@ -244,6 +265,7 @@ def check_frozen(
 def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) -> None:
     """Flag positions outside the box; refuse those beyond ten boxes."""
     issues.complete("in_domain")
+    _check_periods(scans, issues)
     outside_scans = []
     for scan in scans:
         if scan.first_outside is not None:
@@ -282,6 +304,27 @@ def check_domain(scans: list[ScenarioScan], size: Size, issues: IssueCollector) 
         f"unit box and carry no grid weight",
         fix="positions are in lengths of the unit box, the walls' places are the "
         "split's bounds",
+    )
+
+
+def _check_periods(scans: list[ScenarioScan], issues: IssueCollector) -> None:
+    """Flag positions that lie periods away from the box along a periodic axis."""
+    farthest = max(scans, key=lambda scan: scan.most_periods, default=None)
+    if farthest is None or farthest.most_periods_at is None:
+        return
+    if farthest.most_periods <= MAX_PERIODS:
+        return
+    frame, particle, axis = farthest.most_periods_at
+    issues.warning(
+        "in_domain",
+        "positions lie periods away from the box",
+        where=f"scenario {farthest.scenario}, frame {frame}, particle {particle}, "
+        f"{AXES[axis]}",
+        expected=f"at most {MAX_PERIODS:g} period outside of the box",
+        got=f"{farthest.most_periods:.3g} periods outside",
+        fix="wrap positions into the box; where the model moves particles that far, "
+        "leave it: their images in the box are scored, with fewer digits the farther "
+        "away they are",
     )
 
 

@@ -251,8 +251,11 @@ def require_valid_attribute(name: str, value: object) -> None:
     if not is_attribute_valid(name, value):
         raise UsageError(
             f"the label {name!r} does not fit",
+            where=f"label {name!r}",
             expected=describe_kind(name),
             got=quote(value),
+            fix="docs/predictions.md describes the labels; leave one out that is not "
+            "known",
         )
 
 

@@ -11,6 +11,7 @@ from lagbench.data.layout import major_of, quote_root
 from lagbench.data.local import suggest_repair
 from lagbench.data.manifest import read_or_empty
 from lagbench.data.registry import Size, format_ids
+from lagbench.errors import format_count
 
 from .format import FileInfo
 from .issues import IssueCollector, quote
@@ -133,10 +134,9 @@ def check_scenarios(info: FileInfo, size: Size, issues: IssueCollector) -> None:
     ):
         if not scenarios:
             continue
-        plural = "s" if len(scenarios) > 1 else ""
         issues.error(
             "scenarios",
-            f"{len(scenarios)} {kind} scenario{plural}",
+            format_count(len(scenarios), f"{kind} scenario"),
             where="coordinate 'scenario'",
             expected=format_ranges(expected),
             got=f"{kind}: {format_numbers(scenarios)}",

@@ -1,7 +1,7 @@
 """Validate a predictions.nc: make every check and report all issues together.
 
 HDF5 is C code that parses whatever it is given: of 8000 files with one to eight bytes
-changed at random four made HDF5 2.0 loop. Files are therefore read in child processes
+changed at random four made HDF5 2.0 loop. A file is therefore read in a child process
 with limits. A file that loops, crashes or asks for too much ends the child; the parent
 reports that and goes on.
 """
@@ -9,8 +9,8 @@ reports that and goes on.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from lagbench.data.hdf5 import check_file, open_hdf5
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UnreadableFileError, UsageError
-from lagbench.work.machine import run_in_child
+from lagbench.work.machine import ChildStopped, LimitedChild
 
 from .checks import (
     check_domain,
@@ -119,8 +119,8 @@ def validate(
             the test subset there.
         require_truth: whether a missing test subset is an error of the check
             ``dataset``, as it is for scoring; else those checks are skipped and say so.
-        isolated: whether to read the file in child processes with limits on memory
-            and time. Without them a malicious file can stop this process.
+        isolated: whether to read the file in a child process with limits on memory
+            and time. Without it a malicious file can stop this process.
         registry: where splits are described; ours when None.
 
     Returns:
@@ -132,24 +132,10 @@ def validate(
     splits = load_rooted_registry(folder, registry)
     try:
         check_file(file, fix=WRITE)
-        names = _call(read_names, {"path": str(file)}, isolated=isolated)
-    except UnreadableFileError as error:
-        return _unreadable(file, error)
-
-    size, hint = _find_size(names, splits)
-    size_json = None
-    if size is not None:
-        _fetch_truth(size, folder)
-        size_json = size.model_dump_json()
-    request = {
-        "path": str(file),
-        "root": str(folder),
-        "size": size_json,
-        "hint": hint,
-        "require_truth": require_truth,
-    }
-    try:
-        answer = _call(run_checks, request, isolated=isolated)
+        with _open_reader(file, isolated=isolated) as reader:
+            size, answer = _examine(
+                reader, file, folder, splits, require_truth=require_truth
+            )
     except UnreadableFileError as error:
         return _unreadable(file, error)
 
@@ -163,35 +149,65 @@ def validate(
     return result
 
 
-def _call(
-    function: Callable[[Request], Answer], request: Request, *, isolated: bool
-) -> Answer:
-    """Call a function that reads a file, in a child process with limits if isolated.
+Reader = Callable[[Callable[[Request], Answer], Request], Answer]
+"""Calls a function that reads a file of a stranger."""
+
+
+@contextmanager
+def _open_reader(path: Path, *, isolated: bool) -> Iterator[Reader]:
+    """Yield a reader; if isolated, one that calls in a child process with limits.
 
     Raises:
         UnreadableFileError: the child had to be stopped.
     """
     if not isolated:
-        return function(request)
-    path = Path(request["path"])
+        yield lambda function, request: function(request)
+        return
     extra = seconds_for(path)
-    answers, reason = run_in_child(
-        f"{__name__}.{function.__name__}",
-        [request],
-        seconds=CPU_SECONDS + extra,
-        wall=WALL_SECONDS + extra,
+    child = LimitedChild(
+        __name__, seconds=CPU_SECONDS + extra, wall=WALL_SECONDS + extra
     )
-    if not answers:
-        raise UnreadableFileError(
-            "reading the file had to be stopped",
-            where=str(path),
-            expected="a file that HDF5 reads within the limits",
-            got=reason,
-            fix="the file is damaged or made to do harm; write it again with "
-            "lagbench.submission.write",
-        )
-    answer: Answer = answers[0]
-    return answer
+    with child:
+        try:
+            yield lambda function, request: child.call(function.__name__, request)
+        except ChildStopped as stopped:
+            raise UnreadableFileError(
+                "reading the file had to be stopped",
+                where=str(path),
+                expected="a file that HDF5 reads within the limits",
+                got=str(stopped),
+                fix="the file is damaged or made to do harm; write it again with "
+                "lagbench.submission.write",
+            ) from None
+
+
+def _examine(
+    reader: Reader,
+    path: Path,
+    root: Path,
+    registry: Registry,
+    *,
+    require_truth: bool,
+) -> tuple[Size | None, Answer]:
+    """Return the size that a file names, None if there is none, and its checks.
+
+    The reader opens the file twice: the test subset, which the checks need, may have to
+    be fetched, and that is no work for a child that reads what a stranger wrote.
+    """
+    names = reader(read_names, {"path": str(path)})
+    size, hint = _find_size(names, registry)
+    size_json = None
+    if size is not None:
+        _fetch_truth(size, root)
+        size_json = size.model_dump_json()
+    request = {
+        "path": str(path),
+        "root": str(root),
+        "size": size_json,
+        "hint": hint,
+        "require_truth": require_truth,
+    }
+    return size, reader(run_checks, request)
 
 
 def read_names(request: Request) -> Answer:

@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size, format_ids
-from lagbench.errors import DataError, UsageError, WorkFailedError, suggest_name
+from lagbench.errors import (
+    DataError,
+    UsageError,
+    WorkFailedError,
+    format_count,
+    suggest_name,
+)
 
 from .format import (
     ATTRIBUTES,
@@ -87,8 +93,11 @@ class PredictionsWriter:
         if not isinstance(dataset_sha256, str) or not HASH.fullmatch(dataset_sha256):
             raise UsageError(
                 "dataset_sha256 does not fit",
+                where="dataset_sha256",
                 expected="64 hex digits",
                 got=quote(dataset_sha256),
+                fix="copy it from `lagbench info`, or leave it out where the data set "
+                "has a recorded hash",
             )
         require_valid_attribute("method", method)
         self._dataset_sha256 = dataset_sha256
@@ -128,7 +137,12 @@ class PredictionsWriter:
             if isinstance(value, np.generic):
                 value = value.item()
             if name not in OPTIONAL:
-                raise UsageError(f"no label {name!r}", fix=suggest_name(name, OPTIONAL))
+                raise UsageError(
+                    f"no label {name!r}",
+                    where=f"label {quote(name)}",
+                    expected=", ".join(OPTIONAL),
+                    fix=suggest_name(name, OPTIONAL),
+                )
             require_valid_attribute(name, value)
             self._labels[name] = value
 
@@ -140,6 +154,8 @@ class PredictionsWriter:
             raise UsageError(
                 "the file is being written",
                 where=str(self.path),
+                expected="a writer that is not open",
+                got="an open one",
                 fix="enter a writer once",
             )
         self._written.clear()
@@ -214,6 +230,10 @@ class PredictionsWriter:
             raise UsageError(
                 "velocities come for every scenario or for none",
                 where=f"scenario {scenario}",
+                expected=" and ".join(self._variables),
+                got=" and ".join(arrays),
+                fix="leave velocities out: they are not scored; or give velocity=True "
+                "to the writer and velocities of every scenario",
             )
         values = {}
         for name, array in arrays.items():
@@ -234,14 +254,22 @@ class PredictionsWriter:
 
     def _check_scenario(self, scenario: int) -> None:
         """Refuse a scenario that is unknown or written already."""
+        where = f"scenario {scenario!r}"
         expected = f"whole numbers: {format_ids(self._row_of)}"
         if scenario in self._written:
             raise UsageError(
-                f"scenario {scenario!r} is written twice", expected=expected
+                "a scenario is written twice",
+                where=where,
+                expected=expected,
+                fix="add every scenario once, with all of its frames",
             )
         if scenario not in self._row_of:
             raise UsageError(
-                f"scenario {scenario!r} is no test scenario", expected=expected
+                "no such test scenario",
+                where=where,
+                expected=expected,
+                fix="name scenarios by id, not by row; predictions for other subsets "
+                "are not stored",
             )
 
     def _check_frozen(
@@ -256,6 +284,8 @@ class PredictionsWriter:
                 where=where,
                 expected=format_ids(frames),
                 got=repr(diverged_at),
+                fix="give the absolute number of the first frozen frame; frame 0 is "
+                "the first given one",
             )
         first_frozen = frames.index(diverged_at)
         frozen = position[first_frozen:]
@@ -286,10 +316,12 @@ class PredictionsWriter:
             missing = sorted(set(self._row_of) - self._written)
             if missing:
                 raise UsageError(
-                    f"{len(missing)} test scenarios are missing",
+                    f"{format_count(len(missing), 'test scenario')} missing",
                     where=str(self.path),
                     expected=format_ids(self._row_of),
                     got=f"missing: {format_ids(missing)}",
+                    fix="predict every test scenario; `lagbench template` writes a "
+                    "file to fill",
                 )
             with self._writing():
                 if (self._diverged_at != NEVER).any():
@@ -315,7 +347,10 @@ class PredictionsWriter:
             array = numbers.astype(np.float32)
         expected_shape = self.shape_of(scenario)
         if array.shape != expected_shape:
-            fix = None
+            fix = (
+                "predict all frames and all particles of the scenario: "
+                "frame, particle, space"
+            )
             if sorted(array.shape) == sorted(expected_shape):
                 fix = "transpose it: frame, particle, space"
             raise UsageError(
@@ -330,8 +365,9 @@ class PredictionsWriter:
             step, particle, axis = bad_places[0].tolist()
             frame = self.size.task.input_frames + step
             raise UsageError(
-                f"{len(bad_places)} values are not finite as float32",
+                f"{format_count(len(bad_places), 'value')} not finite as float32",
                 where=f"{where}, frame {frame}, particle {particle}",
+                expected="finite positions",
                 got=array[step, particle, axis],
                 fix="freeze a diverging rollout at its last finite frame and give "
                 "diverged_at",
@@ -414,6 +450,8 @@ def _no_positions(where: str, got: str) -> UsageError:
         where=where,
         expected="an array of numbers without a mask",
         got=got[:MAX_REASON],
+        fix="convert it to one NumPy array of float32; of a tensor: "
+        "tensor.detach().cpu().numpy()",
     )
 
 
@@ -503,6 +541,7 @@ def _by_scenario(
     if array.ndim != len(DIMS) or len(array) != len(scenarios):
         raise UsageError(
             "the array does not hold one entry per test scenario",
+            where="positions or velocities",
             expected=f"{len(scenarios)} scenarios ({format_ids(scenarios)}) first, "
             f"{len(DIMS)} dimensions",
             got=f"shape {array.shape}",

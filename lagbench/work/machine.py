@@ -5,7 +5,7 @@ another system may keep it too, but nothing shows that before its hashes are tho
 datasets.yaml.
 
 A library in C that parses a stranger's file may loop, crash or ask for too much:
-:func:`run_in_child` calls any function in a child with limits. Requests and answers are
+:class:`LimitedChild` calls functions in a child with limits. Requests and answers are
 JSON, so nothing that a child sends is executed. Windows has no limits (no module
 ``resource``: then ``LIMITS`` is false), macOS refuses one on the address space. Nothing
 replaces a limit that a system lacks.
@@ -22,10 +22,13 @@ import platform
 import signal
 import subprocess
 import sys
+import tempfile
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from importlib.metadata import version
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 from lagbench.errors import WorkFailedError
 
@@ -119,6 +122,119 @@ def limit_process(*, memory: int, seconds: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
 
 
+class ChildStopped(Exception):
+    """A child under limits has ended before it answered; its text says why."""
+
+
+class LimitedChild:
+    """A process with limits that calls functions of one module for this process.
+
+    Use it as a context manager, which ends the process. It starts with the first call.
+    """
+
+    def __init__(
+        self, module: str, *, seconds: float, wall: float, memory: int = MEMORY
+    ) -> None:
+        """Set the limits of all calls together.
+
+        Args:
+            module: dotted name of the module of the functions.
+            seconds: processor time, without the start [s].
+            wall: time of the clock that this process waits, with the start [s].
+            memory: address space [bytes].
+        """
+        self._arguments = (module, str(memory), str(int(seconds)))
+        self._memory = memory
+        self._wall = wall
+        self._seconds_left = wall
+        self._is_late = False
+        self._process: subprocess.Popen[bytes] | None = None
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Return the child itself."""
+        # a file and not a pipe, which a child that writes much would fill
+        self._stderr = self._stack.enter_context(tempfile.TemporaryFile())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Kill the process: it has nothing to keep."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+        self._stack.close()
+
+    def call(self, function: str, argument: object) -> Any:  # noqa: ANN401 - JSON
+        """Return what a function of the module returns.
+
+        Args:
+            function: name of the function.
+            argument: what JSON can hold.
+
+        Raises:
+            ChildStopped: the child crashed, or went beyond a limit.
+            WorkFailedError: an exception in the child, as where it cannot import the
+                module.
+        """
+        if self._process is None:
+            self._process = self._start()
+        process = self._process
+        start = time.monotonic()
+        timer = threading.Timer(self._seconds_left, self._kill_late, [process])
+        timer.start()
+        try:
+            answer = _ask(process, [function, argument])
+            if answer is None:
+                raise self._failure(process.wait())
+        finally:
+            timer.cancel()
+            self._seconds_left -= time.monotonic() - start
+        return json.loads(answer)
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", CHILD, *self._arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._stderr,
+            env={**os.environ, **ENVIRONMENT},
+        )
+
+    def _kill_late(self, process: subprocess.Popen[bytes]) -> None:
+        self._is_late = True
+        process.kill()
+
+    def _failure(self, code: int) -> Exception:
+        """Return the exception for a child that has ended with an exit code."""
+        if self._is_late:
+            return ChildStopped(f"no end after {self._wall:.0f} s")
+        self._stderr.seek(0)
+        text = self._stderr.read()
+        if b"Traceback" in text and code > 0 and code != OUT_OF_MEMORY:
+            lines = text.decode("utf-8", "replace").strip().rsplit("\n", 1)
+            return WorkFailedError(
+                "a child process itself failed",
+                where=self._arguments[0],
+                got=ascii(lines[-1][:300]),
+                fix="`lagbench doctor` checks the installation; if it finds nothing, "
+                "report this with the file",
+            )
+        return ChildStopped(describe_exit(code, self._memory))
+
+
+def _ask(process: subprocess.Popen[bytes], request: object) -> bytes | None:
+    """Return the answer of a child to a request; None where it ends before."""
+    if process.stdin is None or process.stdout is None:
+        raise WorkFailedError("a child process has no pipes")
+    try:
+        process.stdin.write(json.dumps(request).encode() + b"\n")
+        process.stdin.flush()
+    except BrokenPipeError:
+        return None
+    answer = process.stdout.readline()
+    return answer if answer.endswith(b"\n") else None
+
+
 class Answers(NamedTuple):
     """Answers of a child in the order of the requests, and why it stopped early."""
 
@@ -147,36 +263,22 @@ def run_in_child(
         WorkFailedError: an exception in the child, as where it cannot import the
             function.
     """
-    limits = [str(memory), str(int(seconds))]
-    try:
-        child = subprocess.run(
-            [sys.executable, "-P", "-c", CHILD, function, *limits],
-            input=json.dumps(list(requests)).encode(),
-            capture_output=True,
-            timeout=wall,
-            env={**os.environ, **ENVIRONMENT},
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        return Answers(_read_answers(error.stdout), f"no end after {wall:.0f} s")
-    has_exception = b"Traceback" in child.stderr
-    if has_exception and child.returncode > 0 and child.returncode != OUT_OF_MEMORY:
-        lines = child.stderr.decode("utf-8", "replace").strip().rsplit("\n", 1)
-        raise WorkFailedError(
-            "a child process itself failed",
-            where=function,
-            got=ascii(lines[-1][:300]),
-            fix="`lagbench doctor` checks the installation; if it finds nothing, "
-            "report this with the file",
-        )
-    stopped = _describe_exit(child.returncode, memory)
-    return Answers(_read_answers(child.stdout), stopped)
+    module, _, name = function.rpartition(".")
+    answers = []
+    with LimitedChild(module, seconds=seconds, wall=wall, memory=memory) as child:
+        for request in requests:
+            try:
+                answers.append(child.call(name, request))
+            except ChildStopped as stopped:
+                return Answers(answers, str(stopped))
+    return Answers(answers, None)
 
 
-def _describe_exit(code: int, memory: int) -> str | None:
-    """Return in words why a child has stopped; None where it came to its end."""
-    if code == 0:
-        return None
+def describe_exit(code: int, memory: int) -> str:
+    """Return in words why a child with an exit code has not answered.
+
+    ``memory`` is its limit [bytes].
+    """
     if code == OUT_OF_MEMORY:
         return f"more than {memory >> 20} MiB of memory"
     if code == TOO_LONG:
@@ -187,28 +289,19 @@ def _describe_exit(code: int, memory: int) -> str | None:
     return f"it ended with exit code {code:#x}"
 
 
-def _read_answers(output: bytes | None) -> list[Any]:
-    """Return the answers of a child, without a last line that is not complete."""
-    answers = []
-    for line in (output or b"").splitlines(keepends=True):
-        if line.endswith(b"\n"):
-            answers.append(json.loads(line))
-    return answers
-
-
 def serve() -> None:
     """Answer the requests of stdin, one line each, under the limits of the arguments.
 
     The time of the imports is not counted: on a busy machine they may take seconds.
     """
-    dotted_name, memory, seconds = sys.argv[1:4]
-    module, _, name = dotted_name.rpartition(".")
-    function: Callable[[Any], object] = getattr(importlib.import_module(module), name)
+    module_name, memory, seconds = sys.argv[1:4]
+    module = importlib.import_module(module_name)
     import_seconds = math.ceil(time.process_time())
     limit_process(memory=int(memory), seconds=int(seconds) + import_seconds)
     try:
-        for request in json.load(sys.stdin):
-            sys.stdout.write(json.dumps(function(request)) + "\n")
+        for line in sys.stdin:
+            name, argument = json.loads(line)
+            sys.stdout.write(json.dumps(getattr(module, name)(argument)) + "\n")
             sys.stdout.flush()
     except MemoryError:
         raise SystemExit(OUT_OF_MEMORY) from None

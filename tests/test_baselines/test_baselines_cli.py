@@ -174,7 +174,6 @@ def test_the_speed_up_needs_the_solver(
         ),
         (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
         (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
-        (("--baseline", "gns", *TINY, "--fresh", "--no-resume"), 2, "--no-resume"),
         (
             ("--baseline", "gns", "--split", "cavity", "--size", "mini"),
             4,

@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import tomllib
 from collections.abc import Callable
-from importlib.metadata import requires
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from conftest import SIZE, SPLIT
 from typer.testing import Result
 
 import lagbench
+from lagbench.cli import doctor
 from lagbench.cli.doctor import REQUIRED_LIBRARIES
 from lagbench.data.registry import load
 from lagbench.make.generate import GenerationResult
@@ -83,7 +84,7 @@ def test_generate_and_verify_one_scenario(run: Run, tmp_path: Path) -> None:
     options = [*data_set, "--scenarios", "2"]
     plan = run("generate", *options, "--dry-run").stdout
     assert re.search(
-        r"(?s)1 scenarios to simulate.*disk .*bytes.*free.*time +about \d+ s", plan
+        r"(?s)1 scenario to simulate.*disk .*bytes.*free.*time +about \d+ s", plan
     )
     first = run("generate", *options)
     assert first.exit_code == 0, first.output
@@ -206,6 +207,37 @@ def test_doctor_checks_every_library_that_the_package_declares() -> None:
         if "extra ==" not in requirement:
             declared.add(re.split(r"[^\w.-]", requirement)[0].lower())
     assert {name.lower() for name in REQUIRED_LIBRARIES} == declared
+
+
+def test_doctor_names_one_command_for_all_that_is_missing(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says what cannot be done without it; nothing is broken."""
+    installed_version = doctor.version
+
+    def version(name: str) -> str:
+        if name in ("taichi", "statsmodels"):
+            raise PackageNotFoundError(name)
+        return installed_version(name)
+
+    monkeypatch.setattr(doctor, "version", version)
+    result = run("doctor", "--root", tmp_path)
+    assert result.exit_code == 0
+    last_line = result.stdout.splitlines()[-1]
+    assert "pip install" in last_line
+    assert "[generate,baselines]" in last_line
+    for extra in ("generate", "baselines"):
+        assert doctor.PURPOSES[extra] in result.stdout
+
+
+def test_doctor_knows_the_libraries_of_every_extra() -> None:
+    declared = {}
+    for requirement in requires("lagbench") or []:
+        name, _, extra = requirement.partition("extra ==")
+        library = re.split(r"[^\w.-]", name)[0].lower()
+        if extra.strip(" \"'") in doctor.PURPOSES:
+            declared[library] = extra.strip(" \"'")
+    assert declared == doctor.OPTIONAL_LIBRARIES
 
 
 def test_doctor_finds_this_machine_fit(run: Run, tmp_path: Path) -> None:

@@ -65,6 +65,7 @@ def test_the_help_of_a_group_loads_no_command() -> None:
     modules = loaded_modules([["--help"], ["leaderboard", "--help"], ["--version"]])
     assert modules <= {
         "lagbench.__main__",
+        "lagbench.addresses",
         "lagbench.cli",
         "lagbench.cli.commands",
         "lagbench.cli.lazy_group",

@@ -34,10 +34,9 @@ WRITING = Progress(
 
 
 def test_a_file_gets_lines_with_the_count_and_the_time_left(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 0.0)
-    with progress_bar(quiet=False, unit="steps") as listener:
+    with progress_bar(quiet=False, unit="steps", seconds_per_line=0.0) as listener:
         assert listener is not None
         listener(training_progress(60))
         listener(training_progress(200))
@@ -47,21 +46,15 @@ def test_a_file_gets_lines_with_the_count_and_the_time_left(
     assert re.findall(pattern, output.err) == [("60", "3 min"), ("200", "40 s")]
 
 
-def test_an_unknown_total_is_left_out(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 0.0)
-    with progress_bar(quiet=False) as listener:
+def test_an_unknown_total_is_left_out(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar(quiet=False, seconds_per_line=0.0) as listener:
         assert listener is not None
         listener(WRITING)
     assert capsys.readouterr().err == "writing train: 2 scenarios, 2.00/s\n"
 
 
-def test_quick_work_prints_no_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("lagbench.cli.progress.SECONDS_PER_LINE", 3600.0)
-    with progress_bar(quiet=False, unit="steps") as listener:
+def test_quick_work_prints_no_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_bar(quiet=False, unit="steps", seconds_per_line=3600.0) as listener:
         assert listener is not None
         listener(training_progress(60))
         listener(WRITING)

@@ -5,6 +5,7 @@ error says why not.
 from __future__ import annotations
 
 import math
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def runs() -> Runs:
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory, runs: Runs) -> LocalSplit:
     """A local split of these trajectories, four to train on."""
-    return adopted(tmp_path_factory.mktemp("own"), runs)
+    return adopted(tmp_path_factory.mktemp("own"), runs, test=1)
 
 
 def test_positions_come_out_as_they_went_in(own: LocalSplit, runs: Runs) -> None:
@@ -122,7 +123,7 @@ def test_the_same_arrays_give_the_same_split(
 ) -> None:
     """Once in files of their own, once as one array of four dimensions."""
     np.save(tmp_path / "all.npy", np.stack(runs))
-    made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", **BASIC)
+    made = adopt(tmp_path / "all.npy", output=tmp_path / "mine", test=1, **BASIC)
     assert made.dataset_sha256 == own.dataset_sha256
     assert (made.folder / "split.yaml").read_bytes() == (
         own.folder / "split.yaml"
@@ -203,6 +204,115 @@ def test_an_empty_file_is_no_trajectory(tmp_path: Path, ending: str) -> None:
     assert caught.value.where == str(tmp_path / f"run2.{ending}")
 
 
+def motion(run: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return velocities as forward differences over a quarter of a second."""
+    step = np.diff(run, axis=0, append=2 * run[-1:] - run[-2:-1])
+    return np.asarray(4 * step, np.float32)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, 0.1, 10.0])
+def test_velocities_that_contradict_the_motion_are_refused(
+    tmp_path: Path, factor: float
+) -> None:
+    """Another unit or direction is a mistake; nothing is written."""
+    for number, run in enumerate(straight_runs(3)):
+        path = tmp_path / "in" / f"{number}.npz"
+        path.parent.mkdir(exist_ok=True)
+        np.savez(path, position=run, velocity=factor * motion(run))
+    with pytest.raises(DataError, match="contradict the motion") as caught:
+        adopt(tmp_path / "in", output=tmp_path / "mine", **BASIC)
+    assert "0.npz" in str(caught.value.where)
+    assert not (tmp_path / "mine").exists()
+
+
+def test_two_arrays_of_one_name_are_refused(tmp_path: Path) -> None:
+    """Which one counts would depend on the reader."""
+    paths = [tmp_path / f"{number}.npz" for number in range(3)]
+    for path, run in zip(paths, straight_runs(3), strict=True):
+        np.savez(path, position=run)
+    with zipfile.ZipFile(paths[0]) as archive:
+        content = archive.read("position.npy")
+    with (
+        pytest.warns(match="Duplicate name"),
+        zipfile.ZipFile(paths[0], "a") as archive,
+    ):
+        archive.writestr("position.npy", content)
+    with pytest.raises(UnreadableFileError) as caught:
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    assert caught.value.where == str(paths[0])
+
+
+@pytest.mark.parametrize("ending", ["npy", "nc"])
+def test_exchanged_axes_are_refused_until_they_are_stated(
+    tmp_path: Path, ending: str
+) -> None:
+    """Stated, the split is that of the usual order."""
+    runs = straight_runs(3, frames=12, particles=40)
+    paths = []
+    for number, run in enumerate(runs):
+        path = tmp_path / f"run{number}.{ending}"
+        exchanged = run.swapaxes(0, 1)
+        paths.append(path)
+        if ending == "npy":
+            np.save(path, exchanged)
+            continue
+        with netCDF4.Dataset(path, "w") as file:
+            variable(file, exchanged.shape, "f4")[:] = exchanged
+    with pytest.raises(DataError, match="look exchanged"):
+        adopt(paths, output=tmp_path / "mine", **BASIC)
+    axes = ("particle", "frame", "space")
+    made = adopt(paths, output=tmp_path / "mine", axes=axes, **BASIC)
+    np.testing.assert_array_equal(stored(made, 2, "position"), runs[2])
+    with pytest.raises(UsageError, match="no order of axes"):
+        adopt(paths, output=tmp_path / "other", axes=("frame", "space"), **BASIC)
+
+
+def test_a_lattice_that_flies_far_is_no_exchange(tmp_path: Path) -> None:
+    """Its particles are nearer to each other than two frames of one of them."""
+    lattice = np.stack(np.meshgrid(np.arange(20), np.arange(20)), axis=-1)
+    start = 0.1 + 0.004 * lattice.reshape(-1, 2)
+    rng = np.random.default_rng(0)
+    start = start[rng.permutation(len(start))]
+    time = np.arange(30)[:, None, None]
+    run = (start + 0.02 * time * np.array([1.0, 0.3])).astype(np.float32)
+    paths = save_runs(tmp_path / "in", [run, run + 1e-3, run + 2e-3])
+    assert adopt(paths, output=tmp_path / "mine", **BASIC).frames == 90
+
+
+def test_all_that_is_missing_is_told_at_once(tmp_path: Path) -> None:
+    """Radius, frame interval, folder and trajectories."""
+    paths = save_runs(tmp_path / "in", straight_runs(2))
+    with pytest.raises(UsageError) as caught:
+        adopt(paths)
+    for words in ("--radius", "--frame-interval", "--output", "2 trajectories"):
+        assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(("count", "test_count"), [(4, 1), (12, 4), (20, 6), (70, 7)])
+def test_test_has_enough_trajectories_for_a_p_value(
+    tmp_path: Path, count: int, test_count: int
+) -> None:
+    """Six where train can spare them; with fewer a note says so."""
+    np.save(tmp_path / "runs.npy", np.stack(straight_runs(count)))
+    made = adopt(tmp_path / "runs.npy", output=tmp_path / "mine", **BASIC)
+    assert made.scenarios["test"] == test_count
+    assert bool(made.notes) == (test_count < 6)
+
+
+def test_without_bounds_the_extent_of_all_positions_is_fitted(tmp_path: Path) -> None:
+    """A scale that is a power of two."""
+    runs = [8.0 * run - 5.0 for run in straight_runs(3)]
+    paths = save_runs(tmp_path / "in", runs)
+    basic = {**BASIC, "radius": 0.8}
+    made = adopt(paths, output=tmp_path / "mine", rescale=True, **basic)
+    size = locate(made.folder).size
+    low = np.min([run.min(axis=(0, 1)) for run in runs], axis=0)
+    high = np.max([run.max(axis=(0, 1)) for run in runs], axis=0)
+    scale = 2.0 ** np.ceil(np.log2((high - low).max()))
+    expected = np.stack([0.0 * low, (high - low) / scale], axis=1)
+    np.testing.assert_allclose(size.bounds, expected)
+
+
 def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
     """An .npz file may hold velocities, materials and walls; all of them are stored."""
     named = {
@@ -213,13 +323,13 @@ def test_named_arrays(tmp_path: Path, runs: Runs) -> None:
         np.savez(
             tmp_path / f"{number}.npz",
             position=run,
-            velocity=-run,
+            velocity=motion(run),
             **named,
         )
     made = adopt(
         [tmp_path / f"{n}.npz" for n in range(3)], output=tmp_path / "mine", **BASIC
     )
-    np.testing.assert_array_equal(stored(made, 2, "velocity"), -runs[2])
+    np.testing.assert_array_equal(stored(made, 2, "velocity"), motion(runs[2]))
     np.testing.assert_array_equal(stored(made, 2, "material"), named["material"])
     np.testing.assert_array_equal(
         stored(made, 2, "wall_velocity")[5], named["wall_velocity"]
@@ -457,10 +567,6 @@ def test_what_is_no_trajectory_leaves_nothing(tmp_path: Path, kind: str) -> None
         (
             {"test": 3, "valid": 3},
             "each subset needs a trajectory",
-        ),
-        (
-            {"rescale": True},
-            "where: --rescale",
         ),
         (
             {"bounds": ((1.0, 0.0), (0.0, 1.0))},

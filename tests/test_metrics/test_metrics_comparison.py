@@ -24,6 +24,7 @@ from lagbench.metrics import (
     sign_flip_p,
     standings,
 )
+from lagbench.metrics.aggregate import quantile
 from lagbench.metrics.significance import mean_loss
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
@@ -116,6 +117,15 @@ def test_interval_is_scipys_percentile_bootstrap() -> None:
         x.mean() + stretch * (bound - x.mean()) for bound in (theirs.low, theirs.high)
     ]
     assert [low, high] == pytest.approx(expected, abs=0.05 * (high - low))
+
+
+@given(
+    st.lists(st.floats(-1e9, 1e9), min_size=2, max_size=40),
+    st.floats(0.0, 1.0),
+)
+def test_quantiles_are_those_of_numpy(values: list[float], share: float) -> None:
+    """Bit by bit: numbers in committed score files depend on them."""
+    assert quantile(np.sort(values), share) == np.quantile(values, share)
 
 
 def test_the_two_way_bootstrap_of_a_closed_case() -> None:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -152,7 +153,8 @@ def test_an_exported_step_predicts_what_it_did(
         sums = torch.zeros(4, 2).index_add(0, cell, velocity)
         counts = torch.zeros(4, 2).index_add(0, cell, torch.ones_like(velocity))
         mean = sums / counts.clamp(min=1.0)
-        return now + 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * net(velocity)
+        correction: torch.Tensor = net(velocity)
+        return now + 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * correction
 
     path = export_onnx(
         step,
@@ -190,7 +192,11 @@ def test_an_entry_carries_an_onnx_model(
     assert result.method == "lines"
     board = tmp_path / "board"
     meta = Meta(authors=("A. Author",), command="make")
-    options = {"board": board, "root": generated.root, "new_board": True}
+    options: dict[str, Any] = {
+        "board": board,
+        "root": generated.root,
+        "new_board": True,
+    }
     other = tmp_path / "other.onnx"
     straight_on(other)
     with pytest.raises(UnreadableFileError):

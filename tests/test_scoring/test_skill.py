@@ -14,7 +14,7 @@ import pytest
 import scipy.stats
 from score_bench import ScoreBench, right, still, straight
 
-from lagbench.data.registry import Measured, Size
+from lagbench.data.registry import Measured, Size, load
 from lagbench.errors import DataError, UsageError
 from lagbench.metrics import METRICS, Score
 from lagbench.references import REFERENCES, references_of, shipped
@@ -37,8 +37,13 @@ from lagbench.scoring.references import (
     saved_folder,
 )
 from lagbench.scoring.score_file import read_statistics
-from lagbench.scoring.skill import best_reference, compute_skill
+from lagbench.scoring.skill import (
+    best_reference,
+    compare_with_solvers,
+    compute_skill,
+)
 from lagbench.scoring.tables import card_tables
+from lagbench.submission import Header
 
 
 def scored(
@@ -110,6 +115,42 @@ def test_without_a_reference_there_is_no_skill() -> None:
 def test_a_metric_of_which_more_is_better_gives_no_skill() -> None:
     pearson = scored([0.5, 0.5], "vorticity_pearson")
     assert compute_skill([pearson], {"analog": pearson}) is None
+
+
+@pytest.mark.parametrize(
+    ("seconds", "solver_seconds", "has_ratio"),
+    [(1e3, 1.0, True), (1e-9, 1.0, False), (None, 1.0, False), (1.0, None, False)],
+)
+def test_a_missing_comparison_with_solvers_has_a_reason(
+    seconds: float | None, solver_seconds: float | None, has_ratio: bool
+) -> None:
+    """A slow model is compared; one that is faster than every solver, or states no
+    cost, is not, and the reason says which.
+    """
+    size = load().size("cavity", "mini")
+    references = shipped(size) or {}
+    persistence = references["persistence"].scores["vorticity_nrmse"]
+    header = Header(
+        split="cavity",
+        size="mini",
+        dataset_version=size.version,
+        dataset_sha256="0" * 64,
+        method="slow",
+        scenarios=size.subsets["test"],
+        frames=(6,),
+        particles=size.particles,
+        seconds_per_frame=seconds,
+        device=None,
+        seed=None,
+        parameters=None,
+        training=None,
+        diverged_at={},
+        solver_seconds_per_frame=solver_seconds,
+    )
+    ratio, reason = compare_with_solvers(header, size, persistence, references)
+    assert (ratio is not None) is has_ratio
+    assert (reason is None) is has_ratio
+    assert ("solver_seconds_per_frame" in str(reason)) is (solver_seconds is None)
 
 
 def test_a_ratio_that_is_the_same_in_every_scenario_is_certain() -> None:

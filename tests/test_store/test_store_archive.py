@@ -14,6 +14,7 @@ from conftest import SIZE, SPLIT
 from faulty_server import Mirror, serving
 
 import lagbench
+from lagbench import addresses
 from lagbench.data.manifest import Manifest
 from lagbench.errors import DataError, LagbenchError, UsageError
 from lagbench.exchange import download
@@ -185,13 +186,14 @@ def test_releases_have_one_address(
 def test_without_a_release_no_server_is_asked(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A placeholder is no address, and the error says what is missing."""
+    """No address is set, and the error says so."""
     monkeypatch.setattr(archive, "open_object", None)
     with pytest.raises(UsageError) as caught:
         download(SPLIT, SIZE, root=here, or_generate=False)
     assert caught.value.exit_code == 2
     assert caught.value.where == f"{SPLIT} {SIZE}"
-    assert archive.RELEASES in str(caught.value.got)
+    assert addresses.SETTINGS in str(caught.value.got)
+    assert archive.RELEASES_VARIABLE in str(caught.value.fix)
 
 
 def test_no_server_is_asked_for_a_local_split(

@@ -816,6 +816,27 @@ def test_predictions_are_rollouts_of_the_task(
         np.testing.assert_array_equal(predictions[scenario], expected.numpy())
 
 
+def test_predictions_that_are_no_numbers_are_refused(
+    root: Path, registry: Registry
+) -> None:
+    """The scenario, the first such frame and the particle are named."""
+
+    def step(batch: Batch) -> torch.Tensor:
+        position = extrapolate(batch)
+        if batch.frame.tolist() != [0]:
+            position[3, 1] = torch.nan
+        return position
+
+    with pytest.raises(UsageError) as caught:
+        next(
+            predict(
+                step, "cavity", size="tiny", root=root, registry=registry, history=2
+            )
+        )
+    assert "scenario 4" in str(caught.value.where)
+    assert "particle 3" in str(caught.value.where)
+
+
 @pytest.mark.parametrize("history", [0, 7])
 def test_predictions_start_from_the_input_frames_of_the_task(
     root: Path, registry: Registry, history: int

@@ -38,6 +38,8 @@ from lagbench.make.verify import verify
 from lagbench.scoring.score import score
 from lagbench.submission import Severity, ValidationResult, template, validate
 from lagbench.submission import truth as module
+from lagbench.submission.checks import ScenarioScan, check_domain
+from lagbench.submission.issues import IssueCollector
 from lagbench.submission.truth import Truth
 
 bench = small
@@ -51,6 +53,26 @@ def changed(bench: Bench, new: ArrayLike, place: Any = ...) -> ValidationResult:
         values[place] = new
         store(file, values)
     return bench.validate(path)
+
+
+@pytest.mark.parametrize(("periods", "is_flagged"), [(0.9, False), (-4.0, True)])
+def test_particles_periods_away_from_a_periodic_box_are_flagged(
+    bench: Bench, periods: float, is_flagged: bool
+) -> None:
+    """Their images are scored, so that nothing else would show how far they went."""
+    original = bench.registry.size("cavity", "tiny")
+    size = original.model_copy(update={"periodic": ("x", "y")})
+    block = np.stack([size.box.centre + np.zeros((PARTICLES, 2))] * 2)
+    block = block.astype(np.float32)
+    block[1, 7, 1] = size.box.high[1] + periods * size.box.lengths[1]
+    scan = ScenarioScan(3)
+    scan.add(GIVEN, block, size)
+    issues = IssueCollector()
+    check_domain([scan], size, issues)
+    warnings = issues.result(bench.valid).warnings
+    places = [(issue.check, issue.where) for issue in warnings]
+    place = f"scenario 3, frame {GIVEN + 1}, particle 7, y"
+    assert places == ([("in_domain", place)] if is_flagged else [])
 
 
 def test_particles_outside_the_box_are_flagged(bench: Bench) -> None:

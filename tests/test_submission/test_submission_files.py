@@ -151,120 +151,61 @@ def _nan(values: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("values", "labels", "message"),
+    ("values", "labels", "place"),
     [
-        (
-            {3: truth(3), 4: truth(4)},
-            {},
-            "missing: 5",
-        ),
-        (
-            {**{i: truth(i) for i in TESTS}, 9: truth(3)},
-            {},
-            "no test scenario",
-        ),
-        (
-            {i: truth(i)[:5] for i in TESTS},
-            {},
-            "shape",
-        ),
-        (
-            {i: truth(i).swapaxes(1, 2) for i in TESTS},
-            {},
-            "shape",
-        ),
-        (
-            {i: _nan(truth(i)) for i in TESTS},
-            {},
-            "frame 5, particle 5",
-        ),
-        (
-            {i: truth(i).astype("f8") * 1e300 for i in TESTS},
-            {},
-            "not finite as float32",
-        ),
+        ({3: truth(3), 4: truth(4)}, {}, "refused.nc"),
+        ({**RIGHT, 9: truth(3)}, {}, "scenario 9"),
+        ({i: truth(i)[:5] for i in TESTS}, {}, "position of scenario 3"),
+        ({i: truth(i).swapaxes(1, 2) for i in TESTS}, {}, "position of scenario 3"),
+        ({i: _nan(truth(i)) for i in TESTS}, {}, "frame 5, particle 5"),
+        ({i: truth(i).astype("f8") * 1e300 for i in TESTS}, {}, "frame 3"),
+        *((np.zeros(shape), {}, "positions") for shape in ((2, *SHAPE), SHAPE)),
+        ({}, {"sed": 3}, "'sed'"),
+        *(({}, {"seed": odd}, "'seed'") for odd in ("three", True, 2**70)),
+        ({}, {"parameters": -5}, "'parameters'"),
         *(
-            (np.zeros(shape), {}, "one entry per test scenario")
-            for shape in ((2, *SHAPE), SHAPE)
-        ),
-        (
-            {},
-            {"sed": 3},
-            "did you mean 'seed'",
-        ),
-        *(({}, {"seed": odd}, "an integer") for odd in ("three", True, 2**70)),
-        (
-            {},
-            {"parameters": -5},
-            "an integer >= 0",
-        ),
-        *(
-            ({}, {"seconds_per_frame": odd}, "positive")
+            ({}, {"seconds_per_frame": odd}, "'seconds_per_frame'")
             for odd in (10**400, -1, float("inf"))
         ),
-        *(({}, {"device": odd}, "text") for odd in ("\udcff", "a\0b")),
-        (
-            {},
-            {"training": "x" * 70_000},
-            "text",
-        ),
+        *(({}, {"device": odd}, "'device'") for odd in ("\udcff", "a\0b")),
+        ({}, {"training": "x" * 70_000}, "'training'"),
         *(
-            ({}, {"method": name}, "printable text")
+            ({}, {"method": name}, "'method'")
             for name in ("", " ", "a\x07", "\udcff", "x" * 201, None)
         ),
-        *(({}, {"dataset_sha256": held}, "64 hex digits") for held in ("zz", "", 5)),
+        *(({}, {"dataset_sha256": odd}, "dataset_sha256") for odd in ("zz", "", 5)),
         # no arrays of numbers: nothing is dropped in silence
-        (
-            RIGHT | {3: np.ma.masked_less(truth(3), 0.5)},
-            {},
-            "no positions",
-        ),
+        (RIGHT | {3: np.ma.masked_less(truth(3), 0.5)}, {}, "position of scenario 3"),
         *(
-            (RIGHT | {3: truth(3).astype(kind)}, {}, "no positions")
+            (RIGHT | {3: truth(3).astype(kind)}, {}, "position of scenario 3")
             for kind in (complex, str)
         ),
-        (
-            RIGHT | {3: [truth(3)[0], truth(3)[0, :2]]},
-            {},
-            "no positions",
-        ),
-        (
-            RIGHT | {3: torch.ones(SHAPE, requires_grad=True)},
-            {},
-            "no positions",
-        ),
+        (RIGHT | {3: [truth(3)[0], truth(3)[0, :2]]}, {}, "position of scenario 3"),
+        (RIGHT | {3: torch.ones(SHAPE, requires_grad=True)}, {}, "of scenario 3"),
         # rows instead of ids
-        (
-            RIGHT,
-            {"diverged_at": {0: 10}},
-            "by id",
-        ),
-        (
-            RIGHT,
-            {"velocities": RIGHT | {0: RIGHT[3]}},
-            "by id",
-        ),
+        (RIGHT, {"diverged_at": {0: 10}}, "diverged_at"),
+        (RIGHT, {"velocities": RIGHT | {0: RIGHT[3]}}, "velocities"),
+        # velocities of some scenarios only
+        (RIGHT, {"velocities": {3: RIGHT[3]}}, "scenario 4"),
         # a mark before motion that goes on, beyond the horizon, or in the given frames
-        (
-            RIGHT,
-            {"diverged_at": {4: 7}},
-            "frame 8 differs",
-        ),
         *(
-            (RIGHT, {"diverged_at": {4: mark}}, "no such frame")
-            for mark in (100_000, GIVEN - 1, -5)
+            (RIGHT, {"diverged_at": {4: mark}}, "diverged_at of scenario 4")
+            for mark in (7, 100_000, GIVEN - 1, -5)
         ),
     ],
 )
 def test_wrong_arrays_and_labels_are_refused_and_leave_no_file(
-    bench: Bench, values: Any, labels: dict[str, Any], message: str
+    bench: Bench, values: Any, labels: dict[str, Any], place: str
 ) -> None:
-    """Missing, unknown, misshapen, no numbers; unknown names suggest the nearest; no
-    file is left.
+    """Missing, unknown, misshapen, no numbers: the error says where, what was expected
+    and how to mend it; no file is left.
     """
     before = sorted(bench.folder.iterdir())
-    with pytest.raises(UsageError, match=message):
+    with pytest.raises(UsageError) as caught:
         write(bench.folder / "refused.nc", values, **options(bench, **labels))
+    assert place in str(caught.value.where)
+    assert caught.value.expected
+    assert caught.value.fix
     assert sorted(bench.folder.iterdir()) == before
 
 
