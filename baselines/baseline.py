@@ -41,10 +41,15 @@ __all__ = [
 ]
 
 
+LARGEST_OPTION = 1e12
+"""Greatest number that an option may have: counts, steps and rates are far below."""
+
+
 class Settings(BaseModel):
     """Base of the options that recipes and ``--set`` fill.
 
-    They are frozen. Unknown keys, and yes or no for a number, are errors.
+    They are frozen. Unknown keys, yes or no for a number, and numbers so large that no
+    machine could work on them, are errors.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,6 +62,8 @@ class Settings(BaseModel):
         parsed: object = handler(value)
         if _has_boolean_number(value, parsed):
             raise ValueError("a number, not yes or no")
+        if isinstance(parsed, int | float) and abs(parsed) > LARGEST_OPTION:
+            raise ValueError(f"a number up to {LARGEST_OPTION:g}")
         return parsed
 
 

@@ -27,6 +27,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lagbench.errors import DataError
+
 from .augmentation import (
     Symmetry,
     augment,
@@ -48,6 +50,8 @@ from .strain import RestShape, first_frame
 from .unet import NODES_PER_COARSE_NODE, ContextNetwork, UNet
 
 LIQUID = 0  # material without a shape to come back to
+VISCOSITY_UNIT = 1e-3  # viscosity whose channel is 0 [length^2/s]
+LEAST_VISCOSITY = 1e-6  # lower ones look like it: they act on no grid of ours
 FALL_UNIT = 10.0  # fall by a learned number of 1, in deviations of accelerations
 
 Frame = tuple[Tensor, Tensor]  # position [length] and velocity [length/frame]
@@ -92,6 +96,7 @@ class NeuralMPM(Baseline):
             self.encoder.field_channels
             + self.encoder.forcing_channels
             + options.context
+            + options.viscosity
         )
         self.network = UNet(inputs, self.decoder.channels, options.width)
         # Stresses conserve momentum, so a fall needs a weight of its own. Where all
@@ -196,6 +201,7 @@ class NeuralMPM(Baseline):
             layer=layer,
             walls=self._coming_walls(given),
             context=position.new_zeros(given.windows, 0),
+            viscosity=self._scaled_viscosity(given),
             rest_shape=self._rest_shape(given, layer),
         )
         if self.projection is not None:
@@ -215,6 +221,28 @@ class NeuralMPM(Baseline):
             return given.position.new_zeros(given.windows, 1, wall_count, 2)
         per_second = given.wall_velocity[:, given.frames - 1 :]
         return per_second * self.info.frame_interval
+
+    def _scaled_viscosity(self, given: Batch) -> Tensor:
+        """Return the logarithm of the viscosity of each window, shape [window, 1].
+
+        It is 0 at ``VISCOSITY_UNIT``. There is no column where the U-Net does not see
+        it.
+
+        Raises:
+            DataError: the viscosity is not known.
+        """
+        if not self.options.viscosity:
+            return given.position.new_zeros(given.windows, 0)
+        if given.viscosity is None:
+            raise DataError(
+                "the viscosity is not known",
+                where=f"{self.info.split} {self.info.size}",
+                expected="a viscosity in each scenario file, or in the registry",
+                got="none",
+                fix="train without it: --set model.viscosity=false",
+            )
+        viscosity = given.viscosity.clamp(min=LEAST_VISCOSITY)
+        return torch.log(viscosity / VISCOSITY_UNIT)[:, None]
 
     def _rest_shape(self, given: Batch, layer: Tensor) -> RestShape | None:
         """Return the rest shape of solids; None where strain is not asked for."""
@@ -285,9 +313,13 @@ class NeuralMPM(Baseline):
         return falling.unbind(dim=1)
 
     def _network_inputs(self, state: GridState, fields: Tensor) -> Tensor:
-        """Return fields, context and forcing, [window, channel, x node, y node]."""
-        context = state.context[:, :, None, None].expand(-1, -1, *self.grid.shape)
-        parts = [fields, context]
+        """Return what the U-Net sees, shape [window, channel, x node, y node].
+
+        These are fields, context, viscosity and forcing.
+        """
+        constants = torch.cat([state.context, state.viscosity], dim=1)
+        constant_fields = constants[:, :, None, None].expand(-1, -1, *self.grid.shape)
+        parts = [fields, constant_fields]
         if self.options.wall_velocity:
             parts.append(self.encoder.forcing(state.walls))
         return torch.cat(parts, dim=1)
@@ -302,7 +334,7 @@ class NeuralMPM(Baseline):
         for matrix in mirror_matrices(self.options.symmetry):
             input_blocks = [
                 *self.encoder.mirror_fields(matrix),
-                torch.eye(self.options.context),
+                torch.eye(self.options.context + self.options.viscosity),
                 *self.encoder.mirror_forcing(matrix),
             ]
             image_output = self.network(mirror_field(inputs, matrix, input_blocks))

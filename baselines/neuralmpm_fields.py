@@ -42,6 +42,9 @@ class GridState:
     walls: Tensor
     # output of the context network for the given frames, shape [window, context]
     context: Tensor
+    # logarithm of the given viscosity, in units of the U-Net, shape [window, 1]; no
+    # column where the U-Net does not see it
+    viscosity: Tensor
     rest_shape: RestShape | None = None  # None where strain is not asked for
     projection: ProjectionState | None = None  # None without a projection
     coming: tuple[Tensor, ...] = ()  # predicted positions of the frames to come

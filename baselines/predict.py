@@ -20,7 +20,8 @@ import torch
 from lagbench.atomic import write_atomically
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
-from lagbench.errors import UnreadableFileError, UsageError
+from lagbench.errors import LagbenchError, UnreadableFileError, UsageError
+from lagbench.submission.predictions import open_predictions
 from lagbench.submission.writer import PredictionsWriter
 from lagbench.tensors import Batch
 from lagbench.work.progress import Meter, Progress
@@ -82,6 +83,7 @@ def predict(
     *,
     root: str | Path | None = None,
     size: str | None = None,
+    subset: str = "test",
     settings: Sequence[str] = (),
     device: str = "auto",
     threads: int | None = None,
@@ -107,6 +109,7 @@ def predict(
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         size: size of the split to predict; that of the training when None.
+        subset: the subset to predict: test, or shift, which lies outside train.
         settings: changes of options that have no weights, as in ``model.average=true``.
         device: ``cpu``, ``cuda`` or ``auto``.
         threads: threads on the CPU; one per core by default.
@@ -125,7 +128,7 @@ def predict(
             the training.
         UsageError: the baseline is not installed, there is no such device, the weights
             cannot be run at that size or with those settings, or the output would
-            replace another file, such as the weights.
+            replace another file, such as the weights or another method's predictions.
         WorkFailedError: out of memory, or the disk is full.
     """
     output_path = Path(output)
@@ -147,7 +150,7 @@ def predict(
     bound_memory()
     tests = scenario_paths(
         info.split,
-        subset="test",
+        subset=subset,
         size=info.size,
         root=root_folder,
         registry=known_splits,
@@ -159,8 +162,16 @@ def predict(
         model = restore_for_size(
             trained, info, settings, known_splits, where=str(checkpoint)
         ).to(machine)
-        rollouts = _TimedRollouts(model, info, paths, side_by_side, machine)
+        rollouts = _TimedRollouts(
+            model,
+            info,
+            paths,
+            side_by_side,
+            machine,
+            viscosity=known_splits.size(info.split, info.size).viscosity(),
+        )
         label = method or model.method
+        _check_method(output_path, label)
         parameters = count_parameters(model)
         hardware_label = _describe_hardware(machine)
         writer = PredictionsWriter(
@@ -168,25 +179,16 @@ def predict(
             split=info.split,
             size=info.size,
             method=label,
+            subset=subset,
             dataset_sha256=info.dataset_sha256,
             registry=known_splits,
             device=hardware_label,
             parameters=parameters,
             **_training_attributes(trained, info, settings),
         )
-        meter = Meter(progress)
-        meter.begin("predicting", total=len(paths), scenarios=len(paths))
-        solver_seconds_per_frame = None
-        with writer:
-            for rollout in rollouts:
-                position = rollout.position.numpy()
-                writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
-                meter.count(1, scenarios=1)
-            writer.label(seconds_per_frame=rollouts.seconds_per_frame)
-            if time_solver is not None:
-                solver_seconds_per_frame = time_solver(info.split, info.size)
-            if solver_seconds_per_frame is not None:
-                writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
+        solver_seconds_per_frame = _write_rollouts(
+            writer, rollouts, info, time_solver=time_solver, progress=progress
+        )
 
     result = PredictionResult(
         path=output_path,
@@ -208,6 +210,57 @@ def predict(
     )
     _write_costs(result)
     return result
+
+
+def _write_rollouts(
+    writer: PredictionsWriter,
+    rollouts: _TimedRollouts,
+    info: DatasetInfo,
+    *,
+    time_solver: Callable[[str, str], float | None] | None,
+    progress: Callable[[Progress], None] | None,
+) -> float | None:
+    """Write all rollouts, then their time; return our solver's time for a frame [s]."""
+    count = len(rollouts.paths)
+    meter = Meter(progress)
+    meter.begin("predicting", total=count, scenarios=count)
+    solver_seconds_per_frame = None
+    with writer:
+        for rollout in rollouts:
+            position = rollout.position.numpy()
+            writer.add(rollout.scenario, position, diverged_at=rollout.diverged_at)
+            meter.count(1, scenarios=1)
+        writer.label(seconds_per_frame=rollouts.seconds_per_frame)
+        if time_solver is not None:
+            solver_seconds_per_frame = time_solver(info.split, info.size)
+        if solver_seconds_per_frame is not None:
+            writer.label(solver_seconds_per_frame=solver_seconds_per_frame)
+    return solver_seconds_per_frame
+
+
+def _check_method(output: Path, method: str) -> None:
+    """Refuse to write over the predictions of another method.
+
+    Raises:
+        UsageError: such predictions lie there.
+    """
+    if not output.is_file():
+        return
+    try:
+        with open_predictions(output) as predictions:
+            present = predictions.header.method
+    except LagbenchError:  # an earlier version, or cut short
+        return
+    if present == method:
+        return
+    raise UsageError(
+        "the output would replace the predictions of another method",
+        where="--output",
+        expected=f"no such file, or predictions of {method}",
+        got=f"{output}: predictions of {present}",
+        fix="name another file, as in -o "
+        f"{output.with_name(output.stem + '-2' + output.suffix)}",
+    )
 
 
 def _warn_of_unfinished(checkpoint: Checkpoint, path: Path) -> None:
@@ -311,6 +364,8 @@ class _TimedRollouts:
         paths: list[Path],
         side_by_side: int,
         machine: str,
+        *,
+        viscosity: float | None,
     ) -> None:
         self.seconds = 0.0  # time of the rollouts [s]
         self.clock = "wall"  # clock of the times, 'processor' or 'wall'
@@ -320,9 +375,12 @@ class _TimedRollouts:
         self.frames = 0
         # scenario id to the absolute frame from which its rollout is frozen
         self.diverged: dict[int, int] = {}
+        self.paths = paths  # scenario files
         self._model = model
         self._info = info
         self._machine = machine
+        # of scenarios whose files state none [length^2/s]
+        self._viscosity = viscosity
         self._groups = []
         for first in range(0, len(paths), side_by_side):
             self._groups.append(paths[first : first + side_by_side])
@@ -332,7 +390,9 @@ class _TimedRollouts:
         """Yield the rollout of every scenario."""
         input_frames = slice(0, self._info.input_frames)
         for number, group in enumerate(self._groups):
-            given_frames = scenario_batch(group, input_frames).to(self._machine)
+            given_frames = scenario_batch(
+                group, input_frames, viscosity=self._viscosity
+            ).to(self._machine)
             if number == 0:
                 roll_out(self._model, given_frames, 1)  # to warm up
             started = self._read_clock()

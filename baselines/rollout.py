@@ -101,6 +101,9 @@ def select_window(batch: Batch, window: int) -> Batch:
     origin = batch.origin
     if origin is not None:
         origin = origin[is_inside]
+    viscosity = batch.viscosity
+    if viscosity is not None:
+        viscosity = viscosity[window : window + 1]
     return Batch(
         position=batch.position[is_inside],
         sample=torch.zeros_like(batch.sample[is_inside]),
@@ -109,6 +112,7 @@ def select_window(batch: Batch, window: int) -> Batch:
         scenario=batch.scenario[window : window + 1],
         frame=batch.frame[window : window + 1],
         origin=origin,
+        viscosity=viscosity,
     )
 
 
@@ -180,18 +184,29 @@ def round_parameters(model: nn.Module) -> AbstractContextManager[None]:
     return replace_parameters(rounded)
 
 
-def scenario_batch(paths: Path | Sequence[Path], frames: slice = slice(None)) -> Batch:
+def scenario_batch(
+    paths: Path | Sequence[Path],
+    frames: slice = slice(None),
+    *,
+    viscosity: float | None = None,
+) -> Batch:
     """Return the same frames of whole scenarios, read without a cache.
+
+    Args:
+        paths: files of the scenarios.
+        frames: the frames to read.
+        viscosity: that of scenarios whose files state none [length^2/s]; None where it
+            is not known.
 
     Raises:
         UsageError: the frames are not consecutive ones of a scenario.
     """
     if isinstance(paths, Path):
         paths = [paths]
-    return collate([_read_window(path, frames) for path in paths])
+    return collate([_read_window(path, frames, viscosity) for path in paths])
 
 
-def _read_window(path: Path, frames: slice) -> TensorWindow:
+def _read_window(path: Path, frames: slice, viscosity: float | None) -> TensorWindow:
     """Return frames of a scenario as a window."""
     with read_scenario(path) as file:
         numbers = range(file.header.frames)[frames]
@@ -212,8 +227,11 @@ def _read_window(path: Path, frames: slice) -> TensorWindow:
             # The forcing of all later frames too: a rollout from these knows it.
             walls = file.read("wall_velocity", slice(numbers.start, None))
         scenario = file.header.key.scenario
+        stated = file.header.viscosity
+    if stated is not None:
+        viscosity = stated
     window = copy_window(list(position), material, walls, scenario, numbers.start)
-    return tensors(window)
+    return tensors(window._replace(viscosity=viscosity))
 
 
 def scenario_paths(
@@ -276,7 +294,9 @@ class Validation:
         """Return rollouts of scenarios side by side."""
         paths = [self.task.truth.path(scenario) for scenario in scenarios]
         input_frames = slice(0, self.task.config.input_frames)
-        given_frames = scenario_batch(paths, input_frames).to(device)
+        viscosity = self.task.size.viscosity()
+        given_frames = scenario_batch(paths, input_frames, viscosity=viscosity)
+        given_frames = given_frames.to(device)
         horizon = max(self.frames[scenario] for scenario in scenarios)
         return roll_out(model, given_frames, horizon)
 

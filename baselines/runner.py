@@ -54,6 +54,8 @@ class WeightsRunner:
         self._info: DatasetInfo = check_data(
             trained, root=root, registry=registry, size=size, where=str(path)
         )
+        # of scenarios whose files state none [length^2/s]
+        self._viscosity = registry.size(self._info.split, self._info.size).viscosity()
         bound_memory()
         self._model: Baseline = restore_for_size(
             trained, self._info, settings, registry, where=str(path)
@@ -74,7 +76,9 @@ class WeightsRunner:
             Positions, shape [frame, particle, axis].
         """
         info = self._info
-        given_frames = scenario_batch(scenario_file, slice(0, info.input_frames))
+        given_frames = scenario_batch(
+            scenario_file, slice(0, info.input_frames), viscosity=self._viscosity
+        )
         with use_threads(self._threads), explain_memory_errors("use more memory"):
             rollout = roll_out(self._model, given_frames, frames or info.horizon)[0]
         return rollout.position.numpy()

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,10 @@ from lagbench.errors import UsageError, WorkFailedError
 from .constants import blamed_on_parameters, solver_constants, split_module
 from .draws import generator
 from .solver import Device, Health, Solver, build
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .split import FreeSurfaceParameters, InitialState, SolverParameters
+
+if TYPE_CHECKING:
+    from .free_surface import FreeSurface
 
 # particle-substeps between two reports: about a tenth of a second on a core
 STRIDE = 4_000_000
@@ -152,6 +156,9 @@ class ScenarioBatch:
         )
         self.extremes = [unseen] * scenario_count
         self.solver = _solver(solver_constants(size), job.device, scenario_count)
+        self._is_free_surface = isinstance(
+            self.solver.parameters, FreeSurfaceParameters
+        )
         with self._scenario_names():
             self.solver.load(self.states)
 
@@ -180,17 +187,26 @@ class ScenarioBatch:
             self._advance_to(substep)
             self._position = self.solver.position()
             self._velocity = self.solver.velocity()
+            if self._is_free_surface:
+                self._volume_ratio = cast("FreeSurface", self.solver).volume_ratio()
             for _, index, frame in due:
                 yield index, frame
 
     def frame(self, index: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return position [length] and velocity [length/s], shape [particle, 2], at the
-        last recording.
+        """Return position [length] and velocity [length/s], shape [particle, axis],
+        at the last recording.
         """
         return self._position[index], self._velocity[index]
 
+    def volume_ratio(self, index: int) -> NDArray[np.float32]:
+        """Return J of liquid and Jp of snow at the last recording [1], shape
+        [particle]; free surfaces only.
+        """
+        ratio: NDArray[np.float32] = self._volume_ratio[index]
+        return ratio
+
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]."""
+        """Add an offset to the positions [length], shape [scenario, particle, axis]."""
         self.solver.displace(offset)
         self._displacements.append((self._substep, offset.copy()))
 
@@ -266,7 +282,7 @@ class ScenarioBatch:
 
 @functools.lru_cache(maxsize=1)
 def _solver(
-    parameters: ClosedBoxParameters | FreeSurfaceParameters,
+    parameters: SolverParameters,
     device: Device,
     scenarios: int,
 ) -> Solver:

@@ -13,6 +13,11 @@ merge; the flow never settles. Which walls move goes by id, so that every subset
 all six choices alike. Two walls that meet in a corner never move both, because their
 corner blows up. The Reynolds number is (U/2) L / nu: U/2 is the mean absolute speed of
 a wall, L the box's width.
+
+The subset ``shift`` lies outside train on purpose. Its scenarios alternate: a Reynolds
+number beyond train's range, then two walls that meet in a corner. These slide as one
+belt around the corner, one towards it while the other moves away, so that what the one
+brings the other takes along.
 """
 
 from __future__ import annotations
@@ -24,7 +29,7 @@ from numpy.typing import NDArray
 
 from lagbench.data import WALLS
 
-from .constants import closed_box_walls, constants, interval
+from .constants import closed_box_walls, constants, interval, shift_number
 from .draws import RandomSource, choice, fill, log_uniform, quantise, uniform
 from .split import ClosedBoxParameters, InitialState, Material
 
@@ -40,6 +45,12 @@ DRIVEN = (
     ("bottom", "top"),
 )
 """The sets of walls that move, by id % 6: six consecutive scenarios hold each once."""
+
+BELTS = (("left", "bottom"), ("bottom", "right"), ("right", "top"), ("top", "left"))
+"""The pairs of walls that meet in a corner, in the order of a turn anticlockwise."""
+
+_TURN = {"left": -1.0, "bottom": 1.0, "right": 1.0, "top": -1.0}
+"""Sign of a wall's velocity where it slides anticlockwise around the box."""
 
 _TANGENT = {"left": 1, "right": 1, "bottom": 0, "top": 0}
 
@@ -104,6 +115,13 @@ def _draw_motion(
         latest = start + size.task.input_frames - 1
         first_moving_frame = _draw_integer(rng, earliest, latest)
 
+    belt = _belt(size, scenario)
+    if belt is not None:
+        speed = _draw_program(rng, size, frame_count)
+        for wall in belt:
+            velocity[:, WALLS.index(wall), _TANGENT[wall]] = _TURN[wall] * speed
+        return velocity
+
     for wall in DRIVEN[scenario % len(DRIVEN)]:
         if is_classic(scenario):
             sign = 2 * choice(rng, 2) - 1
@@ -114,6 +132,19 @@ def _draw_motion(
             speed = _draw_program(rng, size, frame_count)
         velocity[:, WALLS.index(wall), _TANGENT[wall]] = speed
     return velocity
+
+
+def _belt(size: Size, scenario: int) -> tuple[str, str] | None:
+    """Return the two walls that slide as a belt: every second scenario of shift."""
+    number = shift_number(size, scenario)
+    if number is None or number % 2 == 0:
+        return None
+    return BELTS[number // 2 % len(BELTS)]
+
+
+def _driven_walls(size: Size, scenario: int) -> tuple[str, ...]:
+    """Return the walls that move."""
+    return _belt(size, scenario) or DRIVEN[scenario % len(DRIVEN)]
 
 
 def start_frame(size: Size, scenario: int, rng: RandomSource) -> int:
@@ -127,12 +158,18 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     low, high = closed_box_walls(size)
     start = start_frame(size, scenario, rng)
     motion = _draw_motion(rng, size, scenario, start)
-    reynolds = log_uniform(rng, *interval(size, "reynolds"))
+    belt = _belt(size, scenario)
+    reynolds_range = "reynolds"
+    if belt is None and shift_number(size, scenario) is not None:
+        reynolds_range = "reynolds_shift"
+    reynolds = log_uniform(rng, *interval(size, reynolds_range))
     viscosity = 0.5 * size.value("speed_max") * (high - low) / reynolds
     position = fill(
         rng, size.particles, low=low, high=high, jitter=size.value("jitter")
     )
-    if is_classic(scenario):
+    if belt is not None:
+        motion_kind = "belt"
+    elif is_classic(scenario):
         motion_kind = "constant"
     else:
         motion_kind = "varying"
@@ -146,7 +183,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
         wall_velocity=motion,
         start_frame=start,
         parameters={
-            "wall": "+".join(DRIVEN[scenario % len(DRIVEN)]),
+            "wall": "+".join(_driven_walls(size, scenario)),
             "motion": motion_kind,
             "reynolds": reynolds,
             "viscosity": viscosity,

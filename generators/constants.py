@@ -13,11 +13,18 @@ from dataclasses import MISSING, Field, fields
 from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+from lagbench.data.box import Box
 from lagbench.data.limits import Limit
 from lagbench.errors import UnreadableFileError, UsageError
 
+from .full_box_parameters import FullBoxParameters
 from .shapes import Region
-from .split import ClosedBoxParameters, FreeSurfaceParameters, SplitGenerator
+from .split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    SolverParameters,
+    SplitGenerator,
+)
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -30,12 +37,15 @@ __all__ = [
     "free_surface_walls",
     "interval",
     "ranges",
+    "shift_number",
     "solver_constants",
     "split_module",
 ]
 
 
-ParametersType = type[ClosedBoxParameters] | type[FreeSurfaceParameters]
+ParametersType = (
+    type[ClosedBoxParameters] | type[FreeSurfaceParameters] | type[FullBoxParameters]
+)
 
 _POSITIVE = Limit(low=0.0, open_low=True)
 _NOT_NEGATIVE = Limit(low=0.0)
@@ -46,6 +56,7 @@ LIMITS = {
     "particles": Limit(low=1, whole=True),
     "grid": Limit(low=4, whole=True),
     "wall": Limit(low=0, whole=True),
+    "force_layers": Limit(low=0, whole=True),
     "substeps_per_frame": Limit(low=1, whole=True),
     "dt": _POSITIVE,
     "density": _POSITIVE,
@@ -120,6 +131,8 @@ def _missing_parameter(
 def _check_value(field: Field[Any], values: Mapping[str, object], size: Size) -> None:
     """Refuse a constant with an impossible value."""
     value = values[field.name]
+    if isinstance(value, Box):  # the registry has checked it
+        return
     limit = LIMITS.get(field.name, Limit())
     if field.type == "bool":
         is_possible = isinstance(value, bool)
@@ -178,7 +191,7 @@ def _list_texts(size: Size) -> str:
     return f"; parameters that are no numbers: {', '.join(texts)}"
 
 
-Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters)
+Kind = TypeVar("Kind", ClosedBoxParameters, FreeSurfaceParameters, FullBoxParameters)
 
 
 def constants(kind: type[Kind], size: Size, **fixed: object) -> Kind:
@@ -209,6 +222,14 @@ def interval(size: Size, name: str) -> tuple[float, float]:
     return float(size.value(f"{name}_min")), float(size.value(f"{name}_max"))
 
 
+def shift_number(size: Size, scenario: int) -> int | None:
+    """Return the place of a scenario in the subset ``shift``; None in other subsets."""
+    shifted = sorted(size.subsets.get("shift", ()))
+    if scenario not in shifted:
+        return None
+    return shifted.index(scenario)
+
+
 def ranges(size: Size, name: str) -> Region:
     """Return the intervals of ``<name>_x`` and ``<name>_y``."""
     return interval(size, f"{name}_x"), interval(size, f"{name}_y")
@@ -237,7 +258,7 @@ def split_module(size: Size) -> SplitGenerator:
     return cast("SplitGenerator", module)
 
 
-def solver_constants(size: Size) -> ClosedBoxParameters | FreeSurfaceParameters:
+def solver_constants(size: Size) -> SolverParameters:
     """Return the constants of the solver of a size.
 
     Raises:

@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 from lagbench.errors import UsageError, WorkFailedError
 
 from . import backend
+from .full_box_parameters import FullBoxParameters
 from .solver import Device, Health
 from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState, Material
 from .transfer import Nothing, Template
 
-Parameters = TypeVar("Parameters", ClosedBoxParameters, FreeSurfaceParameters)
+Parameters = TypeVar(
+    "Parameters", ClosedBoxParameters, FreeSurfaceParameters, FullBoxParameters
+)
 
 
 class _Field(Protocol):
@@ -33,15 +36,26 @@ class _Field(Protocol):
 class Kernels(Protocol):
     """What a driver asks of the kernels of a formulation."""
 
-    x: _Field  # particle positions [length], and two zeros
-    # what particles spread: v_x, v_y and two numbers that are 1 at first
-    carried: _Field
-    slope_x: _Field  # d/dx of the velocity, first, at the particles
-    slope_y: _Field  # d/dy of the same
-    fill: _Field  # m / (rho dx^2), shape [scenario]
-    least: float  # smallest coordinate of a particle
-    most: float  # largest coordinate of a particle
+    x: _Field  # particle positions [length], filled up with zeros
+    carried: _Field  # what particles spread, the velocity first
+    fill: _Field  # m / (rho dx^d), shape [scenario]
     speed_bound: float  # the CFL bound dx/dt [length/s]
+
+    @property
+    def at_rest(self) -> Sequence[float]:
+        """What a particle at rest spreads at first, shape [4]."""
+
+    @property
+    def slopes(self) -> Sequence[_Field]:
+        """Derivative of the velocity, first, at the particles, along each axis."""
+
+    @property
+    def least(self) -> float | Sequence[float]:
+        """Smallest coordinate of a particle, along all axes or along each [length]."""
+
+    @property
+    def most(self) -> float | Sequence[float]:
+        """Largest coordinate of a particle, along all axes or along each [length]."""
 
     def run_serially(self, substeps: int) -> None:
         """Advance scenario 0 by many substeps in one thread."""
@@ -75,6 +89,11 @@ class Driver(ABC, Generic[Parameters]):
         self._kernels = self._compile(device is not Device.CPU, threads)
         self._substeps = 0
 
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return 2
+
     @abstractmethod
     def _compile(self, atomic: bool, threads: int) -> Kernels:
         """Make the kernels and their fields."""
@@ -105,20 +124,21 @@ class Driver(ABC, Generic[Parameters]):
             self._check_state(index, state)
 
         self._place(stack(states, "position"))
-        carried = np.ones((self.scenarios, self.parameters.particles, 4), np.float32)
-        carried[..., :2] = stack(states, "velocity")
+        carried = np.empty((self.scenarios, self.parameters.particles, 4), np.float32)
+        carried[...] = self._kernels.at_rest
+        carried[..., : self.dimension] = stack(states, "velocity")
         self._kernels.carried.from_numpy(carried)
         affine = stack(states, "affine")
-        for axis, field in enumerate((self._kernels.slope_x, self._kernels.slope_y)):
+        for axis, field in enumerate(self._kernels.slopes):
             slope = np.zeros_like(carried)
-            slope[..., :2] = affine[..., axis]
+            slope[..., : self.dimension] = affine[..., axis]
             field.from_numpy(slope)
 
-        # volume of a particle [length^2], shape [scenario]
+        # volume of a particle [length^d], shape [scenario]
         self._volume = np.array(
             [state.area / self.parameters.particles for state in states]
         )
-        fill = self._volume * self.parameters.grid**2
+        fill = self._volume * self.parameters.grid**self.dimension
         self._kernels.fill.from_numpy(fill.astype(np.float32))
         self._start(states)
         self._substeps = 0
@@ -185,12 +205,12 @@ class Driver(ABC, Generic[Parameters]):
         return end
 
     def position(self) -> NDArray[np.float32]:
-        """Particle positions [length], shape [scenario, particle, 2]."""
-        return self._read(self._kernels.x)[..., :2]
+        """Particle positions [length], shape [scenario, particle, axis]."""
+        return self._read(self._kernels.x)[..., : self.dimension]
 
     def velocity(self) -> NDArray[np.float32]:
-        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
-        return self._kernels.carried.to_numpy()[..., :2]
+        """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
+        return self._kernels.carried.to_numpy()[..., : self.dimension]
 
     def _read(self, field: _Field) -> NDArray[np.float32]:
         """Return a field of the particles, shape [scenario, particle, 4]."""
@@ -201,18 +221,22 @@ class Driver(ABC, Generic[Parameters]):
         return values
 
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept
-        in the box.
+        """Add an offset to the positions [length], shape [scenario, particle, axis];
+        kept in the box.
         """
         self._place(self.position() + offset.astype(np.float32))
 
     def _place(self, position: NDArray[np.float32]) -> None:
-        """Set the positions, clipped to the box; the fields hold two zeros beside."""
-        least = np.float32(self._kernels.least)
-        most = np.float32(self._kernels.most)
-        inside = np.clip(position, least, most)
-        padded = np.concatenate((inside, np.zeros_like(inside)), axis=-1)
+        """Set the positions, kept in the box; the fields hold zeros beside."""
+        padded = np.zeros((*position.shape[:-1], 4), np.float32)
+        padded[..., : self.dimension] = self._inside(position)
         self._kernels.x.from_numpy(padded)
+
+    def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return positions clipped to the box [length], shape [..., axis]."""
+        least = np.asarray(self._kernels.least, np.float32)
+        most = np.asarray(self._kernels.most, np.float32)
+        return np.clip(position, least, most)
 
     def _check_state(self, index: int, state: InitialState) -> None:
         """Refuse a state that the kernels cannot start from."""
@@ -250,10 +274,11 @@ class Driver(ABC, Generic[Parameters]):
     def _check_arrays(self, index: int, state: InitialState) -> None:
         """Refuse arrays of another shape or kind of number than the kernels take."""
         count = self.parameters.particles
+        dimension = self.dimension
         expected_arrays = (
-            ("position", (count, 2), "floating", "f"),
-            ("velocity", (count, 2), "floating", "f"),
-            ("affine", (count, 2, 2), "floating", "f"),
+            ("position", (count, dimension), "floating", "f"),
+            ("velocity", (count, dimension), "floating", "f"),
+            ("affine", (count, dimension, dimension), "floating", "f"),
             ("material", (count,), "whole", "iu"),
         )
         for name, shape, number, kinds in expected_arrays:

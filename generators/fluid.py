@@ -4,6 +4,10 @@ Families by id % 4: 0 falling rectangle, 1 body thrown at the right wall, 2 fall
 circle, 3 splash (four overlapping discs with velocities of their own, which tear the
 body apart before it falls). Expected behaviour: a jet along the walls after the impact,
 sloshing, rest.
+
+The subset ``shift`` lies outside train on purpose. Its scenarios alternate: one of the
+families with twice the liquid (and as many particles, so that each stands for twice the
+area), then a column that stands on the floor beside a wall and breaks (a dam break).
 """
 
 from __future__ import annotations
@@ -13,7 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .constants import constants, free_surface_walls, interval, ranges
+from .constants import (
+    constants,
+    free_surface_walls,
+    interval,
+    ranges,
+    shift_number,
+)
 from .draws import RandomSource, choice, direction, normal, quantise, uniform
 from .shapes import (
     Blobs,
@@ -22,6 +32,7 @@ from .shapes import (
     Rectangle,
     Region,
     Shape,
+    body_at,
     place,
     sample_points,
 )
@@ -34,6 +45,9 @@ Array = NDArray[np.float64]
 
 FAMILIES = ("falling-rectangle", "thrown", "falling-circle", "splash")
 """Family of a scenario, by id % 4."""
+
+COLUMN = "column"
+"""Family of the columns that break, which only shift has."""
 
 # Families whose bodies start in one region with one range of velocities share its
 # parameters.
@@ -101,11 +115,42 @@ def _start_region(size: Size, start: str) -> Region:
     return horizontal, vertical
 
 
+def _draw_column(rng: RandomSource, size: Size, number: int) -> InitialState:
+    """Draw a column at rest on the floor, at the left wall or at the right one."""
+    area = uniform(rng, *interval(size, "area"))
+    aspect = uniform(rng, *interval(size, "column_aspect"))
+    shape = Rectangle.of_area(area, 1.0 / aspect)
+    low, high = free_surface_walls(size)
+    half_width, half_height = shape.reach
+    x = low + half_width
+    if number // 2 % 2 == 1:
+        x = high - half_width
+    body = body_at(shape, x, low + half_height)
+    position = np.clip(sample_points(rng, body, size.particles), low, high)
+    return _liquid_at(
+        size,
+        body,
+        family=COLUMN,
+        area=area,
+        position=position,
+        velocity=np.zeros((size.particles, 2)),
+        mean_velocity=(0.0, 0.0),
+    )
+
+
 def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     """Draw a body of liquid, its place and its velocity."""
+    number = shift_number(size, scenario)
+    if number is not None and number % 2 == 1:
+        return _draw_column(rng, size, number)
+
     family = FAMILIES[scenario % len(FAMILIES)]
+    area_range = "area"
+    if number is not None:
+        family = FAMILIES[number // 2 % len(FAMILIES)]
+        area_range = "area_shift"
     start = _START[family]
-    area = uniform(rng, *interval(size, "area"))
+    area = uniform(rng, *interval(size, area_range))
     shape = _draw_shape(rng, family, area, size)
     body = place(rng, shape, _start_region(size, start))
 
@@ -115,6 +160,28 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
     position = sample_points(rng, body, size.particles)
     splash = _draw_splash(rng, body, position, size)
     velocity = quantise(np.array([velocity_x, velocity_y]) + splash)
+    return _liquid_at(
+        size,
+        body,
+        family=family,
+        area=area,
+        position=position,
+        velocity=velocity,
+        mean_velocity=(velocity_x, velocity_y),
+    )
+
+
+def _liquid_at(
+    size: Size,
+    body: Body,
+    *,
+    family: str,
+    area: float,
+    position: Array,
+    velocity: Array,
+    mean_velocity: tuple[float, float],
+) -> InitialState:
+    """Return the initial state of one body of liquid, and what its file states."""
     return InitialState(
         position=position,
         velocity=velocity,
@@ -126,7 +193,7 @@ def initial_state(size: Size, scenario: int, rng: RandomSource) -> InitialState:
             "area": area,
             "centre_x": float(body.centre[0]),
             "centre_y": float(body.centre[1]),
-            "velocity_x": velocity_x,
-            "velocity_y": velocity_y,
+            "velocity_x": mean_velocity[0],
+            "velocity_y": mean_velocity[1],
         },
     )

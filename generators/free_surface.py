@@ -10,16 +10,17 @@ below 0.8. It explodes beyond. Settings that work over thousands of frames are t
 the splits.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import constitutive
 from .driver import Driver, stack
 from .particle_stress import ParticleStress
 from .solver import Health
+from .soundness import sound_speeds
 from .split import FreeSurfaceParameters, InitialState, Material
 
 Array = NDArray[np.float64]
@@ -33,26 +34,13 @@ def courant(parameters: FreeSurfaceParameters) -> dict[Material, float]:
     c^2 is K/rho in liquid and (lambda + 2 mu)/rho in solids, for snow at its hardest.
     """
     p = parameters
-    rope = _wave_modulus(p.rope_modulus, p.rope_poisson)
-    jelly = _wave_modulus(p.jelly_modulus, p.jelly_poisson)
-    snow = _wave_modulus(p.snow_modulus, p.snow_poisson)
-    moduli = {
-        Material.JELLY: jelly,
-        Material.SNOW: p.snow_hardening_max * snow,
-        Material.ROPE: rope,
-        Material.LIQUID: p.liquid_modulus,
-    }
     numbers = {}
-    for material, modulus in moduli.items():
-        sound_speed = float(np.sqrt(modulus / p.density))
-        numbers[material] = sound_speed * p.dt * p.grid
+    for material, sound_speed in sound_speeds(p).items():
+        fastest = sound_speed
+        if material is Material.SNOW:
+            fastest = sound_speed * math.sqrt(p.snow_hardening_max)
+        numbers[material] = fastest * p.dt * p.grid
     return numbers
-
-
-def _wave_modulus(young: float, poisson: float) -> float:
-    """Return lambda + 2 mu of a solid [mass/s^2]."""
-    mu, la = constitutive.lame(young, poisson)
-    return la + 2.0 * mu
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +78,7 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
         kernels.solid = bool((self._material != Material.LIQUID).any())
         matter = np.zeros((self.scenarios, particle_count, 4), np.float32)
         matter[:, :, 0] = self._material
-        matter[:, :, 1] = 1.0
+        matter[:, :, 1:] = 1.0
         kernels.matter.from_numpy(matter)
         identity = np.eye(2, dtype=np.float32)
         shape = (self.scenarios, particle_count, 2, 2)
@@ -114,7 +102,16 @@ class FreeSurface(Driver[FreeSurfaceParameters]):
         """J of liquid, plastic Jp of snow, 1 in other solids [1], shape [scenario,
         particle].
         """
-        return np.asarray(self._kernels.matter.to_numpy()[..., 1])
+        return self._read(self._kernels.matter)[..., 1]
+
+    def volume_ratio_extremes(
+        self,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Smallest and largest :meth:`volume_ratio` of each particle at any substep
+        since the start [1], each of shape [scenario, particle].
+        """
+        matter = self._read(self._kernels.matter)
+        return matter[..., 2], matter[..., 3]
 
     def jacobian(self) -> NDArray[np.float32]:
         """J of liquid, det F of solids (elastic in snow) [1], shape [scenario,

@@ -103,9 +103,11 @@ class NodalStress:
         # particle positions [length], and two zeros
         self.x = ti.Vector.field(4, ti.f32)
         self.carried = ti.Vector.field(4, ti.f32)  # what P2G spreads: v_x, v_y, 1, J
+        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # of a particle at rest
         # d/dx of the nodal (v_x, v_y, r, Jbar) at the particles
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        self.slopes = (self.slope_x, self.slope_y)
         # largest abs(v_x), abs(v_y), J and -J of each particle since the advance began
         self.extremes = ti.Vector.field(4, ti.f32)
         self.rows = [ti.Vector.field(4, ti.f32) for _ in range(3)]  # of the stencil

@@ -111,12 +111,15 @@ class ParticleStress:
         self.x = ti.Vector.field(4, ti.f32)
         # what P2G spreads: v_x, v_y, 1, and J of liquid or 1
         self.carried = ti.Vector.field(4, ti.f32)
+        self.at_rest = (0.0, 0.0, 1.0, 1.0)  # of a particle at rest
         # d/dx of the nodal v_x, v_y, r and Jbar at the particles, the first column of C
         self.slope_x = ti.Vector.field(4, ti.f32)
         self.slope_y = ti.Vector.field(4, ti.f32)  # d/dy of the same
+        self.slopes = (self.slope_x, self.slope_y)
         # deformation gradients of the solids [1]
         self.f = ti.Matrix.field(2, 2, ti.f32)
-        # Material, J of liquid or plastic Jp of snow (1 in other solids), and two zeros
+        # Material, J of liquid or plastic Jp of snow (1 in other solids), and the
+        # smallest and largest that this was since the start
         self.matter = ti.Vector.field(4, ti.f32)
         # largest speed, smallest and largest J, largest abs(v) + abs(A o) since the
         # advance began
@@ -339,6 +342,8 @@ class ParticleStress:
         here = self.here[s, p]
         kind = self.matter[s, p][0]
         old = self.matter[s, p][1]
+        lowest = self.matter[s, p][2]
+        highest = self.matter[s, p][3]
         position = ti.Vector([self.x[s, p][0], self.x[s, p][1]])
         velocity = ti.Vector([here[0], here[1]])
         x = bounded(position + self.dt * velocity, self.least, self.most)
@@ -367,7 +372,9 @@ class ParticleStress:
             determinant = f[0, 0] * f[1, 1] - f[0, 1] * f[1, 0]
             jacobian = ti.select(kind == _LIQUID, j, determinant)
             spread = ti.select(kind == _LIQUID, j, 1.0)
-        self.matter[s, p] = ti.Vector([kind, ratio, 0.0, 0.0])
+        lowest = -larger(-ratio, -lowest)
+        highest = larger(ratio, highest)
+        self.matter[s, p] = ti.Vector([kind, ratio, lowest, highest])
         self.carried[s, p] = ti.Vector([here[0], here[1], 1.0, spread])
         seen = self.extremes[s, p]
         speed = largest_of(ti.abs(here[0]), ti.abs(here[1]))

@@ -22,10 +22,12 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import Box
 from lagbench.data.layout import scenario_path
 from lagbench.data.registry import Size, Task
 from lagbench.data.scenario import read_scenario
@@ -34,8 +36,18 @@ from lagbench.data.writer import ScenarioWriter
 from .batch import Report, ScenarioBatch, SimulationJob, substep_count
 from .constants import split_module
 from .draws import QUANTUM, entropy, seed_text
+from .full_box_parameters import FullBoxParameters
 from .solver import Health
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .soundness import SoundnessRecorder
+from .split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    InitialState,
+    SolverParameters,
+)
+
+if TYPE_CHECKING:
+    from .free_surface import FreeSurface
 
 STILL = 0.01  # share of its greatest kinetic energy from which on a free surface moves
 OUTCOMES = ("active_frames",)
@@ -88,13 +100,19 @@ def _particle_mass(size: Size, state: InitialState) -> float:
     return float(size.value("density")) * state.area / size.particles
 
 
-def file_parameters(size: Size, state: InitialState) -> dict[str, object]:
+def file_parameters(
+    size: Size, scenario: int, state: InitialState
+) -> dict[str, object]:
     """Return what a scenario's file states and hashes: constants, then what was
     drawn.
+
+    Constants of one subset stand in its files only.
     """
+    subset = size.subset_of(scenario)
     parameters: dict[str, object] = {}
     for name, parameter in size.parameters.items():
-        parameters[name] = parameter.value
+        if parameter.subset in (None, subset):
+            parameters[name] = parameter.value
     for name, value in state.parameters.items():
         parameters[_FILE_NAMES.get(name, name)] = value
     parameters["start_frame"] = state.start_frame
@@ -110,8 +128,8 @@ def scenario_writer(
     frame_count = size.frame_count(scenario)
 
     wall_velocity = None
-    if isinstance(split_module(size).solver_parameters(size), ClosedBoxParameters):
-        # of each wall towards each recorded frame [length/s], shape [frame, 4, 2]
+    if _has_driving_walls(split_module(size).solver_parameters(size)):
+        # of each wall towards each recorded frame [length/s], shape [frame, wall, axis]
         first_frame = state.start_frame
         frames = range(first_frame, first_frame + frame_count)
         wall_velocity = np.stack([state.walls_towards(frame) for frame in frames])
@@ -125,11 +143,28 @@ def scenario_writer(
         material=state.material,
         particle_mass=_particle_mass(size, state),
         wall_velocity=wall_velocity,
-        parameters=file_parameters(size, state),
+        parameters=file_parameters(size, scenario, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,
         generator=size.generator,
+        dimension=size.box.dimension,
+        periodic=size.periodic,
+        has_velocity=stores_velocity(size),
     )
+
+
+def stores_velocity(size: Size) -> bool:
+    """Tell whether files hold the solver's velocities: those in three dimensions do
+    not, they would be half of the bytes.
+    """
+    return size.box.dimension == 2
+
+
+def _has_driving_walls(parameters: SolverParameters) -> bool:
+    """Tell whether a full box ends at walls along some axis."""
+    if isinstance(parameters, FullBoxParameters):
+        return not all(parameters.box.periodic)
+    return isinstance(parameters, ClosedBoxParameters)
 
 
 def active_frames(energies: Sequence[float], task: Task) -> int:
@@ -169,24 +204,32 @@ def simulate(
             writer = scenario_writer(job, scenario, state)
             writers.append(stack.enter_context(writer))
 
+        recorders = _soundness_recorders(batch)
         for index, frame in batch.recordings():
             position, velocity = batch.frame(index)
-            writers[index].append(position, velocity)
+            stored_velocity = velocity if stores_velocity(size) else None
+            writers[index].append(position, stored_velocity)
             energies[index].append(_kinetic_energy(velocity, masses[index]))
+            if recorders:
+                recorders[index].add(velocity, batch.volume_ratio(index))
             if frame == COMPILING - 1:
                 started = clock()
 
-        is_free_surface = isinstance(batch.solver.parameters, FreeSurfaceParameters)
         for index, writer in enumerate(writers):
-            if is_free_surface:
-                writer.state(active_frames=active_frames(energies[index], size.task))
             diagnostics = _diagnose(
                 size,
                 batch.states[index],
                 energies=energies[index],
                 extremes=batch.extremes[index],
             )
-            writer.state_facts(asdict(diagnostics))
+            facts = asdict(diagnostics)
+            if recorders:
+                writer.state(active_frames=active_frames(energies[index], size.task))
+                solver = cast("FreeSurface", batch.solver)
+                least, greatest = solver.volume_ratio_extremes()
+                soundness = recorders[index].summary(least[index], greatest[index])
+                facts |= asdict(soundness)
+            writer.state_facts(facts)
     seconds = clock() - started
 
     pace = None
@@ -203,6 +246,14 @@ def simulate(
         )
         for scenario, writer in zip(job.scenarios, writers, strict=True)
     ]
+
+
+def _soundness_recorders(batch: ScenarioBatch) -> list[SoundnessRecorder]:
+    """Return a recorder for each scenario of a free surface, none for a full box."""
+    parameters = batch.solver.parameters
+    if not isinstance(parameters, FreeSurfaceParameters):
+        return []
+    return [SoundnessRecorder(parameters, state.material) for state in batch.states]
 
 
 def _kinetic_energy(velocity: NDArray[np.float32], mass: float) -> float:
@@ -235,11 +286,12 @@ def _diagnose(
 
 
 def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
-    """Return the displacement of a perturbed run [length], shape [particle, 2]."""
+    """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
     seed = (*entropy(size.split, size.name, size.major, scenario), 1)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
-    signs = np.where(rng.random((size.particles, 2)) < 0.5, -1.0, 1.0)
+    shape = (size.particles, size.box.dimension)
+    signs = np.where(rng.random(shape) < 0.5, -1.0, 1.0)
     return (QUANTUM * signs).astype(np.float32)
 
 
@@ -262,8 +314,9 @@ def measure_predictability(
     input_frames = size.task.input_frames
     frame_counts = [size.frame_count(i) - size.frames_behind(i) for i in job.scenarios]
     batch = ScenarioBatch(job, report, frames=frame_counts)
-    # displacements of the batch [length], shape [scenario, particle, 2]
-    offsets = np.zeros((len(frame_counts), size.particles, 2), dtype=np.float32)
+    # displacements of the batch [length], shape [scenario, particle, axis]
+    shape = (len(frame_counts), size.particles, size.box.dimension)
+    offsets = np.zeros(shape, dtype=np.float32)
     limits: list[list[float]] = [[] for _ in frame_counts]
     with ExitStack() as stack:
         truths = []
@@ -279,7 +332,7 @@ def measure_predictability(
             elif frame >= input_frames:
                 position, _ = batch.frame(index)
                 truth = truths[index].read("position", slice(frame, frame + 1))[0]
-                limits[index].append(_root_mean_square_error(position, truth))
+                limits[index].append(_root_mean_square_error(position, truth, size.box))
     return {
         scenario: tuple(limit)
         for scenario, limit in zip(job.scenarios, limits, strict=True)
@@ -287,7 +340,7 @@ def measure_predictability(
 
 
 def _root_mean_square_error(
-    position: NDArray[np.float32], truth: NDArray[np.float32]
+    position: NDArray[np.float32], truth: NDArray[np.float32], box: Box
 ) -> float:
-    error = position.astype(np.float64) - truth.astype(np.float64)
+    error = box.displacement(truth.astype(np.float64), position.astype(np.float64))
     return math.sqrt(math.fsum((error * error).ravel().tolist()) / error.size)

@@ -14,7 +14,13 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from .split import ClosedBoxParameters, FreeSurfaceParameters, InitialState
+from .full_box_parameters import FullBoxParameters
+from .split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    InitialState,
+    SolverParameters,
+)
 
 
 class Device(enum.StrEnum):
@@ -43,7 +49,7 @@ class Solver(Protocol):
     """Advances a batch of scenarios that share their parameters."""
 
     @property
-    def parameters(self) -> ClosedBoxParameters | FreeSurfaceParameters:
+    def parameters(self) -> SolverParameters:
         """Constants that the scenarios share."""
 
     def load(self, states: Sequence[InitialState]) -> None:
@@ -58,14 +64,14 @@ class Solver(Protocol):
         """
 
     def position(self) -> NDArray[np.float32]:
-        """Particle positions [length], shape [scenario, particle, 2]."""
+        """Particle positions [length], shape [scenario, particle, axis]."""
 
     def velocity(self) -> NDArray[np.float32]:
-        """Particle velocities v_p [length/s], shape [scenario, particle, 2]."""
+        """Particle velocities v_p [length/s], shape [scenario, particle, axis]."""
 
     def displace(self, offset: NDArray[np.float32]) -> None:
-        """Add an offset to the positions [length], shape [scenario, particle, 2]; kept
-        in the box.
+        """Add an offset to the positions [length], shape [scenario, particle, axis];
+        kept in the box.
         """
 
     def health(self) -> list[Health]:
@@ -75,11 +81,12 @@ class Solver(Protocol):
 _IMPLEMENTATIONS: dict[type, tuple[str, str]] = {
     ClosedBoxParameters: (".closed_box", "ClosedBox"),
     FreeSurfaceParameters: (".free_surface", "FreeSurface"),
+    FullBoxParameters: (".full_box", "FullBox"),
 }
 
 
 def build(
-    parameters: ClosedBoxParameters | FreeSurfaceParameters,
+    parameters: SolverParameters,
     *,
     device: Device = Device.CPU,
     scenarios: int = 1,

@@ -8,10 +8,12 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .full_box_parameters import FullBoxParameters
 
 if TYPE_CHECKING:
     from lagbench.data.registry import Size
@@ -21,6 +23,7 @@ __all__ = [
     "FreeSurfaceParameters",
     "InitialState",
     "Material",
+    "SolverParameters",
     "SplitGenerator",
 ]
 
@@ -103,6 +106,12 @@ class FreeSurfaceParameters:
     snow_jp_max: float = 4.0  # upper bound of the plastic Jacobian Jp [1]
 
 
+SolverParameters: TypeAlias = (
+    ClosedBoxParameters | FreeSurfaceParameters | FullBoxParameters
+)
+"""Constants of a solver; their type chooses the formulation."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class InitialState:
     """One scenario before its first substep.
@@ -110,26 +119,44 @@ class InitialState:
     Arrays are float64 multiples of 2^-20 (exact in float32), see ``draws.quantise``.
     """
 
-    position: NDArray[np.float64]  # particle positions [length], shape [particle, 2]
-    velocity: NDArray[np.float64]  # particle velocities [length/s], shape [particle, 2]
-    affine: NDArray[np.float64]  # APIC matrix C = grad v [1/s], shape [particle, 2, 2]
+    # particle positions [length], shape [particle, axis]
+    position: NDArray[np.float64]
+    # particle velocities [length/s], shape [particle, axis]
+    velocity: NDArray[np.float64]
+    # APIC matrix C = grad v [1/s], shape [particle, axis, axis]
+    affine: NDArray[np.float64]
     material: NDArray[np.int8]  # Material of each particle, shape [particle], int8
-    # area that the material covers [length^2]; particle volume is area / particles
+    # area that the material covers [length^2], or its volume in a solid box
+    # [length^3]; particle volume is area / particles
     area: float
     # kinematic viscosity nu of a closed box [length^2/s]; free surfaces ignore it
     viscosity: float = 0.0
     # velocity of each wall in the order of WALLS [length/s], shape [4, 2], or a program
     # of shape [frame, 4, 2]: row f acts from frame f-1 to f, counted from the first
-    # substep; row 0 never acts, the last row acts from its frame on
+    # substep; row 0 never acts, the last row acts from its frame on. In a solid box
+    # there are six walls and three axes.
     wall_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 2)))
+    # acceleration of layers of equal height along y [length/s^2], lowest first, a
+    # program of shape [frame, layer, axis] whose rows act as those of the walls
+    body_force: NDArray[np.float64] | None = None
     friction: float = 0.0  # Coulomb friction of the walls (free surface only) [1]
     start_frame: int = 0  # frames simulated before frame 0 is recorded
     # what was drawn for this scenario; stored as attributes and hashed
     parameters: Mapping[str, int | float | str] = field(default_factory=dict)
 
+    def force_towards(self, frame: int) -> NDArray[np.float64]:
+        """Return the acceleration of each layer from the frame before up to this one
+        [length/s^2], shape [layer, axis]; without a force there are no layers.
+        """
+        program = self.body_force
+        if program is None:
+            return np.zeros((0, self.position.shape[1]))
+        row: NDArray[np.float64] = program[min(frame, len(program) - 1)]
+        return row
+
     def walls_towards(self, frame: int) -> NDArray[np.float64]:
         """Return the velocity of each wall from the frame before up to this one
-        [length/s], shape [4, 2].
+        [length/s], shape [4, 2], or [6, 3] in a solid box.
         """
         program = self.wall_velocity
         if program.ndim == 2:
@@ -147,9 +174,7 @@ class SplitGenerator(Protocol):
     initial state from the same random stream, so that work is planned without a draw.
     """
 
-    def solver_parameters(
-        self, size: Size
-    ) -> ClosedBoxParameters | FreeSurfaceParameters:
+    def solver_parameters(self, size: Size) -> SolverParameters:
         """Return the constants of the solver at this size."""
 
     def initial_state(

@@ -19,6 +19,7 @@ from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS
 from .cli.lazy_group import LazyGroup
 from .errors import (
     LagbenchError,
+    UsageError,
     WorkFailedError,
     escape_unprintable,
     find_faulty_package,
@@ -34,6 +35,23 @@ RESUMABLE_COMMANDS = {"demo", "generate", "download", "train"}
 
 DISK_FULL_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
+VANISHED_ERRORS = {
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EIO,
+    errno.ENODEV,
+    errno.ENXIO,
+    errno.ESTALE,
+    errno.EROFS,
+    errno.ENOTCONN,
+}
+"""What a disk or a folder raises that is no longer there, or only read."""
+
+MEMORY_WORDS = ("failed to map segment", "annot allocate memory")
+"""What a library says that finds no memory while it is loaded."""
+
+MOST_LETTERS = 60  # of a word of the command line in a message
+
 
 class _Program(LazyGroup):
     """All commands; what they raise becomes a message on stderr and an exit code."""
@@ -46,29 +64,138 @@ class _Program(LazyGroup):
             if isinstance(stream, io.TextIOWrapper):
                 stream.reconfigure(errors="backslashreplace")
         # --help and --version print here.
-        with _errors_as_messages(), _output_errors():
+        with _errors_as_messages(), _output_errors(), _command_line_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401 (typer and click disagree on its type)
         try:
-            with _short_warnings(), _errors_as_messages(), _output_errors():
+            with (
+                _short_warnings(),
+                _errors_as_messages(),
+                _output_errors(),
+                _command_line_errors(),
+            ):
                 return super().invoke(ctx)
         except KeyboardInterrupt:
-            message = _interruption_message(ctx.invoked_subcommand)
-            typer.echo(message, err=True)
+            _print_error(_interruption_message(ctx.invoked_subcommand))
             raise typer.Exit(INTERRUPTED) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
             if _is_click_error(error) or os.environ.get("LAGBENCH_DEBUG") == "1":
                 raise
-            typer.echo(_unexpected_error_message(error), err=True)
+            _print_error(_unexpected_error_message(error))
             raise typer.Exit(FAILED) from error
 
 
+def _print_error(text: str) -> None:
+    """Print a message on stderr; where that is full, the exit code alone tells."""
+    try:
+        typer.echo(text, err=True)
+    except OSError:
+        # What is buffered would fail again at the end, and change the exit code.
+        with suppress(AttributeError, OSError):
+            null_device = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null_device, sys.stderr.fileno())
+
+
 def _is_click_error(error: Exception) -> bool:
-    """Tell whether an error is click's or typer's copy of it; typer shows those."""
+    """Tell whether an error is click's or typer's copy of it."""
     return any(kind.__name__ == "ClickException" for kind in type(error).__mro__)
+
+
+@contextmanager
+def _command_line_errors() -> Iterator[None]:
+    """Turn the errors of click's parser into errors of ours.
+
+    Raises:
+        UsageError: an option or a command is unknown, missing, or has a wrong value.
+    """
+    try:
+        yield
+    except Exception as error:
+        # Without any argument the help is printed, also by an exception.
+        is_help = type(error).__name__ == "NoArgsIsHelpError"
+        if not _is_click_error(error) or is_help:
+            raise
+        raise _translate_click_error(error) from None
+
+
+def _translate_click_error(error: Any) -> UsageError:  # noqa: ANN401 (two copies of click)
+    """Return an error of click's parser as one of ours."""
+    context = getattr(error, "ctx", None)
+    command = "lagbench"
+    if context is not None and context.parent is not None:
+        command = f"lagbench {_command_words(context)}"
+    message = str(error.format_message()).rstrip(".")
+    help_hint = f"`{command} --help` lists what there is"
+    kind = type(error).__name__
+    if kind == "NoSuchOption":
+        possible = ", ".join(error.possibilities or ())
+        suggestion = f"did you mean {possible}? " if possible else ""
+        return UsageError(
+            "no such option",
+            where=command,
+            expected="an option of this command",
+            got=error.option_name,
+            fix=f"{suggestion}{help_hint}",
+        )
+    if kind == "MissingParameter":
+        name = _parameter_name(error)
+        return UsageError(
+            f"{name} is missing",
+            where=command,
+            expected=getattr(error.param, "help", None) or f"a value of {name}",
+            got="nothing",
+            fix=f"add {name}; {help_hint}",
+        )
+    if kind == "BadParameter":
+        return UsageError(
+            f"{_parameter_name(error)} has a value that does not fit",
+            where=command,
+            expected=str(error.message).rstrip("."),
+            got=_wrong_value(error),
+            fix=f"give another value; {help_hint}",
+        )
+    return UsageError(
+        message[:1].lower() + message[1:],
+        where=command,
+        expected="a command, its arguments and its options",
+        got=" ".join(map(_quote_word, sys.argv[1:])) or None,
+        fix=help_hint,
+    )
+
+
+def _command_words(context: Any) -> str:  # noqa: ANN401 (two copies of click)
+    """Return the words of a command below the program's name."""
+    words: list[str] = []
+    while context.parent is not None:
+        words.insert(0, str(context.info_name))
+        context = context.parent
+    return " ".join(words)
+
+
+def _parameter_name(error: Any) -> str:  # noqa: ANN401 (two copies of click)
+    """Return how the user writes a parameter, as in --size or FILE."""
+    if error.param is None:
+        return str(error.param_hint or "an argument")
+    for name in error.param.opts:
+        if name.startswith("--"):
+            return str(name)
+    return str(error.param.metavar or error.param.name)
+
+
+def _wrong_value(error: Any) -> str | None:  # noqa: ANN401 (two copies of click)
+    """Return the value that a parameter does not take, where its parser tells it."""
+    cause = error.__cause__ or error.__context__
+    if not hasattr(cause, "errors"):
+        return None
+    details = cause.errors()
+    return _quote_word(repr(details[0].get("input")))
+
+
+def _quote_word(word: str) -> str:
+    return word if len(word) <= MOST_LETTERS else f"{word[:MOST_LETTERS]}..."
 
 
 def _interruption_message(command: str | None) -> str:
@@ -102,7 +229,7 @@ def _errors_as_messages() -> Iterator[None]:
     try:
         yield
     except LagbenchError as error:
-        typer.echo(f"lagbench: {error}", err=True)
+        _print_error(f"lagbench: {error}")
         raise typer.Exit(error.exit_code) from error
 
 
@@ -123,6 +250,18 @@ def _output_errors() -> Iterator[None]:
             null_device = os.open(os.devnull, os.O_WRONLY)
             os.dup2(null_device, sys.stdout.fileno())
         raise typer.Exit(PIPE_CLOSED) from None
+    except (MemoryError, ImportError) as error:
+        is_memory = isinstance(error, MemoryError)
+        if not is_memory and not any(word in str(error) for word in MEMORY_WORDS):
+            raise
+        raise WorkFailedError(
+            "there is not enough memory",
+            where="this process",
+            expected="room for the libraries and the data",
+            got=f"{type(error).__name__}: {str(error)[:200]}",
+            fix="raise the limit (`ulimit -v unlimited`, or that of the batch system), "
+            "close other programs, or take fewer --workers",
+        ) from error
     except OSError as error:
         if isinstance(error, PermissionError) and error.filename is not None:
             raise WorkFailedError(
@@ -131,6 +270,15 @@ def _output_errors() -> Iterator[None]:
                 expected="a file or folder that you may read or write",
                 got=error.strerror,
                 fix="see who owns it, or name another",
+            ) from error
+        if error.errno in VANISHED_ERRORS:
+            raise WorkFailedError(
+                "cannot read or write there",
+                where=str(error.filename or "the working folder"),
+                expected="a disk and a folder that stay there while lagbench works",
+                got=error.strerror,
+                fix="see that they are there and can be written to, then repeat the "
+                "command",
             ) from error
         if error.errno not in DISK_FULL_ERRORS:
             raise

@@ -92,6 +92,9 @@ class TensorWindow(NamedTuple):
     # particle positions in the scenario's first frame [length], shape [particle, 2];
     # None unless asked for
     origin: Tensor | None = None
+    # kinematic viscosity [length^2/s]: the scenario's, else that of the data set; None
+    # where none is known
+    viscosity: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +114,9 @@ class Batch:
     # particle positions in the scenario's first frame [length], shape [particle, 2];
     # None unless asked for
     origin: Tensor | None = None
+    # kinematic viscosity of each window [length^2/s], float32, shape [window]; None
+    # where none is known
+    viscosity: Tensor | None = None
 
     @property
     def windows(self) -> int:
@@ -181,10 +187,12 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
     """Put windows side by side.
 
     Raises:
-        UsageError: the windows differ in length, or in whether walls move.
+        UsageError: the windows differ in length, in whether walls move, or in whether
+            their viscosity is known.
     """
     wall_velocities = []
     origins = []
+    viscosities = []
     lengths = set()
     for window in windows:
         lengths.add(window.position.shape[1])
@@ -192,16 +200,20 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
             wall_velocities.append(window.wall_velocity)
         if window.origin is not None:
             origins.append(window.origin)
+        if window.viscosity is not None:
+            viscosities.append(window.viscosity)
 
     all_or_none = {0, len(windows)}
-    is_uniform = len(wall_velocities) in all_or_none and len(origins) in all_or_none
+    counts = {len(wall_velocities), len(origins), len(viscosities)}
+    is_uniform = counts <= all_or_none
     if len(lengths) != 1 or not is_uniform:
         raise UsageError(
             "windows do not fit side by side",
             where="collate",
             expected="windows of one split and one length",
             got=f"lengths {sorted(lengths)}, {len(wall_velocities)} of {len(windows)} "
-            f"with moving walls, {len(origins)} with their first frame",
+            f"with moving walls, {len(origins)} with their first frame, "
+            f"{len(viscosities)} with a viscosity",
         )
 
     particle_counts = torch.tensor([len(window.material) for window in windows])
@@ -219,4 +231,5 @@ def collate(windows: Sequence[TensorWindow]) -> Batch:
         scenario=torch.tensor([window.scenario for window in windows]),
         frame=torch.tensor([window.frame for window in windows]),
         origin=torch.cat(origins) if origins else None,
+        viscosity=torch.tensor(viscosities) if viscosities else None,
     )

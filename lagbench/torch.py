@@ -66,6 +66,7 @@ def tensors(window: ArrayWindow) -> Window:
         scenario=window.scenario,
         frame=window.frame,
         origin=origin,
+        viscosity=window.viscosity,
     )
 
 

@@ -20,6 +20,7 @@ class PageData:
     """The data of a page."""
 
     tabs: list[dict[str, Any]]
+    hero: dict[str, Any] | None
     levels: NDArray[np.int16]
 
     def array(self, reference: dict[str, Any]) -> NDArray[np.float64]:
@@ -31,7 +32,8 @@ def read_page_data(page: str) -> PageData:
     """Return the data that stand in a page."""
     data = json.loads(decode(element_text(page, "page-data"), longest=LONGEST))
     arrays = decode(element_text(page, "page-arrays"), longest=LONGEST)
-    return PageData(tabs=data["tabs"], levels=np.frombuffer(arrays, "<i2"))
+    levels = np.frombuffer(arrays, "<i2")
+    return PageData(tabs=data["tabs"], hero=data["hero"], levels=levels)
 
 
 def element_text(page: str, name: str) -> str:

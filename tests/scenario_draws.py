@@ -85,9 +85,20 @@ def state_of(split: str, size: str, scenario: int) -> InitialState:
     return draw(registry.load().size(split, size), scenario)
 
 
+def usual_ids(size: registry.Size) -> list[int]:
+    """Return the ids of all scenarios that are drawn as those of train are."""
+    return [i for i in size.scenarios if i not in size.subsets.get("shift", ())]
+
+
 def all_of(split: str, size: str = "full") -> list[InitialState]:
-    """Return all scenarios of a size in the order of their ids."""
-    ids = registry.load().size(split, size).scenarios
+    """Return all scenarios of a size but those of shift, in the order of their ids."""
+    ids = usual_ids(registry.load().size(split, size))
+    return [state_of(split, size, scenario) for scenario in ids]
+
+
+def shifted(split: str, size: str = "full") -> list[InitialState]:
+    """Return the scenarios of shift in the order of their ids."""
+    ids = sorted(registry.load().size(split, size).subsets["shift"])
     return [state_of(split, size, scenario) for scenario in ids]
 
 

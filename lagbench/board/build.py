@@ -9,12 +9,15 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lagbench.atomic import write_atomically
+from lagbench.data.box import Box
 from lagbench.data.registry import Registry, Size, load
 from lagbench.errors import (
     ChecksFailedError,
@@ -22,12 +25,14 @@ from lagbench.errors import (
     UnreadableFileError,
     UsageError,
 )
+from lagbench.figures.solid import View
 from lagbench.metrics.aggregate import Score
 from lagbench.metrics.metric import mean
 from lagbench.metrics.significance import (
     FEWEST_SCENARIOS,
     Standing,
     mean_loss,
+    rank_ranges,
     standings,
 )
 from lagbench.metrics.table import METRICS
@@ -48,14 +53,26 @@ from lagbench.scoring.skill import (
 )
 from lagbench.submission.task_checks import frames_to_predict
 
+from .columns import PRESETS
 from .entry import Entry, EntryCost, Status, Verification
 from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
 from .issues import CHECKS
-from .model import Board, BoardRow, Curve, Histogram, Pictures, ReferenceRow, Tab, Value
+from .model import (
+    Board,
+    BoardRow,
+    Curve,
+    Floats,
+    Histogram,
+    Pictures,
+    ReferenceRow,
+    Tab,
+    Value,
+)
 from .page import LINKS, links_in, render, same_page
 from .ranking import CombinedScore, combine, is_current, read_references
-from .sampling import spaced
+from .sampling import coarsen, spaced
+from .variants import find_variants
 from .verified import read_verified, verification_of
 
 COLUMNS = (
@@ -88,6 +105,9 @@ CURVES = (
 )
 """Metrics that details have curves of, beside the ranking one."""
 
+AT_FRAMES = frozenset((*COLUMNS, *CURVES))
+"""Metrics with values at the frames of interest."""
+
 TRIAL = "tiny"  # the size for trying out: nobody is asked to submit to it
 
 TRUE_ENERGY = "energy_true"
@@ -96,18 +116,28 @@ PREDICTED_ENERGY = "energy_predicted"
 TRUTH = 0  # sides of a preview
 PREDICTION = 1
 
-CURVE_FRAMES = 120  # most frames of a curve
+CURVE_FRAMES = 60  # most frames of a curve
+MAP_FRAMES = 4  # most frames of vorticity maps and histograms
+MAP_NODES = 20  # most nodes of a map, a side
 RESIDUAL_BINS = 41  # bins of the histogram of residuals; odd, so that one holds 0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScoredMethod:
-    """An entry with its score files, from which a row is made."""
+    """What a row is made of: an entry, and what was formed from its score files.
+
+    The statistics themselves are let go: those of 100 entries would take gigabytes.
+    """
 
     entry: Entry
     is_current: bool
-    stored: Sequence[ScoreFile]  # score file of each seed
-    scores: Mapping[str, CombinedScore]  # by metric, all seeds together
+    ranking: str  # name of the ranking metric
+    seeds: Sequence[Score]  # ranking metric of each seed, without values per frame
+    values: Mapping[str, Value]
+    curves: Mapping[str, Curve]
+    energy: Curve  # predicted kinetic energy
+    pictures: Pictures | None  # of the first seed
+    residuals: tuple[Histogram, ...]
 
     @property
     def method(self) -> str:
@@ -115,20 +145,55 @@ class ScoredMethod:
         return self.entry.method
 
     @property
-    def ranking(self) -> str:
-        """Name of the ranking metric."""
-        return self.stored[0].scores.ranking
-
-    @property
-    def preview(self) -> Preview:
-        """Pictures of the first seed."""
-        return self.stored[0].preview
+    def losses(self) -> Floats:
+        """Ranking metric, shape [seed, scenario]."""
+        return np.stack([seed.values for seed in self.seeds])
 
     @property
     def is_ranked(self) -> bool:
-        """Whether it takes part in the ranking."""
-        is_active = self.entry.status is Status.ACTIVE
-        return is_active and self.is_current and self.ranking in self.scores
+        """Whether it may take part in the ranking."""
+        return self.entry.status is Status.ACTIVE and self.is_current
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PicturedTruth:
+    """The truth as a score file pictures it."""
+
+    precision: float  # step of the packed vorticity maps [1/frame]
+    method: str
+    energy: Curve  # true kinetic energy
+    pictures: Pictures | None
+
+    @property
+    def order(self) -> tuple[float, str]:
+        """The finest packing comes first."""
+        return self.precision, self.method
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scope:
+    """How much of the score files a board needs: the less, the faster it is formed."""
+
+    metrics: Collection[str] | None = None  # beside the ranking one; None: all
+    intervals: Collection[str] | None = None  # metrics with 95 % intervals; None: all
+    has_pictures: bool = True  # whether curves, maps and films are needed
+
+    def includes(self, metric: str) -> bool:
+        """Tell whether a metric is needed."""
+        return self.metrics is None or metric in self.metrics
+
+    def has_interval(self, metric: str) -> bool:
+        """Tell whether the interval of a metric is needed."""
+        return self.intervals is None or metric in self.intervals
+
+
+EVERYTHING = Scope()
+
+PAGE_SCOPE = Scope(
+    metrics=frozenset((*COLUMNS, *CURVES, *chain.from_iterable(PRESETS.values()))),
+    intervals=COLUMNS,
+)
+"""What the page shows."""
 
 
 def collect(
@@ -136,6 +201,7 @@ def collect(
     *,
     only: Collection[tuple[str, str]] | None = None,
     registry: Registry | None = None,
+    scope: Scope = EVERYTHING,
 ) -> Board:
     """Return the board of a leaderboard's folder.
 
@@ -143,6 +209,7 @@ def collect(
         folder: the leaderboard's folder.
         only: (split, size) to read; all of them when None.
         registry: where splits are described; ours when None.
+        scope: how much of the score files is needed.
 
     Raises:
         UsageError: no leaderboard.
@@ -155,13 +222,20 @@ def collect(
     board.require()
 
     methods: dict[tuple[str, str], list[ScoredMethod]] = {}
+    truths: dict[tuple[str, str], PicturedTruth] = {}
     for path in board.entries():
         if only is not None and path.parts[1:3] not in only:
             continue
-        method = _read_method(board, path, described)
-        if method is not None:
-            data_set = (method.entry.split, method.entry.size)
-            methods.setdefault(data_set, []).append(method)
+        read = _read_method(board, path, described, scope)
+        if read is None:
+            continue
+        method, truth = read
+        data_set = (method.entry.split, method.entry.size)
+        methods.setdefault(data_set, []).append(method)
+        # Maps of truth and prediction share one packing: an explosion leaves nothing
+        # of the truth.
+        finest = truths.setdefault(data_set, truth)
+        truths[data_set] = min(finest, truth, key=lambda pictured: pictured.order)
 
     verified = read_verified(board)
     tabs = []
@@ -177,6 +251,8 @@ def collect(
                     size,
                     description.title,
                     methods=methods[data_set],
+                    truth=truths[data_set],
+                    scope=scope,
                     references=read_references(board, size),
                     verified=verified,
                 )
@@ -195,8 +271,13 @@ def collect(
     return Board(tabs=tuple(tabs), empty=tuple(empty), metrics=metrics)
 
 
-def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod | None:
-    """Return an entry with its scores; None for old scores of another task."""
+def _read_method(
+    board: Folder, path: Path, registry: Registry, scope: Scope
+) -> tuple[ScoredMethod, PicturedTruth] | None:
+    """Return an entry with its scores, and the truth beside them.
+
+    None for old scores of another task.
+    """
     entry = read_entry(board.path / path)
     if entry.yaml_path != path:
         raise ChecksFailedError(
@@ -216,8 +297,59 @@ def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod 
             raise
         return None
 
-    scores = combine([seed.scores.tallies for seed in stored])
-    needed = (stored[0].scores.ranking, TRUE_ENERGY, PREDICTED_ENERGY)
+    ranking = stored[0].scores.ranking
+    scores = _form_scores(board, entry, stored, scope)
+    values = {}
+    for name, combined in scores.items():
+        if scope.includes(name) or name == ranking:
+            values[name] = _value_of_seeds(combined, size, scope, ranking=ranking)
+
+    plain_scores = {name: combined.score for name, combined in scores.items()}
+    preview = stored[0].preview
+    curves = {}
+    residuals: tuple[Histogram, ...] = ()
+    true_pictures = None
+    pictures = None
+    if scope.has_pictures:
+        curves = _make_curves(plain_scores, ranking)
+        residuals = residual_histograms(preview)
+        true_pictures = _make_pictures(preview, TRUTH, size.box)
+        pictures = _make_pictures(preview, PREDICTION, size.box)
+    seeds = []
+    for seed in scores[ranking].seeds:
+        seeds.append(replace(seed, per_frame=np.empty((len(seed.values), 0))))
+    method = ScoredMethod(
+        entry=entry,
+        is_current=current,
+        ranking=ranking,
+        seeds=seeds,
+        values=values,
+        curves=curves,
+        energy=make_curve(plain_scores[PREDICTED_ENERGY]),
+        pictures=pictures,
+        residuals=residuals,
+    )
+    truth = PicturedTruth(
+        precision=stored[0].precision,
+        method=entry.method,
+        energy=make_curve(plain_scores[TRUE_ENERGY]),
+        pictures=true_pictures,
+    )
+    return method, truth
+
+
+def _form_scores(
+    board: Folder, entry: Entry, stored: Sequence[ScoreFile], scope: Scope
+) -> Mapping[str, CombinedScore]:
+    """Return the scores of a method by metric, all seeds together."""
+    ranking = stored[0].scores.ranking
+    needed = (ranking, TRUE_ENERGY, PREDICTED_ENERGY)
+    names: set[str] | None = None
+    if scope.metrics is not None:
+        names = {*scope.metrics, *needed}
+        if scope.has_pictures:
+            names.update(_names_of_curves(ranking))
+    scores = combine([seed.scores.tallies for seed in stored], names)
     missing = []
     for name in needed:
         if name not in scores:
@@ -229,7 +361,17 @@ def _read_method(board: Folder, path: Path, registry: Registry) -> ScoredMethod 
             expected=", ".join(missing),
             fix="score the predictions again: lagbench submit",
         )
-    return ScoredMethod(entry=entry, is_current=current, stored=stored, scores=scores)
+    return scores
+
+
+def _value_of_seeds(
+    combined: CombinedScore, size: Size, scope: Scope, *, ranking: str
+) -> Value:
+    name = combined.score.metric.name
+    interval = (math.nan, math.nan)
+    if scope.has_interval(name) or name == ranking:
+        interval = combined.interval
+    return _make_value(combined.score, interval=interval, std=combined.std, size=size)
 
 
 def _size_of(entry: Entry, registry: Registry, *, where: Path) -> Size:
@@ -252,20 +394,22 @@ def _make_tab(
     title: str,
     *,
     methods: Sequence[ScoredMethod],
+    truth: PicturedTruth,
+    scope: Scope,
     references: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
 ) -> Tab:
-    # Maps of truth and prediction share one packing: an explosion leaves nothing of the
-    # truth. The reference entry is the one with the finest packing.
-    reference_entry = min(methods, key=_coarseness)
-    ranking = reference_entry.ranking
-    places = _rank(methods, ranking)
+    ranking = methods[0].ranking
+    variants = _find_variants(methods)
+    ranked = {}
+    for method in methods:
+        if method.is_ranked and method.method not in variants:
+            ranked[method.method] = method
+    places = standings({name: method.seeds for name, method in ranked.items()})
+    ranges = rank_ranges({name: [method.losses] for name, method in ranked.items()})
 
     def order(method: ScoredMethod) -> tuple[bool, float, str]:
-        loss = math.inf
-        if ranking in method.scores:
-            loss = mean_loss(method.scores[ranking].seeds)
-        return method.method not in places, loss, method.method
+        return method.method not in places, mean_loss(method.seeds), method.method
 
     rows = []
     for method in sorted(methods, key=order):
@@ -273,6 +417,8 @@ def _make_tab(
             method,
             size,
             standing=places.get(method.method),
+            rank_range=ranges.get(method.method),
+            variant_of=variants.get(method.method),
             verified=verification_of(method.entry, verified),
             references=references,
         )
@@ -289,7 +435,7 @@ def _make_tab(
     scenarios = tuple(sorted(size.subsets["test"]))
     reference_rows = []
     for reference in references:
-        reference_rows.append(_make_reference(reference, size, ranking))
+        reference_rows.append(_make_reference(reference, size, ranking, scope))
     return Tab(
         size=size,
         title=title,
@@ -300,24 +446,19 @@ def _make_tab(
         decided=len(scenarios) >= FEWEST_SCENARIOS,
         columns=tuple(columns),
         curves=tuple(curves),
-        energy=make_curve(reference_entry.scores[TRUE_ENERGY].score),
-        truth=_make_pictures(reference_entry.preview, TRUTH),
+        energy=truth.energy,
+        truth=truth.pictures,
         rows=tuple(rows),
         references=tuple(reference_rows),
         solver_seconds=solver_seconds(size),
     )
 
 
-def _coarseness(method: ScoredMethod) -> tuple[float, str]:
-    return method.stored[0].precision, method.method
-
-
-def _rank(methods: Sequence[ScoredMethod], ranking: str) -> Mapping[str, Standing]:
-    ranked = {}
-    for method in methods:
-        if method.is_ranked and ranking in method.scores:
-            ranked[method.method] = method.scores[ranking].seeds
-    return standings(ranked)
+def _find_variants(methods: Sequence[ScoredMethod]) -> Mapping[str, str]:
+    """Return the method that each variant belongs to, by the id of the variant."""
+    entries = [method.entry for method in methods]
+    ranked_entries = [method.entry for method in methods if method.is_ranked]
+    return find_variants(entries, ranked_entries)
 
 
 def _make_row(
@@ -325,18 +466,12 @@ def _make_row(
     size: Size,
     *,
     standing: Standing | None,
+    rank_range: tuple[int, int] | None,
+    variant_of: str | None,
     verified: Verification | None,
     references: Sequence[ReferenceScores],
 ) -> BoardRow:
-    values = {}
-    scores = {}
-    for name, combined in method.scores.items():
-        scores[name] = combined.score
-        values[name] = _make_value(
-            combined.score, interval=combined.interval, std=combined.std, size=size
-        )
-
-    against = _against_classical(method, size, references)
+    against = _against_classical(method, size, references, verified)
     rank = None
     is_tied = False
     p = math.nan
@@ -348,18 +483,21 @@ def _make_row(
         entry=method.entry,
         current=method.is_current,
         rank=rank,
+        rank_range=rank_range,
+        variant_of=variant_of,
         tied=is_tied,
         p=p,
         verified=verified,
         skill=_skill_of(method, references),
         against_classical=_value_of_ratio(against),
         solver=None if against is None else against.reference,
-        values=values,
-        seed_means=method.scores[method.ranking].means,
-        curves=_make_curves(scores, method.ranking),
-        energy=make_curve(scores[PREDICTED_ENERGY]),
-        pictures=_make_pictures(method.preview, PREDICTION),
-        residuals=residual_histograms(method.preview),
+        values=method.values,
+        losses=method.losses,
+        seed_means=tuple(seed.mean for seed in method.seeds),
+        curves=method.curves,
+        energy=method.energy,
+        pictures=method.pictures,
+        residuals=method.residuals,
     )
 
 
@@ -374,37 +512,47 @@ def _skill_of(
     for reference in references:
         if reference.name in NAIVE and ranking in reference.scores:
             baselines[reference.name] = reference.scores[ranking]
-    return _value_of_ratio(compute_skill(method.scores[ranking].seeds, baselines))
+    return _value_of_ratio(compute_skill(method.seeds, baselines))
 
 
 def _against_classical(
-    method: ScoredMethod, size: Size, references: Sequence[ReferenceScores]
+    method: ScoredMethod,
+    size: Size,
+    references: Sequence[ReferenceScores],
+    verified: Verification | None,
 ) -> AgainstClassical | None:
     """Return the score over that of the best classical solver that costs no more.
 
-    None where the entry does not state what a frame costs the model and our solver.
+    Costs that we measured in one run are compared as they are; a cost that the entry
+    states is brought to the machine of the references by the time of our solver on
+    both. None where neither is known.
     """
-    cost = method.entry.cost
-    if not method.is_current or cost is None:
+    if not method.is_current:
         return None
-    seconds = seconds_where_measured(
-        seconds_per_frame=cost.seconds_per_frame,
-        solver_seconds=cost.solver_seconds_per_frame,
-        solver_seconds_here=solver_seconds(size),
-    )
-    if seconds is None:
-        return None
-    solvers = {}
     costs = {}
+    solvers = {}
     for reference in references:
         if reference.name in CLASSICAL and method.ranking in reference.scores:
             solvers[reference.name] = reference.scores[method.ranking]
             costs[reference.name] = reference.seconds_per_frame
+    seconds = None
+    if verified is not None and verified.cost is not None and verified.cost.classical:
+        seconds = verified.cost.seconds_per_frame
+        costs = {**verified.cost.classical}
+    elif method.entry.cost is not None:
+        seconds = seconds_where_measured(
+            seconds_per_frame=method.entry.cost.seconds_per_frame,
+            solver_seconds=method.entry.cost.solver_seconds_per_frame,
+            solver_seconds_here=solver_seconds(size),
+        )
+    if seconds is None:
+        return None
+    timed_solvers = {}
+    for name, score in solvers.items():
+        if name in costs:
+            timed_solvers[name] = score
     return compute_against_classical(
-        method.scores[method.ranking].seeds,
-        solvers,
-        seconds=costs,
-        seconds_per_frame=seconds,
+        method.seeds, timed_solvers, seconds=costs, seconds_per_frame=seconds
     )
 
 
@@ -425,14 +573,17 @@ def _value_of_ratio(ratio: Skill | AgainstClassical | None) -> Value | None:
 
 
 def _make_reference(
-    reference: ReferenceScores, size: Size, ranking: str
+    reference: ReferenceScores, size: Size, ranking: str, scope: Scope
 ) -> ReferenceRow:
     description = REFERENCES[reference.name]
     values = {}
     for name, score in reference.scores.items():
-        values[name] = _make_value(
-            score, interval=score.interval, std=math.nan, size=size
-        )
+        if not scope.includes(name) and name != ranking:
+            continue
+        interval = (math.nan, math.nan)
+        if scope.has_interval(name) or name == ranking:
+            interval = score.interval
+        values[name] = _make_value(score, interval=interval, std=math.nan, size=size)
 
     energy = None
     energy_score = reference.scores.get(PREDICTED_ENERGY)
@@ -452,7 +603,7 @@ def _make_reference(
         name=reference.name,
         definition=description.definition,
         values=values,
-        curves=_make_curves(reference.scores, ranking),
+        curves=_make_curves(reference.scores, ranking) if scope.has_pictures else {},
         energy=energy,
         kind=description.kind,
         cost=cost,
@@ -464,7 +615,7 @@ def _make_value(
 ) -> Value:
     low, high = interval
     at = {}
-    if score.metric.per_frame:
+    if score.metric.per_frame and score.metric.name in AT_FRAMES:
         for frame in reported_frames(size):
             if frame in score.frames:
                 at[frame] = mean(score.at(frame))
@@ -521,20 +672,34 @@ def make_curve(score: Score) -> Curve:
     return Curve(frames=frames, mean=middle, low=low, high=high)
 
 
-def _make_pictures(preview: Preview, side: int) -> Pictures:
+def _flatten_film(film: NDArray[np.float32], box: Box) -> NDArray[np.float32]:
+    """Return where particles stand in the picture, shape [film frame, particle, 2].
+
+    Those of two dimensions stand where they are.
+    """
+    if box.dimension == 2:
+        return film
+    return np.asarray(View(box).place(film), np.float32)
+
+
+def _make_pictures(preview: Preview, side: int, box: Box) -> Pictures:
     histograms = []
     ranges = preview.histogram_range.astype(np.float64).tolist()
     shares = preview.histogram[side].astype(np.float64)
-    for (low, high), frame_shares in zip(ranges, shares, strict=True):
+    for i in spaced(len(preview.map_frames), MAP_FRAMES):
+        low, high = ranges[i]
+        frame_shares = shares[i]
         histograms.append(Histogram(low=low, high=high, shares=frame_shares))
+    maps = spaced(len(preview.map_frames), MAP_FRAMES)
+    vorticity = coarsen(preview.vorticity[side][maps], MAP_NODES)
     return Pictures(
         scenario=preview.scenario,
-        map_frames=preview.map_frames,
-        vorticity=preview.vorticity[side],
+        map_frames=tuple(preview.map_frames[i] for i in maps),
+        vorticity=vorticity.astype(np.float32),
         histograms=tuple(histograms),
         film_frames=preview.film_frames,
         material=preview.material,
-        film=preview.film[side],
+        film=_flatten_film(preview.film[side], box),
     )
 
 
@@ -543,7 +708,8 @@ def residual_histograms(preview: Preview) -> tuple[Histogram, ...]:
 
     The range is symmetric, up to the greatest residual.
     """
-    truth, prediction = preview.vorticity.astype(np.float64)
+    maps = spaced(len(preview.map_frames), MAP_FRAMES)
+    truth, prediction = preview.vorticity[:, maps].astype(np.float64)
     half = RESIDUAL_BINS // 2
     histograms = []
     for difference in prediction - truth:
@@ -590,7 +756,7 @@ def build(
     folder = Folder(board)
     page = folder.path / PAGE
     schema = folder.path / SCHEMA
-    content = collect(board, registry=registry)
+    content = collect(board, registry=registry, scope=PAGE_SCOPE)
     new_page = render(content, _links_of(folder, check=check))
     new_schema = schema_bytes()
 

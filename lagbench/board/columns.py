@@ -11,7 +11,7 @@ import numpy as np
 from lagbench.figures.html import MISSING, sentence, text, words
 from lagbench.metrics.metric import Direction, Metric, mean
 
-from .entry import EntryBudget, EntryCost
+from .entry import EntryBudget, EntryCost, Level
 from .model import BoardRow, ReferenceRow, Tab, Value
 
 TableRow = BoardRow | ReferenceRow
@@ -83,6 +83,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
     "cost": (
         "speed_up",
         "seconds_per_frame",
+        "cost_source",
         "solver_seconds_per_frame",
         "parameters",
         "device",
@@ -130,15 +131,23 @@ class Column:
         return math.nan
 
 
-def _cost_of(row: TableRow) -> EntryCost | None:
+def cost_of(row: TableRow) -> EntryCost | None:
+    """Return the cost of a frame: ours where we measured it, else the stated one."""
     if isinstance(row, ReferenceRow):
         return row.cost
+    if row.verified is not None and row.verified.cost is not None:
+        measured = row.verified.cost
+        return EntryCost.model_construct(
+            seconds_per_frame=measured.seconds_per_frame,
+            device=f"one core, {measured.machine}",
+            solver_seconds_per_frame=measured.solver,
+        )
     return row.entry.cost
 
 
 def _read_cost(key: str) -> Callable[[TableRow], object]:
     """Return a function that reads a part of a row's cost."""
-    return lambda row: getattr(_cost_of(row), key, None)
+    return lambda row: getattr(cost_of(row), key, None)
 
 
 def _read_entry(key: str) -> Callable[[TableRow], object]:
@@ -193,12 +202,56 @@ def _count_seeds(row: TableRow) -> int | None:
     return len(row.entry.predictions)
 
 
+def level_of(row: BoardRow) -> Level:
+    """Return how far the maintainers followed the scores of an entry."""
+    if row.verified is None:
+        return Level.AS_SUBMITTED
+    return row.verified.level
+
+
+def describe_check(row: BoardRow) -> str:
+    """Return in words how far the scores of an entry were followed."""
+    if row.verified is None:
+        return str(Level.AS_SUBMITTED)
+    reproductions = row.verified.reproduced
+    if any(not reproduction.agrees for reproduction in reproductions):
+        return "not reproduced"
+    if row.verified.level.rank < Level.REPRODUCED.rank and reproductions:
+        seeds = len(row.entry.predictions)
+        return f"{len(reproductions)} of {seeds} seeds reproduced"
+    for reproduction in reproductions:
+        if not reproduction.is_complete:
+            return (
+                f"{row.verified.level}, {reproduction.scenarios} of {reproduction.of} "
+                "scenarios"
+            )
+    return str(row.verified.level)
+
+
 def _describe_check(row: TableRow) -> str:
     if isinstance(row, ReferenceRow):
         return ""
-    if row.verified is None:
-        return "as submitted"
-    return "verified"
+    return describe_check(row)
+
+
+def source_of_cost(row: TableRow) -> str:
+    """Return who took the time of a frame; empty where nobody did."""
+    if isinstance(row, ReferenceRow):
+        return "measured" if row.cost else ""
+    if row.verified is not None and row.verified.cost is not None:
+        return "measured"
+    return "self-reported" if row.entry.cost else ""
+
+
+def format_ranks(rank: int, ranks: tuple[int, int] | None) -> str:
+    """Return a range of ranks, or the rank where nothing is claimed.
+
+    >>> format_ranks(2, (1, 3)), format_ranks(2, (2, 2)), format_ranks(2, None)
+    ('1–3', '2', '2')
+    """
+    if ranks is None or ranks[0] == ranks[1]:
+        return str(rank)
+    return f"{ranks[0]}–{ranks[1]}"
 
 
 SKILL = Column(
@@ -252,6 +305,14 @@ ENTRY_COLUMNS = (
         reported=True,
         meaning="Wall time of a frame of one scenario.",
         read=_read_cost("seconds_per_frame"),
+    ),
+    Column(
+        key="cost_source",
+        label="time taken by",
+        form="text",
+        meaning="Measured: we timed all rows in one run on one core. Self-reported: "
+        "the submitter states it.",
+        read=source_of_cost,
     ),
     Column(
         key="solver_seconds_per_frame",
@@ -335,8 +396,9 @@ ENTRY_COLUMNS = (
         key="checked",
         label="scores",
         form="text",
-        meaning="Verified: the maintainers scored these predictions again. As "
-        "submitted: they did not.",
+        meaning="How far the maintainers followed the scores: as submitted (not at "
+        "all), scored again from the submitter's predictions, reproduced from the "
+        "model, or blind: scored on data drawn after the model was frozen.",
         read=_describe_check,
     ),
     Column(
@@ -395,8 +457,8 @@ def presets_of(tab: Tab, columns: Mapping[str, Column]) -> dict[str, tuple[str, 
         "against_classical",
         *tab.columns[:metric_count],
         "kind",
-        "speed_up",
-        "budget",
+        "seconds_per_frame",
+        "cost_source",
         "checked",
     )
     keys_by_name = {"main": main, **PRESETS, "all": tuple(columns)}

@@ -93,7 +93,8 @@ class BoardRow:
 
     entry: Entry
     current: bool  # scored on the data set version of today; others are not ranked
-    rank: int | None  # in the order of the ranking metric; None where not ranked
+    # in the order of the ranking metric; None for variants and where not ranked
+    rank: int | None
     tied: bool  # cannot be told from the leader at 5 %
     # against the leader, corrected by Holm; NaN for the leader and without a claim
     p: float
@@ -108,8 +109,13 @@ class BoardRow:
     seed_means: tuple[float, ...]  # mean of the ranking metric of each seed
     curves: Mapping[str, Curve]
     energy: Curve  # predicted kinetic energy; the truth's is Tab.energy
-    pictures: Pictures  # of the prediction of the first seed
+    pictures: Pictures | None  # of the prediction of the first seed; None if not read
     residuals: tuple[Histogram, ...]  # of predicted minus true vorticity, by map frame
+    # best and worst rank in 95 % of the resamples; None where nothing is claimed
+    rank_range: tuple[int, int] | None = None
+    variant_of: str | None = None  # id of the method that the row is a variant of
+    # ranking metric, NaN where undefined, shape [seed, scenario]
+    losses: Floats | None = None
 
     @property
     def id(self) -> str:
@@ -175,7 +181,8 @@ class Tab:
     # names of metrics with curves, the ranking one or what stands for it first
     curves: tuple[str, ...]
     energy: Curve  # true kinetic energy
-    truth: Pictures  # those of the rows have the same scenario and frames
+    # those of the rows have the same scenario and frames; None if not read
+    truth: Pictures | None
     rows: tuple[BoardRow, ...]  # ranked ones by rank, then the others
     references: tuple[ReferenceRow, ...]
     # processor time of a frame of the solver itself [s]
@@ -185,6 +192,25 @@ class Tab:
     def id(self) -> str:
         """Name in addresses."""
         return f"{self.size.split}-{self.size.name}"
+
+    @property
+    def best_naive(self) -> float | None:
+        """Score of the best naive baseline in the ranking metric; None without one."""
+        means = []
+        for row in self.references:
+            if row.kind is Kind.NAIVE and self.ranking in row.values:
+                mean = row.values[self.ranking].mean
+                if mean > 0.0:
+                    means.append(mean)
+        return min(means, default=None)
+
+    def variants_of(self, row: BoardRow) -> tuple[BoardRow, ...]:
+        """Return the variants of a method, in the order of the rows."""
+        variants = []
+        for other in self.rows:
+            if other.variant_of == row.id:
+                variants.append(other)
+        return tuple(variants)
 
     @property
     def lines(self) -> tuple[BoardRow | ReferenceRow, ...]:

@@ -11,15 +11,15 @@ from __future__ import annotations
 import base64
 import functools
 import hashlib
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from itertools import groupby
 
+from lagbench.addresses import DOCUMENTATION
 from lagbench.figures.colours import DARK, LIGHT, format_variables
 from lagbench.figures.html import (
+    MISSING,
     Markup,
     clipped,
     escaped,
@@ -31,12 +31,29 @@ from lagbench.figures.html import (
 )
 from lagbench.metrics.metric import Direction, Metric
 
-from .columns import format_value, leader_of, value_of
+from .columns import (
+    cost_of,
+    format_ranks,
+    format_value,
+    leader_of,
+    level_of,
+    source_of_cost,
+    value_of,
+)
 from .cost import cost_figure
 from .encoding import decode, encode
+from .entry import Level
 from .model import Board, BoardRow, Tab
+from .overview import (
+    MethodOverview,
+    SizeOverview,
+    conclude,
+    find_hero,
+    make_overviews,
+    summarise,
+)
 from .page_data import page_data
-from .table import draw_table
+from .table import draw_table, fold_button
 from .table_view import LABELS, TableView, make_table
 
 SCRIPTS = (
@@ -45,6 +62,7 @@ SCRIPTS = (
     "scale",
     "chart",
     "state",
+    "fold",
     "table",
     "overview",
     "maps",
@@ -55,22 +73,43 @@ SCRIPTS = (
 )
 """Parts of the script, in this order."""
 
-LINKS: Mapping[str, str] = {
-    "Repository": "../README.md",
-    "Documentation": "../docs/index.md",
-    "How to submit": "../docs/submitting.md",
-    "Citation": "../CITATION.cff",
+PAGES = {
+    "Documentation": "index",
+    "How to take part": "submitting",
+    "What the scores mean": "scoring",
+    "All results": "results",
 }
-"""Links of the page, from the leaderboard's folder; links to missing files are left
-out.
+"""Pages of the documentation's site that the page links, by label."""
+
+LINKS: Mapping[str, str] = {
+    label: f"{DOCUMENTATION.rstrip('/') or '../site'}/{name}.html"
+    for label, name in PAGES.items()
+}
+"""Links of the page, from the leaderboard's folder; where the site has no address, it
+is the one that mkdocs makes in a clone. Links to missing files are left out.
 """
 
+TAKE_PART = """\
+lagbench generate --split cavity --size mini       # the data, bit for bit
+lagbench predict weights.pt -o predictions.nc      # or write the file yourself
+lagbench submit predictions.nc --from meta.yaml    # scores, and adds the entry
+lagbench leaderboard reproduce SPLIT/SIZE/METHOD   # anybody can repeat a score"""
+"""Commands by which a reader takes part."""
+
 FOOT = (
-    "Velocity and vorticity are per frame; lengths are in units of the box. Times are "
-    "of each entry's own machine.",
+    "Velocity and vorticity are per frame; lengths are in units of the box.",
     "This page is one file, built by lagbench leaderboard build from the score files, "
     "and asks nothing of the network. How to cite a data set: lagbench cite.",
 )
+
+OVERVIEW_WORDS = (
+    "Skill is 0 for the best naive baseline, which learns nothing, and 1 for a perfect "
+    "prediction. “0.9× classical” is the error beside that of the best classical "
+    "solver that costs no more per frame: below 1, learning pays. Ranks are ranges in "
+    "95 % of the resamples. Variants of a method are folded behind it, without a rank."
+)
+
+RANK_MEANING = "Best to worst rank in 95 % of the resamples of scenarios and seeds"
 
 DATA_ELEMENT = re.compile(
     rb'(<script type="text/plain" id="page-(?:data|arrays)">)([A-Za-z0-9+/=]*)(?=</)'
@@ -86,7 +125,7 @@ def render(board: Board, links: Mapping[str, str] = LINKS) -> str:
     views = []
     for tab in board.tabs:
         views.append(make_table(tab, board.metrics))
-    data, arrays = page_data(views)
+    data, arrays = page_data(views, find_hero(board))
 
     link_tags = []
     for label, address in links.items():
@@ -192,23 +231,49 @@ def _source_of(content: str) -> str:
 
 
 def draw_intro(board: Board) -> Markup:
-    """Return the sentence under the title."""
-    entry_count = 0
-    verified_count = 0
+    """Return the sentences under the title: what this is, and what is verified."""
+    rows: list[BoardRow] = []
     for tab in board.tabs:
-        entry_count += len(tab.rows)
-        verified_count += sum(row.verified is not None for row in tab.rows)
-    entries = _count(entry_count, "entry", "entries")
+        rows += tab.rows
+    entries = _count(len(rows), "entry", "entries")
     data_sets = _count(len(board.tabs), "data set", "data sets")
-    rescored = "none yet"
-    if verified_count:
-        rescored = f"those of {verified_count}"
     return escaped(
-        "Neural surrogates of Lagrangian continuum simulators on data that anyone "
-        f"regenerates bit for bit: {entries} on {data_sets}. Every score follows from "
-        "a score file; predictions that the maintainers scored again: "
-        f"{rescored}. Costs are self-reported."
+        "Which neural surrogate predicts how fluids and soft bodies move, and is it "
+        f"better than a classical solver of the same cost? {entries} on {data_sets} "
+        "that anyone regenerates bit for bit. Every number follows from committed "
+        f"score files. {_describe_levels(rows)} {_describe_costs(rows)}"
     )
+
+
+def _describe_levels(rows: Sequence[BoardRow]) -> str:
+    """Return how many entries the maintainers followed how far, and where."""
+    counts = dict.fromkeys(Level, 0)
+    machines = set()
+    for row in rows:
+        counts[level_of(row)] += 1
+        if row.verified is not None and row.verified.cost is not None:
+            machines.add(row.verified.cost.machine)
+    clauses = []
+    for level in (Level.BLIND, Level.REPRODUCED, Level.SCORED_AGAIN):
+        if counts[level]:
+            clauses.append(f"{counts[level]} {level}")
+    if not clauses:
+        return "All entries stand as submitted: nobody has scored them again yet."
+    sentence = f"Followed by the maintainers: {', '.join(clauses)}"
+    if machines:
+        sentence += f" (on {', '.join(sorted(machines))})"
+    return f"{sentence}; the others stand as submitted."
+
+
+def _describe_costs(rows: Sequence[BoardRow]) -> str:
+    sources = [source_of_cost(row) for row in rows]
+    measured_count = sources.count("measured")
+    reported_count = sources.count("self-reported")
+    if not reported_count:
+        return ""
+    if not measured_count:
+        return "Costs are self-reported."
+    return f"Costs: {measured_count} measured, {reported_count} self-reported."
 
 
 def _count(count: int, singular: str, plural: str) -> str:
@@ -219,7 +284,7 @@ def _count(count: int, singular: str, plural: str) -> str:
 
 def draw_hero(board: Board) -> Markup:
     """Return the place of the film above the fold, which the script fills."""
-    if not board.tabs:
+    if find_hero(board) is None:
         return Markup("")
     return tag(
         "figure",
@@ -250,139 +315,144 @@ def _tab_link(name: str, label: str, description: str) -> Markup:
 
 
 def draw_empty(board: Board) -> Markup:
-    """Return the names of data sets without an entry, and commands that begin one."""
-    if not board.empty:
-        return Markup("")
-    split, size = board.empty[0]
-    names = ", ".join(" ".join(data_set) for data_set in board.empty)
-    commands = (
-        f"lagbench generate --split {split} --size {size}\n"
-        "lagbench submit predictions.nc --from meta.yaml"
-    )
-    beginning = "There are no entries yet"
-    if board.tabs:
-        beginning = "No entry yet"
-    return tag(
-        "section",
-        tag("p", f"{beginning}: {names}. Yours can be the first:"),
-        tag("pre", tag("code", commands)),
-        class_="empty",
-    )
-
-
-@dataclass(frozen=True)
-class MethodOverview:
-    """A method on all data sets."""
-
-    method: str
-    rows: Mapping[str, BoardRow]  # ranked rows, by id of the tab
-    skills: Sequence[float]
-    # A data set without an entry counts 0, so that nobody leads by the one data set
-    # that suits.
-    mean_skill: float
-
-    @property
-    def name(self) -> str:
-        """Name of the method."""
-        first_row = next(iter(self.rows.values()))
-        return first_row.entry.name
+    """Return how to take part, and the names of data sets without an entry."""
+    parts = [
+        tag("h2", "Take part"),
+        tag(
+            "p",
+            "Predict the test scenarios with your model and submit the file; nobody "
+            "runs your code unless you give the model too.",
+        ),
+        tag("pre", tag("code", TAKE_PART)),
+    ]
+    if board.empty:
+        names = ", ".join(" ".join(data_set) for data_set in board.empty)
+        beginning = "No entry yet" if board.tabs else "There are no entries yet"
+        parts.append(tag("p", f"{beginning}: {names}. Yours can be the first."))
+    return tag("section", *parts, class_="empty", id="take-part")
 
 
 def draw_overview(board: Board) -> Markup:
-    """Return one row per method over all splits, by mean skill."""
+    """Return one table per size: a row per method, by mean skill over all data sets."""
     if not board.tabs:
         return Markup("")
+    parts = [
+        tag("h2", "All data sets"),
+        tag("p", OVERVIEW_WORDS, class_="facts"),
+    ]
+    for overview in make_overviews(board):
+        parts.append(tag("h3", overview.size))
+        sentences = [summarise(overview)]
+        for tab in overview.tabs:
+            sentences.append(conclude(tab))
+        items = [tag("li", sentence) for sentence in sentences if sentence]
+        if items:
+            parts.append(tag("ul", *items, class_="verdicts"))
+        parts.append(_overview_table(overview))
+    return tag("section", *parts, id="overview", class_="tab")
+
+
+def _overview_table(overview: SizeOverview) -> Markup:
     headings = [
+        tag("th", "#", scope="col", class_="rank", title=RANK_MEANING),
         tag("th", "method", scope="col", class_="method"),
+        tag("th", "kind", scope="col", class_="words"),
         tag("th", "mean skill", scope="col"),
     ]
-    for tab in board.tabs:
-        link = tag("a", f"{tab.size.split} {tab.size.name}", href=f"#{tab.id}")
+    for tab in overview.tabs:
+        link = tag("a", tab.size.split, href=f"#{tab.id}")
         headings.append(tag("th", link, scope="col"))
-    lines = []
-    for method in _order_methods(board):
-        lines.append(_overview_line(method, board))
-    caption = (
-        "Skill on every data set (0: the best naive baseline, 1: perfect) where it is "
-        "known, and rank; bold leads. Methods stand in the order of their mean skill, "
-        "in which a data set without an entry counts 0."
-    )
+    headings.append(tag("th", "scores", scope="col", class_="words"))
+    bodies = []
+    complete = []
+    incomplete = []
+    for method in overview.methods:
+        lines = _overview_lines(method, overview)
+        if method.rank is None:
+            incomplete += lines
+        else:
+            complete += lines
+    bodies.append(tag("tbody", *complete))
+    if incomplete:
+        words_of_group = "Not on all data sets, so without a place"
+        heading = tag(
+            "th",
+            words_of_group,
+            colspan=len(headings),
+            scope="rowgroup",
+            class_="group",
+        )
+        bodies.append(tag("tbody", tag("tr", heading), *incomplete))
+    caption = f"All data sets of size {overview.size}"
     table = tag(
         "table",
         tag("caption", caption, class_="unseen"),
         tag("thead", tag("tr", *headings)),
-        tag("tbody", *lines),
+        *bodies,
         class_="board across",
     )
-    region = tag(
+    return tag(
         "div",
         table,
         class_="scroll",
         role="region",
-        aria_label="Overview",
+        aria_label=caption,
         tabindex=0,
     )
-    return tag(
-        "section",
-        tag("h2", "All data sets"),
-        tag("p", caption, class_="facts"),
-        region,
-        id="overview",
-        class_="tab",
-    )
 
 
-def _order_methods(board: Board) -> list[MethodOverview]:
-    """Return the ranked methods, by mean skill; methods without any come last."""
-    rows_by_method: dict[str, dict[str, BoardRow]] = {}
-    for tab in board.tabs:
-        for row in tab.rows:
-            if row.rank is not None:
-                rows_by_method.setdefault(row.id, {})[tab.id] = row
-
-    methods = []
-    for method, rows in rows_by_method.items():
-        skills = []
-        for row in rows.values():
-            if row.skill is not None and math.isfinite(row.skill.mean):
-                skills.append(row.skill.mean)
-        mean_skill = sum(skills) / len(board.tabs)
-        methods.append(MethodOverview(method, rows, skills, mean_skill))
-    return sorted(methods, key=lambda m: (not m.skills, -m.mean_skill, m.method))
+def _overview_lines(method: MethodOverview, overview: SizeOverview) -> list[Markup]:
+    """Return the line of a method, and those of its variants, folded away."""
+    lines = [_overview_line(method, overview)]
+    for variant in method.variants:
+        lines.append(_overview_line(variant, overview, variant_of=method.method))
+    return lines
 
 
-def _overview_line(method: MethodOverview, board: Board) -> Markup:
-    mean_skill = math.nan
-    if method.skills:
-        mean_skill = method.mean_skill
-    coverage = f"{len(method.skills)} of {len(board.tabs)}"
+def _overview_line(
+    method: MethodOverview, overview: SizeOverview, *, variant_of: str | None = None
+) -> Markup:
+    rank = ""
+    if method.rank is not None:
+        rank = format_ranks(method.rank, method.rank_range)
+    name = [tag("span", clipped(method.name, 60), class_="name")]
+    if method.variants:
+        name.append(fold_button(method.method, len(method.variants)))
+    skill = [tag("span", text(method.mean_skill), class_="n")]
+    if method.missing:
+        skill = [tag("span", f"not on {', '.join(method.missing)}", class_="ci gaps")]
     cells = [
-        tag("th", clipped(method.name, 60), scope="row", class_="method"),
-        tag(
-            "td",
-            tag("span", text(mean_skill), class_="n"),
-            tag("span", coverage, class_="ci"),
-        ),
+        tag("td", rank, class_="rank"),
+        tag("th", *name, scope="row", class_="method"),
+        tag("td", str(method.kind), class_="words"),
+        tag("td", *skill),
     ]
-    for tab in board.tabs:
+    for tab in overview.tabs:
         cells.append(_overview_cell(method.rows.get(tab.id), tab))
-    return tag("tr", *cells)
+    cells.append(tag("td", _lowest_level(method), class_="words"))
+    if variant_of is None:
+        return tag("tr", *cells)
+    return tag("tr", *cells, class_="variant folded", data_variant_of=variant_of)
+
+
+def _lowest_level(method: MethodOverview) -> str:
+    """Return what is verified of all its data sets."""
+    levels = [level_of(row) for row in method.rows.values()]
+    return str(min(levels, key=lambda level: level.rank))
 
 
 def _overview_cell(row: BoardRow | None, tab: Tab) -> Markup:
     if row is None:
-        return tag("td", "")
-    ranked_count = sum(other.rank is not None for other in tab.rows)
-    rank = f"{row.rank} of {ranked_count}"
-    if row.tied:
-        rank = f"{row.rank} ≈ of {ranked_count}"
-    if row.skill is None:
-        parts = [tag("span", rank, class_="n")]
-    else:
-        parts = [
-            tag("span", text(row.skill.mean), class_="n"),
-            tag("span", f"rank {rank}", class_="ci"),
-        ]
+        return tag("td", MISSING, class_="missing")
+    remarks = []
+    if row.rank is not None:
+        remarks.append(f"rank {format_ranks(row.rank, row.rank_range)}")
+    if row.against_classical is not None:
+        remarks.append(f"{text(row.against_classical.mean, 2)}× classical")
+    parts = []
+    if row.skill is not None:
+        parts.append(tag("span", text(row.skill.mean), class_="n"))
+    parts.append(tag("span", ", ".join(remarks), class_="ci"))
     link = tag("a", *parts, href=f"#tab={tab.id}&entry={row.id}")
     return tag("td", link, class_="best" if row.rank == 1 else None)
 
@@ -405,6 +475,7 @@ def draw_section(view: TableView, metrics: Mapping[str, Metric]) -> Markup:
         "section",
         tag("h2", f"{tab.title}, {tab.size.name}"),
         tag("p", _describe_task(tab, metrics), class_="facts"),
+        tag("p", conclude(tab), class_="verdict") if conclude(tab) else "",
         tag("ul", *_tiles(view, metrics), class_="tiles"),
         _tools(view),
         table,
@@ -441,8 +512,8 @@ def _tiles(view: TableView, metrics: Mapping[str, Metric]) -> Iterator[Markup]:
     unranked_count = len(tab.rows) - ranked_count
     more = "all ranked"
     if unranked_count:
-        more = f"and {unranked_count} not ranked"
-    yield _tile("entries", str(ranked_count), more)
+        more = f"and {unranked_count} variants or not ranked"
+    yield _tile("methods", str(ranked_count), more)
 
 
 def _leader_tiles(
@@ -454,6 +525,12 @@ def _leader_tiles(
     name = clipped(leader.entry.name, 40)
     if tied_count:
         name += f", and {tied_count} that cannot be told from it"
+    variants = tab.variants_of(leader)
+    if variants and variants[0].values[tab.ranking].mean < float(
+        value_of(leader, ranking)
+    ):
+        name += f"; its variant “{clipped(variants[0].entry.name, 60)}” has "
+        name += text(variants[0].values[tab.ranking].mean)
     if leader.skill is not None:
         yield _tile("skill of the leader", text(leader.skill.mean), name)
     value = float(value_of(leader, ranking))
@@ -470,14 +547,15 @@ def _speed_tiles(tab: Tab) -> Iterator[Markup]:
     fastest = None
     greatest = 0.0
     for row in tab.rows:
-        cost = row.entry.cost
+        cost = cost_of(row)
         has_skill = row.skill is not None and row.skill.mean > 0.0
         if row.rank is None or not has_skill or cost is None or not cost.speed_up:
             continue
         if cost.speed_up > greatest:
             greatest = cost.speed_up
             fastest = row
-    if fastest is None or fastest.entry.cost is None:
+    cost = None if fastest is None else cost_of(fastest)
+    if fastest is None or cost is None:
         return
     comparison = "faster than the solver"
     if greatest < 1.0:
@@ -486,7 +564,7 @@ def _speed_tiles(tab: Tab) -> Iterator[Markup]:
     yield _tile(
         "speed of the fastest entry with skill, solver = 1×",
         format_value(greatest, "factor"),
-        f"{comparison}: {name}, {fastest.entry.cost.device}; self-reported",
+        f"{comparison}: {name}, {cost.device}; {source_of_cost(fastest)}",
     )
 
 
@@ -548,9 +626,12 @@ def _notes(tab: Tab) -> Iterator[Markup]:
     )
     if tab.decided:
         claim = (
-            "≈ cannot be told from the leader at 5 %: two-way bootstrap over scenarios "
-            "and seeds, with one seed each the exact sign-flip test over scenarios; "
-            "p-values corrected by Holm's method."
+            "A rank is the range in which it lies in 95 % of the resamples of "
+            "scenarios and seeds. ≈ cannot be told from the leader at 5 %: two-way "
+            "bootstrap over scenarios and seeds, with one seed each the exact "
+            "sign-flip test over scenarios; p-values corrected by Holm's method. "
+            "Variants of a method by the same authors are folded behind it and have no "
+            "rank."
         )
     yield escaped(
         f"{claim} Shaded rows are reference predictors, never ranked: naive baselines, "
@@ -563,10 +644,10 @@ def _notes(tab: Tab) -> Iterator[Markup]:
         "the nearer to it. † some frames have no value. – not measured or undefined."
     )
     yield escaped(
-        "Times, speed-up, budget, parameters and hardware are self-reported: "
-        "submitters state them and nobody computes them again. A speed-up below 1× "
-        "means slower than the solver. Scores are verified where the maintainers "
-        "scored the predictions again, else as submitted."
+        "Budget, parameters and hardware are self-reported: submitters state them and "
+        "nobody computes them again. So are times, except where the column says "
+        "measured: then we timed all rows in one run on one core. A speed-up below 1× "
+        "means slower than the solver."
     )
     raised: set[str] = set()
     for row in tab.rows:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -18,21 +19,26 @@ from lagbench.data.checksums import round_digits
 from lagbench.figures.colours import MATERIAL_COLOURS
 from lagbench.figures.html import MISSING, text, words
 
+from .columns import describe_check, format_ranks
 from .encoding import ArrayStore
 from .entry import Entry
-from .model import BoardRow, Curve, Histogram, Pictures, ReferenceRow, Value
-from .sampling import coarsen, spaced
-from .table_view import Line, TableView, target_loss
+from .model import BoardRow, Curve, Histogram, Pictures, ReferenceRow, Tab, Value
+from .sampling import spaced
+from .table_view import Line, TableView, describe_verification, target_loss
 
-FILM_FRAMES = 26  # most frames of a film
-FILM_PARTICLES = 160  # most particles of a film
+FILM_FRAMES = 20  # most frames of a film
+FILM_PARTICLES = 80  # most particles of a film
+CURVE_LEVELS = 2000  # steps of a curve: six to a pixel
+MAP_LEVELS = 500  # steps of a vorticity map: more than a colour has
 FILM_LEVELS = 2000  # steps across a film: four to a pixel
-MAP_FRAMES = 4  # most frames of vorticity maps and histograms
-MAP_NODES = 20  # most nodes of a map, a side
 
 # Values of maps are cut off at so many times the truth's greatest: an explosion would
 # leave nothing of the others.
 MAP_RANGE = 4.0
+
+MOST_SPREADS = 8  # most metrics that details show for every scenario
+
+MATERIAL_NAMES = ("liquid", "jelly", "snow", "rope")
 
 COLOURS = {
     "materials": list(MATERIAL_COLOURS),
@@ -44,15 +50,43 @@ COLOURS = {
 Plain = dict[str, Any]
 
 
-def page_data(views: Sequence[TableView]) -> tuple[bytes, bytes]:
-    """Return the data of all tabs as JSON, and the arrays that it refers to."""
+def page_data(
+    views: Sequence[TableView], hero: tuple[Tab, BoardRow] | None = None
+) -> tuple[bytes, bytes]:
+    """Return the data of all tabs as JSON, and the arrays that it refers to.
+
+    Args:
+        views: the tables of all tabs.
+        hero: tab and row whose film stands first on the page.
+    """
     arrays = ArrayStore()
     tabs = []
     for view in views:
         tabs.append(_TabWriter(view, arrays).tab())
-    data = {"colours": COLOURS, "tabs": tabs}
+    data = {"colours": COLOURS, "hero": None, "tabs": tabs}
+    if hero is not None:
+        data["hero"] = _hero(*hero, arrays)
     encoded = json.dumps(data, ensure_ascii=True, allow_nan=False)
     return encoded.encode(), arrays.to_bytes()
+
+
+def _hero(tab: Tab, row: BoardRow, arrays: ArrayStore) -> Plain | None:
+    """Return the film that stands first, with all its particles and frames."""
+    if tab.truth is None or row.pictures is None:
+        return None
+    films = []
+    for pictures in (tab.truth, row.pictures):
+        film = pictures.film.reshape(len(pictures.film), -1)
+        films.append(arrays.add(film, levels=FILM_LEVELS))
+    materials = row.pictures.material.tolist()
+    return {
+        "tab": tab.id,
+        "entry": row.id,
+        "frames": list(row.pictures.film_frames),
+        "material": materials,
+        "films": films,
+        "key": [[i, MATERIAL_NAMES[i]] for i in sorted(set(materials))],
+    }
 
 
 class _TabWriter:
@@ -62,7 +96,10 @@ class _TabWriter:
         self._view = view
         self._tab = view.tab
         self._arrays = arrays
-        greatest = float(np.nanmax(np.abs(self._tab.truth.vorticity), initial=0.0))
+        greatest = 0.0
+        if self._tab.truth is not None:
+            true_vorticity = np.abs(self._tab.truth.vorticity)
+            greatest = float(np.nanmax(true_vorticity, initial=0.0))
         self._map_limit = MAP_RANGE * (greatest or 1.0)
 
     def tab(self) -> Plain:
@@ -123,8 +160,13 @@ class _TabWriter:
         if not row.active:
             status = "inactive"
         residuals = []
-        for i in spaced(len(row.residuals), MAP_FRAMES):
-            residuals.append(self._histogram(row.residuals[i]))
+        pictures = None
+        curves = dict(islice(row.curves.items(), 1))
+        if row.variant_of is None:
+            # variants have one curve, no maps and no film: the page would be too long
+            curves = dict(row.curves)
+            pictures = self._pictures(row.pictures)
+            residuals = [self._histogram(residual) for residual in row.residuals]
         flags = []
         for chip in line.chips:
             flags.append([chip.kind, chip.label, chip.meaning])
@@ -133,16 +175,17 @@ class _TabWriter:
             "status": status,
             "active": row.active,
             "rank": row.rank,
+            "variantOf": row.variant_of,
             "flags": flags,
             "byline": line.byline,
             "links": list(line.links),
             "search": _search_text(line, entry),
             "standing": _describe_standing(row),
-            "curves": self._curves(row.curves),
+            "curves": self._curves(curves),
             "energy": self._curve(row.energy),
             "spread": self._spread(row.values),
             "at": self._at_marked_frames(row.values),
-            "pictures": self._pictures(row.pictures),
+            "pictures": pictures,
             "residuals": residuals,
             "command": entry.command,
             "about": list(_about(row)),
@@ -152,15 +195,20 @@ class _TabWriter:
     def _line(self, line: Line) -> Plain:
         """Return the cells of a line, each kind in the order of the columns."""
         values = []
-        losses = []
+        losses = {}
         texts = []
-        notes = []
-        for key, cell in line.cells.items():
+        notes = {}
+        classes = {}
+        for index, (key, cell) in enumerate(line.cells.items()):
             values.append(plain_number(cell.value))
             loss = target_loss(cell, self._view.columns[key])
-            losses.append(None if loss is None else plain_number(loss))
+            if loss is not None:
+                losses[index] = plain_number(loss)
             texts.append(cell.text)
-            notes.append(cell.note)
+            if cell.note:
+                notes[index] = cell.note
+            if cell.classes and key not in self._view.main:
+                classes[index] = " ".join(cell.classes)
         ranking_cell = line.cells[self._tab.ranking]
         interval: list[float | str | None] = []
         if ranking_cell.interval is not None:
@@ -174,18 +222,16 @@ class _TabWriter:
             "losses": losses,
             "texts": texts,
             "notes": notes,
+            "classes": classes,
             "interval": interval,
         }
 
     def _spread(self, values: Mapping[str, Value]) -> Plain:
         """Return the mean of every scenario, of the main metrics."""
         spread = {}
-        for name in self._tab.columns:
+        for name in self._tab.columns[:MOST_SPREADS]:
             if name in values:
-                means = []
-                for scenario_mean in values[name].per_scenario:
-                    means.append(plain_number(scenario_mean))
-                spread[name] = means
+                spread[name] = self._arrays.add(np.array(values[name].per_scenario))
         return spread
 
     def _at_marked_frames(self, values: Mapping[str, Value]) -> Plain:
@@ -208,7 +254,9 @@ class _TabWriter:
         values = np.stack([curve.mean, curve.low, curve.high], axis=1)
         return {
             "frames": self._arrays.add_whole(curve.frames),
-            "values": self._arrays.add(values, prefer_logarithmic=True),
+            "values": self._arrays.add(
+                values, prefer_logarithmic=True, levels=CURVE_LEVELS
+            ),
         }
 
     def _histogram(self, histogram: Histogram) -> Plain:
@@ -218,30 +266,27 @@ class _TabWriter:
             "shares": self._arrays.add(histogram.shares),
         }
 
-    def _pictures(self, pictures: Pictures) -> Plain:
+    def _pictures(self, pictures: Pictures | None) -> Plain | None:
         """Return maps and film."""
-        maps = spaced(len(pictures.map_frames), MAP_FRAMES)
-        fields = coarsen(pictures.vorticity[maps], MAP_NODES)
+        if pictures is None:
+            return None
+        fields = pictures.vorticity.astype(np.float64)
         fields = np.clip(fields, -self._map_limit, self._map_limit)
-
         frames = spaced(len(pictures.film_frames), FILM_FRAMES)
         particles = spaced(len(pictures.material), FILM_PARTICLES)
         film = pictures.film[frames][:, particles]  # shape [frame, particle, 2]
-        map_frames = []
-        for i in maps:
-            map_frames.append(pictures.map_frames[i])
         maps_of_vorticity = []
         for field in fields:
-            maps_of_vorticity.append(self._arrays.add(field))
+            maps_of_vorticity.append(self._arrays.add(field, levels=MAP_LEVELS))
         histograms = []
-        for i in maps:
-            histograms.append(self._histogram(pictures.histograms[i]))
+        for histogram in pictures.histograms:
+            histograms.append(self._histogram(histogram))
         film_frames = []
         for i in frames:
             film_frames.append(pictures.film_frames[i])
         return {
             "scenario": pictures.scenario,
-            "mapFrames": map_frames,
+            "mapFrames": list(pictures.map_frames),
             "nodes": fields.shape[-1],
             "maps": maps_of_vorticity,
             "histograms": histograms,
@@ -270,14 +315,18 @@ def _search_text(line: Line, entry: Entry) -> str:
     """Return the words in which the page's filter looks for terms, in small letters."""
     words_of_line = [line.name, line.byline, entry.training, entry.hardware]
     words_of_line += [chip.label for chip in line.chips]
-    words_of_line += [cell.text for cell in line.cells.values()]
+    for cell in line.cells.values():
+        if isinstance(cell.value, str):
+            words_of_line.append(cell.value)
     return " ".join(words_of_line).lower()
 
 
 def _describe_standing(row: BoardRow) -> str:
+    if row.variant_of is not None:
+        return f"A variant of {row.variant_of}, not ranked."
     if row.rank is None:
         return "Not ranked."
-    standing = f"Rank {row.rank}"
+    standing = f"Rank {format_ranks(row.rank, row.rank_range)}"
     if len(row.entry.predictions) == 1:
         standing = f"These weights: one seed only. {standing}"
     if math.isnan(row.p):
@@ -291,10 +340,9 @@ def _describe_standing(row: BoardRow) -> str:
 def _about(row: BoardRow) -> Iterator[tuple[str, str]]:
     """Yield the description of a method: labels and words."""
     entry = row.entry
-    verified = "as submitted"
+    verified = describe_check(row)
     if row.verified is not None:
-        line = row.verified
-        verified = f"verified by the maintainers, lagbench {line.lagbench}, {line.date}"
+        verified = describe_verification(row.verified)
     about = {
         "training": entry.training,
         "hardware, self-reported": entry.hardware,

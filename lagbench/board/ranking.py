@@ -7,7 +7,7 @@ have a value there; intervals and tests resample scenarios and seeds together.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,17 +60,21 @@ class CombinedScore:
         return bootstrap_interval(np.stack([seed.values for seed in self.seeds]))
 
 
-def combine(seeds: Sequence[Mapping[int, Tally]]) -> dict[str, CombinedScore]:
+def combine(
+    seeds: Sequence[Mapping[int, Tally]], names: Collection[str] | None = None
+) -> dict[str, CombinedScore]:
     """Return the scores of a method by metric, from tallies by scenario of each seed.
 
-    Metrics of packages are left out, and so are metrics that a seed lacks.
+    Metrics of packages are left out, and so are metrics that a seed lacks. With names,
+    these metrics alone are formed.
     """
     statistics = set(_statistics_of(seeds[0]))
     for tallies in seeds[1:]:
         statistics.intersection_update(_statistics_of(tallies))
     metrics = []
     for metric in METRICS.values():
-        if statistics.issuperset(metric.of):
+        is_needed = names is None or metric.name in names
+        if is_needed and statistics.issuperset(metric.of):
             metrics.append(metric)
 
     scores = [aggregate(metrics, tallies) for tallies in seeds]

@@ -206,6 +206,14 @@ def _read_predictions(
                 expected=[*registry.splits],
                 got=header.split,
             )
+        if header.subset != "test":
+            raise UsageError(
+                "an entry is made of predictions of test",
+                where=str(path),
+                expected="test",
+                got=header.subset,
+                fix="submit the predictions of test; `lagbench score` scores these",
+            )
         share = None
         if any(warning.check == OUTSIDE for warning in validation.warnings):
             share = outside_share(opened, registry.size(header.split, header.size))

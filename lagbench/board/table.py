@@ -1,7 +1,7 @@
-"""The board's table as HTML: every row and column, those hidden at first too.
+"""The board's table as HTML: every row, and the columns that are shown at first.
 
-It stands there without any script. The page's script sorts rows, filters them and hides
-cells by the page data; it reads no number from the table.
+It stands there without any script. The page's script sorts rows, filters them, and adds
+the cells of the other columns from the page data; it reads no number from the table.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from lagbench.figures.html import MISSING, Markup, interval, join, tag, text
 from lagbench.metrics.metric import Direction
 
-from .columns import Column
+from .columns import Column, format_ranks
 from .model import BoardRow, ReferenceRow, Tab
 from .table_view import Cell, Chip, Line, TableView
 
@@ -31,7 +31,7 @@ def draw_table(view: TableView) -> Markup:
         _heading(
             "rank",
             tag("span", "#", class_="metric"),
-            "Rank by the ranking metric",
+            "Best to worst rank by the ranking metric, in 95 % of the resamples",
             class_="rank",
         ),
         _heading(
@@ -80,7 +80,8 @@ def _column_heading(column: Column, *, is_hidden: bool) -> Markup:
 def _draw_line(view: TableView, line: Line) -> Markup:
     cells = []
     for key, cell in line.cells.items():
-        cells.append(_draw_cell(cell, is_hidden=key not in view.main))
+        if key in view.main:
+            cells.append(_draw_cell(cell))
     row = line.row
     if isinstance(row, ReferenceRow):
         return tag(
@@ -94,15 +95,39 @@ def _draw_line(view: TableView, line: Line) -> Markup:
     return tag(
         "tr",
         tag("td", _draw_rank(row), class_="rank"),
-        _entry_heading(view.tab, line),
+        _entry_heading(view.tab, line, row),
         *cells,
-        class_=None if row.active else "inactive",
+        class_=_class_of(row),
         hidden=not row.active,
         data_entry=line.id,
+        data_variant_of=row.variant_of,
     )
 
 
-def _draw_cell(cell: Cell, *, is_hidden: bool) -> Markup:
+def _class_of(row: BoardRow) -> str | None:
+    if not row.active:
+        return "inactive"
+    if row.variant_of is not None:
+        return "variant folded"
+    return None
+
+
+def fold_button(method: str, count: int) -> Markup:
+    """Return the button that shows the variants of a method."""
+    label = f"{count} variants"
+    if count == 1:
+        label = "1 variant"
+    return tag(
+        "button",
+        label,
+        type="button",
+        class_="fold scripted",
+        data_fold=method,
+        aria_expanded="false",
+    )
+
+
+def _draw_cell(cell: Cell) -> Markup:
     parts: list[object] = [cell.text]
     if cell.has_gaps and cell.is_known:
         parts.append(tag("sup", "†"))
@@ -113,14 +138,15 @@ def _draw_cell(cell: Cell, *, is_hidden: bool) -> Markup:
         *parts,
         class_=" ".join(cell.classes) or None,
         title=cell.note or None,
-        hidden=is_hidden,
     )
 
 
 def _draw_rank(row: BoardRow) -> Markup:
     rank = MISSING
-    if row.rank is not None:
-        rank = str(row.rank)
+    if row.variant_of is not None:
+        rank = ""
+    elif row.rank is not None:
+        rank = format_ranks(row.rank, row.rank_range)
     if not row.tied:
         return join([rank])
     meaning = f"not different from the leader at 5 % (p = {text(row.p, 2)}, corrected)"
@@ -130,17 +156,20 @@ def _draw_rank(row: BoardRow) -> Markup:
 def _reference_heading(row: ReferenceRow) -> Markup:
     parts = [
         tag("span", row.name, class_="name"),
-        tag("span", "reference", class_="flag"),
+        tag("span", str(row.kind), class_="flag"),
     ]
     if row.definition:
         parts.append(tag("span", row.definition, class_="sub", title=row.definition))
     return tag("th", *parts, scope="row", class_="method")
 
 
-def _entry_heading(tab: Tab, line: Line) -> Markup:
+def _entry_heading(tab: Tab, line: Line, row: BoardRow) -> Markup:
     address = f"#tab={tab.id}&entry={line.id}"
     parts = [tag("a", line.name, href=address, class_="name")]
     parts += [_draw_chip(chip) for chip in line.chips]
+    variants = tab.variants_of(row)
+    if variants:
+        parts.append(fold_button(line.id, len(variants)))
     parts.append(tag("span", line.byline, class_="sub", title=line.byline))
     if line.links:
         links = []

@@ -24,7 +24,7 @@ from .columns import (
     presets_of,
     value_of,
 )
-from .entry import Entry, EntryFlag
+from .entry import Entry, EntryFlag, Verification
 from .folder import weights_path
 from .model import BoardRow, ReferenceRow, Tab, Value
 
@@ -144,12 +144,22 @@ def make_table(tab: Tab, metrics: Mapping[str, Metric]) -> TableView:
     ranking = columns[tab.ranking]
     painters = {key: _Painter(tab, column) for key, column in columns.items()}
 
-    def order(row: TableRow) -> tuple[bool, float]:
+    methods = {row.id: row for row in tab.rows}
+
+    def order(row: TableRow) -> tuple[bool, float, bool, float]:
+        own_loss = loss_in_order(row)
+        if isinstance(row, BoardRow) and row.active and row.variant_of in methods:
+            # variants stand behind their method
+            method = methods[row.variant_of]
+            return False, loss_in_order(method), True, own_loss
+        is_inactive = isinstance(row, BoardRow) and not row.active
+        return is_inactive, own_loss, False, own_loss
+
+    def loss_in_order(row: TableRow) -> float:
         loss = ranking.loss(float(value_of(row, ranking)))
         if math.isnan(loss):
-            loss = math.inf
-        is_inactive = isinstance(row, BoardRow) and not row.active
-        return is_inactive, loss
+            return math.inf
+        return loss
 
     lines = []
     for place, row in enumerate(sorted(tab.lines, key=order)):
@@ -240,8 +250,7 @@ def _make_cell(
 
 def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
     if column.key == "checked" and isinstance(row, BoardRow) and row.verified:
-        line = row.verified
-        return f"scored again by the maintainers, lagbench {line.lagbench}, {line.date}"
+        return describe_verification(row.verified)
     if metric is None:
         return ""
     notes = []
@@ -252,6 +261,25 @@ def _note_on(row: TableRow, column: Column, metric: Value | None) -> str:
     if metric.undefined:
         notes.append(f"{metric.undefined} frames undefined")
     return "; ".join(notes)
+
+
+def describe_verification(verified: Verification) -> str:
+    """Return who followed the scores of an entry how far, in words."""
+    parts = [f"{verified.level}, lagbench {verified.lagbench}, {verified.date}"]
+    for reproduction in verified.reproduced:
+        seed = "" if reproduction.seed is None else f"seed {reproduction.seed}: "
+        parts.append(
+            f"{seed}{text(reproduction.submitted)} submitted, "
+            f"{text(reproduction.reproduced)} predicted anew on "
+            f"{reproduction.scenarios} of {reproduction.of} scenarios"
+        )
+    if verified.blind is not None:
+        blind = verified.blind
+        parts.append(
+            f"season {blind.season}: skill {text(blind.public)} in public, "
+            f"{text(blind.blind)} blind"
+        )
+    return "; ".join(parts)
 
 
 def _make_line(row: TableRow, place: int, cells: Mapping[str, Cell]) -> Line:

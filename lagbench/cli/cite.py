@@ -7,7 +7,7 @@ from typing import Annotated
 
 import lagbench
 from lagbench.data.local import locate_split
-from lagbench.data.registry import Split
+from lagbench.data.registry import Split, load
 
 from .options import (
     JsonFlag,
@@ -36,12 +36,12 @@ def cite_command(
     root: RootOption = None,
     as_json: JsonFlag = False,
 ) -> None:
-    """Print how to cite a split: version, hashes and original works."""
-    if bibtex and not (split_argument or split_option):
-        version = lagbench.__version__
-        fields = {"title": TITLE, "version": version}
-        text = _format_bibtex("software", "lagbench", fields)
-        print_result({"bibtex": text}, [text], as_json=as_json)
+    """Print how to cite a split: version, hashes and original works.
+
+    Without a split it prints how to cite lagbench itself.
+    """
+    if not (split_argument or split_option):
+        _cite_program(bibtex=bibtex, as_json=as_json)
         return
 
     split = choose_split(split_argument, split_option)
@@ -70,6 +70,22 @@ def cite_command(
     ]
     for size, sha256 in hashes.items():
         lines.append(f"Data set hash of size {size}: {sha256}")
+    print_result(citation, lines, as_json=as_json)
+
+
+def _cite_program(*, bibtex: bool, as_json: bool) -> None:
+    """Print how to cite lagbench itself."""
+    version = lagbench.__version__
+    if bibtex:
+        fields = {"title": TITLE, "version": version}
+        text = _format_bibtex("software", "lagbench", fields)
+        print_result({"bibtex": text}, [text], as_json=as_json)
+        return
+    citation = {"title": TITLE, "version": version, "year": RELEASE_YEAR}
+    lines = [
+        f"The lagbench authors, {TITLE}, version {version}, {RELEASE_YEAR}.",
+        f"Splits: {', '.join(load().splits)}; `lagbench cite cavity` cites one.",
+    ]
     print_result(citation, lines, as_json=as_json)
 
 

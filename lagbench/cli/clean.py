@@ -8,7 +8,6 @@ from lagbench.make.clean import clean
 
 from .options import (
     JsonFlag,
-    PresentSizeOption,
     QuietFlag,
     RootOption,
     accept_split,
@@ -16,11 +15,16 @@ from .options import (
 )
 from .output import format_bytes, print_result
 
+RemovedSizeOption = Annotated[
+    str | None,
+    option("--size NAME", "tiny, mini or full; needed where several have data here."),
+]
+
 
 @accept_split
 def clean_command(
     split: str,
-    size: PresentSizeOption = None,
+    size: RemovedSizeOption = None,
     root: RootOption = None,
     leftovers: Annotated[
         bool,

@@ -40,6 +40,9 @@ def predict_command(
         str | None,
         option("--size NAME", "Size to predict; by default that of the training."),
     ] = None,
+    subset: Annotated[
+        str, option("--subset NAME", "test, or shift, which lies outside train.")
+    ] = "test",
     settings: Annotated[
         list[str] | None,
         option(
@@ -109,6 +112,7 @@ def predict_command(
             output,
             root=root,
             size=size,
+            subset=subset,
             settings=tuple(settings or ()),
             device=device,
             threads=threads,

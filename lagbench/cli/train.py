@@ -96,6 +96,8 @@ def train_command(
         raise UsageError(
             "no model is named",
             where="--baseline",
+            expected="the name of a reference model; docs/baselines.md lists them",
+            got="nothing",
             fix="name one, as in --baseline gns",
         )
     require_libraries(TRAINING_LIBRARIES)
@@ -104,11 +106,11 @@ def train_command(
     if "LOCAL_RANK" not in os.environ:
         locate(split, size, root=root)
 
+    changes = tuple(settings or ())
     with progress_bar(quiet=quiet):
         from lagbench.baselines.machine import is_helper
         from lagbench.baselines.train import train
 
-    changes = tuple(settings or ())
     is_helper_process = is_helper()
     if is_helper_process:
         quiet = True

@@ -10,12 +10,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lagbench.errors import UsageError
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 
@@ -171,6 +174,9 @@ class Box:
                 low = self.low[axis]
                 high = self.high[axis]
                 column = points[..., axis]
+                # Nearly always in truth; NaN and infinity are not inside.
+                if column.min(initial=low) >= low and column.max(initial=low) < high:
+                    continue
                 with np.errstate(invalid="ignore"):  # infinity becomes NaN
                     moved = low + np.mod(column - low, high - low)
                 # The sum can round up to the upper end, which is the lower one.
@@ -213,6 +219,29 @@ class Box:
             return points
         first = points[0]
         return np.asarray(first + self.displacement(first, points))
+
+    def tree(self, position: ArrayLike) -> cKDTree:
+        """Return a tree of points in which periodic axes have no end.
+
+        It is asked for the neighbours of :meth:`tree_points`.
+
+        Args:
+            position: points [length], shape [particle, axis].
+        """
+        # Commands that look for no neighbours save a fifth of a second.
+        from scipy.spatial import cKDTree
+
+        period = None
+        if self.is_periodic:
+            period = np.where(self.periodic, self.lengths, 0.0)  # 0: not periodic
+        return cKDTree(self.tree_points(position), boxsize=period)
+
+    def tree_points(self, position: ArrayLike) -> Floats:
+        """Return points as a tree knows them, from the lower ends of a periodic box."""
+        points = np.asarray(position)
+        if not self.is_periodic:
+            return points
+        return np.asarray(self.wrap(points) - self.low)
 
     def contains(
         self, position: ArrayLike, *, tolerance: float = 0.0

@@ -19,7 +19,11 @@ from lagbench.errors import UsageError, suggest_name
 
 Value = int | float | bool | str
 
-SUBSETS = ("train", "valid", "test", "extra")
+SUBSETS = ("train", "valid", "test", "extra", "shift")
+"""Subsets that a size may have; ``shift`` lies outside train on purpose."""
+
+SCORED_SUBSETS = ("test", "shift")
+"""Subsets that predictions may be of, and that are scored."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,11 +168,13 @@ def check_frames(
     for scenario, count in frame_counts:
         if not FRAMES.holds(count):
             raise ValueError(f"{key}: expected {FRAMES}; got {count!r}")
-        if scenario in subsets.get("test", ()) and count < task_frames:
-            least = f"at least input_frames + horizon = {task_frames}"
-            raise ValueError(
-                f"{key}: expected {least} for test scenario {scenario}; got {count}"
-            )
+        for subset in SCORED_SUBSETS:
+            if scenario in subsets.get(subset, ()) and count < task_frames:
+                least = f"at least input_frames + horizon = {task_frames}"
+                raise ValueError(
+                    f"{key}: expected {least} for {subset} scenario {scenario}; "
+                    f"got {count}"
+                )
 
 
 def check_particle_counts(

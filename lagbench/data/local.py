@@ -328,6 +328,7 @@ def locate(
     *,
     root: str | Path | None = None,
     registry: Registry | None = None,
+    is_chosen_of_several: bool = True,
 ) -> SizeLocation:
     """Return one size of the split that a user means, and the place of its data.
 
@@ -337,6 +338,8 @@ def locate(
             :func:`locate_new` would make.
         root: folder of all data sets.
         registry: the other splits; ours when None.
+        is_chosen_of_several: whether mini is taken where several sizes have data. What
+            removes data must not choose.
 
     Raises:
         UsageError: see :func:`locate_split`; the split has no such size, or none is
@@ -345,7 +348,7 @@ def locate(
     """
     location = locate_split(split, root=root, registry=registry)
     if size is None:
-        size = _size_with_data(location)
+        size = _size_with_data(location, is_chosen_of_several=is_chosen_of_several)
     tier = location.registry.size(location.name, size)
     return SizeLocation(tier, location.root, location.registry)
 
@@ -377,7 +380,7 @@ def _size_to_make(location: SplitLocation) -> str:
     return next(iter(sizes))
 
 
-def _size_with_data(location: SplitLocation) -> str:
+def _size_with_data(location: SplitLocation, *, is_chosen_of_several: bool) -> str:
     """Return the only size of a split, or the only one with data; of several mini."""
     split, root, registry = location
     sizes = []
@@ -392,7 +395,8 @@ def _size_with_data(location: SplitLocation) -> str:
         return sizes_with_data[0].name
     if len(sizes) == 1 and not sizes_with_data:
         return sizes[0].name
-    if any(size.name == DEFAULT_NEW_SIZE for size in sizes_with_data):
+    has_mini = any(size.name == DEFAULT_NEW_SIZE for size in sizes_with_data)
+    if has_mini and is_chosen_of_several:
         return DEFAULT_NEW_SIZE
     raise _size_error(location, sizes, sizes_with_data)
 

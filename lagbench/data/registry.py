@@ -42,6 +42,7 @@ from lagbench.errors import (
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
 from .limits import (
+    SCORED_SUBSETS,
     Value,
     check_frames,
     check_parameters,
@@ -122,6 +123,9 @@ class Parameter(_RegistryModel):
     value: Value | None = None
     unit: str
     description: str
+    # the only subset whose scenarios it concerns and whose files state it; all by
+    # default
+    subset: str | None = None
 
 
 class ScoreGrid(_RegistryModel):
@@ -142,7 +146,7 @@ class Task(_RegistryModel):
     score_grid: ScoreGrid  # grid of the scorer's fields
     # connectivity radius for graph models [length]
     radius: float = Field(gt=0, allow_inf_nan=False)
-    # kinematic viscosity of classical solvers where scenarios state none [length^2/s]
+    # kinematic viscosity that is given where scenarios state none [length^2/s]
     effective_viscosity: float | None = Field(None, gt=0, allow_inf_nan=False)
 
 
@@ -206,6 +210,28 @@ class Size(BaseModel):
     task: Task
     measured: Measured | None = None
     file: Path = Path("datasets.yaml")  # the file that describes it
+    scored_subset: str = "test"  # subset that is predicted and scored
+
+    @property
+    def scored_scenarios(self) -> tuple[int, ...]:
+        """Ids of the scenarios that are predicted and scored."""
+        return self.subsets[self.scored_subset]
+
+    def scored_on(self, subset: str) -> Size:
+        """Return the same size with another subset to predict and to score.
+
+        Raises:
+            UsageError: the size has no such subset, or it is not one to be scored.
+        """
+        choices = [name for name in SCORED_SUBSETS if name in self.subsets]
+        if subset not in choices:
+            raise UsageError(
+                f"no scored subset {subset!r}",
+                where=f"{self.split} {self.name}",
+                expected=" or ".join(choices),
+                fix=suggest_name(subset, choices),
+            )
+        return self.model_copy(update={"scored_subset": subset})
 
     @property
     def major(self) -> int:
@@ -243,6 +269,25 @@ class Size(BaseModel):
                 fix=suggest_name(name, self.parameters),
             )
         return self.parameters[name].value
+
+    def viscosity(self, stated: float | None = None) -> float | None:
+        """Return the kinematic viscosity that a model is given [length^2/s].
+
+        It is the scenario's own; else the effective one of the data set; else that of
+        its liquid. None where none is known.
+
+        Args:
+            stated: viscosity in the scenario's file [length^2/s]; None where it has
+                none.
+        """
+        if stated is not None:
+            return stated
+        if self.task.effective_viscosity is not None:
+            return self.task.effective_viscosity
+        liquid_viscosity = self.parameters.get("liquid_viscosity")
+        if liquid_viscosity is None or liquid_viscosity.value is None:
+            return None
+        return float(liquid_viscosity.value)
 
     @property
     def dimension(self) -> int:

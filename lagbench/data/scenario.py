@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -67,6 +68,37 @@ class ScenarioHeader:
     lagbench_version: str  # version that wrote the file
     # simulation diagnostics by name; no hash covers them
     facts: Mapping[str, float]
+
+    @property
+    def viscosity(self) -> float | None:
+        """Kinematic viscosity that the file states [length^2/s]; None without one."""
+        stated = self.parameters.get("viscosity")
+        return parse_viscosity(stated, where=f"{self.key}")
+
+
+def parse_viscosity(stated: object, *, where: str) -> float | None:
+    """Return the kinematic viscosity in a file's attribute; None without one.
+
+    Args:
+        stated: the attribute ``viscosity``.
+        where: the file.
+
+    Raises:
+        DataError: it is no finite number from 0.
+    """
+    if stated is None:
+        return None
+    values = np.asarray(stated)
+    is_number = values.size == 1 and values.dtype.kind in "iuf"
+    viscosity = float(values.item()) if is_number else math.nan
+    if not 0.0 <= viscosity < math.inf:
+        raise DataError(
+            "the viscosity is no viscosity",
+            where=f"{where}, attribute viscosity",
+            expected="a finite number from 0 [length^2/s]",
+            got=stated,
+        )
+    return viscosity
 
 
 class ScenarioFile:
@@ -355,6 +387,14 @@ def damage_error(
     where = str(path)
     if variable is not None:
         where = f"{path}, variable {variable!r}"
+    if path.exists() and not os.access(path, os.R_OK):
+        return DataError(
+            "a scenario file may not be read",
+            where=where,
+            expected="permission to read it",
+            got="permission denied",
+            fix="see who owns it: ls -l; chmod +r lets others read it",
+        )
     return DataError(
         "a scenario file is damaged or not one of lagbench",
         where=where,

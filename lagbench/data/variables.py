@@ -39,6 +39,11 @@ ATTRIBUTES: Mapping[str, Mapping[str, object]] = {
         "long_name": "mass of one particle, density times area over particles",
         "units": "1",
     },
+    "body_force": {
+        "long_name": "acceleration of the fluid towards each frame; layers of equal "
+        "height along y, lowest first",
+        "units": "s-2",
+    },
     "wall_velocity": {
         "long_name": "velocity of each wall in box lengths per second",
         "units": "s-1",

@@ -81,6 +81,9 @@ class ScenarioWriter:
             entry f acting from frame f-1 to f; walls left, right, bottom, top and, in
             three dimensions, front, back, those of periodic axes too; None where there
             are no moving walls (free surface).
+        body_force: acceleration of the fluid in layers of equal height along y, lowest
+            first [length/s^2], shape [frame, layer, axis], entry f acting from frame
+            f-1 to f; None without a force.
         parameters: physical parameters by name: finite numbers and strings. Each
             becomes an attribute and enters the content hash. ``start_frame`` is one of
             them.
@@ -107,6 +110,7 @@ class ScenarioWriter:
         material: ArrayLike,
         particle_mass: float,
         wall_velocity: ArrayLike | None = None,
+        body_force: ArrayLike | None = None,
         parameters: Mapping[str, object],
         seed: str,
         device: str,
@@ -160,6 +164,8 @@ class ScenarioWriter:
         self._add_constant("particle_mass", (), mass)
         if wall_velocity is not None:
             self._add_walls(np.asarray(wall_velocity, np.float32))
+        if body_force is not None:
+            self._add_force(np.asarray(body_force, np.float32))
 
         self._hasher = ContentHasher(key.identity(seed, self._parameters))
         self._written_frames = 0
@@ -177,6 +183,13 @@ class ScenarioWriter:
         shape = (self._lengths["frame"], len(wall_names), dimension)
         values = np.broadcast_to(wall_velocity, shape)
         self._add_constant("wall_velocity", ("frame", "wall", "space"), values)
+
+    def _add_force(self, body_force: NDArray[np.float32]) -> None:
+        layer_count = body_force.shape[1]
+        self._lengths["layer"] = layer_count
+        shape = (self._lengths["frame"], layer_count, self._lengths["space"])
+        values = np.broadcast_to(body_force, shape)
+        self._add_constant("body_force", ("frame", "layer", "space"), values)
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the frames."""

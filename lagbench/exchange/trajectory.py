@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError, with_confi
 # pydantic reads the TypedDict of Python 3.12 and later only
 from typing_extensions import TypedDict
 
-from lagbench.data.box import Box, parse_periodic
+from lagbench.data.box import Box, parse_periodic, unit_box
 from lagbench.data.checksums import round_digits
 from lagbench.data.limits import FRAMES, NEEDED
 from lagbench.data.local import is_split_name
@@ -362,16 +362,10 @@ def estimate_spacing(position: Array, radius: float, box: Box | None = None) -> 
     It is ``(volume / particles)^(1/d)``, counted around particles inside the material.
     A box with periodic axes has the lengths of the positions.
     """
-    from scipy.spatial import cKDTree
-
-    points = position.astype(np.float64)
     reach = NEIGHBOUR_RADII * radius
-    period = None
-    if box is not None and box.is_periodic:
-        points = np.asarray(box.wrap(points) - box.low)
-        period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
-    tree = cKDTree(points, boxsize=period)
-    counts = tree.query_ball_point(points, reach, return_length=True)
+    box = box or unit_box(position.shape[1])
+    points = box.tree_points(position.astype(np.float64))
+    counts = box.tree(points).query_ball_point(points, reach, return_length=True)
     # This quantile leaves surfaces out.
     inside_count = float(np.quantile(counts, INTERIOR_QUANTILE))
     if inside_count < 2.0 and len(points) > 1:  # a particle counts itself

@@ -251,7 +251,8 @@ class Film:
                 materials = [recording.material for recording in self._recordings]
                 material_key(below, np.concatenate(materials))
             else:
-                colour_bar(below, self._panel, self._limit)
+                is_solid = self._recordings[0].is_solid
+                colour_bar(below, self._panel, self._limit, is_solid=is_solid)
             return pixels_of(drawn)
 
 

@@ -18,10 +18,11 @@ from .canvas import (
     figure,
     pixels_of,
 )
-from .colours import MATERIAL_COLOURS, parse_rgb
-from .panels import Panel, box_of, draw_walls
+from .colours import MATERIAL_COLOURS, PAPER, parse_rgb
+from .panels import Panel, box_of, draw_cube, draw_walls
 from .particles import DOT_DIAMETER, paint_particles
 from .recording import Recording, Scene
+from .solid import View, shade
 
 Packed = NDArray[np.uint32]
 
@@ -86,13 +87,20 @@ class Painter:
         self.panel = panel
         self.limit = limit
         self._side = side * OVERSAMPLING
-        self._diameter = DOT_DIAMETER * recording.spacing * self._side  # [pixel]
+        self._view = None
+        scale = 1.0
+        if recording.is_solid and panel is not Panel.VORTICITY:
+            self._view = View(recording.size.box)
+            scale = self._view.scale
+        spacing = recording.spacing * scale
+        self._diameter = DOT_DIAMETER * spacing * self._side  # [pixel]
         self._walls_by_direction: dict[bytes, Packed] = {}
 
         material_colours = [parse_rgb(colour) for colour in MATERIAL_COLOURS]
         palette = pack(np.array(material_colours))
         self._material_pixels = palette[recording.material]
-        if panel is Panel.VORTICITY:
+        self._is_signed = panel is Panel.VORTICITY and not recording.is_solid
+        if self._is_signed:
             colour_map = build_vorticity_map()
         else:
             colour_map = build_speed_map()
@@ -101,7 +109,10 @@ class Painter:
         # middles of the pixels along one side, and the pixels within the walls
         number = np.arange(self._side)
         self._middle = (number + 0.5) / self._side
-        self._is_inside = _find_inside(recording, self._middle)
+        if self._view is None:
+            self._is_inside = _find_inside(recording, self._middle)
+        else:
+            self._is_inside = np.ones((self._side, self._side), bool)
 
     def paint(self, scene: Scene) -> Packed:
         """Return the panel of one frame, shape [row, column], first row at the top."""
@@ -115,18 +126,23 @@ class Painter:
     def _paint_vorticity(self, scene: Scene, walls: Packed) -> Packed:
         """Return a square around every node that has a vorticity, walls elsewhere."""
         grid = scene.fields.grid
-        last = grid.nodes - 1
-        node = self._middle * grid.cells - grid.origin
-        nearest = np.floor(node + 0.5).astype(np.intp)
-        column = np.clip(nearest, 0, last)
-        row = last - column[::-1]
+        nearest = []
+        for axis, count in enumerate(grid.shape):
+            start = grid.start[axis]
+            node = (self._middle - start) * grid.cells - grid.origin
+            number = np.floor(node + 0.5).astype(np.intp)
+            nearest.append(np.clip(number, 0, count - 1))
+        column = nearest[0]
+        row = grid.shape[1] - 1 - nearest[1][::-1]
 
         # first row at the top, as pixels have it
         rows = scene.vorticity.T[::-1]
         vorticity = rows[np.ix_(row, column)]
         is_defined = np.isfinite(vorticity)
         finite_vorticity = np.where(is_defined, vorticity, 0.0)
-        share = 0.5 + 0.5 * finite_vorticity / self.limit
+        share = finite_vorticity / self.limit
+        if self._is_signed:
+            share = 0.5 + 0.5 * share
         colours = self._look_up(share)
         return np.where(is_defined, colours, walls)
 
@@ -136,9 +152,18 @@ class Painter:
             colours = self._look_up(scene.speed / self.limit)
         else:
             colours = self._material_pixels
+        position = scene.position
+        if self._view is not None:
+            # farther particles are painted first, and paler
+            depth = self._view.depth(position)
+            order = np.argsort(-depth, kind="stable")
+            position = self._view.place(position[order])
+            rgb = unpack(colours[order]).astype(np.float64)
+            paper = parse_rgb(PAPER).astype(np.float64)
+            colours = pack(shade(rgb, depth[order], paper).round().astype(np.uint8))
         return paint_particles(
             walls,
-            scene.position,
+            position,
             colours,
             view=UNIT_SQUARE,
             diameter=self._diameter,
@@ -153,7 +178,10 @@ class Painter:
             side = self._side / DPI  # [inch]
             with figure(side, side) as drawn:
                 axes = drawn.add_axes((0, 0, 1, 1))
-                draw_walls(axes, scene.recording, scene.frame)
+                if self._view is None:
+                    draw_walls(axes, scene.recording, scene.frame)
+                else:
+                    draw_cube(axes, scene.recording, scene.frame)
                 walls = pack(pixels_of(drawn))
             self._walls_by_direction[directions] = walls
         return walls

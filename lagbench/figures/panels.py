@@ -19,6 +19,7 @@ from .canvas import build_speed_map, build_vorticity_map
 from .colours import INK, MATERIAL_COLOURS, MOVING, PAPER, WALL
 from .particles import DOT_DIAMETER
 from .recording import Recording, Scene
+from .solid import SLICE, View, shade
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,6 +51,17 @@ UNITS = {  # label of each colour bar; time is physical, as in velocities of the
     Panel.STREAMLINES: "speed on the grid  [length/s]",
 }
 
+
+def title_of(panel: Panel, recording: Recording) -> str:
+    """Return the heading of a panel; fields of three dimensions are slices."""
+    title = TITLES[panel]
+    if not recording.is_solid or panel in (Panel.MATERIAL, Panel.SPEED):
+        return title
+    if panel is Panel.VORTICITY:
+        title = "Vorticity magnitude"
+    return f"{title}, {SLICE}"
+
+
 # particles drawn at the most; more would take memory and no eye would tell
 MOST_DOTS = 1 << 16
 POINTS_PER_INCH = 72.0
@@ -57,8 +69,6 @@ POINTS_PER_INCH = 72.0
 # nodes with neighbours to differentiate over, below which no streamline is drawn
 FEW_NODES = 4
 
-# direction along the walls left, right, bottom, top
-_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])
 # places of the arrowheads on a moving wall, as shares of its length from its middle
 _ARROWHEADS = (-0.4, -0.2, 0.0, 0.2, 0.4)
 
@@ -88,8 +98,13 @@ def draw(
         limit: top of the colour scale.
         detail: how dense and thick streamlines are, 0 to 1.
     """
-    draw_walls(axes, scene.recording, scene.frame)
-    scale = colour_scale(panel, limit)
+    recording = scene.recording
+    shows_particles = panel in (Panel.MATERIAL, Panel.SPEED)
+    if recording.is_solid and shows_particles:
+        draw_cube(axes, recording, scene.frame)
+    else:
+        draw_walls(axes, recording, scene.frame)
+    scale = colour_scale(panel, limit, is_solid=recording.is_solid)
     if panel is Panel.MATERIAL:
         colours = np.array(MATERIAL_COLOURS)[scene.recording.material]
         _draw_dots(axes, scene, colours)
@@ -106,7 +121,7 @@ def draw(
 
 def box_of(recording: Recording) -> tuple[float, float, float, float]:
     """Return left, right, bottom and top wall of the box [length]."""
-    horizontal, vertical = recording.size.bounds
+    horizontal, vertical = recording.size.bounds[:2]
     left, right = horizontal
     bottom, top = vertical
     return left, right, bottom, top
@@ -115,10 +130,11 @@ def box_of(recording: Recording) -> tuple[float, float, float, float]:
 def moving_walls(recording: Recording, frame: int) -> Iterator[tuple[int, Floats]]:
     """Yield number and velocity of each wall that slides towards a frame.
 
-    Velocities are those along the wall [length/s], shape [2].
+    Velocities are those along the wall [length/s], shape [axis].
     """
-    velocities = recording.wall_velocity[frame] * _ALONG
-    for wall, velocity in enumerate(velocities):
+    for wall, velocity in enumerate(recording.wall_velocity[frame]):
+        velocity = velocity.copy()
+        velocity[wall // 2] = 0.0
         if velocity.any():
             yield wall, velocity
 
@@ -154,7 +170,34 @@ def draw_walls(axes: Axes, recording: Recording, frame: int) -> None:
         (left, top, width, 1 - top),
     ]
     for wall, velocity in moving_walls(recording, frame):
-        _draw_moving_wall(axes, bands[wall], velocity)
+        along_plane = velocity[:2]
+        if wall < len(bands) and along_plane.any():
+            _draw_moving_wall(axes, bands[wall], along_plane)
+
+
+def draw_cube(axes: Axes, recording: Recording, frame: int) -> None:
+    """Draw the edges of a box of three dimensions, and fill the walls that move."""
+    from matplotlib.patches import Polygon
+
+    axes.set(
+        xlim=(0, 1),
+        ylim=(0, 1),
+        xticks=[],
+        yticks=[],
+        aspect="equal",
+        frame_on=False,
+    )
+    view = View(recording.size.box)
+    for wall, _ in moving_walls(recording, frame):
+        corners = view.wall(wall)
+        face = Polygon(
+            corners, closed=True, facecolor=MOVING, alpha=0.18, lw=0, zorder=0.5
+        )
+        axes.add_patch(face)
+    for ends, is_front in view.edges():
+        x, y = ends.T
+        order = 3.0 if is_front else 1.0
+        axes.plot(x, y, color=WALL, lw=0.8, zorder=order)
 
 
 def _draw_moving_wall(
@@ -185,18 +228,34 @@ def _draw_moving_wall(
 def _draw_dots(axes: Axes, scene: Scene, colours: NDArray[Any]) -> None:
     """Draw a dot for every particle, or for every k-th of too many.
 
-    Dots are cut off at the walls.
+    Dots are cut off at the walls. In three dimensions farther ones are drawn first,
+    and paler.
     """
+    from matplotlib.colors import to_rgba_array
+
+    recording = scene.recording
     step = math.ceil(len(scene.position) / MOST_DOTS)
-    x, y = scene.position[::step].T
+    position = scene.position[::step]
+    colours = colours[::step]
+    scale = 1.0
+    if recording.is_solid:
+        view = View(recording.size.box)
+        scale = view.scale
+        depth = view.depth(position)
+        order = np.argsort(-depth, kind="stable")
+        rgb = to_rgba_array(colours)[order, :3]
+        colours = shade(rgb, depth[order], np.ones(3))
+        position = view.place(position[order])
+    x, y = position.T
     drawn = axes.get_figure()
     assert drawn is not None  # axes stand in a figure
     side = axes.get_position().width * drawn.get_figwidth()  # type: ignore[union-attr]
-    length = DOT_DIAMETER * scene.recording.spacing
+    length = DOT_DIAMETER * recording.spacing * scale
     diameter = length * POINTS_PER_INCH * side  # [point]
     area = step * float(diameter**2)  # [point^2]
-    dots = axes.scatter(x, y, area, colours[::step], linewidths=0, zorder=2)
-    dots.set_clip_path(_box_patch(axes, scene.recording))
+    dots = axes.scatter(x, y, area, colours, linewidths=0, zorder=2)
+    if not recording.is_solid:
+        dots.set_clip_path(_box_patch(axes, recording))
 
 
 def _box_patch(axes: Axes, recording: Recording) -> Rectangle:
@@ -216,12 +275,14 @@ def _draw_field(axes: Axes, scene: Scene, field: Floats, scale: ScalarMappable) 
     """
     grid = scene.fields.grid
     half_spacing = grid.spacing / 2
-    low = grid.axis[0] - half_spacing
-    high = grid.axis[-1] + half_spacing
+    extent = []
+    for axis in range(2):
+        places = grid.places(axis)
+        extent += [places[0] - half_spacing, places[-1] + half_spacing]
     image = axes.imshow(
         np.ma.masked_invalid(field.T),
         origin="lower",
-        extent=(low, high, low, high),
+        extent=tuple(extent),
         interpolation="nearest",
         cmap=scale.cmap,
         norm=cast("Normalize", scale.norm),
@@ -241,8 +302,8 @@ def _draw_streamlines(axes: Axes, scene: Scene, *, detail: float) -> None:
     u = np.ma.masked_array(u, is_missing)
     v = np.ma.masked_array(v, is_missing)
     axes.streamplot(
-        fields.grid.axis,
-        fields.grid.axis,
+        fields.grid.places(0),
+        fields.grid.places(1),
         u.T,
         v.T,
         density=0.7 + 0.7 * detail,
@@ -260,21 +321,28 @@ def _grid_speed(scene: Scene) -> Floats:
     return per_frame / scene.recording.size.frame_interval
 
 
-def colour_scale(panel: Panel, limit: float) -> ScalarMappable:
+def colour_scale(
+    panel: Panel, limit: float, *, is_solid: bool = False
+) -> ScalarMappable:
     """Return the colours of values up to a limit.
 
-    Speeds start at 0, vorticities at minus the limit.
+    Speeds and magnitudes start at 0, vorticities of the plane at minus the limit.
     """
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    if panel is Panel.VORTICITY:
+    if panel is Panel.VORTICITY and not is_solid:
         return ScalarMappable(Normalize(-limit, limit), build_vorticity_map())
     return ScalarMappable(Normalize(0.0, limit), build_speed_map())
 
 
 def colour_bar(
-    axes: Axes, panel: Panel, limit: float, *, label: str | None = None
+    axes: Axes,
+    panel: Panel,
+    limit: float,
+    *,
+    label: str | None = None,
+    is_solid: bool = False,
 ) -> None:
     """Draw a horizontal colour bar with its unit.
 
@@ -282,13 +350,13 @@ def colour_bar(
     """
     from matplotlib.ticker import MaxNLocator
 
-    if panel is Panel.VORTICITY:
+    if panel is Panel.VORTICITY and not is_solid:
         pointed = "both"
     else:
         pointed = "max"
     drawn = axes.get_figure()
     assert drawn is not None  # axes stand in a figure
-    scale = colour_scale(panel, limit)
+    scale = colour_scale(panel, limit, is_solid=is_solid)
     bar = drawn.colorbar(scale, cax=axes, orientation="horizontal", extend=pointed)
     bar.outline.set_visible(False)
     bar.set_label(label or UNITS[panel], labelpad=3)

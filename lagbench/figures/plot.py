@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from lagbench.data import WALLS
+from lagbench.data.box import WALL_NAMES
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
 from lagbench.errors import DataError, UsageError, suggest_name
@@ -24,13 +25,13 @@ from lagbench.store.copy import update_working_copy
 from .canvas import DPI, draw_header, figure, save
 from .colours import MUTED
 from .panels import (
-    TITLES,
     Panel,
     colour_bar,
     draw,
     limit_of,
     material_key,
     moving_walls,
+    title_of,
 )
 from .recording import Recording, Scene, open_recording
 
@@ -55,7 +56,8 @@ KINDS = (ALL, *(str(panel) for panel in Panel))
 
 SEPARATOR = "  ·  "
 KIND_PARAMETERS = ("family", "pair")  # parameters that say of which kind a scenario is
-DIRECTIONS = {(1, 0): "right", (-1, 0): "left", (0, 1): "up", (0, -1): "down"}
+# along each axis, against it and with it
+DIRECTIONS = (("left", "right"), ("down", "up"), ("forward", "back"))
 
 # lengths of a picture of one frame [inch]
 SIDE = 3.25
@@ -140,7 +142,7 @@ def plot_frame(
         for column, panel in enumerate(panels):
             left = (MARGIN + column * (SIDE + GAP)) / width
             axes = drawn.add_axes((left, BAR / height, SIDE / width, SIDE / height))
-            axes.set_title(TITLES[panel] + moment)
+            axes.set_title(title_of(panel, recording) + moment)
             limit = limit_of(panel, scene)
             draw(axes, panel, scene, limit=limit)
 
@@ -150,7 +152,7 @@ def plot_frame(
             if panel is Panel.MATERIAL:
                 material_key(below, recording.material)
             else:
-                colour_bar(below, panel, limit)
+                colour_bar(below, panel, limit, is_solid=recording.is_solid)
         return save(drawn, output)
 
 
@@ -183,11 +185,20 @@ def _describe_scene(scene: Scene) -> str:
         f"t = {scene.time:.2f} s",
     ]
     for wall, velocity in moving_walls(scene.recording, scene.frame):
-        x_sign, y_sign = np.sign(velocity).astype(int).tolist()
-        direction = DIRECTIONS[x_sign, y_sign]
+        direction = _name_direction(velocity)
         speed = np.abs(velocity).max()
-        parts.append(f"{WALLS[wall]} wall moves {direction} at {speed:.3g} length/s")
+        name = WALL_NAMES[wall]
+        parts.append(f"{name} wall moves {direction} at {speed:.3g} length/s")
     return SEPARATOR.join(parts)
+
+
+def _name_direction(velocity: NDArray[np.float64]) -> str:
+    """Return the direction of a velocity, along each axis along which it points."""
+    names = []
+    for component, (backward, forward) in zip(velocity, DIRECTIONS, strict=False):
+        if component:
+            names.append(forward if component > 0.0 else backward)
+    return " and ".join(names)
 
 
 def _describe_parameters(recording: Recording, names: Sequence[str]) -> list[str]:
@@ -457,4 +468,5 @@ def _draw_key(
             materials.append(cell.scene.recording.material)
         material_key(below, np.concatenate(materials))
     else:
-        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit)
+        is_solid = sheet.rows[0][0].scene.recording.is_solid
+        colour_bar(below, sheet.panel, sheet.limit, label=sheet.unit, is_solid=is_solid)

@@ -41,8 +41,8 @@ class Scene:
 
     recording: Recording  # scenario that the frame belongs to
     frame: int  # absolute frame number
-    position: NDArray[np.float64]  # [length], shape [particle, 2]
-    # velocity of the solver [length/s], shape [particle, 2]
+    position: NDArray[np.float64]  # [length], shape [particle, axis]
+    # velocity of the solver [length/s], shape [particle, axis]
     velocity: NDArray[np.float64]
     # x(f) - x(f-1), at frame 0 velocity times frame interval [length/frame]
     displacement: NDArray[np.float64]
@@ -61,14 +61,27 @@ class Scene:
     @cached_property
     def fields(self) -> gridding.Fields:
         """Fields on the size's score grid; vorticity and divergence in 1/frame."""
+        return self._whole_fields.section
+
+    @cached_property
+    def _whole_fields(self) -> gridding.Fields:
         grid = self.recording.size.field_grid
         full = grid.full_weight(self.recording.particles, self.recording.area)
         return gridding.fields(self.position, self.displacement, grid, full=full)
 
     @property
     def vorticity(self) -> NDArray[np.float64]:
-        """Vorticity at the nodes of the score grid [1/s], shape [x node, y node]."""
-        return self.fields.vorticity / self.recording.size.frame_interval
+        """Vorticity at the nodes of the score grid [1/s], shape [x node, y node].
+
+        In three dimensions it is the magnitude in the middle plane across z.
+        """
+        interval = self.recording.size.frame_interval
+        whole = self._whole_fields
+        if whole.grid.dimension == 2:
+            return whole.vorticity / interval
+        across = whole.vorticity[:, :, whole.grid.middle_layer]
+        magnitude: NDArray[np.float64] = np.sqrt((across**2).sum(axis=-1))
+        return magnitude / interval
 
 
 class Recording:
@@ -104,10 +117,12 @@ class Recording:
         self._is_present = np.isfinite(read("position", 0)).all(axis=-1)
         material = read("material", slice(None))
         self.material = material[self._is_present].astype(np.int8)
-        # [length/s], shape [frame, wall, 2]; zeros without walls
-        self.wall_velocity = np.zeros((frames, 4, 2))
+        # [length/s], shape [frame, wall, axis]; zeros without walls
+        dimension = self.size.dimension
+        self.wall_velocity = np.zeros((frames, 2 * dimension, dimension))
         if "wall_velocity" in variables:
             self.wall_velocity[:] = read("wall_velocity", slice(frames))
+        self._has_velocity = "velocity" in variables
         self._particle_mass = float(read("particle_mass", slice(None)))
 
     @property
@@ -117,14 +132,21 @@ class Recording:
 
     @property
     def area(self) -> float:
-        """Area that the material covers at first [length^2]."""
+        """Area or volume that the material covers at first [length^d]."""
         mass = self._particle_mass * self.particles
         return mass / float(self.size.value("density"))
 
     @property
     def spacing(self) -> float:
         """Mean distance of neighbouring particles at first [length]."""
+        if self.is_solid:
+            return float(np.cbrt(self.area / self.particles))
         return float(np.sqrt(self.area / self.particles))
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether the box has three dimensions."""
+        return self.size.dimension == 3
 
     @property
     def reynolds(self) -> float | None:
@@ -170,12 +192,19 @@ class Recording:
         """
         number = self.frame_number(frame)
         position = self._read_particles("position", number)
-        velocity = self._read_particles("velocity", number)
+        interval = self.size.frame_interval
         if number > 0:
             before = self._read_particles("position", number - 1)
             displacement = self.size.box.displacement(before, position)
+        elif not self._has_velocity and self.frames > 1:
+            after = self._read_particles("position", 1)
+            displacement = self.size.box.displacement(position, after)
         else:
-            displacement = velocity * self.size.frame_interval
+            displacement = self._read_particles("velocity", number) * interval
+        if self._has_velocity:
+            velocity = self._read_particles("velocity", number)
+        else:
+            velocity = displacement / interval
         return Scene(self, number, position, velocity, displacement)
 
     def _read_particles(self, name: str, frame: int) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from lagbench.atomic import write_atomically
@@ -143,6 +143,7 @@ def dataset_card(
     parts += ["## Task", _task_table(size, manifest)]
     if manifest.statistics:
         parts += _statistics_section(manifest)
+    parts += _soundness_section(manifest)
     parts += ["## Parameters", _parameter_table(size)]
     parts += ["## Regenerate and verify", *_verification_section(size, manifest)]
     parts += ["## Scenarios", _scenario_table(manifest)]
@@ -278,6 +279,34 @@ def _statistics_section(manifest: Manifest) -> list[str]:
         "With the frame as unit of time: velocity is x(f) - x(f-1), acceleration its "
         "difference.",
         markdown(("", "x", "y"), rows),
+    ]
+
+
+def _soundness_section(manifest: Manifest) -> list[str]:
+    """Return how compressible a free surface is; empty for a full box."""
+    entries = [entry for entry in manifest.files if "mach_999" in entry.facts]
+    if not entries:
+        return []
+
+    def extreme(choose: Callable[[Iterable[float]], float], name: str) -> str:
+        return f"{choose(entry.facts[name] for entry in entries):.4g}"
+
+    clamped = sum(int(entry.facts["clamped_particles"]) for entry in entries)
+    rows = [
+        ("speed over speed of sound, 99.9 %", extreme(max, "mach_999")),
+        ("speed over speed of sound, largest", extreme(max, "mach_max")),
+        ("J of liquid, 99.9 % lie above", extreme(min, "liquid_jacobian_999")),
+        ("J of liquid, smallest at any substep", extreme(min, "liquid_jacobian_min")),
+        ("Jp of snow, smallest at any substep", extreme(min, "snow_jp_min")),
+        ("particles that reached a numerical bound", str(clamped)),
+    ]
+    return [
+        "## Compressibility",
+        "The worst scenario of each row; quantiles are over particles and frames of "
+        "one scenario. A liquid bears no tension (J is 1 at most), and snow that flies "
+        "apart keeps the room of loose snow: both are part of the model and are not "
+        "counted as bounds.",
+        markdown(("", ""), rows),
     ]
 
 

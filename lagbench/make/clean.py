@@ -42,7 +42,8 @@ def clean(
 
     Args:
         split: name of the split.
-        size: name of the size; the only one that is there when None.
+        size: name of the size; the only one that is there when None. Where several are
+            there it must be named.
         root: folder of all data sets; else ``LAGBENCH_ROOT``, else the user data
             folder.
         leftovers: remove only temporary files of killed writers.
@@ -50,11 +51,13 @@ def clean(
         registry: where splits are described; ours when None.
 
     Raises:
-        UsageError: unknown split or size.
+        UsageError: unknown split or size, or no size is named and several are there.
         WorkFailedError: another process writes the data set, or a file cannot be
             removed.
     """
-    tier, home, _ = locate(split, size, root=root, registry=registry)
+    tier, home, _ = locate(
+        split, size, root=root, registry=registry, is_chosen_of_several=False
+    )
     folder = tier.folder(home)
     if not folder.is_dir():
         return CleanResult(removed=(), bytes=0, dry_run=dry_run)

@@ -362,7 +362,7 @@ def _check_header(
 
     state = draw_initial_state(size, scenario)
     expected = {}
-    for name, value in file_parameters(size, state).items():
+    for name, value in file_parameters(size, scenario, state).items():
         expected[name] = to_plain(value)
     # What only the simulation tells is covered by the content hash.
     stated = {}

@@ -27,6 +27,7 @@ from lagbench.data.registry import Size, format_ids, parse_ids
 from lagbench.errors import UsageError, WorkFailedError, suggest_name
 from lagbench.generators.batch import substep_count
 from lagbench.generators.constants import solver_constants
+from lagbench.generators.full_box_parameters import FullBoxParameters
 from lagbench.generators.split import ClosedBoxParameters
 
 if TYPE_CHECKING:
@@ -277,9 +278,16 @@ def _rates_path() -> Path:
     return cache_folder("rates") / "rates.json"
 
 
+SOLVER_KINDS = ("closed_box", "free_surface", "full_box_2d", "full_box_3d")
+"""Solvers whose pace a machine notes."""
+
+
 def _solver_kind(size: Size) -> str:
     """Return which of the solvers a size is simulated with."""
-    if isinstance(solver_constants(size), ClosedBoxParameters):
+    constants = solver_constants(size)
+    if isinstance(constants, FullBoxParameters):
+        return f"full_box_{constants.box.dimension}d"
+    if isinstance(constants, ClosedBoxParameters):
         return "closed_box"
     return "free_surface"
 
@@ -297,9 +305,7 @@ def _read_rates() -> dict[str, dict[int, RateRow]]:
         document = json.loads(data)
         if document["machine"] != platform.node():
             return {}
-        closed_box = _parse_rows(document.get("closed_box", {}))
-        free_surface = _parse_rows(document.get("free_surface", {}))
-        return {"closed_box": closed_box, "free_surface": free_surface}
+        return {kind: _parse_rows(document.get(kind, {})) for kind in SOLVER_KINDS}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError):
         return {}
 

@@ -160,16 +160,7 @@ class Bonds:
             position: positions in the first frame [length], shape [particle, axis].
             box: box that holds the particles.
         """
-        # splits without bodies save a fifth of a second
-        from scipy.spatial import cKDTree
-
-        points = position
-        period = None
-        if box.is_periodic:
-            points = np.asarray(box.wrap(position) - box.low)
-            period = np.where(box.periodic, box.lengths, 0.0)  # 0: not periodic
-        tree = cKDTree(points, boxsize=period)
-        neighbours = tree.query_pairs(radius, output_type="ndarray")
+        neighbours = box.tree(position).query_pairs(radius, output_type="ndarray")
         pairs = np.asarray(neighbours, np.intp).reshape(-1, 2)
         first_length = np.sqrt(_squared_lengths(position, pairs, box))
         return cls(pairs, STRETCH * first_length, box)

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from lagbench.errors import UsageError
 
-from .aggregate import Score, mean_over_seeds, resample
+from .aggregate import RESAMPLES, Resampling, Score, mean_over_seeds, resample
 from .frame import Floats
 from .metric import mean
 
@@ -287,3 +287,69 @@ def standings(scores: Mapping[str, Seeds]) -> dict[str, Standing]:
             tied=i > 0 and losses[name] < math.inf and not differs,
         )
     return ranked
+
+
+RANK_SHARE = 0.95
+"""Share of the resamples in which a rank lies within its range."""
+
+
+def rank_ranges(
+    losses: Mapping[str, Sequence[Floats]],
+) -> dict[str, tuple[int, int]]:
+    """Return the best and the worst rank of each method in 95 % of the resamples.
+
+    Methods are ordered by the mean of their mean losses over data sets. All methods of
+    a data set get the same draw of scenarios, so that what makes a scenario hard for
+    everybody moves no rank; the seeds of each method are drawn apart
+    (:func:`lagbench.metrics.aggregate.resample`). A method whose losses are undefined
+    in some scenarios draws from its own.
+
+    Args:
+        losses: by method, for each data set in the same order, the losses of shape
+            [seed, scenario], NaN where undefined.
+
+    Returns:
+        Empty where a data set has fewer than six scenarios: nothing is claimed there.
+        Methods without a value in some data set share the last ranks.
+    """
+    names = sorted(losses)
+    means = []  # of each method, shape [method]
+    resampled = []  # shape [method, resample]
+    for number, name in enumerate(names):
+        tables = losses[name]
+        if any(table.shape[1] < FEWEST_SCENARIOS for table in tables):
+            return {}
+        mean_over_sets = 0.0
+        deviations = np.zeros(RESAMPLES)
+        for data_set, table in enumerate(tables):
+            resampling = None
+            if not np.isinf(table).any():
+                resampling = resample(table)
+            if resampling is None:
+                mean_over_sets = math.inf
+                continue
+            parts = {}
+            for stream, part in resampling.parts.items():
+                if stream:
+                    # each method has seeds of its own
+                    stream = len(tables) * (1 + number)
+                parts[stream + data_set] = part
+            own = Resampling(mean=resampling.mean, parts=parts)
+            mean_over_sets += own.mean / len(tables)
+            if parts:
+                deviations += own.deviations / len(tables)
+        means.append(mean_over_sets)
+        resampled.append(mean_over_sets + deviations)
+
+    ranges = {}
+    table = np.array(resampled)
+    tail = (1.0 - RANK_SHARE) / 2.0
+    for number, name in enumerate(names):
+        better = np.count_nonzero(table < table[number], axis=0)
+        as_good = np.count_nonzero(table <= table[number], axis=0)
+        # the smallest rank that ties allow, and the greatest
+        low = float(np.quantile(1 + better, tail, method="inverted_cdf"))
+        high = float(np.quantile(as_good, 1.0 - tail, method="inverted_cdf"))
+        own_rank = 1 + sum(mean < means[number] for mean in means)
+        ranges[name] = (min(int(low), own_rank), max(int(high), own_rank))
+    return ranges

@@ -24,6 +24,7 @@ import numpy as np
 
 from lagbench.data.grid import node_velocity, transfer
 from lagbench.data.scenario import ScenarioFile, read_scenario
+from lagbench.metrics.frame import directions
 
 from .assignment import assign_particles
 from .predictor import (
@@ -33,6 +34,7 @@ from .predictor import (
     Prediction,
     ReferencePredictor,
     fills_box,
+    fitted_field,
     given_in,
     linear_field,
     wall_motion,
@@ -41,8 +43,10 @@ from .predictor import (
 from .train_library import Mirror, long_enough, mirrors_of
 
 ANGLES = np.arange(64) * (np.pi / 64)
-DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
-"""Directions on which clouds are projected, shape [2, direction]."""
+PLANE_DIRECTIONS = np.stack([np.cos(ANGLES), np.sin(ANGLES)])
+SPACE_DIRECTIONS = directions(3).astype(np.float64).T
+DIRECTIONS = {2: PLANE_DIRECTIONS, 3: SPACE_DIRECTIONS}
+"""Directions on which clouds are projected, shape [axis, direction], by dimension."""
 
 LEVELS = (np.arange(256) + 0.5) / 256
 """Levels at which distributions along a direction are compared; clouds may differ in
@@ -56,7 +60,7 @@ class InitialCloud:
     # quantiles along each direction by material [length], each [level, direction]
     clouds: dict[int, Floats]
     shares: dict[int, float]  # share of each material in the particles [1]
-    field: Floats  # velocity at the nodes [length/frame], shape [x node, y node, 2]
+    field: Floats  # velocity at the nodes [length/frame], shape [*node, axis]
 
 
 def describe_start(given: Given, mirror: Mirror | None = None) -> InitialCloud:
@@ -71,7 +75,7 @@ def describe_start(given: Given, mirror: Mirror | None = None) -> InitialCloud:
     shares = {}
     for kind in np.unique(given.material).tolist():
         members = given.material == kind
-        projections = position[members] @ DIRECTIONS
+        projections = position[members] @ DIRECTIONS[position.shape[1]]
         clouds[kind] = np.quantile(projections, LEVELS, axis=0)
         shares[kind] = float(np.mean(members))
     sums = transfer(position, velocity, grid)
@@ -139,7 +143,10 @@ def _carry(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
         after = mirror.positions(_frame(file, frame))
         step = given.box.displacement(before, after)  # [length/frame]
         points, velocities = with_wall_images(given, before, step, walls[frame])
-        field = linear_field(points, velocities)
+        if given.box.dimension == 2:
+            field = linear_field(points, velocities)
+        else:
+            field = fitted_field(points, velocities)
         position = given.inside(position + field(position))
         before = after
         yield position.astype("float32")
@@ -150,7 +157,7 @@ def _follow(given: Given, file: ScenarioFile, mirror: Mirror) -> Prediction:
     frames = given.predicted_frames
     before = mirror.positions(_frame(file, frames[0] - 1))
     partner = assign_particles(
-        given.last, before, given.material, file.read("material")
+        given.last, before, given.material, file.read("material"), given.box
     )
     for frame in frames:
         yield mirror.positions(_frame(file, frame))[partner].astype("float32")

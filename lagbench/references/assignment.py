@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import UNIT_SQUARE, Box
+
 from .predictor import Floats
+
+MOST_TOGETHER = 4096
+"""Particles among which the best assignment is sought: its time grows with the cube."""
 
 
 def assign_particles(
@@ -13,26 +18,28 @@ def assign_particles(
     other_position: Floats,
     material: NDArray[np.integer],
     other_material: NDArray[np.integer],
+    box: Box = UNIT_SQUARE,
 ) -> NDArray[np.intp]:
     """Return for each particle its partner in another cloud.
 
     Within each material the sum of squared distances is least, once the clouds are
-    moved so that their means agree. Where the other cloud has fewer or more particles
+    moved so that their means agree. Along a periodic axis, where a cloud has no mean,
+    they stay and distances are the shortest. More than :data:`MOST_TOGETHER` particles
+    are halved along the longest side of their cloud, both clouds at the same rank,
+    until there are no more than that. Where the other cloud has fewer or more particles
     of a material, some are taken more than once, or not at all, evenly over their
     numbers. A material that it lacks is matched to all of its particles.
 
     Args:
-        position: our positions [length], shape [particle, 2].
-        other_position: positions of the other cloud [length], shape [other, 2].
+        position: our positions [length], shape [particle, axis].
+        other_position: positions of the other cloud [length], shape [other, axis].
         material: material of each of our particles, shape [particle].
         other_material: material of each particle of the other cloud, shape [other].
+        box: box that holds the particles.
 
     Returns:
         Indices into the other cloud, shape [particle].
     """
-    from scipy.optimize import linear_sum_assignment
-    from scipy.spatial.distance import cdist
-
     partner = np.empty(len(position), np.intp)
     for kind in np.unique(material):
         ours = np.flatnonzero(material == kind)
@@ -40,8 +47,37 @@ def assign_particles(
         if not pool.size:
             pool = np.arange(len(other_position))
         chosen = pool[np.arange(len(ours)) * len(pool) // len(ours)]
-        here = position[ours] - position[ours].mean(axis=0)
-        there = other_position[chosen] - other_position[chosen].mean(axis=0)
-        cost = cdist(here, there, "sqeuclidean")
-        partner[ours] = chosen[linear_sum_assignment(cost)[1]]
+        here = _centre(position[ours], box)
+        there = _centre(other_position[chosen], box)
+        partner[ours] = chosen[_match(here, there, box)]
     return partner
+
+
+def _centre(position: Floats, box: Box) -> Floats:
+    """Return positions from the mean of their cloud, from 0 along periodic axes."""
+    mean = np.where(box.periodic, 0.0, position.mean(axis=0))
+    return np.asarray(position - mean)
+
+
+def _match(here: Floats, there: Floats, box: Box) -> NDArray[np.intp]:
+    """Return for each point here the index of its point there; there are as many."""
+    from scipy.optimize import linear_sum_assignment
+    from scipy.spatial.distance import cdist
+
+    if len(here) > MOST_TOGETHER:
+        partner = np.empty(len(here), np.intp)
+        axis = int(np.argmax(np.ptp(here, axis=0)))
+        half = len(here) // 2
+        order = np.argsort(here[:, axis], kind="stable")
+        other_order = np.argsort(there[:, axis], kind="stable")
+        for part in (slice(None, half), slice(half, None)):
+            ours = order[part]
+            others = other_order[part]
+            partner[ours] = others[_match(here[ours], there[others], box)]
+        return partner
+    if box.is_periodic:
+        way = box.displacement(here[:, None], there[None])
+        cost = np.einsum("ijk,ijk->ij", way, way)
+    else:
+        cost = cdist(here, there, "sqeuclidean")
+    return np.asarray(linear_sum_assignment(cost)[1], np.intp)

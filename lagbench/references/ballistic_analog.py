@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
 from lagbench.metrics.transport import sliced_wasserstein2
@@ -94,32 +95,35 @@ def choice_for(size: Size) -> Choice:
     return Choice()
 
 
-def label_bodies(position: Floats, radius: float) -> NDArray[np.intp]:
+def label_bodies(
+    position: Floats, radius: float, box: Box = UNIT_SQUARE
+) -> NDArray[np.intp]:
     """Return the number of the body of each particle.
 
     A body is all that hangs together by steps shorter than the radius.
 
     Args:
-        position: positions [length], shape [particle, 2].
+        position: positions [length], shape [particle, axis].
         radius: longest distance of neighbours [length].
+        box: box that holds the particles.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import KDTree
 
-    pairs = KDTree(position).query_pairs(radius, output_type="ndarray")
+    pairs = box.tree(position).query_pairs(radius, output_type="ndarray")
     count = len(position)
     links = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return np.asarray(connected_components(links, directed=False)[1], np.intp)
 
 
-def bodies_touch(position: Floats, body: NDArray[np.intp], radius: float) -> bool:
+def bodies_touch(
+    position: Floats, body: NDArray[np.intp], radius: float, box: Box = UNIT_SQUARE
+) -> bool:
     """Tell whether particles of two bodies lie within the radius of each other."""
-    from scipy.spatial import KDTree
-
     for number in range(1, int(body.max()) + 1):
-        tree = KDTree(position[body == number])
-        nearest, _ = tree.query(position[body < number], distance_upper_bound=radius)
+        tree = box.tree(position[body == number])
+        others = box.tree_points(position[body < number])
+        nearest, _ = tree.query(others, distance_upper_bound=radius)
         if np.isfinite(nearest).any():
             return True
     return False
@@ -128,13 +132,15 @@ def bodies_touch(position: Floats, body: NDArray[np.intp], radius: float) -> boo
 def frames_of_flight(given: Given) -> int:
     """Return how many frames on the bodies still fly freely, at most the horizon."""
     radius = given.size.task.radius
-    body = label_bodies(given.last, radius)
+    body = label_bodies(given.last, radius, given.box)
     low = given.box.lower_walls + 1e-9
     high = given.box.upper_walls - 1e-9
     for frames_on in range(1, len(given.predicted_frames)):
         position = ballistic_positions(given, frames_on)
         on_wall = ((position <= low) | (position >= high)).any(axis=1)
-        if on_wall.mean() > CONTACT_SHARE or bodies_touch(position, body, radius):
+        if on_wall.mean() > CONTACT_SHARE or bodies_touch(
+            position, body, radius, given.box
+        ):
             return frames_on - 1
     return len(given.predicted_frames)
 
@@ -146,7 +152,7 @@ def predict_positions(
     library: StateLibrary | None,
     without: int | None = None,
 ) -> Iterator[Floats]:
-    """Yield positions of the predicted frames [length], each [particle, 2].
+    """Yield positions of the predicted frames [length], each [particle, axis].
 
     Args:
         given: what is given of the scenario.
@@ -176,11 +182,13 @@ class FollowedAnalog:
     """An analog and the particles that follow it."""
 
     members: NDArray[np.intp]  # our particles, shape [member]
-    paths: Floats  # of their partners, from the compared frame on, [frame, member, 2]
-    offset: Floats  # from partner to particle at that frame [length], [member, 2]
+    paths: (
+        Floats  # of their partners, from the compared frame on, [frame, member, axis]
+    )
+    offset: Floats  # from partner to particle at that frame [length], [member, axis]
 
     def positions(self, frames_on: int) -> Floats:
-        """Return the members' positions so many frames on [length], [member, 2]."""
+        """Return the members' positions so many frames on [length], [member, axis]."""
         path = self.paths[min(frames_on, len(self.paths) - 1)]
         return np.asarray(path + self.offset * OFFSET_FADING**frames_on)
 
@@ -214,7 +222,11 @@ def _analogs_of(
         mirror = mirrors_of(given.size)[library.mirrors[state]]
         start = mirror.positions(motion.position[frame])
         partner = assign_particles(
-            position[members], start, given.material[members], motion.material
+            position[members],
+            start,
+            given.material[members],
+            motion.material,
+            given.box,
         )
         stop = frame + 1 + len(given.predicted_frames)
         paths = mirror.positions(motion.position[frame:stop, partner])

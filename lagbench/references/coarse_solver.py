@@ -36,6 +36,7 @@ from .predictor import (
     linear_field,
     with_wall_images,
 )
+from .train_library import UP
 
 if TYPE_CHECKING:
     from lagbench.generators.solver import Solver
@@ -162,16 +163,14 @@ def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
         step_before = given.box.displacement(given.position[-3], given.position[-2])
         velocity = (1.5 * given.step - 0.5 * step_before) / interval
     else:
-        velocity = given.step / interval + [
-            0.0,
-            -0.5 * float(given.size.value("gravity")) * interval,
-        ]
+        velocity = given.step / interval
+        velocity[:, UP] -= 0.5 * float(given.size.value("gravity")) * interval
     # row 0 of a program never acts: row 1 is on the way to the first predicted frame
     walls = given.walls[given.predicted_frames[0] - 1 :] / interval
     return InitialState(
         position=given.last[carriers],
         velocity=velocity[carriers],
-        affine=np.zeros((count, 2, 2)),
+        affine=np.zeros((count, given.box.dimension, given.box.dimension)),
         material=given.material[carriers],
         area=given.area,
         viscosity=float(str(given.parameters.get("viscosity", 0.0))),
@@ -186,15 +185,13 @@ def _leaders(
     """Return for each other particle the index of the nearest of its material that
     carries mass.
     """
-    from scipy.spatial import KDTree
-
     leader = np.zeros(len(others), np.intp)
     for kind in np.unique(given.material[others]):
         pool = np.flatnonzero(given.material[carriers] == kind)
         led = np.flatnonzero(given.material[others] == kind)
-        leader[led] = pool[
-            KDTree(given.last[carriers[pool]]).query(given.last[others[led]])[1]
-        ]
+        tree = given.box.tree(given.last[carriers[pool]])
+        points = given.box.tree_points(given.last[others[led]])
+        leader[led] = pool[tree.query(points)[1]]
     return leader
 
 

@@ -30,7 +30,7 @@ def predict_lines(given: Given) -> Prediction:
 def ballistic_positions(given: Given, frames_on: int) -> Floats:
     """Return where free particles are so many frames after the last given one.
 
-    The unit is length, the shape [particle, 2].
+    The unit is length, the shape [particle, axis].
     """
     fallen = given.fall * (frames_on * (frames_on + 1) / 2)
     return given.inside(given.last + frames_on * given.step + fallen)

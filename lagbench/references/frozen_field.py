@@ -31,7 +31,7 @@ def decay(position: Floats, box: Box) -> float:
     """Return the factor on the speed from frame to frame, fitted to given frames [1].
 
     Args:
-        position: the given frames [length], shape [frame, particle, 2].
+        position: the given frames [length], shape [frame, particle, axis].
         box: box that holds the particles.
     """
     steps = box.displacement(position[:-1], position[1:])

@@ -2,8 +2,7 @@
 
 A *naive* predictor learns nothing and knows no equation; it may look things up in
 train. A *classical* one integrates the equations. Both get what a model gets of a test
-scenario: its first frames, its materials and the motion of its walls. A classical one
-also knows the viscosity.
+scenario: its first frames, its materials, the motion of its walls and its viscosity.
 
 Some predictors carry the particles of a full box by a velocity field that is known at
 scattered points. Between the points the field is linear on their Delaunay triangles.
@@ -23,7 +22,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import WALLS
 from lagbench.data.box import Box
 from lagbench.data.grid import Placement
 from lagbench.data.registry import Size
@@ -32,13 +30,17 @@ from lagbench.data.scenario import ScenarioFile
 Floats = NDArray[np.float64]
 
 Prediction = Iterator[NDArray[np.float32]]
-"""Positions of one predicted frame after the other [length], each [particle, 2]."""
+"""Positions of one predicted frame after the other [length], each [particle, axis]."""
 
 Field = Callable[[Floats], Floats]
-"""From points [length], shape [point, 2], to velocities there [length/frame]."""
+"""From points [length], shape [point, axis], to velocities there [length/frame]."""
 
 MIRRORED_LAYER = 4.0
 """Depth of the layer that is mirrored at the walls, in spacings of the points."""
+
+
+NEAREST = 10
+"""Points around a place to which a linear function is fitted in three dimensions."""
 
 
 class Kind(enum.StrEnum):
@@ -56,12 +58,15 @@ class Given:
 
     size: Size  # the split and size
     root: Path  # folder of all data sets: train may be looked at
-    position: Floats  # the given frames [length], shape [frame, particle, 2]
+    position: Floats  # the given frames [length], shape [frame, particle, axis]
     material: NDArray[np.int8]  # index into MATERIALS, shape [particle]
     # velocity of each wall from frame f-1 to f, to the end of the horizon
-    # [length/frame], shape [frame, 4, 2]
+    # [length/frame], shape [frame, wall, axis]
     walls: Floats
-    area: float  # area that the particles cover at first [length^2]
+    area: float  # area or volume that the particles cover at first [length^d]
+    # acceleration of the fluid in layers of equal height along y, lowest first, to the
+    # end of the horizon [length/frame^2], shape [frame, layer, axis]; None without one
+    body_force: Floats | None = None
     # what the scenario's file states: viscosity, friction and the like
     parameters: Mapping[str, object]
 
@@ -72,17 +77,19 @@ class Given:
 
     @property
     def last(self) -> Floats:
-        """Positions of the last given frame [length], shape [particle, 2]."""
+        """Positions of the last given frame [length], shape [particle, axis]."""
         return np.asarray(self.position[-1])
 
     @property
     def step(self) -> Floats:
-        """Last given velocity [length/frame], shape [particle, 2]."""
+        """Last given velocity [length/frame], shape [particle, axis]."""
         return self.box.displacement(self.position[-2], self.position[-1])
 
     @property
     def middle(self) -> Floats:
-        """Positions half a frame before the last given one, [particle, 2] [length].
+        """Positions half a frame before the last given one [length].
+
+        The shape is [particle, axis].
 
         There the particles have the velocity :attr:`step`.
         """
@@ -92,9 +99,13 @@ class Given:
 
     @property
     def fall(self) -> Floats:
-        """Acceleration of a free particle [length/frame^2], shape [2]."""
-        gravity = float(self.size.value("gravity"))
-        return np.array([0.0, -gravity]) * self.size.frame_interval**2
+        """Acceleration of a free particle [length/frame^2], shape [axis].
+
+        The second axis points up.
+        """
+        gravity = np.zeros(self.box.dimension)
+        gravity[1] = -float(self.size.value("gravity"))
+        return np.asarray(gravity * self.size.frame_interval**2)
 
     @property
     def viscosity(self) -> float:
@@ -119,7 +130,7 @@ class Given:
         return bool(self.walls.any())
 
     def inside(self, position: Floats) -> Floats:
-        """Return positions, those beyond a wall put on it, shape [particle, 2]."""
+        """Return positions, those beyond a wall put on it, shape [particle, axis]."""
         return self.box.inside(position)
 
 
@@ -162,6 +173,7 @@ def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
         position=file.read("position", slice(0, task.input_frames)).astype(np.float64),
         material=material,
         walls=wall_motion(file, size, task.input_frames + task.horizon),
+        body_force=_body_force(file, size),
         area=mass / float(size.value("density")),
         parameters=file.header.parameters,
     )
@@ -170,12 +182,21 @@ def given_in(file: ScenarioFile, size: Size, root: Path) -> Given:
 def wall_motion(file: ScenarioFile, size: Size, frames: int) -> Floats:
     """Return the velocity of each wall towards the first frames [length/frame].
 
-    Shape [frame, 4, 2].
+    Shape [frame, wall, axis], with two walls for each axis.
     """
     if "wall_velocity" not in file.variables:
-        return np.zeros((frames, len(WALLS), 2))
+        return np.zeros((frames, 2 * size.dimension, size.dimension))
     speed = file.read("wall_velocity", slice(0, frames)).astype(np.float64)
     return np.asarray(speed * size.frame_interval)
+
+
+def _body_force(file: ScenarioFile, size: Size) -> Floats | None:
+    """Return the acceleration towards the first frames [length/frame^2], if any."""
+    if "body_force" not in file.variables:
+        return None
+    frames = slice(0, size.task.input_frames + size.task.horizon)
+    acceleration = file.read("body_force", frames).astype(np.float64)
+    return np.asarray(acceleration * size.frame_interval**2)
 
 
 def linear_field(points: Floats, values: Floats) -> Field:
@@ -198,6 +219,35 @@ def linear_field(points: Floats, values: Floats) -> Field:
     return field
 
 
+def fitted_field(points: Floats, values: Floats) -> Field:
+    """Return the field that a linear function of the nearest points has.
+
+    The function is fitted by weighted least squares to :data:`NEAREST` points, with
+    weights of the inverse squared distance. There is nothing to triangulate, which in
+    three dimensions takes 40 times as long as a reading.
+    """
+    from scipy.spatial import KDTree
+
+    tree = KDTree(points)
+
+    def field(at: Floats) -> Floats:
+        neighbours = tree.query(at, k=min(NEAREST, len(points)))
+        distance = np.asarray(neighbours[0])
+        nearest = np.asarray(neighbours[1])
+        way = points[nearest] - at[:, None]  # shape [place, neighbour, axis]
+        basis = np.concatenate([np.ones((*way.shape[:2], 1)), way], axis=2)
+        floor = np.finfo(np.float64).tiny
+        weight = 1.0 / (distance**2 + 1e-6 * distance.max(axis=1)[:, None] ** 2 + floor)
+        weighted = weight[..., None] * basis
+        matrix = np.einsum("nki,nkj->nij", weighted, basis)
+        size = np.trace(matrix, axis1=1, axis2=2)
+        matrix += 1e-12 * size[:, None, None] * np.eye(basis.shape[2])
+        right = np.einsum("nki,nkj->nij", weighted, values[nearest])
+        return np.asarray(np.linalg.solve(matrix, right)[:, 0])
+
+    return field
+
+
 def with_wall_images(
     given: Given, points: Floats, values: Floats, walls: Floats
 ) -> tuple[Floats, Floats]:
@@ -207,13 +257,15 @@ def with_wall_images(
 
     Args:
         given: what is given of the scenario: its box, and whether walls move.
-        points: points in the box [length], shape [point, 2].
-        values: velocities there [length/frame], shape [point, 2].
-        walls: velocities of the walls, left, right, bottom, top [length/frame], shape
-            [4, 2].
+        points: points in the box [length], shape [point, axis].
+        values: velocities there [length/frame], shape [point, axis].
+        walls: velocities of the walls, left, right, bottom, top and so on
+            [length/frame], shape [wall, axis].
     """
     box = given.box
     depth = MIRRORED_LAYER * np.sqrt(box.volume / len(points))
+    if box.dimension == 3:
+        depth = MIRRORED_LAYER * np.cbrt(box.volume / len(points))
     places = [points]
     speeds = [values]
     for number, motion in enumerate(walls):

@@ -1,6 +1,8 @@
 """Scores of the reference predictors, measured once per data set and shipped.
 
-``measured/<split>-<size>.json`` is bound to the hash of the data set. It has the value
+``measured/<split>-<size>.json`` is bound to the hash of the data set;
+``measured/<split>-<size>-shift.json``, on the subset ``shift``, also to that of the
+subset. A file has the value
 of every metric per scenario. For metrics that have a value at each frame it has the
 mean over scenarios: at the reported frames, and for the metrics in :data:`CURVES` at
 all frames (of long rollouts at a hundred, linear between). Scores have five significant
@@ -85,7 +87,10 @@ def correlation_of(scores: Mapping[str, Score]) -> NDArray[np.float64]:
 
 def shipped_path(size: Size, folder: Path = FOLDER) -> Path:
     """Return the file with the scores of the references of a split and size."""
-    return folder / f"{size.split}-{size.name}.json"
+    name = f"{size.split}-{size.name}"
+    if size.scored_subset != "test":
+        name += f"-{size.scored_subset}"
+    return folder / f"{name}.json"
 
 
 def shipped(size: Size, folder: Path = FOLDER) -> Mapping[str, ReferenceScores] | None:
@@ -156,6 +161,9 @@ def _read(size: Size, folder: Path) -> dict[str, Any] | None:
         return None
     content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     is_current = content["dataset_sha256"] == size.measured.dataset_sha256
+    if size.scored_subset != "test":
+        subset_sha256 = size.measured.subset_sha256.get(size.scored_subset)
+        is_current = is_current and content.get("subset_sha256") == subset_sha256
     if content["lagbench_floors"] == FORMAT and is_current:
         return content
     return None
@@ -221,12 +229,19 @@ def write_shipped(
         if "solver_seconds_per_frame" in before:
             cost = before["solver_seconds_per_frame"]
             costs["solver_seconds_per_frame"] = cost
+    subset: dict[str, Any] = {}
+    if size.scored_subset != "test":
+        subset["subset"] = size.scored_subset
+        if size.measured is not None:
+            hashes = size.measured.subset_sha256
+            subset["subset_sha256"] = hashes.get(size.scored_subset)
     content = {
         "lagbench_floors": FORMAT,
         "split": size.split,
         "size": size.name,
         "dataset_version": size.version,
         "dataset_sha256": dataset_sha256,
+        **subset,
         "scenarios": list(any_score.scenarios),
         "frames": [any_score.frames[0], any_score.frames[-1]],
         "reported_frames": list(reported),

@@ -2,7 +2,8 @@
 
 A box that is symmetric has no preferred side: a scenario that is mirrored is one more
 scenario. On free surfaces, where matter falls, the left and right sides are exchanged;
-in full boxes also the lower and upper ones.
+in full boxes also the lower and upper ones. In three dimensions front and back are
+exchanged too.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from lagbench.data.box import Box
 from lagbench.data.registry import Size
 from lagbench.data.scenario import read_scenario
 from lagbench.errors import DataError
+from lagbench.metrics.frame import directions
 
 from .predictor import Floats, fills_box
 
@@ -27,14 +29,20 @@ FEATURE_LEVELS = (np.arange(16) + 0.5) / 16
 """Levels of the quantiles that describe a cloud along a direction."""
 
 FEATURE_ANGLES = np.arange(8) * (np.pi / 8)
-FEATURE_DIRECTIONS = np.stack([np.cos(FEATURE_ANGLES), np.sin(FEATURE_ANGLES)])
-"""Directions along which clouds are described, shape [2, direction]."""
+PLANE_DIRECTIONS = np.stack([np.cos(FEATURE_ANGLES), np.sin(FEATURE_ANGLES)])
+SPACE_DIRECTIONS = directions(3)[::4].astype(np.float64).T
+FEATURE_DIRECTIONS = {2: PLANE_DIRECTIONS, 3: SPACE_DIRECTIONS}
+"""Directions along which clouds are described, shape [axis, direction], by dimension.
+"""
 
 VELOCITY_WEIGHT = 20.0
 """Frames over which a difference of velocities counts as one of positions."""
 
 STATE_STRIDE = 2
 """Frames from one state of a scenario to the next."""
+
+UP = 1
+"""Axis along which matter falls."""
 
 LAST_STATE = 2 / 3
 """Share of a scenario's frames within which a state may lie; the rest is its future."""
@@ -48,7 +56,7 @@ class Mirror:
     axes: tuple[int, ...]
 
     def positions(self, position: Floats) -> Floats:
-        """Return mirrored positions [length], shape [..., 2]."""
+        """Return mirrored positions [length], shape [..., axis]."""
         image = np.array(position, np.float64)
         for axis in self.axes:
             image[..., axis] = self.box.low[axis] + self.box.high[axis]
@@ -56,14 +64,14 @@ class Mirror:
         return image
 
     def velocities(self, velocity: Floats) -> Floats:
-        """Return mirrored velocities, shape [..., 2]."""
+        """Return mirrored velocities, shape [..., axis]."""
         image = np.array(velocity, np.float64)
         for axis in self.axes:
             image[..., axis] *= -1.0
         return image
 
     def walls(self, wall_velocity: Floats) -> Floats:
-        """Return the velocities of the mirrored walls, shape [..., 4, 2]."""
+        """Return the velocities of the mirrored walls, shape [..., wall, axis]."""
         image = self.velocities(wall_velocity)
         for axis in self.axes:
             pair = [2 * axis, 2 * axis + 1]
@@ -74,7 +82,9 @@ class Mirror:
 def mirrors_of(size: Size) -> tuple[Mirror, ...]:
     """Return the mirror images under which a split is the same; the first is itself."""
     box = size.box
-    symmetric_axes = range(box.dimension) if fills_box(size) else range(1)
+    symmetric_axes = list(range(box.dimension))
+    if not fills_box(size):
+        symmetric_axes.remove(UP)
     mirrors = []
     for count in range(len(symmetric_axes) + 1):
         for axes in itertools.combinations(symmetric_axes, count):
@@ -106,7 +116,7 @@ def long_enough(size: Size) -> tuple[int, ...]:
 class TrainScenario:
     """The motion of one scenario of train."""
 
-    position: NDArray[np.float32]  # [length], shape [frame, particle, 2]
+    position: NDArray[np.float32]  # [length], shape [frame, particle, axis]
     material: NDArray[np.int8]  # shape [particle]
 
     def positions_at(self, frames: Sequence[int] | NDArray[np.intp]) -> Floats:
@@ -131,8 +141,8 @@ def describe_state(
     weighted by the material's share. States of the same materials can be compared.
 
     Args:
-        position: positions [length], shape [particle, 2].
-        velocity: velocities [length/frame], shape [particle, 2].
+        position: positions [length], shape [particle, axis].
+        velocity: velocities [length/frame], shape [particle, axis].
         material: material of each particle, shape [particle].
 
     Returns:
@@ -143,7 +153,8 @@ def describe_state(
         members = material == kind
         share = float(np.mean(members))
         for values, weight in ((position, 1.0), (velocity, VELOCITY_WEIGHT)):
-            projections = values[members] @ FEATURE_DIRECTIONS
+            along = FEATURE_DIRECTIONS[values.shape[1]]
+            projections = values[members] @ along
             quantiles = np.quantile(projections, FEATURE_LEVELS, axis=0)
             parts.append(weight * np.sqrt(share / quantiles.size) * quantiles.ravel())
     return np.concatenate(parts)

@@ -74,7 +74,7 @@ class Preview:
     film_frames: tuple[int, ...]
     particles: tuple[int, ...]  # numbers of the particles in the film
     material: NDArray[np.int8]  # their materials, shape [film particle]
-    # their positions [length], shape [side, film frame, film particle, 2]
+    # their positions [length], shape [side, film frame, film particle, axis]
     film: NDArray[np.float32]
 
 
@@ -191,6 +191,8 @@ class ScoreCard:
         content: dict[str, Any] = {"lagbench_scores": FORMAT}
         for name in IDENTITY:
             content[name] = getattr(self.header, name)
+        if self.header.subset != "test":
+            content["subset"] = self.header.subset
         content["predictions_sha256"] = self.predictions_sha256
         for name in LABELS:
             label = getattr(self.header, name)

@@ -1,9 +1,11 @@
 """Measure the reference predictors of data sets and write the scores that are shipped.
 
 usage: python -m lagbench.scoring.measure_references [--split cavity] [--size mini]
-           [--root FOLDER] [--workers 2] [--predictor analog ...] [--costs]
+           [--subset shift] [--root FOLDER] [--workers 2] [--predictor analog ...]
+           [--costs]
 
-All splits and sizes whose data are there are measured, or those named. With --predictor
+All splits and sizes whose data are there are measured on test, or those named, or on
+another subset, which then must be there. With --predictor
 only these references are measured anew, from the start; the others, and all costs, stay
 as they are. Without it each measured scenario is saved under the root folder: an
 interrupted run continues where it stopped. Last a frame of each reference and of the
@@ -22,6 +24,7 @@ import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
+from lagbench.data.limits import SCORED_SUBSETS
 from lagbench.data.local import resolve_root
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
@@ -111,6 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--split")
     parser.add_argument("--size")
+    parser.add_argument("--subset", default="test", choices=SCORED_SUBSETS)
     parser.add_argument("--root", type=Path)
     parser.add_argument("--workers", type=int, default=1)
     part = parser.add_mutually_exclusive_group()
@@ -120,7 +124,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     root = resolve_root(options.root)
     try:
-        for size in measured_sizes(root, split=options.split, name=options.size):
+        for tier in measured_sizes(root, split=options.split, name=options.size):
+            size = tier.scored_on(options.subset)
             if not options.costs:
                 measure_and_ship(
                     size, root, workers=options.workers, names=options.predictor

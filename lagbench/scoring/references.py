@@ -238,7 +238,10 @@ def saved_folder(size: Size, root: Path) -> Path:
     sha256 = "unrecorded"
     if size.measured:
         sha256 = size.measured.dataset_sha256
-    return root / ".floors" / f"{size.split}-{size.name}-{sha256[:16]}"
+    name = f"{size.split}-{size.name}"
+    if size.scored_subset != "test":
+        name += f"-{size.scored_subset}"
+    return root / ".floors" / f"{name}-{sha256[:16]}"
 
 
 def measure(
@@ -252,10 +255,10 @@ def measure(
 ) -> dict[str, ReferenceScores]:
     """Return the scores of references of a data set by name.
 
-    The test subset must be there, and train for ``analog``.
+    The scored subset must be there, and train for ``analog``.
 
     Args:
-        size: the split and size.
+        size: the split and size, and the subset that it scores.
         root: folder of all data sets.
         names: names of the references; by default all.
         workers: worker processes.

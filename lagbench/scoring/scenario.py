@@ -55,8 +55,8 @@ class PreviewRecorder:
         particles = _spaced(range(len(scenario.material)), PARTICLES)
 
         maps = (2, len(map_frames))
-        nodes = config.grid.shape
-        film = (2, len(film_frames), len(particles), 2)
+        nodes = config.grid.section.shape
+        film = (2, len(film_frames), len(particles), config.box.dimension)
         nan = np.float32(np.nan)
         self.preview = Preview(
             scenario=number,
@@ -90,9 +90,14 @@ class PreviewRecorder:
         i = preview.map_frames.index(pair.frame)
         truth = pair.true_vorticity
         prediction = pair.predicted_vorticity
-        clipped = np.clip(prediction, -VORTICITY_LIMIT, VORTICITY_LIMIT)
-        preview.vorticity[0, i][pair.nodes] = truth
-        preview.vorticity[1, i][pair.nodes] = clipped
+        if pair.truth.fields.grid.dimension == 2:
+            preview.vorticity[0, i][pair.nodes] = truth
+            preview.vorticity[1, i][pair.nodes] = _clip_vorticity(prediction)
+        else:
+            section = pair.truth.fields.section
+            predicted_section = pair.predicted_fields.section
+            preview.vorticity[0, i] = section.vorticity
+            preview.vorticity[1, i] = _clip_vorticity(predicted_section.vorticity)
 
         if not pair.truth_rotates:
             return
@@ -100,6 +105,10 @@ class PreviewRecorder:
         if distributions is not None:
             preview.histogram[:, i] = distributions
             preview.histogram_range[i] = (np.min(truth), np.max(truth))
+
+
+def _clip_vorticity(vorticity: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.clip(vorticity, -VORTICITY_LIMIT, VORTICITY_LIMIT)
 
 
 def _spaced(numbers: range, count: int) -> tuple[int, ...]:

@@ -131,7 +131,7 @@ def score(
     if write:
         _check_overwriting(folder / JSON_NAME, header)
 
-    size = splits.size(header.split, header.size)
+    size = splits.size(header.split, header.size).scored_on(header.subset)
     # a validation that compares with the truth has hashed it
     is_hashed = validated is None and "discontinuous_start" not in result.skipped
     task = load_scored_task(size, data_root, is_hashed=is_hashed)

@@ -86,6 +86,8 @@ def _write_card(file: Any, card: ScoreCard) -> None:  # noqa: ANN401
     attributes: dict[str, Any] = {"lagbench_scores": FORMAT}
     for name in IDENTITY:
         attributes[name] = getattr(card.header, name)
+    if card.header.subset != "test":
+        attributes["subset"] = card.header.subset
     attributes["predictions_sha256"] = card.predictions_sha256
     attributes["ranking_metric"] = card.ranking
     attributes["statistics"] = " ".join(names)

@@ -80,6 +80,8 @@ def reported_frames(size: Size) -> tuple[int, ...]:
 def read_score_file(path: Path, size: Size | None = None) -> ScoreFile:
     """Read a score file; with a size it must have the shape of that task.
 
+    The scores are those of the subset that the size scores, see ``Size.scored_on``.
+
     Raises:
         UnreadableFileError: it is no score file, or of another task.
     """
@@ -184,12 +186,13 @@ def _check_shapes(preview: Preview) -> None:
     film_count = len(preview.film_frames)
     particle_count = len(preview.particles)
     nodes = preview.vorticity.shape[2:4]
+    space = preview.film.shape[-1]
     shapes = {
         "vorticity": (preview.vorticity.shape, (2, map_count, *nodes)),
         "histogram": (preview.histogram.shape, (2, map_count, BINS)),
         "histogram_range": (preview.histogram_range.shape, (map_count, 2)),
         "material": (preview.material.shape, (particle_count,)),
-        "film": (preview.film.shape, (2, film_count, particle_count, 2)),
+        "film": (preview.film.shape, (2, film_count, particle_count, space)),
     }
     for name, (got, expected) in shapes.items():
         if got != expected:
@@ -209,7 +212,7 @@ def _check_shapes(preview: Preview) -> None:
 def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> None:
     """Refuse a file that is not of the task of a split and size."""
     frames = tuple(frames_to_predict(size))
-    ids = tuple(sorted(size.subsets["test"]))
+    ids = tuple(sorted(size.scored_scenarios))
     scored_ids = tuple(sorted(scores.tallies))
     scored_frames = next(iter(scores.tallies.values())).frames
     if scored_ids != ids or scored_frames != frames:
@@ -217,7 +220,10 @@ def _check_task(scores: SubmissionStatistics, preview: Preview, size: Size) -> N
     if scores.ranking != ranking_metric(size) or preview.scenario != ids[0]:
         raise ValueError("another ranking metric or another pictured scenario")
 
-    has_other_grid = preview.vorticity.shape[2:] != size.field_grid.shape
+    grid = size.field_grid.section
+    has_other_grid = preview.vorticity.shape[2:] != grid.shape
+    if preview.film.shape[-1] != size.dimension:
+        raise ValueError("a film of another dimension")
     if has_other_grid or preview.map_frames != reported_frames(size):
         raise ValueError("maps of another grid or of other frames")
     film_frames = preview.film_frames

@@ -44,7 +44,8 @@ class OpenScenario:
 
     def _frames(self) -> Iterator[NDArray[np.float32]]:
         numbers = self.scenario.config.predicted_frames
-        frame_bytes = 8 * len(self.scenario.material)
+        particle_bytes = 4 * self.scenario.config.box.dimension
+        frame_bytes = particle_bytes * len(self.scenario.material)
         step = max(1, BLOCK_BYTES // frame_bytes)
         for first in numbers[::step]:
             last = min(first + step, numbers.stop)
@@ -91,14 +92,14 @@ class ScoredTask:
 
 
 def load_scored_task(
-    size: Size, root: Path, *, subset: str = "test", is_hashed: bool = False
+    size: Size, root: Path, *, subset: str | None = None, is_hashed: bool = False
 ) -> ScoredTask:
     """Check that a subset is there and collect what the metrics need.
 
     Args:
         size: the split and size.
         root: folder of all data sets.
-        subset: the subset whose truth is needed.
+        subset: the subset whose truth is needed; that which the size scores when None.
         is_hashed: whether the caller has fetched and hashed the files just before, so
             that they are not hashed again.
 
@@ -107,6 +108,7 @@ def load_scored_task(
             are not recorded.
     """
     truth = Truth(size, root, subset)
+    subset = truth.subset
     if not is_hashed:
         update_working_copy(size, root, size.subsets[subset])
         truth.require()
@@ -120,6 +122,8 @@ def load_scored_task(
     if size.measured:
         statistics: Mapping[str, tuple[float, ...]] = size.measured.statistics
         limit = size.measured.twin_floor
+        if subset == "shift":
+            limit = ()  # it was measured on test
     else:
         manifest = read_manifest(root, size.split, size.name, size.major)
         statistics = manifest.statistics if manifest else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
     from lagbench.data.layout import ScenarioKey
     from lagbench.data.manifest import Manifest
+    from lagbench.data.registry import Size
 
 
 CHUNK_BYTES = 4 << 20
@@ -82,8 +84,9 @@ def open_split(
         dask arrays, ``material`` (scenario, particle), ``particle_mass`` (scenario), in
         a closed box ``wall_velocity`` (scenario, frame, wall, space), and
         ``frame_count`` and ``particle_count`` (scenario). Coordinate ``scenario`` holds
-        the ids. Scenarios with fewer frames or particles than the largest are padded
-        with NaN, material with -1.
+        the ids, ``viscosity`` (scenario) the kinematic viscosity that a model is given
+        [length^2/s], NaN where none is known. Scenarios with fewer frames or particles
+        than the largest are padded with NaN, material with -1.
 
     Raises:
         UsageError: unknown split, size or subset.
@@ -98,10 +101,16 @@ def open_split(
     # thread.
     with ExitStack() as open_files:
         scenarios = []
+        viscosities = []
         for scenario, path in paths.items():
             file = _open_scenario(path, tier.key(scenario), hint)
             scenarios.append(open_files.enter_context(file))
+            viscosities.append(_read_viscosity(file, tier, path))
         joined = _join_scenarios(scenarios, list(paths))
+        # Lengths have no unit, as in scenario files.
+        attributes = {"long_name": "given kinematic viscosity", "units": "s-1"}
+        coordinate = ("scenario", viscosities, attributes)
+        joined = joined.assign_coords(viscosity=coordinate)
         # Local splits are recognised by it.
         first_path = next(iter(paths.values()))
         joined.encoding["source"] = str(first_path.absolute())
@@ -149,6 +158,17 @@ def _join_scenarios(
     for variable in joined.variables.values():
         variable.attrs.pop("content_sha256", None)
     return joined
+
+
+def _read_viscosity(file: xr.Dataset, tier: Size, path: Path) -> float:
+    """Return the given viscosity of a scenario [length^2/s], NaN where unknown."""
+    from lagbench.data.scenario import parse_viscosity
+
+    stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
+    viscosity = tier.viscosity(stated)
+    if viscosity is None:
+        return math.nan
+    return viscosity
 
 
 def _open_scenario(path: Path, key: ScenarioKey, fix: str) -> xr.Dataset:

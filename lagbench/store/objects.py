@@ -8,6 +8,7 @@ wrong answer of the store is a DataError, a fault of the connection a WorkFailed
 from __future__ import annotations
 
 import http.client
+import ipaddress
 import os
 import re
 import shutil
@@ -31,6 +32,12 @@ from lagbench.errors import (
 )
 
 TIMEOUT = 30.0  # how long a store may be silent [s]
+
+# An S3 store that accepts and never answers is given up after the product, a minute.
+S3_TIMEOUT = 10.0  # how long one answer is waited for [s]
+S3_ATTEMPTS = 2  # of botocore, also where the store is busy
+S3_ROUNDS = 3  # of s3fs, each with so many attempts
+
 HTTP = ("http://", "https://")
 S3 = ("s3://", "s3a://")
 LOCAL = ("file://", "local://")
@@ -44,6 +51,9 @@ _BUSY_STATUSES = {408, 425, 429, 500, 502, 503, 504}
 # No object has more bytes, and Python refuses to read an endless number.
 _LENGTH = re.compile(r"\d{1,18}")
 _RANGE = re.compile(r"bytes (\d{1,18})-(\d{1,18})/(\d{1,18}|\*)")
+
+# A last label of digits, or of hexadecimal ones, makes a resolver read numbers.
+_NUMBER = re.compile(r"[0-9]+|0[xX][0-9a-fA-F]*")
 
 _systems: dict[tuple[object, ...], Any] = {}
 
@@ -137,6 +147,7 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
             where=url,
             expected="http://host/path",
             got=str(error),
+            fix="name a store: --from URL or --root URL",
         ) from error
     except (OSError, http.client.HTTPException) as error:
         unreachable = StoreUnreachableError(
@@ -173,11 +184,32 @@ def _open_http(url: str, offset: int, hint: str) -> Answer:
 def _percent_encode(url: str) -> str:
     """Return an address with unusual characters encoded, but for encoded ones."""
     parts = urllib.parse.urlsplit(url)
-    if not parts.hostname:
-        raise ValueError("it names no host")
+    _check_host(parts.hostname)
     path = urllib.parse.quote(parts.path, safe=string.punctuation)
     query = urllib.parse.quote(parts.query, safe=string.punctuation)
     return parts._replace(path=path, query=query).geturl()
+
+
+def _check_host(host: str | None) -> None:
+    """Refuse a number that stands for an IP address in another spelling.
+
+    ``0x7f.1`` and ``2130706433`` are this machine to a resolver, and no host to a
+    reader.
+
+    Raises:
+        ValueError: there is no host, or it is such a number.
+    """
+    if not host:
+        raise ValueError("it names no host")
+    last_label = host.rstrip(".").rpartition(".")[2]
+    if not _NUMBER.fullmatch(last_label):
+        return
+    try:
+        ipaddress.IPv4Address(host)
+    except ValueError:
+        raise ValueError(
+            "its host is a number, but no address as in 192.0.2.1"
+        ) from None
 
 
 def _parse_length(text: str | None) -> int | None:
@@ -220,6 +252,18 @@ def _status_error(
 
 class _Redirections(urllib.request.HTTPRedirectHandler):
     """Refuses a redirection to no address, as a fault of the store."""
+
+    def redirect_request(
+        self,
+        req: urllib.request.Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> urllib.request.Request | None:
+        _check_host(urllib.parse.urlsplit(newurl).hostname)
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
 
     def http_error_302(
         self,
@@ -270,9 +314,13 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         ) from None
     except Exception as error:  # file systems raise what their libraries raise
         store_error = _translate_error(error, url)
-        # botocore has tried its own errors again by itself, and no permission comes
-        # with time.
+        # botocore has tried its own errors again by itself, as those of a silent store,
+        # and no permission comes with time.
         may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
+        if may_pass and url.startswith(S3):
+            from botocore import exceptions
+
+            may_pass = not isinstance(error, exceptions.HTTPClientError)
         if may_pass and isinstance(store_error, WorkFailedError):
             raise BrokenError(store_error) from error
         raise store_error from error
@@ -393,11 +441,29 @@ def _file_system(url: str) -> tuple[Any, str]:
     key = (scheme, *settings)
     if key not in _systems:
         system, _ = fsspec.core.url_to_fs(
-            url, use_listings_cache=False, skip_instance_cache=True
+            url,
+            use_listings_cache=False,
+            skip_instance_cache=True,
+            **_client_options(url),
         )
+        if url.startswith(S3):
+            system.retries = S3_ROUNDS
         _systems[key] = system
     system = _systems[key]
     return system, system._strip_protocol(url)
+
+
+def _client_options(url: str) -> dict[str, Any]:
+    """Return how long a client of S3 waits, and how often; nothing for other stores."""
+    if not url.startswith(S3):
+        return {}
+    return {
+        "config_kwargs": {
+            "connect_timeout": S3_TIMEOUT,
+            "read_timeout": S3_TIMEOUT,
+            "retries": {"total_max_attempts": S3_ATTEMPTS},
+        }
+    }
 
 
 @contextmanager

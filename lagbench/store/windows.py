@@ -22,7 +22,7 @@ from lagbench.data.hdf5 import list_variables
 from lagbench.data.layout import major_of
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size
-from lagbench.data.scenario import damage_error
+from lagbench.data.scenario import damage_error, parse_viscosity
 from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedError
 
 from .copy import scenario_files
@@ -43,6 +43,7 @@ class _OpenScenario(NamedTuple):
     position: h5py.Dataset
     material: NDArray[np.int8]
     wall_velocity: Floats | None
+    viscosity: float | None
 
 
 class _Identity(NamedTuple):
@@ -140,6 +141,11 @@ class FrameStore:
         opened = self._open(scenario)
         return opened.material, opened.wall_velocity
 
+    def viscosity(self, scenario: int) -> float | None:
+        """Return the kinematic viscosity that is given [length^2/s], if one is."""
+        self._reset_after_fork()
+        return self._open(scenario).viscosity
+
     def _reset_after_fork(self) -> None:
         """Reopen files after a fork: HDF5 handles do not survive one."""
         if os.getpid() != self._process:
@@ -190,7 +196,9 @@ class FrameStore:
         wall_velocity = None
         if "wall_velocity" in variables:
             wall_velocity = variables["wall_velocity"][...]
-        return _OpenScenario(file, position, material, wall_velocity)
+        stated = parse_viscosity(file.attrs.get("viscosity"), where=str(path))
+        viscosity = self._size.viscosity(stated)
+        return _OpenScenario(file, position, material, wall_velocity, viscosity)
 
     def _check_identity(self, file: h5py.File, scenario: int, *, frames: int) -> None:
         """Refuse a file of another scenario, version or content."""
@@ -284,6 +292,9 @@ class Window(NamedTuple):
     # particle positions in the scenario's first frame [length], shape [particle, axis];
     # None unless asked for
     origin: NDArray[np.float32] | None = None
+    # kinematic viscosity [length^2/s]: the scenario's, else that of the data set; None
+    # where none is known
+    viscosity: float | None = None
 
 
 class WindowReader:
@@ -392,14 +403,11 @@ class WindowReader:
 
     @property
     def viscosity(self) -> float | None:
-        """Kinematic viscosity of the liquid [length^2/s].
+        """Kinematic viscosity of all scenarios [length^2/s].
 
-        None where scenarios differ: it is not given.
+        None where scenarios differ: each window has its own.
         """
-        viscosity = self.size.parameters.get("liquid_viscosity")
-        if viscosity is None or viscosity.value is None:
-            return None
-        return float(viscosity.value)
+        return self.size.viscosity()
 
     def place(self, index: int) -> tuple[int, int]:
         """Return scenario id and first frame of a window."""
@@ -418,6 +426,7 @@ class WindowReader:
         if walls is not None:
             walls = walls[frame : frame + self.length]
         window = copy_window(frames, material, walls, scenario, frame)
+        window = window._replace(viscosity=self.store.viscosity(scenario))
         if not self.origin:
             return window
         first_frame = self.store.frames(scenario, 0, 1)[0]
@@ -448,9 +457,9 @@ def windows(
 
     ``data[i]`` has ``position`` [length], float32, shape [particle, frame, axis];
     ``material``, int8, shape [particle]; ``wall_velocity`` [length/s], float32, shape
-    [frame, wall, axis], or None; the ids ``scenario`` and ``frame``. ``data.size`` is
-    the description of the data set. `lagbench.torch.WindowDataset` gives the same
-    windows as tensors.
+    [frame, wall, axis], or None; the ids ``scenario`` and ``frame``; ``viscosity``
+    [length^2/s]. ``data.size`` is the description of the data set.
+    `lagbench.torch.WindowDataset` gives the same windows as tensors.
 
     Args:
         split: name of the split, or path of a local split's folder.

@@ -190,7 +190,7 @@ def scan_positions(
     Returns what was seen, and the content hash where all scenarios are known.
     """
     stored_scenarios = set(predictions.header.scenarios)
-    known_scenarios = sorted(stored_scenarios.intersection(size.subsets["test"]))
+    known_scenarios = sorted(stored_scenarios.intersection(size.scored_scenarios))
     scans = []
     hasher = predictions.start_hash()
     for scenario in known_scenarios:

@@ -60,8 +60,11 @@ OPTIONAL: Mapping[str, type[str] | type[int] | type[float]] = {
     "solver_seconds_per_frame": float,
     "budget": str,
     "provenance": str,
+    "subset": str,
 }
-"""Attributes that a file may have: cost, provenance and size of the model."""
+"""Attributes that a file may have: cost, provenance and size of the model, and the
+subset, which is ``test`` where none is named.
+"""
 
 MAX_NAME = 200
 """Longest required attribute [characters]."""
@@ -144,6 +147,7 @@ class Header:
     # scenario id to its number of particles; empty where all have as many
     particle_counts: Mapping[int, int] = field(default_factory=dict)
     space: int = 2  # components of a position
+    subset: str = "test"  # subset whose scenarios are predicted
 
     def particle_count(self, scenario: int) -> int:
         """Return how many particles a scenario has."""
@@ -324,6 +328,7 @@ def header_of(info: FileInfo) -> Header:
         if kind is float and isinstance(value, int):
             value = float(value)
         labels[name] = value if isinstance(value, kind) else None
+    labels["subset"] = labels["subset"] or "test"
     if labels["budget"] is not None:
         labels["budget"] = parse_budget(labels["budget"])
     if labels["provenance"]:

@@ -68,7 +68,7 @@ class StartFrames:
 def read_starts(predictions: Predictions, truth: Truth) -> dict[int, StartFrames]:
     """Return how each known scenario begins, by ascending id."""
     first_frame = predictions.header.frames[0]
-    test_scenarios = set(truth.size.subsets["test"])
+    test_scenarios = set(truth.size.scored_scenarios)
     scenarios = sorted(test_scenarios.intersection(predictions.header.scenarios))
     starts = {}
     for scenario in scenarios:

@@ -120,7 +120,7 @@ def check_scenarios(info: FileInfo, size: Size, issues: IssueCollector) -> None:
         issues.skip("the coordinate 'scenario' cannot be read", "scenarios")
         return
     issues.complete("scenarios")
-    expected = size.subsets["test"]
+    expected = size.scored_scenarios
     missing = sorted(set(expected) - set(stored))
     unknown = sorted(set(stored) - set(expected))
     duplicate = []
@@ -199,7 +199,7 @@ def check_particles(info: FileInfo, size: Size, issues: IssueCollector) -> bool:
     stored = info.integers.get("scenario", ())
     counts = info.integers.get("particle_count", (most,) * len(stored))
     for scenario, count in zip(stored, counts, strict=False):
-        is_known = scenario in size.subsets["test"]
+        is_known = scenario in size.scored_scenarios
         if not is_known or count == size.particle_count(scenario):
             continue
         issues.error(
@@ -216,7 +216,7 @@ def check_particles(info: FileInfo, size: Size, issues: IssueCollector) -> bool:
 
 def max_test_particles(size: Size) -> int:
     """Return the most particles of a test scenario."""
-    return max(size.particle_count(scenario) for scenario in size.subsets["test"])
+    return max(size.particle_count(scenario) for scenario in size.scored_scenarios)
 
 
 def format_numbers(numbers: Sequence[int]) -> str:

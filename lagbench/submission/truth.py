@@ -29,15 +29,15 @@ BLOCK = 16
 
 
 class Truth:
-    """The test subset of a data set under a root folder.
+    """The scored subset of a data set under a root folder.
 
-    While a model is trained it is the valid subset.
+    It is test, or what the size says; while a model is trained it is valid.
     """
 
-    def __init__(self, size: Size, root: Path, subset: str = "test") -> None:
+    def __init__(self, size: Size, root: Path, subset: str | None = None) -> None:
         self.size = size
         self.root = root
-        self.subset = subset
+        self.subset = subset or size.scored_subset
 
     @property
     def folder(self) -> Path:

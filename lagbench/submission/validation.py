@@ -211,12 +211,12 @@ def _examine(
 
 
 def read_names(request: Request) -> Answer:
-    """Return the split and the size that a file names; called in a child.
+    """Return the split, size and subset that a file names; called in a child.
 
     They are None where the file names none or cannot be read.
     """
     path = Path(request["path"])
-    names: Answer = {"split": None, "size": None}
+    names: Answer = {"split": None, "size": None, "subset": None}
     try:
         with open_hdf5(path, fix=WRITE) as file:
             info = inspect_file(file, path)
@@ -234,7 +234,8 @@ def _find_size(names: Answer, registry: Registry) -> tuple[Size | None, str]:
     if names["split"] is None or names["size"] is None:
         return None, ""
     try:
-        return registry.size(names["split"], names["size"]), ""
+        size = registry.size(names["split"], names["size"])
+        return size.scored_on(names["subset"] or "test"), ""
     except (UsageError, UnreadableFileError) as error:
         hint = error.fix or error.what
         return None, hint.splitlines()[0]
@@ -244,7 +245,7 @@ def _fetch_truth(size: Size, root: Path) -> None:
     # Validating without a store needs no network library.
     from lagbench.store.copy import update_working_copy
 
-    update_working_copy(size, root, size.subsets["test"])
+    update_working_copy(size, root, size.scored_scenarios)
 
 
 def run_checks(request: Request) -> Answer:

@@ -61,6 +61,7 @@ class PredictionsWriter:
         split: name of the split.
         size: name of the size; the only one with data, of several mini, when None.
         method: what makes the predictions.
+        subset: the subset that is predicted: test, or shift, which lies outside train.
         velocity: whether velocities are stored too (they are not scored).
         dataset_sha256: hash of the data set that the model was given; else the recorded
             one.
@@ -80,6 +81,7 @@ class PredictionsWriter:
         split: str | Path,
         size: str | None = None,
         method: str,
+        subset: str = "test",
         velocity: bool = False,
         dataset_sha256: str | None = None,
         root: str | Path | None = None,
@@ -87,7 +89,8 @@ class PredictionsWriter:
         **labels: Label,
     ) -> None:
         self.path = Path(path)
-        self.size, folder, _ = locate(split, size, root=root, registry=registry)
+        tier, folder, _ = locate(split, size, root=root, registry=registry)
+        self.size = tier.scored_on(subset)
         if dataset_sha256 is None:
             dataset_sha256 = _recorded_hash(self.size, folder)
         if not isinstance(dataset_sha256, str) or not HASH.fullmatch(dataset_sha256):
@@ -103,12 +106,14 @@ class PredictionsWriter:
         self._dataset_sha256 = dataset_sha256
         self._variables = ("position", "velocity") if velocity else ("position",)
         self._row_of: dict[int, int] = {}
-        for row, scenario in enumerate(sorted(self.size.subsets["test"])):
+        for row, scenario in enumerate(sorted(self.size.scored_scenarios)):
             self._row_of[scenario] = row
         self._is_open = False
         self._written: set[int] = set()
         self._diverged_at = np.full(len(self._row_of), NEVER, np.int32)
         self._labels: dict[str, Label] = {"method": method}
+        if subset != "test":
+            self._labels["subset"] = subset
         self.label(**labels)
 
     def shape_of(self, scenario: int) -> tuple[int, int, int]:
@@ -136,7 +141,7 @@ class PredictionsWriter:
         for name, value in labels.items():
             if isinstance(value, np.generic):
                 value = value.item()
-            if name not in OPTIONAL:
+            if name not in OPTIONAL or name == "subset":
                 raise UsageError(
                     f"no label {name!r}",
                     where=f"label {quote(name)}",
@@ -469,6 +474,7 @@ def write(
     split: str | Path,
     size: str | None = None,
     method: str,
+    subset: str = "test",
     velocities: Mapping[int, ArrayLike] | ArrayLike | None = None,
     diverged_at: Mapping[int, int] | None = None,
     dataset_sha256: str | None = None,
@@ -486,6 +492,7 @@ def write(
         split: name of the split.
         size: name of the size; the only one with data, of several mini, when None.
         method: what made the predictions.
+        subset: the subset that is predicted: test, or shift, which lies outside train.
         velocities: velocities [length/s], in the same form; stored, not scored.
         diverged_at: scenario id to the absolute frame from which its rollout is frozen.
         dataset_sha256: hash of the data set that the model was given; else the recorded
@@ -508,13 +515,14 @@ def write(
         split=split,
         size=size,
         method=method,
+        subset=subset,
         velocity=velocities is not None,
         dataset_sha256=dataset_sha256,
         root=root,
         registry=registry,
         **labels,
     )
-    scenarios = sorted(writer.size.subsets["test"])
+    scenarios = sorted(writer.size.scored_scenarios)
     position_of = _by_scenario(positions, scenarios)
     velocity_of = {} if velocities is None else _by_scenario(velocities, scenarios)
     frozen_from = diverged_at or {}

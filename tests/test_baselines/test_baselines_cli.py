@@ -31,6 +31,7 @@ from lagbench.submission.validation import validate
 Command = Callable[..., Result]
 
 
+HUGE = ("--set", f"training.steps={10**40}")
 TINY = ("--split", "curl-noise", "--size", "tiny", "--threads", "1")
 
 
@@ -173,6 +174,7 @@ def test_the_speed_up_needs_the_solver(
             "did you mean 'latent'",
         ),
         (("--baseline", "gns", *TINY, "--recipe", "shrt"), 2, "no recipe"),
+        (("--baseline", "gns", *TINY, *HUGE), 2, "training.steps"),
         (("--baseline", "gns", *TINY, "--device", "tpu"), 2, "no device 'tpu'"),
         (
             ("--baseline", "gns", "--split", "cavity", "--size", "mini"),

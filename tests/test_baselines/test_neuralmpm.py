@@ -113,6 +113,24 @@ def test_smoothing_damps_what_the_grid_does_not_see() -> None:
     assert bool((deviation[1:] < 0.85 * deviation[:-1]).all())
 
 
+def test_a_model_that_sees_the_viscosity_depends_on_it() -> None:
+    """Of two windows with the same frames the predictions differ; without it not."""
+    frames = swirl(0, 3)
+    window = batch(frames, frames)
+    window = replace(window, viscosity=torch.tensor([1e-4, 1e-2]))
+    for sees_viscosity in (True, False):
+        model = surrogate(awake=0.1, viscosity=sees_viscosity)
+        predicted = rolled(model, window, 2)
+        first, second = predicted.chunk(2)
+        assert torch.equal(first, second) != sees_viscosity
+
+
+def test_a_viscosity_that_is_not_known_is_refused() -> None:
+    model = surrogate(viscosity=True)
+    with pytest.raises(DataError):
+        model.start(batch(swirl(0, 3)))
+
+
 @pytest.mark.parametrize("conserve", [False, True])
 def test_particles_stay_inside_the_walls(conserve: bool) -> None:
     """Velocities are the differences of the positions, also where a wall stops."""

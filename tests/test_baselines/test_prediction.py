@@ -607,6 +607,18 @@ def test_predictions_are_replaced_while_their_cost_is_beside_them(
         run(name="predictions.nc")
 
 
+def test_predictions_of_another_method_are_not_replaced(
+    run: Predict, tmp_path: Path
+) -> None:
+    """The user may name another file."""
+    run(name="predictions.nc", method="mine")
+    before = (tmp_path / "predictions.nc").read_bytes()
+    with pytest.raises(UsageError) as caught:
+        run(name="predictions.nc", method="other")
+    assert "mine" in str(caught.value.got)
+    assert (tmp_path / "predictions.nc").read_bytes() == before
+
+
 def test_out_of_memory(run: Predict, monkeypatch: pytest.MonkeyPatch) -> None:
     error = torch.OutOfMemoryError("no memory left")
     monkeypatch.setattr(Drift, "advance", Mock(side_effect=error))

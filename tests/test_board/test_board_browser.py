@@ -134,7 +134,7 @@ def test_long_author_lines_clip_no_column(
         f"th.textContent)"
     )
     assert len(heads) == 2 + 1 + 4 + 4
-    assert heads[-2:] == ["budgetself\u2011reported", "scores"]
+    assert heads[-2:] == ["time taken by", "scores"]
     titles = page.value(
         f"[...{table}.querySelectorAll('tr[data-entry] .sub')].map(e => e.title)"
     )
@@ -268,22 +268,72 @@ def test_overview_leads_to_every_board(page: Page, board: Board) -> None:
         page.value("document.querySelector('section.tab:not([hidden])').id")
         == "overview"
     )
-    lines = "[...document.querySelectorAll('.across tbody tr')]"
+    lines = "[...document.querySelectorAll('.across')[0].querySelectorAll('tbody tr')]"
     cells = f"{lines}.map(tr => [...tr.cells].map(td => td.textContent))"
-    rows = {row[0]: row[1:] for row in page.value(cells)}
-    ranked = [row for row in board.tabs[1].rows if row.rank is not None]
+    rows = {row[1]: row for row in page.value(cells)}
+    ranked = [row for row in board.tabs[0].rows if row.rank is not None]
+    assert rows.keys() == {row.entry.name for row in ranked}
     for row in ranked:
         skill = format_value(row.skill.mean, "number") if row.skill else ""
-        assert (
-            rows[row.entry.name][2]
-            == f"{skill}rank {row.rank}{' ≈' if row.tied else ''} of {len(ranked)}"
-        )
-    run(page, "document.querySelector('.across tbody td:nth-child(4) a').click()")
+        assert rows[row.entry.name][4] == f"{skill}rank {row.rank}"
+    opener = (
+        "document.querySelectorAll('.across')[1].querySelector('td:nth-child(5) a')"
+    )
+    run(page, f"{opener}.click()")
     until(page, "document.getElementById('panel').open")
     assert (
         page.value("document.querySelector('section.tab:not([hidden])').id")
         == board.tabs[1].id
     )
+
+
+def test_variants_unfold_behind_their_method(
+    running: Browser, board: Board, tmp_path: Path
+) -> None:
+    """They are hidden until their method's button is pressed, or a filter finds
+    them; they stand behind their method, have no rank and open a panel without a film.
+    """
+    tab = board.tabs[0]
+    head, variant, *others = tab.rows
+    variant = replace(variant, variant_of=head.id, rank=None, tied=False)
+    path = tmp_path / "variants.html"
+    tab = replace(tab, rows=(head, *others, variant))
+    path.write_text(render(replace(board, tabs=(tab,))), "utf-8")
+    page = running.open(path, width=1280)
+    still(page)
+    restored(page, f"#tab={tab.id}&sort=-name")
+    section = "document.querySelector('section:not([hidden])')"
+    line = f"{section}.querySelector('tr[data-entry={variant.id}]')"
+    is_shown = f"getComputedStyle({line}).display !== 'none'"
+    assert not page.value(is_shown)
+    run(page, f"{section}.querySelector('.fold').click()")
+    assert page.value(is_shown)
+    assert page.value(f"{line}.previousElementSibling.dataset.entry") == head.id
+    assert page.value(f"{line}.cells[0].textContent") == ""
+    run(page, f"{section}.querySelector('.fold').click()")
+    assert not page.value(is_shown)
+    restored(page, f"#tab={tab.id}&filter={variant.id}")
+    assert page.value(is_shown)
+    run(page, f"{line}.querySelector('.name').click()")
+    until(page, "document.getElementById('panel').open")
+    assert page.value("document.querySelectorAll('#panel canvas').length") == 0
+    assert page.messages == []
+    close(page)
+
+
+def test_other_columns_come_when_they_are_asked_for(page: Page, board: Board) -> None:
+    """Every number of a row is in the table, in the order of the headings."""
+    tab = board.tabs[0]
+    restored(page, f"#tab={tab.id}&columns=all")
+    columns = columns_of(tab, board.metrics)
+    for row in tab.rows[:2]:
+        texts = page.value(
+            f"[...document.querySelectorAll('#{tab.id} tr[data-entry={row.id}] > *')]"
+            ".slice(2).map(td => td.textContent)"
+        )
+        assert len(texts) == len(columns)
+        for cell, column in zip(texts, columns.values(), strict=True):
+            assert cell.startswith(format_value(value_of(row, column), column.form))
 
 
 def test_the_table_needs_no_script(

@@ -5,6 +5,7 @@ pictures.
 from __future__ import annotations
 
 import math
+import re
 import shutil
 from pathlib import Path
 
@@ -12,10 +13,12 @@ import numpy as np
 import pytest
 from board_bench import PLACE, BoardBench, copied, master, noisy
 from numpy.typing import NDArray
+from sample_boards import make_entry
 
 from lagbench.board.build import (
     CURVE_FRAMES,
     RESIDUAL_BINS,
+    Scope,
     build,
     collect,
     make_curve,
@@ -25,6 +28,7 @@ from lagbench.board.folder import Folder
 from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
 from lagbench.board.show import choose_data_sets, tables, to_plain
+from lagbench.board.variants import find_variants
 from lagbench.data.registry import Registry
 from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
 from lagbench.metrics import METRICS, Score, bootstrap_interval
@@ -289,6 +293,49 @@ def test_the_order_of_files_does_not_matter(bench: BoardBench, tmp_path: Path) -
             shutil.copyfile(path, copy)
         pages.append(build(target, registry=bench.registry).page.read_bytes())
     assert pages[0] == pages[1]
+
+
+def test_less_is_formed_to_the_same_numbers(bench: BoardBench, board: Board) -> None:
+    """A board of some metrics without pictures has the ranks and values of the whole
+    one.
+    """
+    scope = Scope(metrics=("position_rmse",), intervals=(), has_pictures=False)
+    small = collect(bench.folder, registry=bench.registry, scope=scope)
+    for row, whole in zip(small.tabs[0].rows, board.tabs[0].rows, strict=True):
+        assert row.values.keys() == {"vorticity_nrmse", "position_rmse"}
+        ranking = row.values["vorticity_nrmse"]
+        assert ranking.mean == whole.values["vorticity_nrmse"].mean
+        assert row.losses.tolist() == whole.losses.tolist()
+        assert row.values["position_rmse"].mean == whole.values["position_rmse"].mean
+        assert math.isnan(row.values["position_rmse"].low)
+        assert row.pictures is None
+        assert row.rank == whole.rank
+
+
+def test_names_tell_variants() -> None:
+    """A name that continues another one of the same authors with a comma or a word is
+    that of a variant.
+    """
+    names = (
+        "GNS",
+        "GNS, wide",
+        "GNS without noise",
+        "GNS2",
+        "GNS + MLP",
+        "GNS, wide, 2",
+    )
+    entries = []
+    for name in names:
+        method = re.sub("[^a-z0-9]+", "-", name.lower())
+        entry = make_entry("GNS", 0, "cavity", "mini", None)
+        entries.append(entry.model_copy(update={"name": name, "method": method}))
+    stranger = entries[1].model_copy(update={"authors": ("Z.",), "method": "theirs"})
+    variants = find_variants([*entries, stranger], entries)
+    assert variants == {
+        "gns-wide": "gns",
+        "gns-without-noise": "gns",
+        "gns-wide-2": "gns",
+    }
 
 
 def test_an_entry_in_another_place_is_refused(own: BoardBench) -> None:

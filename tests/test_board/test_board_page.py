@@ -19,9 +19,9 @@ from sample_boards import make_board, with_entry
 from lagbench.board.columns import columns_of
 from lagbench.board.entry import EntryCost, EntryFlag, Weights
 from lagbench.board.model import Board, BoardRow, Tab
+from lagbench.board.overview import conclude, find_hero, make_overviews
 from lagbench.board.page import render, same_page
 from lagbench.board.table_view import MOST_REASONS, Cell, make_table
-from lagbench.figures.html import text
 
 HOSTILE = (
     "</script><script>console.error(1)</script>"
@@ -106,7 +106,7 @@ def test_every_number_arrives_at_the_script(board: Board, page: str) -> None:
                 number = math.nan
             assert number == pytest.approx(value.mean, rel=1e-8, nan_ok=True)
         if isinstance(row, BoardRow):
-            expected = "verified" if row.verified else "as submitted"
+            expected = "scored again" if row.verified else "as submitted"
             assert values["checked"] == expected
 
 
@@ -139,37 +139,113 @@ def test_pages_are_compared_by_content(page: str) -> None:
     assert not same_page(b"another file", original)
 
 
-def overview_lines(page: str) -> dict[str, list[str]]:
-    """Return the texts of the first cell of the overview, by name of the method."""
-    table = page[page.index('class="board across"') :]
-    body = table[table.index("<tbody>") : table.index("</tbody>")]
-    lines = {}
-    for line in re.findall(r"<tr>.*?</tr>", body):
-        cells = re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", line)
-        lines[cells[0]] = re.findall(r">([^<>]+)<", cells[1])
-    return lines
+def row_of(board: Board, name: str, method: str, **changes: Any) -> BoardRow:
+    """Return the first row of a board under another name, with other skills."""
+    row = with_entry(board.tabs[0].rows[0], name=name, method=method)
+    return replace(row, **changes)
 
 
-def test_the_overview_is_ordered_by_mean_skill(board: Board, page: str) -> None:
-    """A data set without an entry counts 0; methods without any skill come last."""
-    lines = overview_lines(page)
-    skills: dict[str, list[float]] = {}
-    for tab in board.tabs:
-        for row in tab.rows:
-            if row.rank is None:
-                continue
-            known = skills.setdefault(row.entry.name, [])
-            if row.skill:
-                known.append(row.skill.mean)
-    assert lines.keys() == skills.keys()
+def test_only_methods_that_ran_everything_have_a_place(board: Board) -> None:
+    """They stand in the order of their mean skill; the others follow, whatever their
+    skill, and say what is missing. Not running a data set is no advantage.
+    """
+    skills = {
+        "steady": (0.5, 0.4),
+        "uneven": (0.9, -0.3),
+        "picky": (0.99, None),
+    }
+    tabs = []
+    for number, split in enumerate(("cavity", "fluid")):
+        tab = make_board(((split, "mini"),)).tabs[0]
+        rows = []
+        for rank, (method, skills_of_method) in enumerate(skills.items(), 1):
+            skill = skills_of_method[number]
+            if skill is not None:
+                value = replace(tab.rows[0].values[tab.ranking], mean=skill)
+                rows.append(row_of(board, method, method, skill=value, rank=rank))
+        tabs.append(replace(tab, rows=tuple(rows)))
+    (overview,) = make_overviews(replace(board, tabs=tuple(tabs)))
+    places = []
+    for method in overview.methods:
+        places.append((method.method, method.rank, method.missing))
+    assert places == [
+        ("steady", 1, ()),
+        ("uneven", 2, ()),
+        ("picky", None, ("fluid",)),
+    ]
+    means = [method.mean_skill for method in overview.methods]
+    assert means == pytest.approx([0.45, 0.3, 0.99])
+    page = render(replace(board, tabs=tuple(tabs)))
+    assert "not on fluid" in page
 
-    order = []
-    for name, cell in lines.items():
-        known = skills[name]
-        mean = sum(known) / 2 if known else math.nan
-        assert cell == [text(mean), f"{len(known)} of 2"]
-        order.append(mean if known else -math.inf)
-    assert order == sorted(order, reverse=True)
+
+def test_the_places_over_all_data_sets_are_ranges(board: Board) -> None:
+    """Two methods that win in turn share places; a third far behind does not."""
+    tab = make_board((("cavity", "mini"),)).tabs[0]
+    rng = np.random.Generator(np.random.PCG64(3))
+    noise = rng.random((2, len(tab.scenarios)))
+    rows = []
+    for rank, (method, level) in enumerate((("a", 1.0), ("b", 1.0), ("c", 9.0)), 1):
+        losses = level + noise[rank % 2 : rank % 2 + 1]
+        skill = replace(tab.rows[0].values[tab.ranking], mean=1.0 - losses.mean() / 10)
+        rows.append(
+            row_of(board, method, method, losses=losses, skill=skill, rank=rank)
+        )
+    naive = replace(
+        tab.references[0],
+        values={tab.ranking: replace(tab.rows[0].values[tab.ranking], mean=10.0)},
+    )
+    tab = replace(tab, rows=tuple(rows), references=(naive,))
+    (overview,) = make_overviews(replace(board, tabs=(tab,)))
+    ranges = {method.method: method.rank_range for method in overview.methods}
+    assert ranges["c"] == (3, 3)
+    assert ranges["a"] == ranges["b"] == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "high", "beginning"),
+    [
+        (1.5, 1.9, "Learning does not pay on cavity full"),
+        (0.9, 1.1, "Whether learning pays on cavity full is open"),
+        (0.5, 0.6, "Learning pays on cavity full"),
+    ],
+)
+def test_a_sentence_says_whether_learning_pays(
+    board: Board, ratio: float, high: float, beginning: str
+) -> None:
+    """It follows from the best ratio of any active entry that learns."""
+    row = board.tabs[0].rows[0]
+    value = replace(row.values["position_rmse"], mean=ratio, low=0.1, high=high)
+    worse = replace(value, mean=9.0, high=10.0)
+    rows = (
+        replace(row, against_classical=worse, solver="projection"),
+        replace(row, against_classical=value, solver="projection"),
+    )
+    tab = first_tab(board, *rows)
+    assert conclude(tab).startswith(beginning)
+    assert conclude(first_tab(board, row)) == ""
+
+
+def test_variants_have_no_film(board: Board) -> None:
+    """Their method has; the page would become too long."""
+    head, variant = board.tabs[0].rows[:2]
+    variant = replace(variant, variant_of=head.id, rank=None)
+    plain = read_page_data(with_rows(board, head, variant)).tabs[0]["rows"]
+    assert plain[0]["pictures"] is not None
+    assert plain[1]["pictures"] is None
+    assert plain[1]["variantOf"] == head.id
+
+
+def test_the_first_film_is_of_several_materials(board: Board) -> None:
+    """It has all particles that are known, with a key; links say how to take part."""
+    hero = find_hero(board)
+    assert hero is not None
+    tab, row = hero
+    assert tab.size.split == "fluid"  # the sample has four materials there
+    plain = read_page_data(render(board)).hero
+    assert plain["entry"] == row.id
+    assert len(plain["material"]) == row.pictures.film.shape[1]
+    assert [name for _, name in plain["key"]] == ["liquid", "jelly", "snow", "rope"]
 
 
 def test_references_are_judged_like_entries(board: Board) -> None:

@@ -189,6 +189,13 @@ def test_bibtex_of_a_split_has_its_version_and_every_hash(
         assert size.dataset_sha256 in fields["note"]
 
 
+def test_without_a_split_lagbench_itself_is_cited(run: Run) -> None:
+    result = run("cite")
+    assert result.exit_code == 0
+    assert lagbench.__version__ in result.stdout
+    assert json.loads(run("cite", "--json").stdout)["version"] == lagbench.__version__
+
+
 def test_a_citation_names_the_work_behind_the_split(run: Run) -> None:
     assert "Ghia" in run("cite", "cavity").stdout
     assert json.loads(run("cite", "cavity", "--json").stdout)["licence"] == "CC-BY-4.0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -130,6 +131,61 @@ def test_a_full_disk_exits_5() -> None:
     assert done.returncode == 5
     assert b"fix:" in done.stderr
     assert b"unexpected" not in done.stderr
+
+
+@pytest.mark.skipif(
+    not Path("/dev/full").exists(), reason="this system has no /dev/full"
+)
+@pytest.mark.parametrize(
+    ("words", "code"), [(("info", "none"), 2), (("info", "-x"), 2)]
+)
+def test_a_full_stderr_leaves_the_exit_code(words: tuple[str, ...], code: int) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([*PROGRAM, *words], stderr=full, check=False)
+    assert done.returncode == code
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("score", ("FILE", "lagbench score --help")),
+        ("score a.nc --root", ("--root",)),
+        ("score a.nc --worker 2", ("--worker", "--workers")),
+        ("score a.nc --workers x", ("--workers", "'x'")),
+        ("plot cavity --dpi 5", ("--dpi", "5")),
+        ("leaderboard chek", ("chek",)),
+        ("cite cavity fluid", ("fluid",)),
+    ],
+)
+def test_mistakes_on_the_command_line_are_told_like_all_others(
+    line: str, words: tuple[str, ...], run: Run
+) -> None:
+    """Where, got and fix; no box and no usage line."""
+    result = run(*line.split())
+    assert result.exit_code == 2
+    for word in ("where: lagbench", "fix: ", *words):
+        assert word in result.stderr
+    assert "Usage:" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "word"),
+    [
+        (OSError(errno.EIO, "Input/output error", "/mnt/disk/file"), "/mnt/disk/file"),
+        (OSError(errno.ESTALE, "Stale file handle", "/mnt/disk"), "/mnt/disk"),
+        (FileNotFoundError(errno.ENOENT, "No such file"), "the working folder"),
+        (MemoryError(), "memory"),
+        (ImportError("x.so: failed to map segment from shared object"), "memory"),
+    ],
+)
+def test_a_vanished_disk_and_full_memory_are_no_faults_of_lagbench(
+    error: Exception, word: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raise_in_list(error, monkeypatch)
+    result = run("list")
+    assert result.exit_code == 5
+    assert word in result.stderr
+    assert "unexpected" not in result.stderr
 
 
 def test_letters_that_a_stream_lacks_are_escaped() -> None:

@@ -30,6 +30,7 @@ from lagbench.data.registry import load
 from lagbench.errors import UnreadableFileError, UsageError
 from lagbench.exchange import adopt
 from lagbench.exchange.local_split import LocalSplit
+from lagbench.make.clean import clean
 from lagbench.make.verify import verify
 
 
@@ -171,6 +172,11 @@ def test_the_only_size_there_is_the_default(own: Path, tmp_path: Path) -> None:
     mini_folder.mkdir(parents=True)
     (mini_folder / "0000.nc").touch()
     assert locate("cavity", root=tmp_path).size.name == "mini"
+    # Nothing is removed by a default.
+    with pytest.raises(UsageError) as unnamed:
+        clean("cavity", root=tmp_path)
+    assert unnamed.value.where == "--size"
+    assert (mini_folder / "0000.nc").exists()
     # Where a split has no mini, its only size is the default.
     assert (
         locate_new("own", root=own.parent).size.name

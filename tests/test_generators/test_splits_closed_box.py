@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenario_draws import all_of, changed, draw, neighbours, state_of
+from scenario_draws import (
+    all_of,
+    changed,
+    draw,
+    neighbours,
+    shifted,
+    state_of,
+    usual_ids,
+)
 from scipy.interpolate import CubicHermiteSpline
 
 from lagbench.data import WALLS, registry
@@ -25,7 +33,7 @@ def test_cavity_scenarios_draw_what_the_design_says() -> None:
     size = registry.load().size("cavity", "full")
     fastest = size.value("speed_max")
     states = all_of("cavity")
-    for scenario, state in zip(size.scenarios, states, strict=True):
+    for scenario, state in zip(usual_ids(size), states, strict=True):
         drawn = state.parameters
         assert 20.0 <= float(drawn["reynolds"]) <= 400.0
         # Re = (U / 2) L / nu with L = 0.875 and mu = rho nu with rho = 1e-4.
@@ -62,6 +70,39 @@ def test_cavity_walls_slide_along_themselves_and_never_meet_in_a_corner() -> Non
             assert not np.array_equal(bottom, top)
 
 
+@pytest.mark.parametrize("size", ["full", "mini"])
+def test_shifted_cavities_lie_outside_train(size: str) -> None:
+    """Half has a Reynolds number beyond train's, half two walls that meet in a corner
+    and move as one belt around it.
+    """
+    most = max(float(s.parameters["reynolds"]) for s in all_of("cavity", size))
+    usual = {state.parameters["wall"] for state in all_of("cavity", size)}
+    states = shifted("cavity", size)
+    for state in states[::2]:
+        assert float(state.parameters["reynolds"]) > 1.2 * most
+        assert state.parameters["wall"] in usual
+    # each wall's direction anticlockwise, in the order of WALLS
+    turn = np.array([-1.0, 1.0, 1.0, -1.0])
+    for state in states[1::2]:
+        assert state.parameters["wall"] not in usual
+        assert float(state.parameters["reynolds"]) <= most
+        along = state.wall_velocity[:, (0, 1, 2, 3), (1, 1, 0, 0)] * turn
+        moving = np.flatnonzero(along.any(axis=0))
+        assert len(moving) == 2
+        assert set(moving) not in ({0, 1}, {2, 3})
+        np.testing.assert_array_equal(along[:, moving[0]], along[:, moving[1]])
+    assert len({state.parameters["wall"] for state in states[1::2]}) == 4
+
+
+@pytest.mark.parametrize("size", ["full", "mini"])
+def test_shifted_frequencies_lie_outside_train(size: str) -> None:
+    """One below and one above all of train, half of the scenarios each."""
+    usual = [state.parameters["frequency"] for state in all_of("curl-noise", size)]
+    shifts = [state.parameters["frequency"] for state in shifted("curl-noise", size)]
+    assert all(frequency < min(usual) for frequency in shifts[::2])
+    assert all(frequency > max(usual) for frequency in shifts[1::2])
+
+
 def test_cavity_programs_are_hermite_splines_at_rest_in_their_knots() -> None:
     """With knots every 25 frames, SciPy's spline that is flat in each is the program;
     signs alternate.
@@ -91,7 +132,7 @@ def test_one_cavity_in_eight_is_the_classic(size: str, expected: int) -> None:
     train has all walls.
     """
     tier = registry.load().size("cavity", size)
-    states = dict(zip(tier.scenarios, all_of("cavity", size), strict=True))
+    states = dict(zip(usual_ids(tier), all_of("cavity", size), strict=True))
     classic = {}
     for i, state in states.items():
         if state.parameters["motion"] == "constant":
@@ -137,7 +178,7 @@ def test_curl_noise_frequencies_follow_the_thesis() -> None:
     for size, count, least in (("full", 10, 4), ("mini", 3, 2), ("tiny", 2, 1)):
         states = all_of("curl-noise", size)
         frequencies = [state.parameters["frequency"] for state in states]
-        ids = registry.load().size("curl-noise", size).scenarios
+        ids = usual_ids(registry.load().size("curl-noise", size))
         assert frequencies == [i % count + least for i in ids]
     # At mini the scale falls as frequency squared: one vorticity [1/frame]. Full has
     # one scale.

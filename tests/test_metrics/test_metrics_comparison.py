@@ -25,7 +25,7 @@ from lagbench.metrics import (
     standings,
 )
 from lagbench.metrics.aggregate import quantile
-from lagbench.metrics.significance import mean_loss
+from lagbench.metrics.significance import mean_loss, rank_ranges
 
 DIFFERENCES = st.lists(st.integers(-5, 5).map(float), min_size=1, max_size=9)
 
@@ -376,3 +376,48 @@ def test_seeds_of_a_method_are_compared_together() -> None:
     assert found.difference == pytest.approx(-9.5)
     assert found.p == differ(values, other.values)
     assert found.interval == bootstrap_interval(values, minus=other.values)
+
+
+def test_ranges_of_ranks_are_those_of_all_draws() -> None:
+    """The shares of ranks are counted over all 6^6 draws of six scenarios."""
+    losses = {
+        "a": np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+        "b": np.array([1.9, 1.4, 3.2, 4.1, 5.6, 5.2]),
+        "c": np.array([2.1, 2.9, 3.1, 5.2, 5.9, 7.2]),
+    }
+    names = sorted(losses)
+    values = np.array([losses[name] for name in names])  # shape [method, scenario]
+    stretch = math.sqrt(6 / 5)
+    ranks = []
+    for draw in itertools.product(range(6), repeat=6):
+        middle = values.mean(axis=1)
+        means = middle + stretch * (values[:, draw].mean(axis=1) - middle)
+        ranks.append([1 + np.sum(means < mean) for mean in means])
+    expected = {}
+    for name, ranks_of_name in zip(names, np.sort(ranks, axis=0).T, strict=True):
+        tail = int(0.025 * len(ranks))
+        expected[name] = (ranks_of_name[tail], ranks_of_name[-1 - tail])
+    assert expected == {"a": (1, 2), "b": (1, 2), "c": (3, 3)}
+    tables = {name: [table[None]] for name, table in losses.items()}
+    assert rank_ranges(tables) == expected
+    backwards = {name: tables[name] for name in reversed(names)}
+    assert rank_ranges(backwards) == expected
+
+
+def test_ranges_of_ranks_know_ties_gaps_and_few_scenarios() -> None:
+    """Equal methods share their ranks, those without a value the last ones; few
+    scenarios claim nothing. Seeds that scatter widen a range.
+    """
+    same = np.arange(1.0, 9.0)[None]
+    nothing = np.full((1, 8), np.nan)
+    ranges = rank_ranges(
+        {"b": [same], "a": [same], "far": [9.0 + same], "none": [nothing]}
+    )
+    assert ranges == {"a": (1, 2), "b": (1, 2), "far": (3, 3), "none": (4, 4)}
+    assert rank_ranges({"a": [same[:, :5]], "b": [same[:, :5]]}) == {}
+
+    scatter = np.array([[-2.0], [0.0], [2.0]])
+    sure = {"a": [same], "b": [same + 0.5]}
+    unsure = {"a": [same + scatter], "b": [same + 0.5 + scatter]}
+    assert rank_ranges(sure) == {"a": (1, 1), "b": (2, 2)}
+    assert rank_ranges(unsure) == {"a": (1, 2), "b": (1, 2)}

@@ -94,6 +94,21 @@ def test_the_default_root_is_that_of_the_environment(
         assert "content_sha256" not in data["position"].attrs
 
 
+def test_the_given_viscosity_is_a_coordinate(tmp_path: Path) -> None:
+    """Each scenario has its own; one that states none has none in the cavity."""
+    stated = dict(zip(TEST_IDS, (2e-3, 5e-4), strict=False))
+    for scenario in TEST_IDS:
+        parameters: dict[str, object] = {"grid": 16}
+        if scenario in stated:
+            parameters["viscosity"] = stated[scenario]
+        write_scenario(tmp_path, make_key(scenario), parameters=parameters)
+    with open_split("cavity", size="tiny", root=tmp_path) as data:
+        for scenario in TEST_IDS:
+            viscosity = float(data["viscosity"].sel(scenario=scenario))
+            expected = stated.get(scenario, np.nan)
+            np.testing.assert_equal(viscosity, expected)
+
+
 def test_it_is_lazy_and_bounded(tmp_path: Path) -> None:
     """Positions are dask arrays in chunks of some megabytes, one scenario each."""
     for scenario in TEST_IDS:

@@ -346,6 +346,9 @@ def test_no_store_at_all(here: Path) -> None:
         "http://host:abc/data",
         "http://exa mple/data",
         "http:///data",
+        "http://0x7f.1/data",
+        "http://2130706433/data",
+        "http://127.1/data",
         "http://a..b/",
     ],
 )

@@ -4,13 +4,15 @@ is left half done.
 
 from __future__ import annotations
 
+import socket
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 from conftest import SIZE, SPLIT
-from object_stores import files, machine
+from object_stores import CREDENTIALS, files, machine
 from typer.testing import CliRunner
 
 import lagbench
@@ -20,7 +22,7 @@ from lagbench.errors import DataError, LagbenchError, UsageError, WorkFailedErro
 from lagbench.exchange import download
 from lagbench.make.generate import generate
 from lagbench.make.verify import verify
-from lagbench.store import copy
+from lagbench.store import copy, objects
 
 Use = Callable[[str], object]
 
@@ -111,6 +113,34 @@ def test_where_nothing_can_be_written_nothing_is_kept(
         with pytest.raises(UsageError):
             generate(SPLIT, SIZE, root=root, dry_run=dry_run)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def silent_store(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A store that accepts connections and never answers, waited for briefly."""
+    pytest.importorskip("s3fs")
+    monkeypatch.setattr(objects, "S3_TIMEOUT", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"http://127.0.0.1:{server.getsockname()[1]}"
+        environment = {**CREDENTIALS, "AWS_ENDPOINT_URL": address}
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        yield "s3://bucket/data"
+
+
+def test_a_silent_store_is_given_up(
+    silent_store: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time is the product of timeout, attempts and rounds, and pauses."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    start = time.monotonic()
+    words = ["verify", SPLIT, "--size", SIZE, "--root", silent_store]
+    result = CliRunner().invoke(app, words)
+    waited = time.monotonic() - start
+    limit = objects.S3_TIMEOUT * objects.S3_ATTEMPTS * objects.S3_ROUNDS
+    assert waited < 2 * limit + 5.0
+    assert result.exit_code == 5
+    assert "s3://bucket/data" in result.stderr
 
 
 def test_the_command_line_says_it_too(s3: str) -> None:

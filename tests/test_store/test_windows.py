@@ -260,6 +260,73 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
     assert data.viscosity == 1e-3
 
 
+def write_viscous(
+    folder: Path, registry: Registry, *, split: str, stated: dict[int, object]
+) -> None:
+    """Write the valid subset of a tiny split, some scenarios with a viscosity."""
+    size = registry.size(split, "tiny")
+    for scenario in size.subsets["valid"]:
+        parameters: dict[str, object] = {"grid": 16}
+        if scenario in stated:
+            parameters["viscosity"] = stated[scenario]
+        write_scenario(
+            folder,
+            make_key(scenario, subset="valid", split=split),
+            frames=size.frame_count(scenario),
+            walls=split == "cavity",
+            parameters=parameters,
+        )
+
+
+def test_windows_have_the_viscosity_of_their_scenario(
+    tmp_path: Path, unmeasured: Registry
+) -> None:
+    """Windows of loaders and of rollouts agree."""
+    (scenario,) = unmeasured.size("cavity", "tiny").subsets["valid"][:1]
+    write_viscous(tmp_path, unmeasured, split="cavity", stated={scenario: 2e-3})
+    options: dict[str, Any] = {
+        "subset": "valid",
+        "size": "tiny",
+        "root": tmp_path,
+        "registry": unmeasured,
+    }
+    data = WindowDataset("cavity", **options)
+    path = scenario_paths("cavity", **options)[scenario]
+    expected = torch.tensor([2e-3])
+    torch.testing.assert_close(collate([data[0]]).viscosity, expected)
+    torch.testing.assert_close(scenario_batch(path).viscosity, expected)
+
+
+def test_windows_have_the_viscosity_of_the_data_set_where_files_state_none(
+    tmp_path: Path, unmeasured: Registry
+) -> None:
+    """That of curl noise is the effective one of its task."""
+    write_viscous(tmp_path, unmeasured, split="curl-noise", stated={})
+    data = lagbench.windows(
+        "curl-noise", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
+    )
+    task = unmeasured.size("curl-noise", "tiny").task
+    assert task.effective_viscosity is not None
+    assert data[0].viscosity == data.viscosity == task.effective_viscosity
+
+
+@pytest.mark.parametrize("stated", [-1e-3, float("nan"), "thick"])
+def test_a_viscosity_that_is_none_is_damage(
+    tmp_path: Path, unmeasured: Registry, stated: object
+) -> None:
+    (scenario,) = unmeasured.size("cavity", "tiny").subsets["valid"][:1]
+    write_viscous(tmp_path, unmeasured, split="cavity", stated={scenario: 1e-3})
+    path = tmp_path / f"cavity/tiny/v2/valid/{scenario:04d}.nc"
+    with h5py.File(path, "r+") as file:
+        file.attrs["viscosity"] = stated
+    data = lagbench.windows(
+        "cavity", subset="valid", size="tiny", root=tmp_path, registry=unmeasured
+    )
+    with pytest.raises(DataError) as caught:
+        data[0]
+    assert path.name in (caught.value.where or "")
+
+
 def test_collate_puts_windows_side_by_side(train: Open) -> None:
     """Each window keeps its number, scenario and first frame."""
     data = train()

@@ -2,11 +2,11 @@
 
 /** Return the content of the panel and its film. */
 function drawDetail(tab, state, row) {
-  const [filmFigure, film] = drawFilm(tab, row);
+  const [filmFigure, film] = row.pictures ? drawFilm(tab, row) : [null, null];
   const content = [
     drawTiles(tab, row),
     drawFlags(row),
-    el("div", { class: "figures" }, [drawErrors(tab, row), drawScenarios(tab, row), drawMaps(tab, row), filmFigure, drawEnergy(tab, row), drawHistograms(tab, row)]),
+    el("div", { class: "figures" }, [drawErrors(tab, row), drawScenarios(tab, row), row.pictures ? drawMaps(tab, row) : null, filmFigure, drawEnergy(tab, row), row.pictures ? drawHistograms(tab, row) : null]),
     drawFrames(tab, row),
     drawNumbers(tab, row),
     drawOrigin(row),
@@ -20,7 +20,7 @@ function referencesOf(tab) {
 }
 
 function leaderOf(tab) {
-  return tab.rows.find((row) => row.active);
+  return tab.rows.find((row) => row.rank) ?? tab.rows.find((row) => row.active && row.pictures);
 }
 
 function drawTiles(tab, row) {
@@ -71,7 +71,7 @@ function drawScenarios(tab, row) {
 }
 
 function scenarioChart(tab, by, rows) {
-  const held = rows.map(([kind, row]) => [kind, short(row.name), (row.spread[by] ?? []).map(number)]);
+  const held = rows.map(([kind, row]) => [kind, short(row.name), row.spread[by] ? [...numbersOf(row.spread[by])] : []]);
   const count = tab.scenarios.length;
   const places = { low: -0.5, high: count - 0.5, share: (value) => (value + 0.5) / count, factor: "", ticks: tab.scenarios.map((id, i) => ({ value: i, label: String(id) })) };
   const plot = new Plot(places, spanning(held.flatMap(([, , values]) => values)), { xLabel: "scenario", yLabel: columnOf(tab, by).quantity });

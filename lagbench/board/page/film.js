@@ -39,11 +39,8 @@ function particleColours(materials, first) {
 
 /** Plays one film on two canvases, `pixels` wide; `ended` is called `rest` seconds after its last frame, `stop` ends it. */
 class Film {
-  constructor(tab, row, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
-    Object.assign(this, { rest, ended, rested: 0 });
-    this.frames = row.pictures.filmFrames;
-    this.materials = row.pictures.material;
-    this.sides = [["truth", numbersOf(tab.truth.film)], [short(row.name), numbersOf(row.pictures.film)]];
+  constructor({ frames, materials, sides }, { pixels = 560, rest = 0, ended = () => this.toggle(false) } = {}) {
+    Object.assign(this, { frames, materials, sides, rest, ended, rested: 0 });
     this.time = 0;
     this.playing = false;
     this.canvases = this.sides.map(([name]) => el("canvas", { width: pixels, height: pixels, class: "film", role: "img", "aria-label": `Particles of ${name}` }));
@@ -123,8 +120,17 @@ class Film {
   }
 }
 
+/** Return the film of a row beside the truth. */
+function filmOf(tab, row) {
+  return {
+    frames: row.pictures.filmFrames,
+    materials: row.pictures.material,
+    sides: [["truth", numbersOf(tab.truth.film)], [short(row.name), numbersOf(row.pictures.film)]],
+  };
+}
+
 function drawFilm(tab, row) {
-  const film = new Film(tab, row);
+  const film = new Film(filmOf(tab, row));
   const caption = `${film.materials.length} of the particles of scenario ${row.pictures.scenario}, ${film.frames.length} frames and what lies between them.`;
   return [figure("Rollout", film.element(), caption, { width: "wide", name: "film" }), film];
 }

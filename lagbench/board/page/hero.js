@@ -1,39 +1,57 @@
-// Above the fold: the truth beside the leader of the data set in view; on the overview one data set after another.
+// Above the fold: the truth beside a leader; on the overview that of the data set with the most materials.
 
-const hero = { holder: document.getElementById("hero"), isWanted: !quiet.matches, film: null, tab: null, isCycling: false };
+const hero = { holder: document.getElementById("hero"), isWanted: !quiet.matches, film: null, tab: null };
 
-function tabsWithLeader() {
-  return BOARD.tabs.filter(leaderOf);
+/** Return the tab of the first film. */
+function heroTab() {
+  return BOARD.hero && BOARD.tabs.find((tab) => tab.id === BOARD.hero.tab);
 }
 
-/** Show the film of a tab; without one, of all tabs in turn. */
+/** Show the film of a tab; on the overview the first one. */
 function setHero(tab) {
-  hero.isCycling = !tab;
-  const tabs = tabsWithLeader();
-  const next = tab ?? (tabs.includes(hero.tab) ? hero.tab : tabs[0]);
-  if (next !== hero.tab) drawHero(next);
+  const next = tab ?? heroTab();
+  if (hero.holder && next !== hero.tab) drawHero(next);
+}
+
+/** Return what the film of a tab shows: the first film has all particles that are known. */
+function heroFilm(tab, leader) {
+  if (tab !== heroTab()) return filmOf(tab, leader);
+  const { frames, material, films } = BOARD.hero;
+  return { frames, materials: material, sides: [["truth", numbersOf(films[0])], [`model: ${short(leader.name)}`, numbersOf(films[1])]] };
 }
 
 function drawHero(tab) {
   hero.film?.stop();
-  const leader = tab && leaderOf(tab);
+  const isFirst = Boolean(tab) && tab === heroTab();
+  const leader = isFirst ? tab.rows.find((row) => row.id === BOARD.hero.entry) : tab && leaderOf(tab);
+  const isShown = isFirst || Boolean(leader?.pictures);
   hero.tab = tab;
-  hero.film = leader ? new Film(tab, leader, { pixels: 440, rest: 1.2, ended: nextHero }) : null;
-  hero.holder.hidden = !leader;
-  if (!leader) return;
+  hero.film = isShown ? new Film(heroFilm(tab, leader), { pixels: 440, rest: 1.2, ended: nextHero }) : null;
+  hero.holder.hidden = !isShown;
+  if (!isShown) return;
   hero.film.play.addEventListener("click", () => { hero.isWanted = hero.film.playing; });
-  const key = columnOf(tab, "skill") ? "skill" : tab.ranking;
+  const by = columnOf(tab, "skill") ? "skill" : tab.ranking;
   const address = addressOf({ ...readAddress(tab.id), entry: leader.id });
   const caption = el(
     "figcaption",
     {},
     el("strong", {}, `${tab.split} ${tab.size}`),
-    ": the truth, and the leader of the table, ",
+    ": the truth beside ",
     el("a", { href: address }, short(leader.name)),
-    ` (${columnOf(tab, key).label} ${textOf(tab, leader, key)}).`,
+    ` (${columnOf(tab, by).label} ${textOf(tab, leader, by)}).`,
+    isFirst ? materialKey() : null,
   );
   hero.holder.replaceChildren(...hero.film.element(), caption);
   playHero();
+}
+
+/** Return the names of the materials in their colours. */
+function materialKey() {
+  if (BOARD.hero.key.length < 2) return null;
+  return el("span", { class: "materials" }, BOARD.hero.key.map(([material, name]) => {
+    const dot = svg("svg", { viewBox: "0 0 10 10", width: 10, height: 10, "aria-hidden": "true" }, svg("circle", { cx: 5, cy: 5, r: 4.5, fill: BOARD.colours.materials[material] }));
+    return el("span", {}, dot, ` ${name}`);
+  }));
 }
 
 /** Play unless the reader does not want it or reads a panel. */
@@ -42,11 +60,8 @@ function playHero() {
   if (hero.film && hero.film.playing !== isWanted) hero.film.toggle();
 }
 
-/** Begin again, or with the next data set. */
+/** Begin again. */
 function nextHero() {
-  const tabs = tabsWithLeader();
-  const next = tabs[(tabs.indexOf(hero.tab) + 1) % tabs.length];
   hero.film.toggle(false);
-  if (hero.isCycling && next !== hero.tab) drawHero(next);
-  else playHero();
+  playHero();
 }

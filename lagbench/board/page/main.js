@@ -94,7 +94,7 @@ function openPanel() {
   panel.scrollTop = 0;
   panel.querySelector("h2").focus();
   playHero();
-  if (!quiet.matches) film.toggle(true);
+  if (!quiet.matches) film?.toggle(true);
 }
 
 panel.addEventListener("close", () => {
@@ -185,6 +185,7 @@ document.addEventListener("keydown", (event) => {
 if (BOARD.tabs.length) {
   linkTabs();
   BOARD.tabs.forEach(linkTools);
+  linkFolds();
   window.addEventListener("hashchange", () => isAddress(location.hash) && follow());
   follow();
 }

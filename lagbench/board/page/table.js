@@ -41,7 +41,7 @@ function textOf(tab, row, key) {
 }
 
 function noteOf(tab, row, key) {
-  return row.notes[indexOf(tab, key)];
+  return row.notes[indexOf(tab, key)] ?? "";
 }
 
 /** Return the entries that are shown, in order, and all that could be. */
@@ -64,7 +64,9 @@ function sortValue(tab, row, key) {
 /** Return rows sorted; those without a value come last whichever way. */
 function ordered(tab, rows, { key, down }) {
   const sign = down ? -1 : 1;
-  const pairs = rows.map((row) => [row, sortValue(tab, row, key)]);
+  const methods = new Map(rows.map((row) => [row.id, row]));
+  const variants = rows.filter((row) => row.active && methods.has(row.variantOf));
+  const pairs = rows.filter((row) => !variants.includes(row)).map((row) => [row, sortValue(tab, row, key)]);
   pairs.sort(([first, a], [second, b]) => {
     const gaps = isGap(a) - isGap(b);
     if (gaps) return gaps;
@@ -72,7 +74,8 @@ function ordered(tab, rows, { key, down }) {
     if (a > b) return sign;
     return first.place - second.place;
   });
-  return pairs.map(([row]) => row);
+  // variants stand behind their method, best first
+  return pairs.flatMap(([row]) => [row, ...variants.filter((variant) => variant.variantOf === row.id)]);
 }
 
 function isGap(value) {
@@ -85,6 +88,32 @@ function nextSort(tab, key, sort) {
   if (FIRST_CELLS.includes(key)) return { key, down: false };
   const { direction, form } = columnOf(tab, key);
   return { key, down: ["higher", "none"].includes(direction) && form !== "text" };
+}
+
+/** Return the cells of a line by key; those that are not in the page yet are made when asked for. */
+function cellsOf(tab, row) {
+  if (!row.cells) {
+    const shown = [...FIRST_CELLS, ...tab.columns.map((column) => column.key).filter((key) => tab.presets.main.includes(key))];
+    const cells = [...lineOf(tab, row).cells];
+    row.cells = new Map(shown.map((key, place) => [key, cells[place]]));
+  }
+  return row.cells;
+}
+
+/** Add the cells of all columns that the page did not bring. */
+function completeLine(tab, row) {
+  const cells = cellsOf(tab, row);
+  let before = null;
+  for (const key of cellKeys(tab)) {
+    if (!cells.has(key)) {
+      const index = indexOf(tab, key);
+      const attributes = { class: row.classes[index], title: row.notes[index] };
+      const cell = el("td", attributes, textOf(tab, row, key));
+      before.after(cell);
+      cells.set(key, cell);
+    }
+    before = cells.get(key);
+  }
 }
 
 /** Show the lines and columns that were asked for, in order; return the entries shown and all that could be. */
@@ -102,10 +131,15 @@ function arrange(tab, state) {
   const { every, entries } = shownRows(tab, state);
   const shown = new Set([...tab.references, ...entries]);
   const rows = [...tab.references, ...tab.rows];
+  const isMain = state.preset === "main";
   for (const row of rows) {
-    const line = lineOf(tab, row);
-    line.hidden = !shown.has(row);
-    keys.forEach((key, place) => { line.cells[place].hidden = !shownKeys.has(key); });
+    lineOf(tab, row).hidden = !shown.has(row);
+    if (!isMain) completeLine(tab, row);
+    for (const [key, cell] of cellsOf(tab, row)) cell.hidden = !shownKeys.has(key);
+  }
+  // a filter that finds a variant shows it
+  for (const row of rows) {
+    if (row.variantOf && row.active) lineOf(tab, row).classList.toggle("found", Boolean(state.filter) && shown.has(row));
   }
   const lines = ordered(tab, rows, state.sort).map((row) => lineOf(tab, row));
   sectionOf(tab).querySelector("tbody").append(...lines);

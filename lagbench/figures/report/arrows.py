@@ -43,7 +43,7 @@ def arrow_figures(subject: Subject, gallery: Gallery) -> Iterator[ReportFigure]:
     """Yield a figure of velocity arrows over time for each of the first entries."""
     scenario = subject.scenarios[0]
     moments = gallery.at(scenario, subject.times)
-    speeds = [_speed(moment.truth.fields.velocity) for moment in moments]
+    speeds = [_speed(moment.truth.fields.section.velocity) for moment in moments]
     limit = limit_of(speeds)
     caption = (
         f"Scenario {scenario}; colour is speed on the score grid, on one scale for all "
@@ -81,8 +81,9 @@ def _draw_panels(
     limit: float,
 ) -> list[Markup]:
     """Return the panels of truth, prediction and difference at one frame."""
-    true = moment.truth.fields.velocity
-    predicted = moment.pairs[entry.number].predicted_fields.velocity
+    fields = moment.truth.fields.section
+    true = fields.velocity
+    predicted = moment.pairs[entry.number].predicted_fields.section.velocity
     velocities = {
         "truth": true,
         "prediction": predicted,
@@ -91,30 +92,28 @@ def _draw_panels(
     classes = gallery.labels[moment.scenario].classes
     panels = []
     for name, velocity in velocities.items():
-        arrows = _draw_arrows(subject, moment.truth.fields, velocity, limit=limit)
+        arrows = _draw_arrows(fields, velocity, limit=limit)
         alt = f"{name}, frame {moment.frame}"
         panels.append(draw_line_panel(arrows, classes, alt))
     return panels
 
 
-def _draw_arrows(
-    subject: Subject, fields: Fields, velocity: Floats, *, limit: float
-) -> Markup:
+def _draw_arrows(fields: Fields, velocity: Floats, *, limit: float) -> Markup:
     """Return arrows at every k-th node that counts, coloured by speed.
 
     A panel shows the inside of the box in coordinates from 0 to :data:`SIDE`, from the
     top left.
     """
     grid = fields.grid
-    every = math.ceil(grid.nodes / MOST_ARROWS)
+    every = math.ceil(max(grid.shape) / MOST_ARROWS)
     counted = np.argwhere(fields.counted)  # shape [node, 2]
     is_shown = (counted - every // 2) % every == 0
     column, row = counted[is_shown.all(axis=1)].T
 
-    (left, right), (_, top) = subject.task.size.bounds
+    (left, right), (_, top) = grid.box.bounds
     scale = SIDE / (right - left)
-    node_x = (column + grid.origin) * grid.spacing
-    node_y = (row + grid.origin) * grid.spacing
+    node_x = grid.start[0] + (column + grid.origin) * grid.spacing
+    node_y = grid.start[1] + (row + grid.origin) * grid.spacing
     x = (node_x - left) * scale
     y = (top - node_y) * scale
 

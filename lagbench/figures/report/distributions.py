@@ -335,6 +335,8 @@ def _draw_residuals(
         x = pair.true_vorticity
     else:
         x = np.flatnonzero(pair.nodes).astype(np.float64)
+        # in three dimensions a node has three components
+        x = np.repeat(x, len(residual) // max(1, len(x)))
     plot = Plot(
         x_axis.axis,
         y_axis,

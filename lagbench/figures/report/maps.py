@@ -22,6 +22,7 @@ from lagbench.figures.html import (
     tag,
 )
 from lagbench.figures.png import encode_indexed_png
+from lagbench.figures.solid import SLICE
 from lagbench.scoring.task import ScoredTask
 
 from .subject import Gallery, Moment, ScenarioLabel, Subject, limit_of
@@ -86,12 +87,13 @@ _SEQUENTIAL = _build_palette(FAST, FAST)
 
 def crop_to_walls(task: ScoredTask, field: Floats) -> Floats:
     """Return the nodes of a field that lie within the walls, shape [x node, y node]."""
-    axis = task.config.grid.axis
-    slack = WALL_SHARE * task.config.grid.spacing
-    (left, right), (bottom, top) = task.size.bounds
-    is_column_inside = (axis >= left - slack) & (axis <= right + slack)
-    is_row_inside = (axis >= bottom - slack) & (axis <= top + slack)
-    return field[np.ix_(is_column_inside, is_row_inside)]
+    grid = task.config.grid.section
+    slack = WALL_SHARE * grid.spacing
+    insides = []
+    for axis, (low, high) in enumerate(grid.box.bounds):
+        places = grid.places(axis)
+        insides.append((places >= low - slack) & (places <= high + slack))
+    return field[np.ix_(*insides)]
 
 
 def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
@@ -153,9 +155,9 @@ def field_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
 
 def _masked_speeds(moment: Moment) -> list[Floats]:
     """Return the speed of truth and entries at the nodes, NaN where none counts."""
-    flows = [moment.truth.fields]
+    flows = [moment.truth.fields.section]
     for pair in moment.pairs:
-        flows.append(pair.predicted_fields)
+        flows.append(pair.predicted_fields.section)
     speeds = []
     for flow in flows:
         squares = flow.velocity**2
@@ -229,6 +231,9 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
             panels.append(draw_image_panel(png, classes, alt))
         return panels
 
+    what = "Vorticity"
+    if subject.task.config.box.dimension == 3:
+        what = f"Vorticity across a slice {SLICE}"
     rows = [("truth", draw_row("true vorticity", true_fields))]
     for entry in subject.entries:
         fields = []
@@ -244,7 +249,7 @@ def scenario_figure(subject: Subject, gallery: Gallery) -> ReportFigure:
         title=f"Every test scenario at frame {frame}",
         thesis="Figs. 5.26, 5.27",
         body=draw_panel_grid(columns, rows, width=5.0),
-        caption="Vorticity; each column has a colour scale of its own, set by its "
+        caption=f"{what}; each column has a colour scale of its own, set by its "
         "truth. Orange edges move.",
         wide=True,
     )
@@ -258,6 +263,8 @@ def _describe_scenario(scenario: int, label: ScenarioLabel) -> str:
         if len(label.moving) > 1:
             verb = "walls move"
         details.append(f"{' and '.join(label.moving)} {verb} (orange)")
+    if label.is_slice:
+        details.append(f"a slice {SLICE}, and the vorticity across it")
     if not details:
         return f"Scenario {scenario}."
     return f"Scenario {scenario}: {', '.join(details)}."

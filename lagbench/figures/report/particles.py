@@ -19,6 +19,7 @@ from lagbench.figures.html import (
 )
 from lagbench.figures.particles import DOT_DIAMETER, Interval, paint_particles
 from lagbench.figures.png import encode_indexed_png
+from lagbench.figures.solid import View
 from lagbench.metrics.frame import Snapshot
 
 from .subject import Gallery, Moment, Subject
@@ -98,9 +99,23 @@ def _scenario_figure(
 
 def _draw_snapshot(subject: Subject, snapshot: Snapshot) -> bytes:
     material = snapshot.scenario.material
-    spacing = float(np.sqrt(snapshot.scenario.area / len(material)))
-    bounds = subject.task.size.bounds
-    return draw_materials(snapshot.position, material, view=bounds, spacing=spacing)
+    volume = snapshot.scenario.area / len(material)
+    box = subject.task.size.box
+    if box.dimension == 2:
+        return draw_materials(
+            snapshot.position,
+            material,
+            view=(box.bounds[0], box.bounds[1]),
+            spacing=float(np.sqrt(volume)),
+        )
+    view = View(box)
+    order = np.argsort(-view.depth(snapshot.position), kind="stable")
+    return draw_materials(
+        view.place(snapshot.position[order]),
+        material[order],
+        view=((0.0, 1.0), (0.0, 1.0)),
+        spacing=float(np.cbrt(volume)) * view.scale,
+    )
 
 
 def draw_materials(

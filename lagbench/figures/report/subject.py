@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from lagbench.data import WALLS
+from lagbench.data.box import WALL_NAMES
 from lagbench.data.local import load_rooted_registry, resolve_root
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
@@ -40,9 +40,6 @@ TOP_PERCENTILE = 99.5  # full colour is this percentile of the truth's magnitude
 
 SAME_FIELDS = ("split", "size", "dataset_version", "dataset_sha256")
 """Fields of the header that all entries of a report share."""
-
-# direction along the walls left, right, bottom, top
-_ALONG = np.array([(0.0, 1.0), (0.0, 1.0), (1.0, 0.0), (1.0, 0.0)])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -263,6 +260,7 @@ class ScenarioLabel:
     moving: tuple[str, ...]  # names of the walls that slide
     reynolds: float | None  # Reynolds number, None where there is none
     mark: str  # family, pair or frequency, as in "falling circle", or empty
+    is_slice: bool = False  # whether maps are slices of three dimensions
 
     @property
     def classes(self) -> str:
@@ -305,14 +303,17 @@ class Moment:
     def true_vorticity(self) -> Floats:
         """Vorticity of the truth [1/frame], shape [x node, y node].
 
-        NaN stands where it is not compared.
+        NaN stands where it is not compared. In three dimensions it is the component
+        across the middle plane, in that plane.
         """
-        return self.truth.fields.vorticity
+        return self.truth.fields.section.vorticity
 
     def predicted_vorticity(self, number: int) -> Floats:
         """Return the vorticity of an entry where it is compared, NaN elsewhere."""
         pair = self.pairs[number]
-        return np.where(pair.nodes, pair.predicted_fields.vorticity, np.nan)
+        is_compared = self.truth.fields.section.differentiable
+        vorticity = pair.predicted_fields.section.vorticity
+        return np.where(is_compared, vorticity, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -382,10 +383,11 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
     moving = []
     if "wall_velocity" in file.variables:
         wall_velocity = np.asarray(file.read("wall_velocity"), np.float64)
-        largest = np.abs(wall_velocity).max(axis=0) * _ALONG  # shape [wall, 2]
-        for wall, velocity in zip(WALLS, largest, strict=True):
-            if velocity.any():
-                moving.append(wall)
+        largest = np.abs(wall_velocity).max(axis=0)  # shape [wall, axis]
+        for number, velocity in enumerate(largest):
+            along = np.delete(velocity, number // 2)
+            if along.any():
+                moving.append(WALL_NAMES[number])
 
     marks = []
     for name in ("family", "pair"):
@@ -397,7 +399,12 @@ def _label_scenario(truth: OpenScenario) -> ScenarioLabel:
     value = parameters.get("reynolds_number")
     if isinstance(value, (int, float)):
         reynolds = float(value)
-    return ScenarioLabel(moving=tuple(moving), reynolds=reynolds, mark=", ".join(marks))
+    return ScenarioLabel(
+        moving=tuple(moving),
+        reynolds=reynolds,
+        mark=", ".join(marks),
+        is_slice=truth.scenario.config.box.dimension == 3,
+    )
 
 
 def limit_of(fields: Sequence[Floats]) -> float:

@@ -1,0 +1,168 @@
+"""Weakly compressible flow in a full box: two or three axes, walled or periodic.
+
+Equations and the bounds within which they hold stand in :mod:`.nodal_stress_nd`, the
+rules of walls and periodic axes in :mod:`.box_tables`.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.errors import UsageError
+
+from .driver import Driver
+from .full_box_parameters import FullBoxParameters
+from .nodal_stress import JACOBIAN_BOUND
+from .nodal_stress_nd import NodalStressND
+from .solver import Health
+from .split import InitialState
+
+
+class FullBox(Driver[FullBoxParameters]):
+    """Solver of a full box; its methods are those of :class:`.Solver`."""
+
+    _kernels: NodalStressND
+
+    def _compile(self, atomic: bool, threads: int) -> NodalStressND:
+        return NodalStressND(
+            self.parameters, scenarios=self.scenarios, atomic=atomic, threads=threads
+        )
+
+    @property
+    def dimension(self) -> int:
+        """Number of axes: 2 or 3."""
+        return self.parameters.box.dimension
+
+    def _start(self, states: Sequence[InitialState]) -> None:
+        p = self.parameters
+        kernels = self._kernels
+        self._states = list(states)
+        self._drive_towards(0)
+        # nu dt / dx^2, shape [scenario]
+        viscosity = np.array([state.viscosity for state in states])
+        spread = viscosity * p.dt * p.grid**2
+        kernels.spread.from_numpy(spread.astype(np.float32))
+        for field in (kernels.drag, kernels.node, kernels.moved, kernels.gain):
+            field.fill(0.0)
+
+    def _inside(self, position: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return positions between the walls, wrapped along periodic axes [length]."""
+        box = self.parameters.box
+        wrapped = box.wrap(position).astype(np.float32)
+        # Rounding to float32 may reach the end of a period, which is its start.
+        is_at_end = wrapped >= np.asarray(box.high, np.float32)
+        start = np.asarray(box.low, np.float32)
+        wrapped = np.where(is_at_end & box.periodic, start, wrapped)
+        clipped = super()._inside(wrapped)
+        return np.where(box.periodic, wrapped, clipped)
+
+    def _drive_towards(self, frame: int) -> None:
+        """Set walls and forces as they act up to a frame."""
+        walls = [state.walls_towards(frame) for state in self._states]
+        self._kernels.move_walls(np.stack(walls).astype(np.float32))
+        if self.parameters.force_layers:
+            forces = [state.force_towards(frame) for state in self._states]
+            self._kernels.apply_force(np.stack(forces).astype(np.float32))
+
+    def _drive(self, end: int) -> int:
+        if not any(_has_program(state) for state in self._states):
+            return end
+        interval = self.parameters.substeps_per_frame
+        frame, past = divmod(self._substeps, interval)
+        if past == 0:
+            self._drive_towards(frame + 1)
+        return min(end, (frame + 1) * interval)
+
+    def jacobian(self) -> NDArray[np.float32]:
+        """Volume ratio J of the particles [1], shape [scenario, particle]."""
+        return np.asarray(self._kernels.carried.to_numpy()[:, :, 3])
+
+    def grid_velocity(self) -> NDArray[np.float32]:
+        """Nodal velocities of the last substep [length/s].
+
+        The shape is [scenario, *cells, axis]; a node is the middle of its cell.
+        """
+        shape = (self.scenarios, *self._kernels.tables.shape, -1)
+        values = self._kernels.moved.to_numpy().reshape(shape)
+        interior = (slice(1, -1),) * self.dimension
+        inside = values[(slice(None), *interior)]
+        return np.asarray(inside[..., : self.dimension])
+
+    def health(self) -> list[Health]:
+        """Return what each scenario went through during the last advance."""
+        # largest velocity of any particle by component, and J, shape [scenario, 4]
+        extremes = self._read(self._kernels.extremes).max(axis=1)
+        lowest = self._read(self._kernels.x)[..., 3].max(axis=1)
+        # largest velocity component of any node, shape [scenario]
+        peaks = self._kernels.peak.to_numpy().max(axis=1)
+        healths = []
+        for extreme, low, peak in zip(extremes, lowest, peaks, strict=True):
+            is_finite = np.isfinite(extreme).all() and np.isfinite([low, peak]).all()
+            health = Health(
+                finite=bool(is_finite),
+                max_speed=float(np.max([*extreme[:3], peak])),
+                jacobian_min=float(-low),
+                jacobian_max=float(extreme[3]),
+            )
+            healths.append(health)
+        return healths
+
+    def close(self) -> None:
+        """Give the memory back, for good; kernels of other solvers in this process
+        compile again.
+        """
+        self._kernels.release()
+
+    def _broken_bounds(self, index: int, health: Health) -> dict[str, str]:
+        broken = {}
+        if health.jacobian_min <= 0.0:
+            broken["J > 0"] = f"J = {health.jacobian_min:.6g}"
+        if health.jacobian_max > JACOBIAN_BOUND:
+            broken[f"J <= {JACOBIAN_BOUND:g}"] = f"J = {health.jacobian_max:.6g}"
+        return broken
+
+    def _check_state(self, index: int, state: InitialState) -> None:
+        super()._check_state(index, state)
+        self._check_walls(index, state)
+        self._check_force(index, state)
+
+    def _check_walls(self, index: int, state: InitialState) -> None:
+        """Refuse walls that move as no wall of this box can."""
+        p = self.parameters
+        speed_bound = self._kernels.speed_bound / 2.0
+        shape = (2 * self.dimension, self.dimension)
+        speeds = np.abs(np.asarray(state.wall_velocity))
+        has_walls = speeds.shape[-2:] == shape
+        if has_walls:
+            wall = np.arange(2 * self.dimension)
+            may_move = np.full(shape, p.no_slip)
+            may_move[wall, wall // 2] = False  # a wall does not move along its normal
+            may_move[np.repeat(p.box.periodic, 2)] = False
+            is_allowed = (speeds == 0.0) | (may_move & (speeds <= speed_bound))
+        if not has_walls or not is_allowed.all():
+            raise UsageError(
+                "walls can only slide along themselves, and only no-slip walls "
+                "can move",
+                where=f"scenario {index}, wall_velocity",
+                expected=f"shape [..., {shape[0]}, {shape[1]}], speeds up to dx/(2 dt)"
+                f" = {speed_bound:.6g}, zeros along periodic axes",
+                got=f"shape {speeds.shape}, speeds up to {speeds.max():.6g}",
+            )
+
+    def _check_force(self, index: int, state: InitialState) -> None:
+        """Refuse a body force of other layers than the solver has."""
+        layer_count = self.parameters.force_layers
+        force = state.force_towards(0)
+        if force.shape != (layer_count, self.dimension) or not np.isfinite(force).all():
+            raise UsageError(
+                "the body force does not fit the box",
+                where=f"scenario {index}, body_force",
+                expected=f"finite, shape [frame, {layer_count}, {self.dimension}]",
+                got=f"shape [frame, {force.shape[0]}, {force.shape[1]}]",
+            )
+
+
+def _has_program(state: InitialState) -> bool:
+    """Tell whether walls or forces change from frame to frame."""
+    return state.wall_velocity.ndim == 3 or state.body_force is not None

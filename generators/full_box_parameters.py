@@ -1,0 +1,52 @@
+"""Constants of the solver of full boxes in two and three dimensions.
+
+NumPy only: a split can be drawn, inspected and tested without Taichi.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lagbench.data.box import Box
+
+__all__ = ["FullBoxParameters"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FullBoxParameters:
+    """Constants of the weakly compressible solver of a full box.
+
+    The equations stand in :mod:`.nodal_stress_nd`. Nodes are the middles of cells; the
+    box is a whole number of cells long along each axis.
+    """
+
+    particles: int  # particles in one scenario
+    grid: int  # cells across a length of 1
+    dt: float  # substep [s]
+    box: Box  # walls and periodic axes
+    # whether the walls hold the fluid or let it slide
+    no_slip: bool
+    density: float  # rest density rho [mass/length^d]
+    modulus: float  # bulk modulus E [mass length^(2-d)/s^2]; c^2 = E/rho
+    # lambda, share of the grid velocity mixed into v_p per substep [1]
+    velocity_relaxation: float
+    # kappa, share of the nodal J mixed into J_p per substep [1]
+    jacobian_relaxation: float
+    # theta, pull of J_p towards the grid density per substep [1]
+    density_coupling: float
+    shift: float  # beta, strength of the particle shift [1]
+    # layers of equal height along y on which a body force acts; 0 for no force
+    force_layers: int = 0
+    # substeps for which one row of a program of walls or forces acts
+    substeps_per_frame: int = 1
+
+    @property
+    def cells(self) -> tuple[int, ...]:
+        """Cells along each axis, shape [axis]."""
+        return tuple(round(length * self.grid) for length in self.box.lengths.tolist())
+
+    @property
+    def origin(self) -> tuple[float, ...]:
+        """Coordinate of the ghost nodes below each axis [cells], shape [axis]."""
+        # twelve digits: a sum of halves and whole cells is exact
+        return tuple(round(low * self.grid - 0.5, 12) for low in self.box.low)

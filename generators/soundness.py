@@ -1,0 +1,166 @@
+"""Is a free surface nearly incompressible, and does no numerical bound act?
+
+The Mach number of a particle is its speed over the speed of sound in its material at
+rest. A weakly compressible liquid needs about 0.3 at most: its density then varies by
+less than a tenth, and what moves is governed by its mass and not by its stiffness.
+
+Two bounds of the model are physics and are no clamps: a liquid bears no tension, so its
+J stays at 1 where it separates; and snow that flies apart keeps the room of loose snow,
+``snow_jp_max``. All other bounds are numerical. :class:`SoundnessRecorder` counts the
+particles that reached one of these at any substep:
+
+- J of a liquid at ``jacobian_min``;
+- Jp of snow at ``snow_jp_min``;
+- a hardening factor exp(xi (1 - Jp)) at ``snow_hardening_min`` or at
+  ``snow_hardening_max``.
+
+No hash covers these numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .split import FreeSurfaceParameters, Material
+
+BIN = 1e-3
+"""Width of the bins by which quantiles of Mach numbers and of J are counted [1]."""
+
+_BIN_COUNT = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class FreeSurfaceSoundness:
+    """How compressible a scenario was, and which bounds it reached."""
+
+    mach_999: float  # Mach number that 99.9 % of particles and frames stay below [1]
+    mach_max: float  # largest Mach number of any particle at any recorded frame [1]
+    # J that 99.9 % of liquid particles and frames stay above, 1 without liquid [1]
+    liquid_jacobian_999: float
+    liquid_jacobian_min: float  # smallest J of a liquid at any substep [1]
+    liquid_jacobian_max: float  # largest J of a liquid at any substep [1]
+    snow_jp_min: float  # smallest Jp of snow at any substep, 1 without snow [1]
+    snow_jp_max: float  # largest Jp of snow at any substep, 1 without snow [1]
+    # particles that reached a numerical bound at any substep [1]
+    clamped_particles: int
+
+
+def sound_speeds(parameters: FreeSurfaceParameters) -> dict[Material, float]:
+    """Return the speed of sound c of each material at rest [length/s].
+
+    c^2 is K/rho in liquid and (lambda + 2 mu)/rho in solids.
+    """
+    p = parameters
+    moduli = {
+        Material.LIQUID: p.liquid_modulus,
+        Material.JELLY: wave_modulus(p.jelly_modulus, p.jelly_poisson),
+        Material.SNOW: wave_modulus(p.snow_modulus, p.snow_poisson),
+        Material.ROPE: wave_modulus(p.rope_modulus, p.rope_poisson),
+    }
+    speeds = {}
+    for material, modulus in moduli.items():
+        speeds[material] = math.sqrt(modulus / p.density)
+    return speeds
+
+
+def wave_modulus(young: float, poisson: float) -> float:
+    """Return lambda + 2 mu = E (1 - nu) / ((1 + nu) (1 - 2 nu)) [mass/s^2]."""
+    return young * (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+
+
+class SoundnessRecorder:
+    """Collects the Mach numbers and J of one scenario, frame by frame.
+
+    Its memory does not grow with the frames: values are counted in bins of
+    :data:`BIN`, and a quantile is the end of a bin.
+    """
+
+    def __init__(
+        self, parameters: FreeSurfaceParameters, material: NDArray[np.integer]
+    ) -> None:
+        self._parameters = parameters
+        self._is_liquid = material == Material.LIQUID
+        self._is_snow = material == Material.SNOW
+        speeds = sound_speeds(parameters)
+        # of each particle [length/s], shape [particle]
+        self._sound_speed = np.array([speeds[Material(kind)] for kind in material])
+        self._mach_counts = np.zeros(_BIN_COUNT, np.int64)
+        self._mach_max = 0.0
+        self._jacobian_counts = np.zeros(_BIN_COUNT, np.int64)
+
+    def add(self, velocity: NDArray[np.float32], ratio: NDArray[np.float32]) -> None:
+        """Add a recorded frame.
+
+        Args:
+            velocity: particle velocities [length/s], shape [particle, 2].
+            ratio: J of liquid [1], shape [particle]; of others it is not read.
+        """
+        velocity_square = np.square(velocity, dtype=np.float64).sum(axis=-1)
+        mach = np.sqrt(velocity_square) / self._sound_speed
+        self._mach_max = max(self._mach_max, float(mach.max()))
+        self._mach_counts += _count_bins(mach)
+        self._jacobian_counts += _count_bins(ratio[self._is_liquid].astype(np.float64))
+
+    def summary(
+        self, least: NDArray[np.float32], greatest: NDArray[np.float32]
+    ) -> FreeSurfaceSoundness:
+        """Return what the frames and substeps so far have shown.
+
+        Args:
+            least: smallest J of liquid or Jp of snow at any substep [1], shape
+                [particle].
+            greatest: the largest, shape [particle].
+        """
+        liquid_jacobian_999 = 1.0
+        if self._is_liquid.any():
+            # the other tail: the start of the bin that holds it
+            liquid_jacobian_999 = _quantile(self._jacobian_counts, 0.001) - BIN
+        return FreeSurfaceSoundness(
+            mach_999=round(_quantile(self._mach_counts, 0.999), 3),
+            mach_max=self._mach_max,
+            liquid_jacobian_999=round(liquid_jacobian_999, 3),
+            liquid_jacobian_min=_least(least[self._is_liquid]),
+            liquid_jacobian_max=_greatest(greatest[self._is_liquid]),
+            snow_jp_min=_least(least[self._is_snow]),
+            snow_jp_max=_greatest(greatest[self._is_snow]),
+            clamped_particles=self._count_clamped(least, greatest),
+        )
+
+    def _count_clamped(
+        self, least: NDArray[np.float32], greatest: NDArray[np.float32]
+    ) -> int:
+        p = self._parameters
+        # Jp at which the hardening factor meets its caps [1]
+        stiffest = 1.0 - math.log(p.snow_hardening_max) / p.snow_hardening
+        softest = 1.0 - math.log(p.snow_hardening_min) / p.snow_hardening
+        is_clamped_liquid = self._is_liquid & (least <= np.float32(p.jacobian_min))
+        lowest_plastic = np.float32(max(p.snow_jp_min, stiffest))
+        is_clamped_snow = self._is_snow & (
+            (least <= lowest_plastic) | (greatest >= np.float32(softest))
+        )
+        return int(np.count_nonzero(is_clamped_liquid | is_clamped_snow))
+
+
+def _count_bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return how many values lie in each bin; the last one holds all that is beyond."""
+    index = np.minimum(values / BIN, _BIN_COUNT - 1).astype(np.int64)
+    return np.bincount(index, minlength=_BIN_COUNT)
+
+
+def _quantile(counts: NDArray[np.int64], share: float) -> float:
+    """Return the end of the first bin up to which a share of the values lies."""
+    cumulative = np.cumsum(counts)
+    index = int(np.searchsorted(cumulative, share * cumulative[-1]))
+    return (index + 1) * BIN
+
+
+def _least(values: NDArray[np.float32]) -> float:
+    return float(values.min()) if values.size else 1.0
+
+
+def _greatest(values: NDArray[np.float32]) -> float:
+    return float(values.max()) if values.size else 1.0

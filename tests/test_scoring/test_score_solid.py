@@ -1,0 +1,147 @@
+"""Scoring in three dimensions with periodic axes: flows whose scores are known."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import lagbench
+from lagbench.data.local import locate
+from lagbench.data.scenario import read_scenario
+from lagbench.exchange import adopt
+from lagbench.exchange.local_split import LocalSplit
+from lagbench.figures.plot import KINDS, plot_frame
+from lagbench.figures.report.report import write_report
+from lagbench.references.predictor import given_in
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.score_file_checks import find_unreadable
+
+SIDE = 8
+FRAMES = 10
+GIVEN = 4
+AMPLITUDES = ((0.02, 0.03, 0.01), (0.01, 0.02, 0.03), (0.03, 0.01, 0.02))
+"""Of the flows of Arnold, Beltrami and Childress [length/frame]."""
+
+
+def beltrami(position: NDArray[np.float64], a: float, b: float, c: float) -> object:
+    """Return the ABC flow of period 1, whose curl is 2 pi times itself."""
+    x, y, z = 2.0 * math.pi * position.T
+    return np.stack(
+        [
+            a * np.sin(z) + c * np.cos(y),
+            b * np.sin(x) + a * np.cos(z),
+            c * np.sin(y) + b * np.cos(x),
+        ],
+        axis=1,
+    )
+
+
+def carried(amplitudes: tuple[float, float, float]) -> NDArray[np.float32]:
+    """Return particles of a lattice that the flow carries, by the classical Runge-Kutta
+    method.
+    """
+    axis = (np.arange(SIDE) + 0.5) / SIDE
+    grid = np.meshgrid(axis, axis, axis, indexing="ij")
+    x = np.stack(grid, axis=-1).reshape(-1, 3)
+    frames = []
+    for _ in range(FRAMES):
+        frames.append(x % 1.0)
+        k1 = np.asarray(beltrami(x, *amplitudes))
+        k2 = np.asarray(beltrami(x + k1 / 2, *amplitudes))
+        k3 = np.asarray(beltrami(x + k2 / 2, *amplitudes))
+        k4 = np.asarray(beltrami(x + k3, *amplitudes))
+        x = x + (k1 + 2 * k2 + 2 * k3 + k4) / 6
+    return np.asarray(np.stack(frames), np.float32)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> LocalSplit:
+    folder = tmp_path_factory.mktemp("abc")
+    paths = []
+    for number, amplitudes in enumerate(AMPLITUDES):
+        paths.append(folder / f"run{number}.npy")
+        np.save(paths[-1], carried(amplitudes))
+    return adopt(
+        paths,
+        output=folder / "abc",
+        valid=1,
+        test=1,
+        radius=0.2,
+        frame_interval=0.1,
+        bounds=((0.0, 1.0),) * 3,
+        periodic=("x", "y", "z"),
+        input_frames=GIVEN,
+        frames_of_interest=(6,),
+        cells=4,
+        full_box=True,
+    )
+
+
+def test_truth_is_perfect_and_references_are_measured(
+    made: LocalSplit, tmp_path: Path
+) -> None:
+    """A steady flow is what the frozen field predicts best, far better than rest."""
+    path = tmp_path / "predictions.nc"
+    truth = carried(AMPLITUDES[2])[GIVEN:]
+    root = made.folder.parent
+    lagbench.submission.write(path, {2: truth}, split=made.folder, method="truth")
+    validated = lagbench.validate(path, root=root, isolated=False)
+    card = lagbench.score(
+        path, root=root, output_dir=tmp_path, workers=1, validated=validated
+    )
+    assert card.submission["vorticity_nrmse"].mean == 0.0
+    assert card.submission["position_rmse"].mean == 0.0
+    errors = {}
+    for name, scores in card.scores.items():
+        errors[name] = scores["position_rmse"].mean
+        assert math.isfinite(errors[name])
+    assert {"analog", "frozen-field"} <= errors.keys()
+    assert errors["frozen-field"] < 0.2 * errors["persistence"]
+    # slices and a film of three components, which the board reads in a child
+    assert card.preview.vorticity.shape == (2, 2, 4, 4)
+    assert card.preview.film.shape[-1] == 3
+    assert not find_unreadable([card.files[1]])
+
+
+def test_references_of_a_steady_flow_follow_it(made: LocalSplit) -> None:
+    """The first step of constant velocity is the given one, by the shortest way; the
+    projection solver carries the particles better than their last velocities do.
+    """
+    size = locate(made.folder).size
+    root = made.folder.parent
+    with read_scenario(size.path(root, 2)) as file:
+        given = given_in(file, size, root)
+    first = next(REFERENCES["constant-velocity"].predict(given))
+    step = given.box.displacement(given.last, first.astype(np.float64))
+    np.testing.assert_allclose(step, given.step, atol=1e-6)
+    assert np.abs(given.step).max() < 0.1
+
+    truth = carried(AMPLITUDES[2])[-1].astype(np.float64)
+    errors = {}
+    for name in ("constant-velocity", "projection-2x"):
+        *_, last = REFERENCES[name].predict(given)
+        error = given.box.displacement(truth, last.astype(np.float64))
+        errors[name] = float(np.sqrt(np.mean(error**2)))
+    assert errors["projection-2x"] < 0.6 * errors["constant-velocity"]
+
+
+@pytest.mark.slow
+def test_pictures_and_report_are_drawn(made: LocalSplit, tmp_path: Path) -> None:
+    """Particles, slices and arrows, of the files of a set without walls."""
+    path = tmp_path / "predictions.nc"
+    root = made.folder.parent
+    lagbench.template(made.folder, output=path)
+    validated = lagbench.validate(path, root=root, isolated=False)
+    card = lagbench.score(path, root=root, write=False, workers=1, validated=validated)
+    page = write_report(tmp_path / "report", [card], [path], root=root)
+    text = page.read_text("utf-8")
+    assert "a slice across z" in text
+    assert "arrows" in text
+    scenario = locate(made.folder).size.path(root, 2)
+    for kind in KINDS:
+        picture = plot_frame(scenario, 3, tmp_path / f"{kind}.png", kind=kind)
+        assert picture.stat().st_size > 2000

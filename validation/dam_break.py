@@ -1,0 +1,166 @@
+"""A column of liquid breaks: its front beside the experiment of Martin & Moyce (1952).
+
+    python -m validation.dam_break --size full --json dam.json
+
+A column of width a and height 2 a stands at rest in the corner of the box of ``fluid``
+and is let go. Its front z runs along the floor; Martin and Moyce measured Z = z / a
+against T = t sqrt(2 g / a) (Phil. Trans. R. Soc. A 244, 312-324, columns with n^2 = 2).
+The solver has the constants of the split at a size; the particles fill cells as
+densely as :data:`PER_CELL` says.
+
+The deviation counts from Z = 1.44 on: before, the experiment's gate was still opening.
+Exit code 0: done; 2: bad options; 5: the solver failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.checksums import round_digits
+from lagbench.data.registry import load
+from lagbench.errors import LagbenchError, WorkFailedError
+from lagbench.generators.constants import free_surface_walls
+from lagbench.generators.draws import quantise
+from lagbench.generators.fluid import solver_parameters
+from lagbench.generators.solver import build
+from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
+
+_EXPERIMENT = """
+0.41 1.11  0.84 1.22  1.19 1.44  1.43 1.67  1.63 1.89
+1.83 2.11  1.98 2.33  2.20 2.56  2.32 2.78  2.51 3.00
+2.65 3.22  2.83 3.44  2.98 3.67  3.11 3.89  3.33 4.11
+"""
+EXPERIMENT_TIME = np.array(_EXPERIMENT.split()[::2], dtype=np.float64)
+"""T of the experiment [1]."""
+
+EXPERIMENT_FRONT = np.array(_EXPERIMENT.split()[1::2], dtype=np.float64)
+"""Z of the experiment at these times [1]."""
+
+WIDTH = 0.2
+"""Width a of the column [length]."""
+
+PER_CELL = 4
+"""Particles of a cell."""
+
+FIRST_FRONT = 1.44
+"""Least Z of the experiment that counts [1]."""
+
+SPRAY = 0.002
+"""Share of the particles that may run ahead of the front."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DamBreak:
+    """The front of a breaking column beside that of the experiment."""
+
+    size: str  # size of fluid whose constants were used
+    particles: int  # particles of the column
+    time: tuple[float, ...]  # T of the experiment [1]
+    front: tuple[float, ...]  # Z of the solver at these times [1]
+    experiment: tuple[float, ...]  # Z of the experiment [1]
+    deviation: float  # mean of abs(Z / Z_experiment - 1) where it counts [1]
+    bias: float  # mean of Z / Z_experiment - 1 where it counts [1]
+
+
+def column(parameters: FreeSurfaceParameters, low: float) -> InitialState:
+    """Return a column at rest in the left corner, on a lattice of particles."""
+    spacing = 1.0 / (parameters.grid * math.sqrt(PER_CELL))
+    columns = round(WIDTH / spacing)
+    rows = round(2.0 * WIDTH / spacing)
+    x = low + (np.arange(columns) + 0.5) * (WIDTH / columns)
+    y = low + (np.arange(rows) + 0.5) * (2.0 * WIDTH / rows)
+    grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
+    position = np.stack([grid_x.ravel(), grid_y.ravel()], axis=-1)
+    count = len(position)
+    return InitialState(
+        position=quantise(position),
+        velocity=np.zeros((count, 2)),
+        affine=np.zeros((count, 2, 2)),
+        material=np.full(count, Material.LIQUID, dtype=np.int8),
+        area=2.0 * WIDTH * WIDTH,
+    )
+
+
+def front_of(position: NDArray[np.float32], low: float) -> float:
+    """Return Z: how far the front has run, without the spray ahead of it [1]."""
+    return (float(np.quantile(position[:, 0], 1.0 - SPRAY)) - low) / WIDTH
+
+
+def run(size: str) -> DamBreak:
+    """Let the column break with the constants of a size of fluid.
+
+    Raises:
+        LagbenchError: there is no such size, or the solver failed.
+    """
+    tier = load().size("fluid", size)
+    low, _ = free_surface_walls(tier)
+    constants = solver_parameters(tier)
+    state = column(constants, low)
+    constants = replace(constants, particles=len(state.position))
+    solver = build(constants)
+    solver.load([state])
+
+    time_unit = math.sqrt(WIDTH / (2.0 * constants.gravity))  # of T [s]
+    times: list[float] = []
+    fronts: list[float] = []
+    substep = 0
+    stride = max(1, tier.substeps_per_frame // 4)
+    while not times or times[-1] < EXPERIMENT_TIME[-1]:
+        times.append(substep * constants.dt / time_unit)
+        fronts.append(front_of(solver.position()[0], low))
+        solver.advance(stride)
+        substep += stride
+
+    front = np.interp(EXPERIMENT_TIME, times, fronts)
+    counts = EXPERIMENT_FRONT >= FIRST_FRONT
+    relative = front[counts] / EXPERIMENT_FRONT[counts] - 1.0
+    return DamBreak(
+        size=size,
+        particles=constants.particles,
+        time=tuple(EXPERIMENT_TIME.tolist()),
+        front=tuple(round_digits(value) for value in front.tolist()),
+        experiment=tuple(EXPERIMENT_FRONT.tolist()),
+        deviation=round_digits(float(np.abs(relative).mean())),
+        bias=round_digits(float(relative.mean())),
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command and return its exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m validation.dam_break",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--size", default="full", help="size of fluid (default full)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="results")
+    options = parser.parse_args(arguments)
+    try:
+        result = run(options.size)
+        if options.json is not None:
+            text = json.dumps(asdict(result), indent=1) + "\n"
+            options.json.write_text(text, encoding="utf-8")
+    except (LagbenchError, OSError) as error:
+        sys.stderr.write(f"error: {error}\n")
+        return getattr(error, "exit_code", WorkFailedError.exit_code)
+    lines = ["     T  Z here  Z 1952"]
+    rows = zip(result.time, result.front, result.experiment, strict=True)
+    for time, front, experiment in rows:
+        lines.append(f"{time:6.2f}{front:8.2f}{experiment:8.2f}")
+    percent = 100.0 * result.deviation
+    lines.append(f"mean deviation {percent:.1f} %, bias {100.0 * result.bias:+.1f} %")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
