@@ -33,9 +33,6 @@ from lagbench.tensors import Batch
 from .baseline import Baseline
 from .graph import Bounds
 
-# outward normals of the walls left, right, bottom, top
-_NORMALS = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
-
 # accelerations in the way back to the true path at most, in their deviations
 _MOST_DEVIATIONS = 3.0
 
@@ -47,7 +44,7 @@ class Symmetry(enum.StrEnum):
     MIRROR = "mirror"
     """x -> -x about the middle of the box: any split."""
     SQUARE = "square"
-    """All eight images of the square: splits without gravity."""
+    """All eight images of the square, or 48 of the cube: splits without gravity."""
 
 
 def check_symmetry(symmetry: object, size: Size) -> None:
@@ -108,10 +105,16 @@ def mirror_field(field: Tensor, matrix: Tensor, channels: Sequence[Tensor]) -> T
 
 
 def draw_mirror_matrices(
-    symmetry: Symmetry, windows: int, generator: torch.Generator
+    symmetry: Symmetry,
+    windows: int,
+    generator: torch.Generator,
+    *,
+    dimension: int = 2,
 ) -> Tensor:
-    """Return the matrix of one random mirror image per window, [window, 2, 2]."""
+    """Return the matrix of one random mirror image per window, [window, axis, axis]."""
     device = generator.device
+    if dimension == 3:
+        return _draw_solid_matrices(symmetry, windows, generator)
     bits = torch.randint(2, (3, windows), generator=generator, device=device)
     flip_x, flip_y, swap = bits * (symmetry is Symmetry.SQUARE)
     if symmetry is Symmetry.MIRROR:
@@ -121,30 +124,53 @@ def draw_mirror_matrices(
     return torch.where(swap.bool()[:, None, None], matrix.flip(2), matrix)
 
 
+def _draw_solid_matrices(
+    symmetry: Symmetry, windows: int, generator: torch.Generator
+) -> Tensor:
+    """Return a random signed permutation of three axes per window, [window, 3, 3].
+
+    Where gravity acts along the second axis it stays as it is.
+    """
+    device = generator.device
+    signs = 1.0 - 2.0 * torch.randint(
+        2, (windows, 3), generator=generator, device=device
+    )
+    order = torch.arange(3, device=device).expand(windows, 3)
+    if symmetry is Symmetry.SQUARE:
+        draws = torch.rand(windows, 3, generator=generator, device=device)
+        order = draws.argsort(dim=1)
+    else:
+        signs[:, 1] = 1.0
+    if symmetry is Symmetry.NONE:
+        signs = torch.ones_like(signs)
+    permutation = torch.eye(3, device=device)[order]
+    return signs[:, :, None] * permutation
+
+
 def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
     """Return the mirror image of each window about the middle of the box.
 
     Args:
         batch: windows.
-        matrix: signed permutation of the axes for each window, shape [window, 2, 2].
-        bounds: box (low, high) along x and y [length].
+        matrix: signed permutation of the axes for each window, shape [window, axis,
+            axis].
+        bounds: box (low, high) along each axis [length].
 
     Raises:
-        UsageError: x and y change places in a box that is no square.
+        UsageError: axes change places in a box whose sides differ.
     """
-    (left, right), (bottom, top) = bounds
-    width = right - left
-    height = top - bottom
-    if abs(width - height) > 1e-6 and bool((matrix[:, 0, 1] != 0.0).any()):
+    lengths = [high - low for low, high in bounds]
+    swaps_axes = bool((matrix.diagonal(dim1=1, dim2=2) == 0.0).any())
+    if max(lengths) - min(lengths) > 1e-6 and swaps_axes:
         raise UsageError(
-            "x and y cannot change places in this box",
+            "axes cannot change places in this box",
             where="symmetry",
-            expected="a square box",
-            got=f"sides {width:g} and {height:g}",
+            expected="sides of one length",
+            got=", ".join(f"{length:g}" for length in lengths),
             fix="use symmetry: mirror",
         )
     matrix = matrix.to(batch.position)
-    centre = batch.position.new_tensor([(left + right) / 2, (bottom + top) / 2])
+    centre = batch.position.new_tensor([(low + high) / 2 for low, high in bounds])
     by_particle = matrix[batch.sample]
 
     position = _multiply(by_particle[:, None], batch.position - centre) + centre
@@ -162,7 +188,12 @@ def mirror_batch(batch: Batch, matrix: Tensor, bounds: Bounds) -> Batch:
 
 def wall_permutation(matrix: Tensor) -> Tensor:
     """Return the permutation of the walls by an image, [..., new wall, old wall]."""
-    normals = _NORMALS.to(matrix)
+    dimension = matrix.shape[-1]
+    normals = torch.zeros(2 * dimension, dimension)
+    for axis in range(dimension):
+        normals[2 * axis, axis] = -1.0
+        normals[2 * axis + 1, axis] = 1.0
+    normals = normals.to(matrix)
     image_normals = _multiply(matrix[..., None, :, :], normals)  # [..., wall, 2]
     cosines = (normals[:, None] * image_normals[..., None, :, :]).sum(dim=-1)
     return (cosines > 0.5).to(matrix)
@@ -195,7 +226,7 @@ def add_walk_noise(
     first frame. The frames after the history move along.
     """
     velocity_count = history - 1
-    shape = (len(position), velocity_count, 2)
+    shape = (len(position), velocity_count, position.shape[2])
     normal = torch.randn(shape, generator=generator, device=generator.device)
     step = normal * (std / math.sqrt(velocity_count))
 
@@ -234,7 +265,10 @@ def augment(model: Baseline, batch: Batch, generator: torch.Generator) -> Batch:
     symmetry = model.options.symmetry
     noise_std = model.options.noise_std
     if symmetry is not Symmetry.NONE:
-        matrix = draw_mirror_matrices(symmetry, batch.windows, generator)
+        dimension = batch.position.shape[2]
+        matrix = draw_mirror_matrices(
+            symmetry, batch.windows, generator, dimension=dimension
+        )
         batch = mirror_batch(batch, matrix, model.info.bounds)
     if noise_std > 0.0:
         position = add_walk_noise(batch.position, model.history, noise_std, generator)

@@ -102,7 +102,8 @@ class Baseline(nn.Module):
         method: name of the model on the board.
         any_size: whether weights of one size can be run at another, with other
             particles and other distances.
-        any_box: whether the model knows periodic boxes as well as walls.
+        any_box: whether the model knows periodic boxes as well as walls, and three
+            dimensions as well as two.
 
     Args:
         options: the model's options.
@@ -122,6 +123,14 @@ class Baseline(nn.Module):
                 where=f"the box of {info.split} {info.size}",
                 expected="walls along every axis",
                 got=f"periodic along {', '.join(info.periodic)}",
+            )
+        if len(info.bounds) != 2 and not self.any_box:
+            raise UsageError(
+                f"{self.method} knows two dimensions only",
+                where=f"the box of {info.split} {info.size}",
+                expected="bounds of x and y",
+                got=f"{len(info.bounds)} axes",
+                fix="train a graph network, such as gns",
             )
         self.options = options
         self.info = info
@@ -281,8 +290,8 @@ class DatasetInfo:
     version: str  # semantic version of the split
     dataset_sha256: str  # hash of the data set
     particles: Count  # particles in one scenario
-    # box that holds the particles, (low, high) along x and y [length]
-    bounds: tuple[Pair, Pair]
+    # box that holds the particles, (low, high) along each axis [length]
+    bounds: Annotated[tuple[Pair, ...], Field(min_length=2, max_length=3)]
     radius: Positive  # connectivity radius [length]
     input_frames: Count  # frames given at the start of a test scenario
     horizon: Count  # frames to predict after them
@@ -291,9 +300,9 @@ class DatasetInfo:
     frame_interval: Positive  # time between frames [s]
     moving_walls: bool  # whether scenario files hold wall_velocity
     # over train: position_mean, position_std [length], velocity_mean, velocity_std
-    # [length/frame], acceleration_mean, acceleration_std [length/frame^2], one (x, y)
-    # pair each
-    statistics: Mapping[str, Pair]
+    # [length/frame], acceleration_mean, acceleration_std [length/frame^2], one number
+    # for each axis
+    statistics: Mapping[str, tuple[Finite, ...]]
     periodic: tuple[str, ...] = ()  # names of the axes that have no walls
 
     @property
@@ -308,7 +317,10 @@ def rescale(trained: DatasetInfo, target: DatasetInfo) -> DatasetInfo:
 
     Statistics [length, length/frame, length/frame^2] stay those of the training. Bodies
     fill the same area with more or fewer particles, so the radius [length] goes with
-    the square root of the area per particle.
+    the square root of the area per particle, or the cube root of the volume.
     """
-    radius = trained.radius * math.sqrt(trained.particles / target.particles)
+    ratio = trained.particles / target.particles
+    radius = trained.radius * math.sqrt(ratio)
+    if len(trained.bounds) == 3:
+        radius = trained.radius * math.cbrt(ratio)
     return replace(target, radius=radius, statistics=trained.statistics)

@@ -82,7 +82,7 @@ def _find_hash(manifest: Manifest, size: Size) -> str | None:
     return None
 
 
-def _find_statistics(manifest: Manifest, size: Size) -> dict[str, tuple[float, float]]:
+def _find_statistics(manifest: Manifest, size: Size) -> dict[str, tuple[float, ...]]:
     """Return the statistics of the data at hand, else those of datasets.yaml.
 
     Without train there are none at hand.
@@ -90,6 +90,7 @@ def _find_statistics(manifest: Manifest, size: Size) -> dict[str, tuple[float, f
     statistics = manifest.statistics
     if not statistics and size.measured is not None:
         statistics = size.measured.statistics
-    if not statistics:
-        return {}
-    return {name: (float(x), float(y)) for name, (x, y) in statistics.items()}
+    rows = {}
+    for name, row in statistics.items():
+        rows[name] = tuple(float(value) for value in row)
+    return rows

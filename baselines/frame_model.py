@@ -7,7 +7,9 @@ standardised:
     z = (q - mean) / std,   q = (x, y, u, v),   u(f) = x(f) - x(f-1)          (Eq. 4.15)
 
 with the public statistics of the training scenarios, one number per feature. The first
-frame of a window has no frame before it: it takes the velocity of the second.
+frame of a window has no frame before it: it takes the velocity of the second. In three
+dimensions q has six components. Along periodic axes positions are wrapped, velocities
+and errors follow the shortest way.
 """
 
 from __future__ import annotations
@@ -28,8 +30,6 @@ from . import baseline
 from .baseline import Baseline, Batch, DatasetInfo
 from .graph import MATERIALS
 
-FEATURES = 4  # x, y and the two components of the velocity per frame
-
 
 class FrameState(nn.Module):
     """Turns positions into standardised states, and back."""
@@ -40,6 +40,7 @@ class FrameState(nn.Module):
     def __init__(self, info: DatasetInfo) -> None:
         super().__init__()
         self.box = TensorBox(info.box)
+        self.dimension = info.box.dimension
         statistics = info.statistics
         mean = (*statistics["position_mean"], *statistics["velocity_mean"])
         std = (*statistics["position_std"], *statistics["velocity_std"])
@@ -49,7 +50,7 @@ class FrameState(nn.Module):
         self.register_buffer("std", std_tensor, persistent=False)
 
     def standardise(self, position: Tensor) -> Tensor:
-        """Return the states [1], shape [..., frame, particle, 4].
+        """Return the states [1], shape [..., frame, particle, 2 axis].
 
         Raises:
             DataError: there are fewer than two consecutive frames.
@@ -67,17 +68,41 @@ class FrameState(nn.Module):
         return (state - self.mean.to(state.dtype)) / self.std.to(state.dtype)
 
     def position(self, state: Tensor) -> Tensor:
-        """Return the positions of states [length], shape [..., 2] from [..., 4]."""
-        mean = self.mean[:2].to(state.dtype)
-        std = self.std[:2].to(state.dtype)
-        return state[..., :2] * std + mean
+        """Return the positions of states [length], [..., axis] from [..., 2 axis]."""
+        mean = self.mean[: self.dimension].to(state.dtype)
+        std = self.std[: self.dimension].to(state.dtype)
+        return state[..., : self.dimension] * std + mean
+
+    def wrap(self, state: Tensor) -> Tensor:
+        """Return states whose positions lie in the box along periodic axes."""
+        if not self.box.box.is_periodic:
+            return state
+        mean = self.mean[: self.dimension].to(state.dtype)
+        std = self.std[: self.dimension].to(state.dtype)
+        position = self.box.wrap(self.position(state))
+        return torch.cat([(position - mean) / std, state[..., self.dimension :]], -1)
+
+    def squared_errors(self, truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
+        """Return squared errors of positions and velocities [1], halves of Eq. 4.16."""
+        dimension = self.dimension
+        difference = predicted - truth
+        if self.box.box.is_periodic:
+            std = self.std[:dimension].to(truth.dtype)
+            true_position = self.position(truth)
+            way = self.box.displacement(true_position, self.position(predicted))
+            difference = torch.cat([way / std, difference[..., dimension:]], dim=-1)
+        error = difference.square()
+        return {
+            "position": error[..., :dimension].mean(),
+            "velocity": error[..., dimension:].mean(),
+        }
 
 
 def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
     """Return positions and materials of a batch, window by window.
 
-    Positions [length] have shape [window, frame, particle, 2], materials shape [window,
-    particle].
+    Positions [length] have shape [window, frame, particle, axis], materials shape
+    [window, particle].
 
     Raises:
         DataError: a window has another number of particles.
@@ -100,15 +125,9 @@ def arrange_in_frames(batch: Batch, particles: int) -> tuple[Tensor, Tensor]:
 class FrameWindow:
     """The state of a rollout: the input of :meth:`FrameModel.next_state`."""
 
-    # the last standardised states [1], shape [window, frame, particle, 4]
+    # the last standardised states [1], shape [window, frame, particle, 2 axis]
     state: Tensor
     material: Tensor  # material of each particle, shape [window, particle]
-
-
-def squared_errors(truth: Tensor, predicted: Tensor) -> dict[str, Tensor]:
-    """Return squared errors of positions and velocities [1], halves of Eq. 4.16."""
-    error = (predicted - truth).square()
-    return {"position": error[..., :2].mean(), "velocity": error[..., 2:].mean()}
 
 
 class FrameModel(Baseline):
@@ -131,7 +150,7 @@ class FrameModel(Baseline):
 
     @abstractmethod
     def next_state(self, window: FrameWindow) -> Tensor:
-        """Return the next standardised state [1], shape [window, particle, 4]."""
+        """Return the next standardised state [1], shape [window, particle, 2 axis]."""
 
     @property
     def history(self) -> int:
@@ -140,15 +159,15 @@ class FrameModel(Baseline):
 
     @property
     def features(self) -> int:
-        """Numbers that describe a frame: 4 per particle."""
-        return FEATURES * self.info.particles
+        """Numbers that describe a frame: in two dimensions 4 per particle."""
+        return 2 * self.info.box.dimension * self.info.particles
 
     def forward(
         self, batch: Batch, generator: torch.Generator | None = None
     ) -> dict[str, Tensor]:
         """Return the squared errors of position and velocity after one step [1]."""
         truth, predicted = self.predict_last_frame(batch, generator)
-        return squared_errors(truth, predicted)
+        return self.frame_state.squared_errors(truth, predicted)
 
     def predict_last_frame(
         self, batch: Batch, generator: torch.Generator | None
@@ -183,8 +202,8 @@ class FrameModel(Baseline):
         return FrameWindow(torch.cat([repeated, state], dim=1), window.material)
 
     def advance(self, state: FrameWindow) -> tuple[FrameWindow, Tensor]:
-        """Return the next window and positions [length], shape [particle, 2]."""
-        new_state = self.next_state(state)
+        """Return the next window and positions [length], shape [particle, axis]."""
+        new_state = self.frame_state.wrap(self.next_state(state))
         states = torch.cat([state.state[:, 1:], new_state.unsqueeze(1)], dim=1)
         position = self.frame_state.position(new_state).flatten(0, 1)
         return FrameWindow(states, state.material), position.to(torch.float32)
@@ -220,12 +239,13 @@ class FrameNetworkOptions(baseline.Options):
 class FrameNetwork(FrameModel):
     """Base of the networks: inputs are states, and materials if the recipe says so."""
 
+    any_box = True
     options: FrameNetworkOptions
     typical_change: Tensor
 
     def __init__(self, options: FrameNetworkOptions, info: DatasetInfo) -> None:
         super().__init__(options, info)
-        self.input_features = FEATURES + options.material
+        self.input_features = 2 * info.box.dimension + options.material
         # the standard deviation of a state's change per frame [standardised]
         statistics = info.statistics
         ratios = []
@@ -260,7 +280,7 @@ class FrameNetwork(FrameModel):
         return torch.cat([window.state, material], dim=-1)
 
     def decode_state(self, output: Tensor, window: FrameWindow) -> Tensor:
-        """Return the next state [1], shape [window, particle, 4], from an output.
+        """Return the next state [1], shape [window, particle, 2 axis], from an output.
 
         The output of the network has shape [window, feature].
         """

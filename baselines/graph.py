@@ -25,13 +25,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import KDTree, cKDTree
 from torch import Tensor, nn
 
+from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.errors import UsageError
 from lagbench.tensors import TensorBox
 
-Bounds = tuple[tuple[float, float], tuple[float, float]]
+Bounds = Sequence[tuple[float, float]]
+"""Low and high end of the box along each axis."""
 
 # cells are wider than the radius by this share, more than rounding can move a particle
 MARGIN = 1e-6
@@ -47,6 +49,7 @@ def radius_graph(
     *,
     self_edges: bool = False,
     most: int | None = None,
+    box: Box = UNIT_SQUARE,
 ) -> Tensor:
     """Connect all pairs of particles within a radius, itself included.
 
@@ -59,23 +62,32 @@ def radius_graph(
     SuperGAT's link loss takes the missing ones as unlinked.
 
     Args:
-        position: positions [length], shape [particle, 2].
+        position: positions [length], shape [particle, axis].
         radius: connectivity radius [length].
         sample: window of each particle, ascending, shape [particle].
         self_edges: whether each particle is its own neighbour too.
         most: neighbours of a receiver at most, the nearest; of equally far ones any.
+        box: box that holds the particles. With three dimensions or periodic axes a
+            k-d tree on the CPU finds the pairs, by their shortest distance.
 
     Raises:
         UsageError: shapes do not fit, or the radius is no positive number.
     """
-    _check_search(position, radius, sample)
+    _check_search(position, radius, sample, dimension=box.dimension)
     x = position.detach().double()
     if sample is None:
         window = torch.zeros(len(x), dtype=torch.int64, device=x.device)
     else:
         window = sample
 
-    if most is not None:
+    if box.dimension != 2 or box.is_periodic:
+        x_array = x.cpu().numpy()
+        window_array = window.cpu().numpy()
+        numbers = tree_edges(
+            x_array, window_array, radius, box=box, self_edges=self_edges, most=most
+        )
+        edges = torch.from_numpy(np.sort(numbers)).to(x.device)
+    elif most is not None:
         x_array = x.cpu().numpy()
         window_array = window.cpu().numpy()
         numbers = nearest_edges(x_array, window_array, radius, self_edges, most)
@@ -90,13 +102,15 @@ def radius_graph(
     return torch.stack([senders, receivers])
 
 
-def _check_search(position: Tensor, radius: float, sample: Tensor | None) -> None:
+def _check_search(
+    position: Tensor, radius: float, sample: Tensor | None, *, dimension: int
+) -> None:
     """Refuse arguments of :func:`radius_graph` that do not fit."""
-    if position.ndim != 2 or position.shape[1] != 2:
+    if position.ndim != 2 or position.shape[1] != dimension:
         raise UsageError(
             "positions have the wrong shape",
             where="radius_graph",
-            expected="[particle, 2]",
+            expected=f"[particle, {dimension}]",
             got=tuple(position.shape),
         )
     if not (math.isfinite(radius) and radius > 0.0):
@@ -233,17 +247,60 @@ def nearest_edges(
     return np.concatenate(parts)
 
 
+def tree_edges(
+    x: NDArray[np.float64],
+    window: NDArray[np.int64],
+    radius: float,
+    *,
+    box: Box,
+    self_edges: bool,
+    most: int | None,
+) -> NDArray[np.int64]:
+    """Return receiver * 2^32 + sender of every edge, in any box.
+
+    ``x`` are positions [length], shape [particle, axis], ``window`` the number of the
+    window of each.
+    """
+    parts = [np.empty(0, np.int64)]
+    finite = np.flatnonzero(np.isfinite(x).all(axis=1))
+    for number in np.unique(window[finite]):
+        members = finite[window[finite] == number]
+        tree = box.tree(x[members])
+        if most is None:
+            pairs = tree.query_pairs(radius, output_type="ndarray")
+            first, second = members[pairs].T
+            parts += [(first << 32) | second, (second << 32) | first]
+        else:
+            parts.append(_nearest_in_tree(tree, members, radius, most))
+        if self_edges:
+            parts.append((members << 32) | members)
+    return np.concatenate(parts)
+
+
+def _nearest_in_tree(
+    tree: cKDTree, members: NDArray[np.int64], radius: float, most: int
+) -> NDArray[np.int64]:
+    """Return the edges to the nearest neighbours of each particle of a tree."""
+    ranks = np.arange(1, min(most + 1, len(members)) + 1)
+    reach = math.nextafter(radius, math.inf)  # the tree leaves out what is as far
+    answer = tree.query(np.asarray(tree.data), k=ranks, distance_upper_bound=reach)
+    neighbours = np.asarray(answer[1])
+    receiver = np.arange(len(members))[:, None]
+    is_neighbour = (neighbours < len(members)) & (neighbours != receiver)
+    is_heard = is_neighbour & (is_neighbour.cumsum(axis=1) <= most)
+    i, rank = np.nonzero(is_heard)
+    return np.asarray((members[i] << 32) | members[neighbours[i, rank]])
+
+
 MATERIALS = 4  # in datasets.yaml: 0 liquid, 1 jelly, 2 snow, 3 rope
 EMBEDDING = 16  # numbers that a material is embedded in
-EDGE_FEATURES = 3  # displacement over radius along x and y, distance over radius
-_WALLS = 4  # left, right, bottom, top, the order of wall_velocity in scenario files
 
 
 class Standardisation(nn.Module):
     """Standardisation by train statistics: ``(x - mean) / sqrt(std^2 + noise^2)``."""
 
-    mean: Tensor  # mean over train, (x, y)
-    std: Tensor  # standard deviation over train, (x, y)
+    mean: Tensor  # mean over train, shape [axis]
+    std: Tensor  # standard deviation over train, shape [axis]
 
     def __init__(
         self, mean: Sequence[float], std: Sequence[float], *, noise: float = 0.0
@@ -266,16 +323,28 @@ class Standardisation(nn.Module):
         return standardised * self.std + self.mean
 
 
-def wall_distance(position: Tensor, bounds: Bounds, reach: float) -> Tensor:
-    """Return distances to left, right, bottom and top wall over the reach [1].
+def wall_distance(
+    position: Tensor,
+    bounds: Bounds,
+    reach: float,
+    periodic: Sequence[bool] = (False, False, False),
+) -> Tensor:
+    """Return distances to the two walls of each axis over the reach [1].
+
+    Those along x come first. A periodic axis has no walls, and they count as out of
+    reach.
 
     They are clipped to [-1, 1]: a wall farther away than the reach looks like one at
     it; outside the box distances are negative. The shape is [..., wall].
     """
-    (left, right), (bottom, top) = bounds
-    x, y = position.unbind(dim=-1)
-    distance = torch.stack([x - left, right - x, y - bottom, top - y], dim=-1)
-    return (distance / reach).clamp(-1.0, 1.0)
+    distances = []
+    components = position.unbind(dim=-1)
+    for x, (low, high), is_periodic in zip(components, bounds, periodic, strict=False):
+        if is_periodic:
+            distances += [torch.full_like(x, reach), torch.full_like(x, reach)]
+        else:
+            distances += [x - low, high - x]
+    return (torch.stack(distances, dim=-1) / reach).clamp(-1.0, 1.0)
 
 
 def edge_features(
@@ -284,7 +353,7 @@ def edge_features(
     radius: float,
     box: TensorBox | None = None,
 ) -> Tensor:
-    """Return displacement (x, y) and distance of each edge over the radius, [edge, 3].
+    """Return displacement and distance of each edge over the radius, [edge, axis + 1].
 
     The displacement is the way from receiver to sender.
 
@@ -313,10 +382,10 @@ def edge_features(
 class NodeFeatures(nn.Module):
     """Features of a particle: velocities, walls, material, and moving walls if asked.
 
-    There are 2 numbers of each velocity, 4 of walls, 16 of the material and 8 of moving
-    walls. The velocities are the last one and the changes that led to it, each over its
-    own deviation: in velocities alone the changes, of which the network predicts the
-    next, are hundredths.
+    In two dimensions there are 2 numbers of each velocity, 4 of walls, 16 of the
+    material and 8 of moving walls. The velocities are the last one and the changes that
+    led to it, each over its own deviation: in velocities alone the changes, of which
+    the network predicts the next, are hundredths.
 
     Moving walls: the velocity per frame of each wall over the velocity's deviation,
     times ``1 - distance / reach`` (0 beyond the reach), so that it acts where the wall
@@ -332,12 +401,15 @@ class NodeFeatures(nn.Module):
         *,
         velocities: int = 5,
         moving_walls: bool = False,
+        periodic: Sequence[bool] = (False, False, False),
     ) -> None:
         super().__init__()
+        self.dimension = len(bounds)
+        self.periodic = tuple(periodic)  # axes without walls
         self.velocities = velocities  # number of last velocities per particle
         self.velocity = velocity
         self.acceleration = acceleration
-        self.bounds = bounds  # of the box, (low, high) along x and y [length]
+        self.bounds = bounds  # of the box, (low, high) along each axis [length]
         self.reach = reach  # how far a particle sees a wall [length]
         self.moving_walls = moving_walls  # whether wall velocities are features too
         self.embedding = nn.Embedding(MATERIALS, EMBEDDING)
@@ -345,8 +417,10 @@ class NodeFeatures(nn.Module):
     @property
     def count(self) -> int:
         """Features of a particle: with five velocities 30, or 38 with moving walls."""
-        moving_wall_features = 2 * _WALLS * self.moving_walls
-        return 2 * self.velocities + _WALLS + EMBEDDING + moving_wall_features
+        axes = self.dimension
+        walls = 2 * axes
+        moving_wall_features = axes * walls * self.moving_walls
+        return axes * self.velocities + walls + EMBEDDING + moving_wall_features
 
     def forward(
         self,
@@ -358,19 +432,20 @@ class NodeFeatures(nn.Module):
         """Return the features of each particle, shape [particle, count].
 
         Args:
-            position: positions [length], shape [particle, 2].
-            velocity: last velocities, oldest first, shape [particle, velocities, 2].
+            position: positions [length], shape [particle, axis].
+            velocity: last velocities, oldest first, shape [particle, velocities, axis].
             material: material of each particle, shape [particle].
             wall_velocity: velocities of the walls in the window of each particle,
-                shape [particle, 4, 2]; None stands for walls at rest.
+                shape [particle, wall, axis]; None stands for walls at rest.
         """
         last_velocity = self.velocity(velocity[:, -1])
         changes = self.acceleration(velocity.diff(dim=1)).flatten(1)
-        distance = wall_distance(position, self.bounds, self.reach)
+        distance = wall_distance(position, self.bounds, self.reach, self.periodic)
         embedded = self.embedding(material).to(position.dtype)
         parts = [last_velocity, changes, distance, embedded]
         if self.moving_walls:
-            felt_velocity = distance.new_zeros(len(distance), _WALLS, 2)
+            shape = (*distance.shape, self.dimension)
+            felt_velocity = distance.new_zeros(shape)
             if wall_velocity is not None:
                 nearness = 1.0 - distance.clamp(min=0.0)
                 felt_velocity = nearness.unsqueeze(-1) * wall_velocity

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from lagbench.data.grid import Grid, Placement
 
 from .baseline import Batch, DatasetInfo
-from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow, squared_errors
+from .frame_model import FrameNetwork, FrameNetworkOptions, FrameWindow
 from .mlp import Activation, dense
 from .torch_grid import transfer
 
@@ -80,15 +80,19 @@ class LSTM(FrameNetwork):
         """Return the errors of position, velocity and density map [1].
 
         The density error is relative over the nodes of the scorer's grid: it is 1 for
-        an empty map.
+        an empty map. In three dimensions and in periodic boxes there is no such error.
         """
         truth, predicted = self.predict_last_frame(batch, generator)
+        errors = self.frame_state.squared_errors(truth, predicted)
+        box = self.info.box
+        if box.dimension != 2 or box.is_periodic:
+            return errors
         true_density = self._density(truth)
         predicted_density = self._density(predicted)
 
         squared_error = (predicted_density - true_density).square().sum()
         density_error = squared_error / true_density.square().sum()
-        return {**squared_errors(truth, predicted), "density": density_error}
+        return {**errors, "density": density_error}
 
     def _density(self, state: Tensor) -> Tensor:
         """Return the weights at the nodes of the scorer's grid [1]."""

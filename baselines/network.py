@@ -117,6 +117,7 @@ class EncodeProcessDecode(nn.Module):
         latent: int = 128,
         layers: int = 10,
         sum_messages: bool = True,
+        outputs: int = 2,
     ) -> None:
         super().__init__()
         self.node_encoder = mlp([node_features, latent, latent, latent])
@@ -127,7 +128,7 @@ class EncodeProcessDecode(nn.Module):
                 operator, latent=latent, hidden=latent, sum_messages=sum_messages
             )
             self.processor.append(layer)
-        self.decoder = mlp([latent, latent, latent, 2], norm=False)
+        self.decoder = mlp([latent, latent, latent, outputs], norm=False)
 
     def compile_layers(self) -> None:
         """Compile the edges' encoder and the processor layers, for any number of edges.

@@ -181,6 +181,7 @@ def predict(
             method=label,
             subset=subset,
             dataset_sha256=info.dataset_sha256,
+            root=root_folder,
             registry=known_splits,
             device=hardware_label,
             parameters=parameters,
@@ -422,7 +423,13 @@ class _TimedRollouts:
         stride = max(1, len(positions) // TIMED_SEARCHES)
         for frame in range(0, len(positions), stride):
             started = self._read_clock()
-            radius_graph(positions[frame], float(radius), given.sample, most=most)
+            radius_graph(
+                positions[frame],
+                float(radius),
+                given.sample,
+                most=most,
+                box=self._info.box,
+            )
             elapsed = self._read_clock() - started
             self._search_seconds.append(elapsed / len(rollouts))
 

@@ -121,7 +121,8 @@ def _advance(model: Baseline, given: Batch, frames: int) -> tuple[Tensor, int]:
 
     Positions have shape [frame, particle, 2].
     """
-    predicted = torch.empty((frames, len(given.position), 2), dtype=torch.float32)
+    particles, _, dimension = given.position.shape
+    predicted = torch.empty((frames, particles, dimension), dtype=torch.float32)
     state = model.start(given)
     for frame in range(frames):
         output: object = model.advance(state)

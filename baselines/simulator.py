@@ -26,6 +26,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from lagbench.baselines.operators.operator import Losses, Operator
+from lagbench.data.box import UNIT_SQUARE, Box
 from lagbench.data.grid import Grid, Placement
 from lagbench.errors import UsageError
 
@@ -39,7 +40,6 @@ from .baseline import (
     last_velocities,
 )
 from .graph import (
-    EDGE_FEATURES,
     NodeFeatures,
     Standardisation,
     edge_features,
@@ -126,7 +126,8 @@ def loss_terms(
 ) -> dict[str, Tensor]:
     """Return the six terms without their weights.
 
-    Terms of weight 0 have no graph of gradients.
+    Terms of weight 0 have no graph of gradients. In three dimensions and in periodic
+    boxes there are no terms of the grid.
 
     Args:
         predicted: predicted motion.
@@ -137,11 +138,13 @@ def loss_terms(
         norm: norm of the errors.
         weights: weights by term; a missing one is 1.
     """
-    terms = {}
+    terms: dict[str, Tensor] = {}
     for name in PARTICLE_TERMS:
         with _record_graph(weights, name):
             error = getattr(predicted, name) - getattr(target, name)
             terms[name] = mean_norm(error / scales[name], norm)
+    if grid.dimension != 2 or grid.box.is_periodic:
+        return terms
 
     with torch.no_grad():
         true_fields = _target_fields(target, grid, sample)
@@ -278,6 +281,7 @@ class GraphNetwork(Baseline):
     Options = GraphNetworkOptions
     options: GraphNetworkOptions
     any_size = True
+    any_box = True
     operator: ClassVar[type[Operator]]
 
     def __init__(self, options: GraphNetworkOptions, info: DatasetInfo) -> None:
@@ -294,7 +298,9 @@ class GraphNetwork(Baseline):
         self.radius = info.radius
         if options.radius is not None:
             self.radius = options.radius
-        self.grid = Grid(info.score_cells, Placement(info.score_placement))
+        self.grid = Grid(
+            info.score_cells, Placement(info.score_placement), self._grid_box
+        )
         # Noise on the inputs widens velocities and accelerations.
         self.position = self._standardisation("position", noise=0.0)
         self.velocity = self._standardisation("velocity", noise=options.noise_std)
@@ -308,17 +314,27 @@ class GraphNetwork(Baseline):
             options.wall_reach * self.radius,
             velocities=options.velocities,
             moving_walls=options.wall_velocity,
+            periodic=info.box.periodic,
         )
         self.network = EncodeProcessDecode(
             self.operator,
             node_features=self.features.count,
-            edge_features=EDGE_FEATURES,
+            edge_features=info.box.dimension + 1,
+            outputs=info.box.dimension,
             latent=options.latent,
             layers=options.layers,
             sum_messages=options.sum_messages,
         )
         for parameter in self.network.decoder[-1].parameters():
             nn.init.zeros_(parameter)
+
+    @property
+    def _grid_box(self) -> Box:
+        """Box of the loss's grid: the unit square where there are only walls."""
+        box = self.info.box
+        if box.dimension == 2 and not box.is_periodic:
+            return UNIT_SQUARE
+        return box
 
     def _standardisation(self, name: str, *, noise: float) -> Standardisation:
         statistics = self.info.statistics
@@ -450,7 +466,7 @@ class GraphNetwork(Baseline):
         first = forgotten.to(state.sample.device)[state.sample, None]  # [particle, 1]
         places = torch.arange(velocities, device=first.device).expand(len(first), -1)
         index = places.clamp(min=first)
-        velocity = state.velocity.gather(1, index[..., None].expand(-1, -1, 2))
+        velocity = state.velocity.gather(1, index[..., None].expand_as(state.velocity))
         return replace(state, velocity=velocity)
 
     def start(self, given: Batch) -> ParticleState:
@@ -501,6 +517,7 @@ class GraphNetwork(Baseline):
             self.radius,
             state.sample,
             most=self.options.neighbours,
+            box=self.info.box,
         )
 
     def predict(

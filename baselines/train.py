@@ -23,7 +23,7 @@ from lagbench.data.local import locate
 from lagbench.data.registry import Registry
 from lagbench.errors import UsageError
 from lagbench.submission.budget import Track, track_of
-from lagbench.tensors import TensorWindow, collate
+from lagbench.tensors import Batch, TensorWindow, collate
 from lagbench.torch import WindowDataset, WindowSampler
 from lagbench.work.progress import Meter, Progress
 
@@ -401,7 +401,8 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
 
     A baseline with ``closed_form = True`` has a method ``fit`` beside the contract. It
     sets the coefficients from positions of each scenario, shape [frame, particle, 2],
-    and returns numbers to log.
+    and returns numbers to log. With ``fits_batches = True`` it gets each scenario as a
+    batch of one window, with walls and viscosity.
     """
     log = job.start_log()
     if job.earlier is not None:
@@ -419,7 +420,10 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
             fix="leave the option out",
         )
 
-    numbers = model.fit(_read_scenarios(job))  # type: ignore[operator]
+    scenarios: Iterator[Batch] | Iterator[NDArray[np.float32]] = _read_scenarios(job)
+    if not getattr(model, "fits_batches", False):
+        scenarios = _positions(_read_scenarios(job))
+    numbers = model.fit(scenarios)  # type: ignore[operator]
     log.step = FIT_STEPS
     log.loss = {name: float(value) for name, value in numbers.items()}
     log.epochs = 1.0
@@ -440,8 +444,15 @@ def fit(job: TrainingJob, model: Baseline) -> tuple[TrainingLog, int]:
     return log, FIT_STEPS
 
 
-def _read_scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
-    """Yield the positions of each training scenario, shape [frame, particle, 2]."""
+def _positions(scenarios: Iterator[Batch]) -> Iterator[NDArray[np.float32]]:
+    """Yield the positions of each scenario, shape [frame, particle, 2]."""
+    for scenario in scenarios:
+        yield scenario.position.transpose(0, 1).numpy()
+
+
+def _read_scenarios(job: TrainingJob) -> Iterator[Batch]:
+    """Yield each training scenario as a batch of one window."""
+    viscosity = job.registry.size(job.info.split, job.info.size).viscosity()
     paths: list[Path] = []
     for subset in job.recipe.training.windows:
         files = scenario_paths(
@@ -454,5 +465,5 @@ def _read_scenarios(job: TrainingJob) -> Iterator[NDArray[np.float32]]:
         paths += files.values()
     job.meter.begin("fitting", total=len(paths) + 1, scenarios=len(paths))
     for path in paths:
-        yield scenario_batch(path).position.transpose(0, 1).numpy()
+        yield scenario_batch(path, viscosity=viscosity)
         job.meter.count(1, scenarios=1)

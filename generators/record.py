@@ -227,7 +227,7 @@ def _checked_manifest(size: Size, root: Path) -> Manifest:
             )
         if entry.subset == "train":
             train_paths.append(path)
-    statistics = file_statistics(train_paths)
+    statistics = file_statistics(train_paths, size.box)
     return manifest.model_copy(update={"statistics": statistics})
 
 

@@ -60,11 +60,18 @@ class TensorBox(nn.Module):
         Args:
             position: points [length], shape [..., axis].
         """
-        clamped = position.clamp(self.lower_walls, self.upper_walls)
+        return self.wrap(position.clamp(self.lower_walls, self.upper_walls))
+
+    def wrap(self, position: Tensor) -> Tensor:
+        """Return positions moved by whole periods into [low, high) of periodic axes.
+
+        Args:
+            position: points [length], shape [..., axis].
+        """
         if not self.box.is_periodic:
-            return clamped
-        count = torch.floor((clamped.detach() - self.start) / self.period)
-        wrapped = clamped - torch.where(count == 0.0, 0.0, count * self.period)
+            return position
+        count = torch.floor((position.detach() - self.start) / self.period)
+        wrapped = position - torch.where(count == 0.0, 0.0, count * self.period)
         # The difference can round up to the upper end, which is the lower one.
         is_at_end = wrapped >= self.start + self.period
         return torch.where(is_at_end, self.start, wrapped)

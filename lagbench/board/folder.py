@@ -5,7 +5,7 @@
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
     weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
-    verified.yaml, schema.json, index.html, README.md
+    verified.yaml, gates.json, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
 """
@@ -29,6 +29,7 @@ WEIGHTS = "weights"
 PAGE = "index.html"
 SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
+GATES = "gates.json"  # what weights do in single steps (python -m studies.gates)
 README = "README.md"
 
 MODEL_ENDINGS = (".pt", ".onnx")
@@ -184,7 +185,7 @@ class Folder:
         self, expected_paths: Collection[Path]
     ) -> Iterator[tuple[Path, str]]:
         """Yield the files that should not lie in the folder, and why."""
-        names = (PAGE, SCHEMA, VERIFIED, README)
+        names = (PAGE, SCHEMA, VERIFIED, GATES, README)
         known_paths = {Path(name) for name in names} | set(expected_paths)
         for path in self._files(""):
             if path in known_paths:

@@ -73,7 +73,7 @@ class View:
         The points [length] have the shape [..., axis].
         """
         away = (np.asarray(position, np.float64) - self._centre) @ _VIEW[2]
-        return np.clip(0.5 + 0.5 * away / self._reach, 0.0, 1.0)
+        return np.asarray(np.clip(0.5 + 0.5 * away / self._reach, 0.0, 1.0))
 
     def edges(self) -> Iterator[tuple[Floats, bool]]:
         """Yield the edges of the box, shape [end, 2], and whether each lies in front.

@@ -76,8 +76,12 @@ def _match(here: Floats, there: Floats, box: Box) -> NDArray[np.intp]:
             partner[ours] = others[_match(here[ours], there[others], box)]
         return partner
     if box.is_periodic:
-        way = box.displacement(here[:, None], there[None])
-        cost = np.einsum("ijk,ijk->ij", way, way)
+        cost = np.zeros((len(here), len(there)))
+        for axis, is_periodic in enumerate(box.periodic):
+            way = here[:, axis, None] - there[:, axis]
+            if is_periodic:
+                way -= box.lengths[axis] * np.rint(way / box.lengths[axis])
+            cost += way**2
     else:
         cost = cdist(here, there, "sqeuclidean")
     return np.asarray(linear_sum_assignment(cost)[1], np.intp)

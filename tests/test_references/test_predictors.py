@@ -339,6 +339,19 @@ def test_a_start_is_as_near_wherever_in_the_box_it_is(bench: ScoreBench) -> None
     assert near == pytest.approx(0.1 / deviation, rel=0.01)
 
 
+def test_many_particles_of_three_dimensions_find_themselves() -> None:
+    """Clouds beyond what is assigned together are halved alike: a cloud in another
+    order is found again, also through the ends of a periodic box.
+    """
+    rng = np.random.default_rng(0)
+    points = rng.random((4400, 3))
+    order = rng.permutation(len(points))
+    liquid = np.zeros(len(points), np.int8)
+    box = Box.from_bounds([(0.0, 1.0)] * 3, [True, False, True])
+    partner = assign_particles(points, points[order], liquid, liquid, box)
+    np.testing.assert_array_equal(points[order][partner], points)
+
+
 def test_a_permuted_cloud_is_assigned_particle_by_particle() -> None:
     """Each material is assigned on its own."""
     points = scattered(120, 0.0, 1.0)

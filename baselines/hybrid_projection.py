@@ -1,0 +1,426 @@
+"""Hybrid: the projection solver, with a viscous closure whose coefficients are learned.
+
+    du/dt + div(u u) = -grad p + nu' lap u - mu lap lap u,    div u = 0
+    nu' = (1 + a) nu + b h^2 / T,    mu = c h^4 / T
+
+with the viscosity nu that is given, the spacing h of the grid and the frame interval T.
+The solver that made the data carries momentum through particles and a grid of its own:
+it damps what its grid hardly sees. The textbook solver of
+:mod:`lagbench.references.projection` does not; a, b and c say by how much it should.
+With all three 0 the model is that solver, digit by digit.
+
+The coefficients are fitted to rollouts of the solver over many frames of ``train``: a
+solver with a learned part that is trained through its own steps (Um et al. 2020,
+arXiv 2007.00016; Kochkov et al. 2021, PNAS 118). Three numbers need no gradient: the
+simplex method of Nelder and Mead (1965) finds them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.optimize import minimize
+from torch import Tensor
+
+from lagbench.data.box import Box
+from lagbench.errors import DataError, UsageError
+from lagbench.references.staggered import StaggeredGrid, Velocity
+
+from .baseline import Baseline, Batch, DatasetInfo, Options
+
+Floats = NDArray[np.float64]
+
+STABLE_SHARE = 1.5
+"""Time step times the fastest hyperviscous rate, at most; Heun's scheme allows 2."""
+
+FIRST_STEP = 0.02  # of the simplex method, in each coefficient
+LARGEST = 2.0  # magnitude of a coefficient in the search
+WORST_ERROR = 10.0  # error of coefficients with which the solver breaks down
+
+
+class ClosedGrid(StaggeredGrid):
+    """The staggered grid of the reference solver, with a hyperviscosity.
+
+    Args:
+        box: the box.
+        cells: cells along each axis.
+        no_slip: whether walls hold the fluid.
+        hyperviscosity: mu [length^4/s].
+    """
+
+    def __init__(
+        self, box: Box, *, cells: Sequence[int], no_slip: bool, hyperviscosity: float
+    ) -> None:
+        super().__init__(box, cells=cells, no_slip=no_slip)
+        self.hyperviscosity = hyperviscosity
+
+    def acceleration(
+        self,
+        velocity: Velocity,
+        *,
+        viscosity: float,
+        wall_velocity: Floats,
+        force: Sequence[float] | None = None,
+    ) -> Velocity:
+        """Return the reference's acceleration less ``mu lap lap u`` [length/s^2]."""
+        rates = super().acceleration(
+            velocity, viscosity=viscosity, wall_velocity=wall_velocity, force=force
+        )
+        if self.hyperviscosity == 0.0:
+            return rates
+        at_rest = np.zeros_like(wall_velocity)
+        for component, values in enumerate(velocity):
+            ghosted = self._with_ghosts(values, component, wall_velocity)
+            laplacian = self._laplacian(ghosted)
+            bilaplacian = self._laplacian(
+                self._with_ghosts(laplacian, component, at_rest)
+            )
+            change = -self.hyperviscosity * bilaplacian
+            if not self.box.periodic[component]:
+                # Nothing flows through a wall.
+                faces = np.moveaxis(change, component, 0)
+                faces[0] = 0.0
+                faces[-1] = 0.0
+            rates[component] += change
+        return rates
+
+    def step_count(
+        self,
+        velocity: Velocity,
+        *,
+        duration: float,
+        viscosity: float,
+        wall_velocity: Floats,
+    ) -> int:
+        """Return how many time steps a duration takes at the least [1]."""
+        steps = super().step_count(
+            velocity,
+            duration=duration,
+            viscosity=viscosity,
+            wall_velocity=wall_velocity,
+        )
+        fastest_laplacian = float((4.0 / self.spacing**2).sum())
+        rate = abs(self.hyperviscosity) * fastest_laplacian**2
+        return max(steps, int(np.ceil(duration * rate / STABLE_SHARE)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flow:
+    """One scenario on the way: its solver and where its fluid is."""
+
+    grid: ClosedGrid
+    field: Velocity  # face velocities [length/s]
+    position: Floats  # particle positions [length], shape [particle, axis]
+    walls: Floats  # wall velocities of all known frames [length/s]
+    frame: int  # row of `walls` of the frame that was reached
+    viscosity: float  # nu' [length^2/s]
+
+    def wall_velocity(self, frame: int) -> Floats:
+        """Return the wall velocities towards a frame; the last known ones stay."""
+        return np.asarray(self.walls[min(frame, len(self.walls) - 1)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flows:
+    """State of a rollout: a flow for each window."""
+
+    flows: tuple[Flow, ...]
+    device: torch.device
+
+
+class HybridOptions(Options):
+    """Options of the hybrid."""
+
+    in_training = frozenset({"scenarios", "frames", "evaluations"})
+    of_weights = frozenset({"resolution"})
+
+    # cells over those of the score grid, along each axis
+    resolution: float = Field(default=2.0, gt=0.0, le=4.0, allow_inf_nan=False)
+    # whether b and c are fitted; else a alone
+    numerical: bool = True
+    scenarios: int = Field(default=12, ge=1)  # of train, to fit on, at most
+    frames: int = Field(default=60, ge=2)  # that each of them is rolled out
+    evaluations: int = Field(default=45, ge=1)  # of the fit, at most
+
+
+class HybridProjection(Baseline):
+    """The projection solver with a learned viscous closure."""
+
+    method = "hybrid projection"
+    closed_form: ClassVar[bool] = True
+    fits_batches: ClassVar[bool] = True
+
+    Options = HybridOptions
+    options: HybridOptions
+    coefficients: Tensor
+
+    def __init__(self, options: HybridOptions, info: DatasetInfo) -> None:
+        super().__init__(options, info)
+        self.register_buffer("coefficients", torch.zeros(3))  # a, b, c
+
+    @property
+    def history(self) -> int:
+        """Given frames that the solver reads: the last two."""
+        return 2
+
+    def forward(
+        self, batch: Batch, generator: torch.Generator | None = None
+    ) -> dict[str, Tensor]:
+        """Refuse: the coefficients are fitted as a whole, without steps.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            f"{self.method} takes no training steps",
+            where="HybridProjection.forward",
+            fix="train it with `lagbench train`",
+        )
+
+    # --- the solver ---------------------------------------------------------------
+
+    def start(self, given: Batch) -> Flows:
+        """Return the flows that the last two given frames show.
+
+        Raises:
+            DataError: the viscosity is not known.
+        """
+        values = self.coefficients.double().cpu().numpy()
+        flows = []
+        for window in range(given.windows):
+            is_inside = given.sample == window
+            flows.append(self._begin(given, window, is_inside, values))
+        return Flows(flows=tuple(flows), device=given.position.device)
+
+    def _begin(
+        self, given: Batch, window: int, is_inside: Tensor, coefficients: Floats
+    ) -> Flow:
+        """Return the flow of one window, brought to its last given frame."""
+        interval = self.info.frame_interval
+        frames = given.position[is_inside].double().cpu().numpy()
+        walls = np.zeros((1, 2 * frames.shape[2], frames.shape[2]))
+        if given.wall_velocity is not None:
+            walls = given.wall_velocity[window].double().cpu().numpy()
+        viscosity, hyperviscosity = self._closure(given, window, coefficients)
+        box = self.info.box
+        grid = ClosedGrid(
+            box,
+            cells=self._cell_counts(box),
+            no_slip=bool(walls.any()),
+            hyperviscosity=hyperviscosity,
+        )
+        last = frames.shape[1] - 1
+        step = box.displacement(frames[:, -2], frames[:, -1])
+        flow = Flow(
+            grid=grid,
+            field=[],
+            position=frames[:, -1],
+            walls=walls,
+            frame=last,
+            viscosity=viscosity,
+        )
+        wall_velocity = flow.wall_velocity(last)
+        middle = box.inside(frames[:, -1] - step / 2.0)
+        if not box.is_periodic:
+            middle = (frames[:, -1] + frames[:, -2]) / 2
+        # The velocities of the last step hold half a frame before its end.
+        field = grid.from_particles(
+            middle, step / interval, wall_velocity=wall_velocity
+        )
+        field = grid.advance(
+            field,
+            duration=0.5 * interval,
+            viscosity=viscosity,
+            wall_velocity=wall_velocity,
+        )
+        return replace(flow, field=field)
+
+    def _closure(
+        self, given: Batch, window: int, coefficients: Floats
+    ) -> tuple[float, float]:
+        """Return nu' [length^2/s] and mu [length^4/s] of a window."""
+        if given.viscosity is None:
+            raise DataError(
+                "the viscosity is not known",
+                where=f"{self.info.split} {self.info.size}",
+                expected="a viscosity in each scenario file, or in the registry",
+                got="none",
+                fix="choose a model that does not ask for it",
+            )
+        # A file states it in float64; the solver's steps may hang on the last digit.
+        stated = float(given.viscosity[window])
+        relative, added, hyper = (float(value) for value in coefficients)
+        box = self.info.box
+        spacing = float((box.lengths / np.asarray(self._cell_counts(box))).min())
+        interval = self.info.frame_interval
+        viscosity = (1.0 + relative) * stated + added * spacing**2 / interval
+        return max(viscosity, 0.0), max(hyper, 0.0) * spacing**4 / interval
+
+    def _cell_counts(self, box: Box) -> tuple[int, ...]:
+        density = self.options.resolution * self.info.score_cells
+        return tuple(max(4, round(density * length)) for length in box.lengths)
+
+    def advance(self, state: Flows) -> tuple[Flows, Tensor]:
+        """Return the next state and positions [length], shape [particle, axis]."""
+        flows = []
+        positions = []
+        for flow in state.flows:
+            moved = self._advance_flow(flow)
+            flows.append(moved)
+            positions.append(moved.position)
+        position = torch.from_numpy(np.concatenate(positions)).float()
+        return replace(state, flows=tuple(flows)), position.to(state.device)
+
+    def _advance_flow(self, flow: Flow) -> Flow:
+        """Return a flow one frame later."""
+        interval = self.info.frame_interval
+        wall_velocity = flow.wall_velocity(flow.frame + 1)
+        field = flow.grid.advance(
+            flow.field,
+            duration=interval,
+            viscosity=flow.viscosity,
+            wall_velocity=wall_velocity,
+        )
+        position = flow.grid.carry(
+            flow.position,
+            before=flow.field,
+            after=field,
+            duration=interval,
+            wall_velocity=wall_velocity,
+        )
+        return replace(flow, field=field, position=position, frame=flow.frame + 1)
+
+    # --- the fit ------------------------------------------------------------------
+
+    def fit(self, scenarios: Iterable[Batch]) -> Mapping[str, float]:
+        """Fit the coefficients to scenarios of train; return errors to log.
+
+        The error is that of the vorticity on the solver's grid over the true one's, the
+        root of a mean over frames, and the mean over scenarios.
+
+        Args:
+            scenarios: whole scenarios, one a batch.
+        """
+        samples = []
+        for scenario in islice(scenarios, self.options.scenarios):
+            samples.append(self._prepare(scenario))
+        size = 3 if self.options.numerical else 1
+
+        def measure(values: NDArray[np.float64]) -> float:
+            coefficients = np.zeros(3)
+            coefficients[:size] = values
+            if np.abs(coefficients).max() > LARGEST:
+                return WORST_ERROR
+            errors = [self._error(sample, coefficients) for sample in samples]
+            return float(np.mean(errors))
+
+        plain_error = measure(np.zeros(size))
+        simplex = np.vstack([np.zeros(size), FIRST_STEP * np.eye(size)])
+        found = minimize(
+            measure,
+            np.zeros(size),
+            method="Nelder-Mead",
+            options={
+                "maxfev": self.options.evaluations,
+                "initial_simplex": simplex,
+                "xatol": 1e-4,
+                "fatol": 1e-5,
+            },
+        )
+        best = torch.zeros(3)
+        if found.fun < plain_error:
+            best[:size] = torch.from_numpy(found.x).float()
+        self.coefficients.copy_(best)
+        names = ("relative", "added", "hyper")
+        numbers = dict(zip(names, best.tolist(), strict=True))
+        return {"error_without": plain_error, "error": float(found.fun)} | numbers
+
+    def _prepare(self, scenario: Batch) -> tuple[Batch, list[Floats]]:
+        """Return the first frames of a scenario, and its true vorticity later on."""
+        given_frames = self.info.input_frames
+        last = min(scenario.frames, given_frames + self.options.frames)
+        given = scenario.part(slice(given_frames))
+        vorticity = []
+        for frame in range(given_frames, last):
+            window = scenario.part(slice(0, frame + 1))
+            flow = self._observe(window)
+            vorticity.append(compute_vorticity(flow.field, flow.grid))
+        return given, vorticity
+
+    def _observe(self, window: Batch) -> Flow:
+        """Return the flow of a window's last step, half a frame before its end."""
+        interval = self.info.frame_interval
+        box = self.info.box
+        flow = self._begin_at_rest(window)
+        frames = window.position[:, -2:].double().numpy()
+        step = box.displacement(frames[:, 0], frames[:, 1])
+        field = flow.grid.from_particles(
+            box.inside(frames[:, 1] - step / 2.0),
+            step / interval,
+            wall_velocity=flow.wall_velocity(window.frames - 1),
+        )
+        return replace(flow, field=field)
+
+    def _begin_at_rest(self, window: Batch) -> Flow:
+        """Return the flow of a window without its field."""
+        box = self.info.box
+        dimension = window.position.shape[2]
+        walls = np.zeros((1, 2 * dimension, dimension))
+        if window.wall_velocity is not None:
+            walls = window.wall_velocity[0].double().numpy()
+        grid = ClosedGrid(
+            box,
+            cells=self._cell_counts(box),
+            no_slip=bool(walls.any()),
+            hyperviscosity=0.0,
+        )
+        return Flow(
+            grid=grid,
+            field=[],
+            position=np.zeros((0, dimension)),
+            walls=walls,
+            frame=0,
+            viscosity=0.0,
+        )
+
+    def _error(self, sample: tuple[Batch, list[Floats]], coefficients: Floats) -> float:
+        """Return the error of a rollout with some coefficients [1]."""
+        given, true_vorticity = sample
+        flow = self._begin(
+            given, 0, torch.ones(len(given.position), dtype=torch.bool), coefficients
+        )
+        interval = self.info.frame_interval
+        squared_error = 0.0
+        squared_truth = 0.0
+        field = flow.field
+        for step, truth in enumerate(true_vorticity, start=1):
+            later = flow.grid.advance(
+                field,
+                duration=interval,
+                viscosity=flow.viscosity,
+                wall_velocity=flow.wall_velocity(flow.frame + step),
+            )
+            # The mean of both ends stands for the step between two frames.
+            middle = [(a + b) / 2 for a, b in zip(field, later, strict=True)]
+            difference = compute_vorticity(middle, flow.grid) - truth
+            squared_error += float(np.square(difference).sum())
+            squared_truth += float(np.square(truth).sum())
+            field = later
+        if not np.isfinite(squared_error) or squared_truth == 0.0:
+            return WORST_ERROR
+        return min(WORST_ERROR, float(np.sqrt(squared_error / squared_truth)))
+
+
+def compute_vorticity(velocity: Velocity, grid: StaggeredGrid) -> Floats:
+    """Return dv/dx - du/dy at the inner corners of a grid in two dimensions [1/s]."""
+    u, v = velocity
+    dv_dx = np.diff(v, axis=0)[:, 1:-1] / grid.spacing[0]
+    du_dy = np.diff(u, axis=1)[1:-1] / grid.spacing[1]
+    return np.asarray(dv_dx - du_dy)

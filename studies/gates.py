@@ -1,0 +1,308 @@
+"""Gates: what the weights of a graph network must do before they support a claim.
+
+    python -m studies.gates --root FOLDER [-o leaderboard] [--weights FILE ...]
+
+A graph network that fails them was trained too little or with settings that do not fit:
+comparing it with another method says nothing about the method. On ``valid``:
+
+- *one step*: root-mean-square error of the acceleration of one step, over that of the
+  true acceleration beyond gravity. At 1 the network is as good as no network.
+- *free flight*: mean error of the vertical acceleration where matter falls freely [g].
+- *settled*: the same where matter is at rest.
+- *densest cell*: particles in the fullest cell of the score grid in rollouts, over
+  those in the truth. A large number is a collapse.
+
+Free flight and rest have no meaning in full boxes without gravity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lagbench.atomic import write_atomically
+from lagbench.baselines.baseline import Baseline
+from lagbench.baselines.checkpoint import load, restore
+from lagbench.baselines.rollout import roll_out, scenario_batch, scenario_paths
+from lagbench.data.checksums import file_sha256, round_digits
+from lagbench.data.registry import Size
+from lagbench.data.registry import load as load_registry
+from lagbench.tensors import Batch
+
+Floats = NDArray[np.float64]
+
+LIMITS = {"one_step": 1.0, "free_flight": 0.02, "settled": 0.01, "densest_cell": 3.0}
+"""A measure of a gate must stay below its limit; its size counts, not its sign."""
+
+FORMAT = 1  # of gates.json
+BOARD_WEIGHTS = Path("leaderboard/weights")
+METHODS = ("gns", "supergat")  # graph networks that are measured by default
+FRAME_STEP = 20  # frames between the windows of a scenario
+ROLLOUT_STEP = 10  # frames between the states in which the fullest cell is sought
+FALL_TOLERANCE = 0.02  # of a window in free flight: mean acceleration off g, in g
+REST_LIMIT = 0.05  # of a settled window: root-mean-square acceleration, in g
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gates:
+    """The measures of one file of weights; None where a gate has no meaning."""
+
+    split: str
+    size: str
+    dataset_version: str  # of the training data
+    method: str  # name of the entry on the board, or of the file
+    weights_sha256: str
+    one_step: float  # error over the true acceleration beyond gravity [1]
+    free_flight: float | None  # mean vertical error [g]
+    settled: float | None  # mean vertical error [g]
+    densest_cell: float  # over that of the truth [1]
+
+    @property
+    def failed(self) -> list[str]:
+        """Names of the gates that the weights do not pass."""
+        names = []
+        for name, limit in LIMITS.items():
+            value = getattr(self, name)
+            if value is not None and not abs(value) < limit:
+                names.append(name)
+        return names
+
+
+@dataclass(kw_only=True)
+class StepErrors:
+    """Sums over the windows of one step [length/frame^2]."""
+
+    squared_error: float = 0.0
+    squared_truth: float = 0.0  # of accelerations beyond gravity
+    values: int = 0
+    free_flight: list[float]  # mean vertical errors of windows that fall
+    settled: list[float]  # mean vertical errors of windows at rest
+
+    def add(self, error: Floats, truth: Floats, fall: float) -> None:
+        """Add a window.
+
+        Args:
+            error: predicted less true acceleration, shape [particle, axis].
+            truth: true acceleration, shape [particle, axis].
+            fall: acceleration of a free particle along the vertical axis.
+        """
+        beyond_gravity = truth.copy()
+        beyond_gravity[:, 1] -= fall
+        self.squared_error += float(np.square(error).sum())
+        self.squared_truth += float(np.square(beyond_gravity).sum())
+        self.values += error.size
+        if fall == 0.0:
+            return
+        gravity = abs(fall)
+        mean_error = float(error[:, 1].mean()) / gravity
+        if np.abs(beyond_gravity.mean(axis=0)).max() < FALL_TOLERANCE * gravity:
+            self.free_flight.append(mean_error)
+        elif np.sqrt(np.square(truth).mean()) < REST_LIMIT * gravity:
+            self.settled.append(mean_error)
+
+    @property
+    def relative(self) -> float:
+        """Root-mean-square error over that of the truth beyond gravity [1]."""
+        if self.squared_truth == 0.0:
+            return math.inf
+        return math.sqrt(self.squared_error / self.squared_truth)
+
+
+@torch.no_grad()
+def predict_step(model: Baseline, window: Batch) -> tuple[Floats, Floats]:
+    """Return error and truth of the acceleration of a window's last frame.
+
+    Both are in length/frame^2 and have the shape [particle, axis].
+    """
+    given = window.part(slice(window.frames - 1))
+    _, predicted = model.advance(model.start(given))
+    box = model.box.box
+    frames = window.position.double().numpy()
+    before = box.displacement(frames[:, -3], frames[:, -2])
+    true_velocity = box.displacement(frames[:, -2], frames[:, -1])
+    error = box.displacement(frames[:, -1], predicted.double().numpy())
+    return np.asarray(error), np.asarray(true_velocity - before)
+
+
+def measure_steps(
+    model: Baseline, paths: Sequence[Path], size: Size, *, every: int = FRAME_STEP
+) -> StepErrors:
+    """Return the errors of single steps from true states of whole scenarios."""
+    gravity = size.parameters.get("gravity")
+    fall = 0.0
+    if gravity is not None and gravity.value:
+        fall = -float(gravity.value) * size.frame_interval**2
+    errors = StepErrors(free_flight=[], settled=[])
+    needed = max(model.history, 3)
+    for path in paths:
+        scenario = scenario_batch(path, viscosity=size.viscosity())
+        for last in range(needed, scenario.frames, every):
+            window = scenario.part(slice(last - needed, last + 1))
+            error, truth = predict_step(model, window)
+            errors.add(error, truth, fall)
+    return errors
+
+
+def count_densest(position: NDArray[np.float32], cells: int) -> int:
+    """Return the most particles in a cell of a grid over the unit box."""
+    index = np.clip((position * cells).astype(np.int64), 0, cells - 1)
+    flat = np.zeros(len(index), np.int64)
+    for axis in range(index.shape[1]):
+        flat = flat * cells + index[:, axis]
+    return int(np.bincount(flat).max())
+
+
+def measure_collapse(model: Baseline, paths: Sequence[Path], size: Size) -> float:
+    """Return the particles in the fullest cell of rollouts over those of the truth.
+
+    The largest ratio of all scenarios counts.
+    """
+    task = size.task
+    cells = task.score_grid.cells
+    last = task.input_frames + task.horizon
+    ratios = []
+    for path in paths:
+        scenario = scenario_batch(path, slice(last), viscosity=size.viscosity())
+        given = scenario.part(slice(task.input_frames))
+        (rollout,) = roll_out(model, given, task.horizon)
+        predicted_counts = []
+        true_counts = []
+        for step in range(0, task.horizon, ROLLOUT_STEP):
+            true_frame = scenario.position[:, task.input_frames + step].numpy()
+            predicted_counts.append(
+                count_densest(rollout.position[step].numpy(), cells)
+            )
+            true_counts.append(count_densest(true_frame, cells))
+        ratios.append(max(predicted_counts) / max(true_counts))
+    return max(ratios)
+
+
+def measure(
+    weights: Path, *, root: Path, scenarios: int, rollouts: int, every: int = FRAME_STEP
+) -> Gates:
+    """Return the gates of a file of weights, on the subset valid of its data set.
+
+    Args:
+        weights: file of a training or of an entry.
+        root: folder of all data sets.
+        scenarios: scenarios whose single steps are measured, at most.
+        rollouts: scenarios that are rolled out, at most.
+        every: frames between the measured steps of a scenario.
+    """
+    checkpoint = load(weights)
+    model = restore(checkpoint, where=str(weights))
+    model.eval()
+    info = checkpoint.info
+    size = load_registry().size(info.split, info.size)
+    valid = scenario_paths(info.split, subset="valid", size=info.size, root=root)
+    paths = list(valid.values())
+    errors = measure_steps(model, paths[:scenarios], size, every=every)
+    return Gates(
+        split=info.split,
+        size=info.size,
+        dataset_version=info.version,
+        method=weights.stem,
+        weights_sha256=file_sha256(weights),
+        one_step=round_digits(errors.relative, 4),
+        free_flight=_mean(errors.free_flight),
+        settled=_mean(errors.settled),
+        densest_cell=round_digits(measure_collapse(model, paths[:rollouts], size), 4),
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    if not values:
+        return None
+    return round_digits(float(np.mean(values)), 4)
+
+
+def to_json(rows: Iterable[Gates]) -> str:
+    """Return gates.json: limits, and measures with the gates that failed."""
+    entries = [{**asdict(row), "failed": row.failed} for row in rows]
+    content = {"format": FORMAT, "limits": LIMITS, "weights": entries}
+    return json.dumps(content, indent=1) + "\n"
+
+
+def to_markdown(rows: Iterable[Gates]) -> str:
+    """Return the table of all measures."""
+    lines = [
+        "| data set | weights | one step | free flight [g] | settled [g] "
+        "| densest cell | verdict |",
+        "| --- | --- | ---: | ---: | ---: | ---: | --- |",
+    ]
+    for row in rows:
+        verdict = "*under-trained*" if row.failed else "passes"
+        cells = [
+            f"{row.split} {row.size} {row.dataset_version}",
+            row.method.replace("_", "\\_"),
+            *(_format(getattr(row, name)) for name in LIMITS),
+            verdict,
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _format(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3g}"
+
+
+def board_weights(splits: Sequence[str], size: str) -> list[Path]:
+    """Return the committed weights of the graph networks that are measured."""
+    paths: list[Path] = []
+    for split in splits:
+        folder = BOARD_WEIGHTS / split / size
+        for method in METHODS:
+            paths += sorted(folder.glob(f"{method}_[0-9]*.pt"))
+    return paths
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure weights, print the table and write both files; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m studies.gates",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--root", type=Path, default=os.environ.get("LAGBENCH_ROOT"))
+    parser.add_argument(
+        "--weights", type=Path, nargs="+", help="instead of the board's"
+    )
+    parser.add_argument("--split", nargs="+", default=["cavity", "curl-noise"])
+    parser.add_argument("--size", default="mini")
+    parser.add_argument("--scenarios", type=int, default=8)
+    parser.add_argument("--rollouts", type=int, default=4)
+    parser.add_argument("--output", "-o", type=Path, help="folder of gates.json")
+    options = parser.parse_args(arguments)
+    if options.root is None:
+        parser.error("name the folder of all data sets: --root FOLDER")
+
+    torch.set_num_threads(1)
+    rows = []
+    for path in options.weights or board_weights(options.split, options.size):
+        row = measure(
+            path,
+            root=Path(options.root),
+            scenarios=options.scenarios,
+            rollouts=options.rollouts,
+        )
+        rows.append(row)
+    if options.output is not None:
+        write_atomically(options.output / "gates.json", to_json(rows).encode())
+    sys.stdout.write(to_markdown(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,145 @@
+"""The hybrid: without its closure the reference solver, with it a better one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from simple_models import info
+
+from lagbench.baselines.baseline import Batch, DatasetInfo
+from lagbench.baselines.hybrid_projection import ClosedGrid, HybridProjection
+from lagbench.baselines.rollout import roll_out
+from lagbench.data.box import Box
+from lagbench.data.registry import Size, load
+from lagbench.errors import DataError
+from lagbench.references import projection
+from lagbench.references.predictor import Given
+from lagbench.tensors import TensorWindow, collate
+
+SIDE = 0.875
+VISCOSITY = 2e-3
+INTERVAL = 0.1
+
+
+def cavity() -> Size:
+    """The description of cavity tiny."""
+    return load().size("cavity", "tiny")
+
+
+def cavity_info(**changes: object) -> DatasetInfo:
+    """Public figures that agree with those of cavity tiny."""
+    size = cavity()
+    values: dict[str, object] = {
+        "bounds": size.bounds,
+        "frame_interval": size.frame_interval,
+        "score_cells": size.task.score_grid.cells,
+        "input_frames": size.task.input_frames,
+        "moving_walls": True,
+    }
+    return info(**(values | changes))
+
+
+def turning(frames: int, *, decay: float = 0.0) -> NDArray[np.float64]:
+    """Return particles in one vortex that fades, shape [frame, particle, 2].
+
+    The stream function is sin(pi x)^2 sin(pi y)^2 in units of the box.
+    """
+    low = np.array([bound[0] for bound in cavity().bounds])
+    axis = (np.arange(24) + 0.5) / 24
+    place = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    path = [low + SIDE * place]
+    for frame in range(frames - 1):
+        sine = np.sin(np.pi * place)
+        twice = np.sin(2 * np.pi * place)
+        flow = np.stack([sine[:, 0] ** 2 * twice[:, 1], -twice[:, 0] * sine[:, 1] ** 2])
+        place = place + 0.004 * np.exp(-decay * frame) * flow.T
+        path.append(low + SIDE * place)
+    return np.array(path)
+
+
+def moving_lid(frames: int) -> NDArray[np.float64]:
+    """Return wall velocities of a lid that slides [length/s], [frame, wall, 2]."""
+    walls = np.zeros((frames, 4, 2))
+    walls[:, 3, 0] = 0.1
+    return walls
+
+
+def batch_of(
+    path: NDArray[np.float64], walls: NDArray[np.float64], viscosity: float | None
+) -> Batch:
+    """Return one window of liquid."""
+    window = TensorWindow(
+        position=torch.from_numpy(path.transpose(1, 0, 2)).float(),
+        material=torch.zeros(path.shape[1], dtype=torch.int64),
+        wall_velocity=torch.from_numpy(walls).float(),
+        scenario=0,
+        frame=0,
+        viscosity=viscosity,
+    )
+    return collate([window])
+
+
+def test_without_a_closure_it_is_the_reference_solver() -> None:
+    """Positions agree to the rounding of float32, with a lid that moves."""
+    size = cavity()
+    frames = size.task.input_frames + size.task.horizon
+    path = turning(size.task.input_frames).astype(np.float32).astype(np.float64)
+    walls = moving_lid(frames).astype(np.float32).astype(np.float64)
+    given = Given(
+        size=size,
+        root=Path(),
+        position=path,
+        material=np.zeros(path.shape[1], np.int8),
+        walls=walls * size.frame_interval,
+        area=SIDE**2,
+        parameters={"viscosity": VISCOSITY},
+    )
+    expected = np.array(list(projection.predict(given, 2)))
+    model = HybridProjection.build({}, cavity_info())
+    window = batch_of(path, walls, VISCOSITY)
+    (rollout,) = roll_out(model, window, size.task.horizon)
+    np.testing.assert_allclose(rollout.position.numpy(), expected, rtol=0, atol=2e-7)
+
+
+def test_a_wave_decays_by_viscosity_and_hyperviscosity() -> None:
+    """cos(k y) in a periodic box decays at nu q^2 + mu q^4.
+
+    q^2 = (2 - 2 cos(k h)) / h^2 is that of central differences.
+    """
+    nu = 1e-3
+    mu = 2e-5
+    box = Box.from_bounds(((0.0, 1.0), (0.0, 1.0)), (True, True))
+    grid = ClosedGrid(box, cells=(16, 16), no_slip=False, hyperviscosity=mu)
+    y = (np.arange(16) + 0.5) / 16
+    k = 2 * np.pi
+    u = np.tile(1e-3 * np.cos(k * y), (16, 1))
+    later = grid.advance(
+        [u, np.zeros((16, 16))],
+        duration=4.0,
+        viscosity=nu,
+        wall_velocity=np.zeros((4, 2)),
+    )
+    q_squared = (2 - 2 * np.cos(k / 16)) * 16**2
+    expected = np.exp(-(nu * q_squared + mu * q_squared**2) * 4.0)
+    assert later[0][0, 0] / u[0, 0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_fit_finds_a_damping_that_the_data_show() -> None:
+    """A vortex that fades faster than its viscosity says gets a greater one."""
+    options = {"resolution": 1.0, "frames": 10, "evaluations": 30, "numerical": False}
+    model = HybridProjection.build(options, cavity_info())
+    path = turning(20, decay=0.06)
+    window = batch_of(path, np.zeros((20, 4, 2)), 1e-3)
+    numbers = model.fit([window])
+    assert numbers["relative"] > 0.0
+    assert numbers["error"] < numbers["error_without"]
+
+
+def test_a_viscosity_that_is_not_known_is_refused() -> None:
+    model = HybridProjection.build({}, cavity_info())
+    with pytest.raises(DataError):
+        model.start(batch_of(turning(6), moving_lid(6), None))
