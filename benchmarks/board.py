@@ -8,13 +8,16 @@ own, films and maps are noise, so that nothing compresses away because two entri
 alike. Every fifth has three seeds, some are superseded, withdrawn or flagged, and their
 texts hold markup. The same call gives the same bytes. Exit code 1 if
 `lagbench leaderboard check` finds anything, a page built again with other bytes
-included, or if the page has more than 2 MB.
+included, if the page has more than 2 MB, or if `build` and `show` take more than 500 MB
+of memory.
 """
 
 from __future__ import annotations
 
 import argparse
 import datetime
+import resource
+import subprocess
 import sys
 import tempfile
 import time
@@ -61,6 +64,8 @@ from lagbench.submission import Header
 from lagbench.submission.task_checks import frames_to_predict
 
 MOST_BYTES = 2_000_000
+MOST_ENTRIES_OF_A_PAGE = 150  # more may make a longer page
+MOST_MEMORY = 500_000_000  # of build and show [bytes]
 SEEDS = 3
 SIZE = "mini"
 NAMES = (
@@ -95,11 +100,11 @@ def _measure(target: Path, entries: int) -> int:
         size = registry.size(splits[number % len(splits)], SIZE)
         make_entry(size, target, number)
 
-    wall = time.perf_counter()
-    cpu = time.process_time()
+    times = {}
+    for command in ("build", "show"):
+        times[command] = _time_command(command, target)
+    memory = 1e3 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
     result = build(target)
-    wall = time.perf_counter() - wall
-    cpu = time.process_time() - cpu
     findings = check_board(target, page=True).findings
     for finding in findings:
         print(finding, file=sys.stderr)
@@ -110,11 +115,29 @@ def _measure(target: Path, entries: int) -> int:
         f"page         {format_bytes(result.bytes)} ({result.bytes} bytes; limit "
         f"{MOST_BYTES})"
     )
-    print(f"build        {cpu:.1f} s of processor time, {wall:.1f} s")
+    for command, (cpu, wall) in times.items():
+        print(f"{command:12s} {cpu:.1f} s of processor time, {wall:.1f} s")
+    print(
+        f"memory       {format_bytes(int(memory))}, limit {format_bytes(MOST_MEMORY)}"
+    )
     print(f"check        {len(findings)} findings")
-    if not findings and result.bytes <= MOST_BYTES:
+    is_short = result.bytes <= MOST_BYTES or result.rows > MOST_ENTRIES_OF_A_PAGE
+    if not findings and is_short and memory <= MOST_MEMORY:
         return 0
     return 1
+
+
+def _time_command(command: str, target: Path) -> tuple[float, float]:
+    """Return processor time and time of a command of the group leaderboard [s]."""
+    words = [sys.executable, "-m", "lagbench", "leaderboard", command]
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    wall = time.perf_counter()
+    subprocess.run(
+        [*words, "--board", str(target)], check=True, stdout=subprocess.DEVNULL
+    )
+    wall = time.perf_counter() - wall
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime - before.ru_utime, wall
 
 
 def make_entry(size: Size, target: Path, number: int) -> None:

@@ -127,12 +127,17 @@ def scenario_writer(
     key = size.key(scenario)
     frame_count = size.frame_count(scenario)
 
+    first_frame = state.start_frame
+    frames = range(first_frame, first_frame + frame_count)
     wall_velocity = None
     if _has_driving_walls(split_module(size).solver_parameters(size)):
         # of each wall towards each recorded frame [length/s], shape [frame, wall, axis]
-        first_frame = state.start_frame
-        frames = range(first_frame, first_frame + frame_count)
         wall_velocity = np.stack([state.walls_towards(frame) for frame in frames])
+
+    body_force = None
+    if state.body_force is not None:
+        # of each layer towards each recorded frame [length/s^2]
+        body_force = np.stack([state.force_towards(frame) for frame in frames])
 
     return ScenarioWriter(
         scenario_path(job.root, key),
@@ -143,6 +148,7 @@ def scenario_writer(
         material=state.material,
         particle_mass=_particle_mass(size, state),
         wall_velocity=wall_velocity,
+        body_force=body_force,
         parameters=file_parameters(size, scenario, state),
         seed=seed_text(size.split, size.name, size.major, scenario),
         device=job.device.value,

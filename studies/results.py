@@ -12,6 +12,7 @@ score files of the leaderboard and the records of trainings; no data set is read
 from __future__ import annotations
 
 import argparse
+import difflib
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -315,6 +316,10 @@ def _missing_lines(results: SplitResults) -> Iterator[str]:
         yield f"- {results.where}: {count} score files of other data, left out."
 
 
+SHOWN_LINES = 20  # of the difference from a stale page
+SHOWN_COLUMNS = 200  # of each of them
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write or check the page; return the exit code."""
     parser = argparse.ArgumentParser(
@@ -360,11 +365,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _check(path: Path, page: bytes) -> int:
-    """Return 0 if a file holds the page, else 1."""
-    if path.is_file() and path.read_bytes() == page:
+    """Return 0 if a file holds the page; else 1, and print how they differ."""
+    if not path.is_file():
+        sys.stdout.write(f"{path}: stale: there is no such page\n")
+        return 1
+    present = path.read_bytes()
+    if present == page:
         sys.stdout.write(f"{path}: up to date\n")
         return 0
+    difference = difflib.unified_diff(
+        present.decode("utf-8", "replace").splitlines(),
+        page.decode().splitlines(),
+        fromfile=str(path),
+        tofile="from the score files",
+        n=0,
+        lineterm="",
+    )
+    lines = list(difference)
     sys.stdout.write(f"{path}: stale\n")
+    for line in lines[:SHOWN_LINES]:
+        sys.stdout.write(f"{line[:SHOWN_COLUMNS]}\n")
+    if len(lines) > SHOWN_LINES:
+        sys.stdout.write(f"... and {len(lines) - SHOWN_LINES} lines more\n")
     return 1
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from lagbench.board.entry import Meta
 from lagbench.board.entry_file import read_entry
+from lagbench.board.folder import LOCK
 from lagbench.board.publish import SubmitResult
 from lagbench.board.ranking import combine, summarise
 from lagbench.board.submit import submit
@@ -374,7 +375,10 @@ class BoardBench:
 
     def state(self) -> dict[str, str]:
         """Return path to hash of every file in the folder."""
-        files = sorted(path for path in self.folder.rglob("*") if path.is_file())
+        files = []
+        for path in sorted(self.folder.rglob("*")):
+            if path.is_file() and path.name != LOCK:
+                files.append(path)
         hashes = {}
         for path in files:
             name = path.relative_to(self.folder).as_posix()

@@ -57,6 +57,8 @@ from .columns import PRESETS
 from .entry import Entry, EntryCost, Status, Verification
 from .entry_file import read_entry, schema_bytes
 from .folder import PAGE, SCHEMA, Folder
+from .gates import gates_failed_by, read_failed_gates
+from .identity import find_impossible_values
 from .issues import CHECKS
 from .model import (
     Board,
@@ -238,6 +240,7 @@ def collect(
         truths[data_set] = min(finest, truth, key=lambda pictured: pictured.order)
 
     verified = read_verified(board)
+    failed_gates = read_failed_gates(board)
     tabs = []
     empty = []
     for split, description in described.splits.items():
@@ -255,6 +258,7 @@ def collect(
                     scope=scope,
                     references=read_references(board, size),
                     verified=verified,
+                    failed_gates=failed_gates,
                 )
                 tabs.append(tab)
             elif name != TRIAL and len(size.subsets["test"]) >= FEWEST_SCENARIOS:
@@ -291,7 +295,9 @@ def _read_method(
     try:
         stored = []
         for score_path in entry.score_paths:
-            stored.append(read_score_file(board.path / score_path, size))
+            score_file = read_score_file(board.path / score_path, size)
+            _require_possible(board, score_path, score_file)
+            stored.append(score_file)
     except UnreadableFileError:
         if current:
             raise
@@ -336,6 +342,20 @@ def _read_method(
         pictures=true_pictures,
     )
     return method, truth
+
+
+def _require_possible(board: Folder, path: Path, score_file: ScoreFile) -> None:
+    """Refuse a score file with values that no prediction can have."""
+    impossible = next(find_impossible_values(score_file), None)
+    if impossible is not None:
+        raise UnreadableFileError(
+            "impossible scores",
+            where=str(board.path / path),
+            expected="scores that a prediction can have",
+            got=impossible,
+            fix=f"lagbench leaderboard check --board {board.path} names all that is "
+            "wrong; submit the predictions again",
+        )
 
 
 def _form_scores(
@@ -398,6 +418,7 @@ def _make_tab(
     scope: Scope,
     references: Sequence[ReferenceScores],
     verified: Mapping[str, Verification],
+    failed_gates: Mapping[str, tuple[str, ...]],
 ) -> Tab:
     ranking = methods[0].ranking
     variants = _find_variants(methods)
@@ -422,7 +443,8 @@ def _make_tab(
             verified=verification_of(method.entry, verified),
             references=references,
         )
-        rows.append(row)
+        failed = gates_failed_by(method.entry, failed_gates)
+        rows.append(replace(row, failed_gates=failed))
 
     columns = []
     for name in dict.fromkeys((ranking, *COLUMNS)):

@@ -31,6 +31,8 @@ SCHEMA = "schema.json"
 VERIFIED = "verified.yaml"
 GATES = "gates.json"  # what weights do in single steps (python -m studies.gates)
 README = "README.md"
+LOCK = ".lock"  # held while the folder is written
+STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
 
 MODEL_ENDINGS = (".pt", ".onnx")
 """Endings of models: weights of `lagbench train`, and ONNX files."""
@@ -42,6 +44,8 @@ ENDINGS = {
     WEIGHTS: (*MODEL_ENDINGS, ".json"),
 }
 PLACEHOLDER = ".gitkeep"  # keeps an empty folder in git
+GIT = (".git", ".gitignore", ".gitattributes", ".github")
+"""What a leaderboard that is the root of a git repository has beside its files."""
 PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 """Names of folders and files: nothing that a terminal or a CI log would obey."""
 
@@ -78,6 +82,21 @@ def score_paths(place: Place, seeds: Sequence[int | None]) -> tuple[Path, ...]:
     return tuple(paths)
 
 
+def is_place_of_file(path: Path) -> bool:
+    """Tell whether a relative path is that of a file which a submission writes.
+
+    >>> is_place_of_file(Path("scores/cavity/mini/gns.nc"))
+    True
+    >>> is_place_of_file(Path("scores/../../gns.nc"))
+    False
+    """
+    if path == Path(VERIFIED):
+        return True
+    if len(path.parts) != DEPTH or not all(map(PART.fullmatch, path.parts)):
+        return False
+    return path.suffix in ENDINGS.get(path.parts[0], ())
+
+
 def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Path:
     """Return the path of the model of a seed, relative to the folder.
 
@@ -112,6 +131,7 @@ class Folder:
                 "no leaderboard here",
                 where=str(self.path),
                 expected=f"a folder that holds {SUBMISSIONS}/",
+                got="no such folder",
                 fix=fix,
             )
 
@@ -198,6 +218,10 @@ class Folder:
             if reason is not None:
                 yield path, reason
 
+    def staging_folders(self) -> tuple[Path, ...]:
+        """Return the folders that killed submissions left behind."""
+        return tuple(sorted(self.path.glob(f"{STAGING}*")))
+
     def reason_unfit(self, path: Path) -> str | None:
         """Return why a relative path cannot be an entry or a score file, else None."""
         link = self.link_in(path)
@@ -250,6 +274,10 @@ class Folder:
         paths: list[Path] = []
         for folder, folder_names, file_names in os.walk(self.path / top):
             here = Path(folder)
+            if here == self.path:
+                passed_over = {LOCK, *GIT}
+                folder_names[:] = sorted(set(folder_names) - passed_over)
+                file_names = sorted(set(file_names) - passed_over)
             links = []
             for name in folder_names:
                 if (here / name).is_symlink():

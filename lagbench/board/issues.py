@@ -25,69 +25,71 @@ class BoardCheck(NamedTuple):
 
 CHECKS: Mapping[str, BoardCheck] = {
     "folder": BoardCheck(
-        "a file, link or folder that nothing here knows",
-        "something that has no place here",
+        "a file, link or folder that is not part of a leaderboard",
+        "not part of a leaderboard",
         "entries, score files, and what README.md names",
         "remove it; predictions and code are kept elsewhere",
     ),
     "readable": BoardCheck(
-        "an entry that is no plain YAML of at most 64 kB",
+        "an entry that is not a plain YAML file of at most 64 kB",
         "the entry cannot be read",
         "plain YAML",
         "write it with `lagbench submit`",
     ),
     "schema": BoardCheck(
-        "unknown or missing keys, values that do not fit, addresses that are no "
-        "named host's",
+        "a missing or unknown key, a value that does not fit, or a web address "
+        "without a host name",
         "the entry does not fit",
         "what leaderboard/schema.json says",
         "docs/submitting.md describes the keys",
     ),
     "split": BoardCheck(
-        "a split or size that datasets.yaml does not have",
+        "an entry for a split or size that datasets.yaml does not have",
         "no such split and size",
         "a split and size that `lagbench list` shows",
         "name another",
     ),
     "place": BoardCheck(
-        "an entry whose split, size or method is not that of its path",
+        "an entry that names another split, size or method than its path does",
         "the entry lies in another place than it says",
         "the path that follows from it",
         "let split, size and method be those of the path",
     ),
     "version": BoardCheck(
-        "an active entry that was scored on another data set than that of today",
+        "an active entry whose data set has a newer version",
         "the data set is no longer the current one",
         "the version of today",
         "predict from the new data and submit again, or set status: withdrawn",
     ),
     "date": BoardCheck(
-        "an entry of a day that has not come yet",
-        "the entry is of a day to come",
+        "an entry whose date lies in the future",
+        "the date of the entry lies in the future",
         "at most today",
         "date: the day of the submission",
     ),
     "name": BoardCheck(
-        "two active entries, or an entry and a reference predictor, whose names "
-        "look alike",
+        "two active entries with names that look alike, or an entry named like a "
+        "reference predictor",
         "two names look alike",
         "a name of its own",
         "choose another name, or say what differs, as in 'GNS, six terms'",
     ),
     "lifecycle": BoardCheck(
-        "an entry that is superseded by one that is not there, or in the end by itself",
-        "the entry is superseded by none",
+        "a superseded entry whose successor is missing, or leads back to the entry "
+        "itself",
+        "the entry is superseded by an entry that is not there",
         "another entry there, active in the end",
         "name an entry that is there and replaces it, or set status: withdrawn",
     ),
     "predictions": BoardCheck(
-        "predictions said to lie in the folder that do not, or of another length",
+        "predictions that the entry places in the folder, but that are missing there "
+        "or have another length",
         "the predictions do not lie where the entry says",
         "a file of that length",
         "correct path and bytes, or remove path",
     ),
     "missing": BoardCheck(
-        "a score file that is not there",
+        "an entry whose score file is missing",
         "a score file is not there",
         "the file that `lagbench submit` wrote beside the entry",
         "add it to the pull request, or submit again",
@@ -98,82 +100,85 @@ CHECKS: Mapping[str, BoardCheck] = {
         "at most 1,000,000 bytes",
     ),
     "score_file": BoardCheck(
-        "a score file that was edited, cannot be read, or belongs to something else",
+        "a score file that was edited, cannot be read, or belongs to another entry",
         "a score file is not the one that the scorer wrote",
         "the file of the entry, unchanged",
     ),
     "values": BoardCheck(
-        "a score file with values that no prediction can have",
-        "no prediction has such scores",
-        "scores of a prediction",
+        "a score file with impossible values, such as a negative error",
+        "impossible scores",
+        "scores that a prediction can have",
     ),
     "score": BoardCheck(
-        "a score block that the score files do not give",
+        "a score in the entry that differs from the one that follows from its score "
+        "files",
         "the score block is not what the score files give",
         "what the score files give",
     ),
     "budget": BoardCheck(
-        "a budget, or its track, that those of the predictions do not give",
+        "a budget or track in the entry that does not follow from the budgets of its "
+        "predictions",
         "the budget is not what those of the predictions give",
         "no track, since the predictions have no budgets",
     ),
     "weights": BoardCheck(
-        "weights that are missing, edited, out of place, without an entry or of two; "
-        "more than 40 MB of"
-        " them; a long or broken log of a training",
+        "weights that are missing, edited, in a wrong place, or named by no entry or "
+        "by two; more than 40 MB of weights; a training log that is too long or "
+        "broken",
         "the weights are not those of the entry",
         "the file that `lagbench submit --weights` wrote",
         "submit with the weights again: lagbench submit --weights; or remove what no "
         "entry names",
     ),
     "twin": BoardCheck(
-        "the same predictions under two names or seeds",
+        "the same predictions submitted twice, under two names or two seeds",
         "the same predictions stand here twice",
         "predictions of its own",
         "submit predictions once; if the method has a new name, supersede the "
         "old entry",
     ),
     "stray": BoardCheck(
-        "a score file that no entry has",
+        "a score file that belongs to no entry",
         "a score file that no entry has",
         "an entry that names these predictions",
         "add its entry, or remove it",
     ),
     "floor": BoardCheck(
-        "scores of a reference predictor that are unknown, cannot be read, or "
-        "belong to something else",
+        "a score file of a reference predictor that is unknown, cannot be read, or is "
+        "of another data set",
         "no reference predictor of the scorer",
         "scores of a reference predictor that `lagbench submit` wrote",
         REFERENCES_ANEW,
     ),
     "verified": BoardCheck(
-        "a line of verified.yaml that no entry with these score files has",
-        "the list names what is not there",
+        "a line of verified.yaml about an entry that is not there, or has other score "
+        "files by now",
+        "verified.yaml has a line about no entry",
         "an entry with these score files",
         "remove the line: it holds for nothing any more",
     ),
     "base": BoardCheck(
-        "an entry that was there before and that the change touches, removes or "
-        "alters in status",
+        "a change to an entry that was there before: edited, removed, superseded or "
+        "withdrawn",
         "the change alters what was there before",
         "the same as before",
         "leave it as it was; if it is yours, say so: --own METHOD",
     ),
     "rescored": BoardCheck(
-        "predictions that, scored again, give something else",
-        "scored again, the predictions are not what the leaderboard says",
+        "predictions whose scores, computed again, differ from the entry",
+        "scored again, the predictions have other scores",
         "what the scorer gives",
     ),
     "measured": BoardCheck(
-        "a shipped score of a reference predictor that is not what the data give, "
-        "measured again",
+        "a shipped score of a reference predictor that differs when it is measured "
+        "again",
         "the shipped scores of a reference predictor are not those of the data",
         "the scores that the package ships",
         "lagbench verify; if the data are the recorded ones, python -m "
         "lagbench.scoring.measure_references",
     ),
     "page": BoardCheck(
-        "a page or schema.json that is not what the submissions give",
+        "an index.html or schema.json that is out of date",
         "the page is not what the submissions give",
         "what they give",
         "lagbench leaderboard build",

@@ -114,6 +114,7 @@ class BoardRow:
     # best and worst rank in 95 % of the resamples; None where nothing is claimed
     rank_range: tuple[int, int] | None = None
     variant_of: str | None = None  # id of the method that the row is a variant of
+    failed_gates: tuple[str, ...] = ()  # of its weights; such a row is under-trained
     # ranking metric, NaN where undefined, shape [seed, scenario]
     losses: Floats | None = None
 

@@ -1,12 +1,15 @@
 """Write an entry with its score files and weights, whole or not at all.
 
-All files are written to a staging folder first and then moved to their places, the YAML
-file last, which names the others by SHA-256. A kill between two moves leaves files that
-``lagbench leaderboard check`` finds.
+All files are written to a staging folder first, then a journal of what is to be moved
+and removed, then they are moved to their places, the YAML file last, which names the
+others by SHA-256. A kill before the journal is written leaves the leaderboard as it
+was; after a kill between two moves the next submission completes them
+(:func:`complete_interrupted`). Both happen under the lock of the leaderboard.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -15,7 +18,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from lagbench.atomic import move_together, refuse_folders
+from lagbench.atomic import move_together, refuse_folders, write_atomically
 from lagbench.errors import UsageError, WorkFailedError
 from lagbench.metrics.aggregate import Tally
 from lagbench.scoring.card import SUBMISSION, ScoreCard
@@ -25,13 +28,24 @@ from lagbench.scoring.score_file_checks import MAX_SCORE_BYTES, read_score_file
 from .draft import Draft, PredictionsFile, fit
 from .entry import DataSet, Entry, Prediction, ScoreBlock, ScoredFile
 from .entry_file import entry_bytes, read_entry_if_valid
-from .folder import REFERENCES, SUBMISSIONS, VERIFIED, Folder, entry_path, score_paths
+from .folder import (
+    REFERENCES,
+    STAGING,
+    SUBMISSIONS,
+    VERIFIED,
+    Folder,
+    entry_path,
+    is_place_of_file,
+    score_paths,
+)
 from .ranking import combine, scored_file, summarise, write_references
 from .verified import list_without_stale_line
 from .weights import copy_weights, name_weights
 
-# begins the name of the staging folder; a killed process leaves it behind
-STAGING = ".submit-"
+JOURNAL = "journal.json"
+"""List of moves and removals; once it is there, the entry counts as submitted."""
+
+LONGEST_JOURNAL = 100_000  # bytes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,12 +113,13 @@ def publish(
         )
         refuse_folders(removed)
         references = write_references(cards[0], folder)
+        _write_journal(staging, moves, removed, folder)
         copies_and_places = []
         for path, copy in moves.items():
             copies_and_places.append((copy, folder.path / path))
         move_together(copies_and_places)
-    for path in removed:
-        path.unlink()
+        for path in removed:
+            path.unlink()
 
     written = [folder.path / path for path in reversed(moves)]
     return _result_of(
@@ -114,6 +129,64 @@ def publish(
         kept=_find_kept_weights(entry, moves, folder),
         removed=removed,
     )
+
+
+def _write_journal(
+    staging: Path, moves: Mapping[Path, Path], removed: Sequence[Path], folder: Folder
+) -> None:
+    """Write down what is to be moved and removed, before any of it is done."""
+    steps = []
+    for path, copy in moves.items():
+        steps.append([copy.relative_to(staging).as_posix(), path.as_posix()])
+    removals = []
+    for path in removed:
+        removals.append(path.relative_to(folder.path).as_posix())
+    content = json.dumps({"moves": steps, "removed": removals})
+    write_atomically(staging / JOURNAL, content.encode(), option="--board")
+
+
+def complete_interrupted(folder: Folder) -> None:
+    """Complete or undo what killed submissions began. Call it under the lock.
+
+    What a journal of strangers names outside the places of entries, score files and
+    weights is not touched.
+    """
+    for staging in folder.staging_folders():
+        if staging.is_symlink() or not staging.is_dir():
+            staging.unlink()
+            continue
+        moves, removed = _read_journal(staging)
+        folder.require_unlinked([*moves, *removed])
+        copies_and_places = []
+        for path, copy in moves.items():
+            if copy.is_file() and not copy.is_symlink():
+                copies_and_places.append((copy, folder.path / path))
+        move_together(copies_and_places)
+        for path in removed:
+            if path not in moves:
+                (folder.path / path).unlink(missing_ok=True)
+        shutil.rmtree(staging)
+
+
+def _read_journal(staging: Path) -> tuple[dict[Path, Path], list[Path]]:
+    """Return copies by their places, and places to clear; nothing without a journal."""
+    journal = staging / JOURNAL
+    if journal.is_symlink() or not journal.is_file():
+        return {}, []
+    moves = {}
+    removed = []
+    try:
+        with journal.open("rb") as file:
+            content = json.loads(file.read(LONGEST_JOURNAL))
+        for name, place in content["moves"]:
+            if is_place_of_file(Path(place)):
+                moves[Path(place)] = staging / Path(name).name
+        for place in content["removed"]:
+            if is_place_of_file(Path(place)):
+                removed.append(Path(place))
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return {}, []
+    return moves, removed
 
 
 def _kept_predictions(draft: Draft) -> tuple[Prediction, ...]:

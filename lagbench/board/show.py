@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from lagbench.errors import UsageError, suggest_name
 from lagbench.figures.tables import Table
+from lagbench.metrics.table import METRICS
+from lagbench.references.predictor import Kind
 from lagbench.scoring.card import digits
 
-from .columns import TableRow, metric_value
-from .entry import EntryCost
+from .build import COLUMNS, Scope
+from .columns import (
+    TableRow,
+    cost_of,
+    describe_check,
+    format_ranks,
+    level_of,
+    metric_value,
+    source_of_cost,
+)
+from .entry import EntryCost, Level
 from .model import Board, BoardRow, ReferenceRow, Tab, Value
 
 NOTHING = "-"
+REMARK_WIDTH = 16  # the whole table fits a terminal of 80 characters
 
 
 def choose_data_sets(
@@ -39,51 +52,71 @@ def choose_data_sets(
     raise UsageError("no entries there", where=f"leaderboard {request}", fix=fix)
 
 
+def scope_of_tables(metrics: Collection[str], *, wide: bool) -> Scope:
+    """Return how much of the score files the tables need."""
+    names = {*metrics}
+    if wide:
+        names.update(COLUMNS)
+    return Scope(metrics=names, intervals=(), has_pictures=False)
+
+
+SCOPE_OF_JSON = Scope(has_pictures=False)
+"""How much of the score files JSON needs."""
+
+
 def tables(
     board: Board, metrics: Collection[str] = (), *, wide: bool = False
 ) -> Iterator[Table]:
-    """Yield a table per tab: ranked rows, reference predictors, other rows.
+    """Yield a table per tab: methods by rank, reference predictors, other rows.
 
     Args:
         board: the board.
         metrics: metrics to show beside the ranking one.
-        wide: whether to show the first metrics of each tab.
+        wide: whether to show variants, the spread over seeds, and the first metrics of
+            each tab.
 
     Raises:
         UsageError: an unknown metric.
     """
     for name in metrics:
-        if name not in board.metrics:
+        if name not in METRICS:
             raise UsageError(
                 f"no metric {name!r} here",
                 where="--metric",
-                fix=suggest_name(name, board.metrics),
+                fix=suggest_name(name, METRICS),
             )
     for tab in board.tabs:
         names = _columns_of(tab, metrics, wide=wide)
-        ranked_rows = []
+        methods = []
         other_rows = []
         for row in tab.rows:
             if row.rank is not None:
-                ranked_rows.append(row)
-            else:
+                methods.append(row)
+            elif wide or row.variant_of is None:
                 other_rows.append(row)
-        rows: list[TableRow] = [*ranked_rows, *tab.references, *other_rows]
+        rows: list[TableRow] = [*methods, *tab.references, *other_rows]
         cells = []
         for table_row in rows:
-            cells.append(_format_row(table_row, names))
+            cells.append(_format_row(tab, table_row, names, wide=wide))
+        headings = [HEADINGS.get(name, name) for name in names]
+        headings[names.index(tab.ranking)] = "score"
         yield Table(
             _title_of(tab),
-            ("rank", "method", *names, "s/frame", "speed-up", "remarks"),
+            ("rank", "method", *headings, "s/frame", "remarks"),
             tuple(cells),
             keys=2,
         )
 
 
+HEADINGS = {"against_classical": "÷class."}
+"""Headings of columns that have other names than their keys."""
+
+
 def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
-    names = [tab.ranking, *metrics]
+    names = [tab.ranking]
     if any(row.against_classical for row in tab.rows):
-        names.insert(0, "against_classical")
+        names.append("against_classical")
+    names += metrics
     if any(row.skill for row in tab.rows):
         names.insert(0, "skill")
     if wide:
@@ -93,11 +126,11 @@ def _columns_of(tab: Tab, metrics: Collection[str], *, wide: bool) -> list[str]:
 
 def _title_of(tab: Tab) -> str:
     size = tab.size
-    title = f"{size.split} {size.name} {size.version}, by {tab.ranking}"
+    title = f"{size.split} {size.name} {size.version}, score: {tab.ranking}"
+    if any(row.variant_of for row in tab.rows):
+        title += "; +n: variants (--wide)"
     if not tab.decided:
         title += ", too few scenarios to tell entries apart"
-    if any(row.entry.cost for row in tab.rows):
-        title += "; cost self-reported"
     return title
 
 
@@ -151,7 +184,11 @@ def _plain_row(row: BoardRow) -> dict[str, Any]:
         "diverged": row.diverged,
         "name": entry.name,
         "status": str(entry.status),
-        "verified": row.verified is not None,
+        "verified": level_of(row) is not Level.AS_SUBMITTED,
+        "level": str(level_of(row)),
+        "cost_source": source_of_cost(row) or None,
+        "variant_of": row.variant_of,
+        "rank_range": row.rank_range,
         "seeds": len(entry.predictions),
         "parameters": entry.parameters,
         "flags": [flag.name for flag in row.flags],
@@ -174,57 +211,73 @@ def _plain_value(value: Value) -> dict[str, float | None]:
     }
 
 
-def _format_row(row: TableRow, names: Sequence[str]) -> tuple[str, ...]:
-    values = [_format_value(metric_value(row, name)) for name in names]
+def _format_row(
+    tab: Tab, row: TableRow, names: Sequence[str], *, wide: bool
+) -> tuple[str, ...]:
+    values = []
+    for name in names:
+        values.append(_format_value(metric_value(row, name), wide=wide))
+    seconds = _format_seconds(cost_of(row))
     if isinstance(row, ReferenceRow):
-        times = _format_times(row.cost)
-        return (NOTHING, row.name, *values, *times, f"{row.kind} reference")
+        return (NOTHING, row.name, *values, seconds, str(row.kind))
     return (
         _format_rank(row),
-        row.id,
+        row.id if wide else _format_name(tab, row),
         *values,
-        *_format_times(row.entry.cost),
-        ", ".join(_remarks_on(row)),
+        seconds,
+        textwrap.fill(
+            ", ".join(_remarks_on(row, wide=wide)),
+            REMARK_WIDTH,
+            break_long_words=False,
+        ),
     )
 
 
-def _format_value(value: Value | None) -> str:
+def _format_name(tab: Tab, row: BoardRow) -> str:
+    """Return the id of a method, and how many variants of it are not shown."""
+    count = len(tab.variants_of(row))
+    if count:
+        return f"{row.id} +{count}"
+    return row.id
+
+
+def _format_value(value: Value | None, *, wide: bool) -> str:
     if value is None or math.isnan(value.mean):
         return NOTHING
-    if math.isnan(value.std):
-        return f"{value.mean:.4g}"
+    if math.isnan(value.std) or not wide:
+        return f"{value.mean:.3g}"
     return f"{value.mean:.4g} ± {value.std:.2g}"
 
 
-def _format_times(cost: EntryCost | None) -> tuple[str, str]:
-    """Return time per frame and speed-up."""
+def _format_seconds(cost: EntryCost | None) -> str:
+    """Return the time of a frame."""
     if cost is None:
-        return "", ""
-    if cost.speed_up is None:
-        return f"{cost.seconds_per_frame:.3g}", ""
-    return f"{cost.seconds_per_frame:.3g}", f"{cost.speed_up:.3g}"
+        return NOTHING
+    return f"{cost.seconds_per_frame:.2g}"
 
 
 def _format_rank(row: BoardRow) -> str:
     if row.rank is None:
         return NOTHING
-    if row.tied:
-        return f"{row.rank}≈"
-    return str(row.rank)
+    return format_ranks(row.rank, row.rank_range)
 
 
-def _remarks_on(row: BoardRow) -> Iterator[str]:
+def _remarks_on(row: BoardRow, *, wide: bool) -> Iterator[str]:
     entry = row.entry
-    if row.verified:
-        yield "verified"
+    if row.verified is not None:
+        yield describe_check(row)
     if str(entry.status) != "active":
         yield str(entry.status)
     if not row.current:
         yield f"data set {entry.dataset.version}"
-    if entry.budget is not None and entry.budget.track:
-        yield entry.budget.track
-    if len(entry.predictions) > 1:
+    if row.variant_of is not None:
+        yield "variant"
+    if entry.kind is not Kind.LEARNED:
+        yield str(entry.kind)
+    if wide and len(entry.predictions) > 1:
         yield f"{len(entry.predictions)} seeds"
+    if row.failed_gates:
+        yield "under-trained"
     if row.diverged:
         yield f"{row.diverged} diverged"
     for flag in row.flags:

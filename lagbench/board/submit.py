@@ -23,12 +23,13 @@ from lagbench.submission.validation import validate
 from lagbench.work.progress import Progress
 
 from .describe import draft_entry
-from .draft import PredictionsFile
+from .draft import Draft, PredictionsFile
 from .entry import OUTSIDE, Meta
 from .fields import MOST_SEEDS
 from .folder import Folder
 from .identity import fingerprint_of, fingerprints_of_entries
-from .publish import SubmitResult, publish
+from .lock import board_lock
+from .publish import SubmitResult, complete_interrupted, publish
 from .seeds import require_new
 
 BOARD = Path("leaderboard")  # the leaderboard's folder, from the root of the repository
@@ -103,10 +104,15 @@ def submit(
         result.check()
         files.append(_read_predictions(path, result, described))
 
-    draft = draft_entry(
-        files, meta, folder=folder, weights=weights, replace=replace, add=add
-    )
+    def draft() -> Draft:
+        return draft_entry(
+            files, meta, folder=folder, weights=weights, replace=replace, add=add
+        )
 
+    if folder.staging_folders():
+        with board_lock(folder):
+            complete_interrupted(folder)
+    draft()  # refuses before the scoring what can be refused
     cards: list[ScoreCard] = []
     for file in files:
         card = score(
@@ -120,11 +126,16 @@ def submit(
         )
         cards.append(card)
     fingerprints = [fingerprint_of(card.tallies[SUBMISSION]) for card in cards]
-    known_fingerprints = fingerprints_of_entries(folder, draft.entries_to_differ_from)
-    require_new(fingerprints, paths, known_fingerprints)
-
     try:
-        return publish(draft, files, cards, folder)
+        # the leaderboard may have changed while the files were scored
+        with board_lock(folder):
+            complete_interrupted(folder)
+            current = draft()
+            known_fingerprints = fingerprints_of_entries(
+                folder, current.entries_to_differ_from
+            )
+            require_new(fingerprints, paths, known_fingerprints)
+            return publish(current, files, cards, folder)
     except OSError as error:
         raise WorkFailedError(
             "cannot write there",

@@ -333,6 +333,13 @@ def chips_of(row: BoardRow) -> Iterator[Chip]:
             meaning="Scored on a data set version that is no longer current: not "
             "ranked.",
         )
+    if row.failed_gates:
+        yield Chip(
+            kind="warn",
+            label="under-trained",
+            meaning="Its weights fail a gate of competence and take part in no claim: "
+            f"{', '.join(row.failed_gates)}.",
+        )
     for flag in row.flags:
         yield _chip_of(flag, kind="bad", most_reasons=len(flag.reasons))
     for warning in row.warnings:

@@ -22,6 +22,7 @@ from lagbench.errors import ChecksFailedError
 from .entry import Entry, Level, Verification
 from .entry_file import examine, format_issues, load_plain, yaml_bytes
 from .folder import VERIFIED, Folder
+from .lock import board_lock
 
 MOST_LIST_BYTES = 2_000_000
 """Longest list [bytes]; a line takes about 700."""
@@ -114,22 +115,23 @@ def record(
 ) -> Verification:
     """Change the line of an entry, an empty one where it has none; return it.
 
-    The file is read again right before, so that a record of somebody else stays.
+    The file is read again under the lock, so that a record of somebody else stays.
     """
-    verified = dict(read_verified(folder))
-    line = verification_of(entry, verified)
-    if line is None:
-        line = Verification(
-            scores=_score_hashes(entry),
-            lagbench=version("lagbench"),
-            date=today(),
-            level=Level.AS_SUBMITTED,
-        )
-    renewed = {"lagbench": version("lagbench"), "date": today()}
-    changed = change(line).model_copy(update=renewed)
-    verified[entry.yaml_path.as_posix()] = changed
-    data = _list_bytes(dict(sorted(verified.items())))
-    write_atomically(folder.path / VERIFIED, data, option="--board")
+    with board_lock(folder):
+        verified = dict(read_verified(folder))
+        line = verification_of(entry, verified)
+        if line is None:
+            line = Verification(
+                scores=_score_hashes(entry),
+                lagbench=version("lagbench"),
+                date=today(),
+                level=Level.AS_SUBMITTED,
+            )
+        renewed = {"lagbench": version("lagbench"), "date": today()}
+        changed = change(line).model_copy(update=renewed)
+        verified[entry.yaml_path.as_posix()] = changed
+        data = _list_bytes(dict(sorted(verified.items())))
+        write_atomically(folder.path / VERIFIED, data, option="--board")
     return changed
 
 

@@ -14,7 +14,13 @@ from lagbench.board.check import CheckResult, check_board
 from lagbench.board.cost import picture
 from lagbench.board.folder import Folder
 from lagbench.board.reproduce import ReproduceResult, reproduce
-from lagbench.board.show import choose_data_sets, tables, to_plain
+from lagbench.board.show import (
+    SCOPE_OF_JSON,
+    choose_data_sets,
+    scope_of_tables,
+    tables,
+    to_plain,
+)
 from lagbench.data.local import locate_new
 from lagbench.data.registry import Size
 from lagbench.errors import DataError, LagbenchError, UsageError, format_count
@@ -120,6 +126,13 @@ def check_command(
             where="--root",
             expected="the folder of the data",
             fix="give --root as well",
+        )
+    if recording and not predictions:
+        raise UsageError(
+            "there is nothing to record",
+            where="--record",
+            expected="predictions that are scored again",
+            fix="give --predictions FILE as well",
         )
     sizes: Sequence[Size] = ()
     if root and not predictions:
@@ -342,7 +355,11 @@ def show_command(
         list[str] | None, option("--metric NAME", "Metric to show; repeatable.")
     ] = None,
     wide: Annotated[
-        bool, option("--wide", "Show the first metrics of each data set.")
+        bool,
+        option(
+            "--wide",
+            "Show variants, deviations and the first metrics of each data set.",
+        ),
     ] = False,
     board: BoardOption = DEFAULT_BOARD,
     as_json: JsonFlag = False,
@@ -352,7 +369,10 @@ def show_command(
     if split_argument or split_option:
         split = choose_split(split_argument, split_option)
     data_sets = Folder(board).data_sets()
-    model = collect(board, only=choose_data_sets(data_sets, split, size))
+    scope = scope_of_tables(metric or (), wide=wide)
+    if as_json:
+        scope = SCOPE_OF_JSON
+    model = collect(board, only=choose_data_sets(data_sets, split, size), scope=scope)
     if as_json:
         print_json(to_plain(model))
         return

@@ -261,6 +261,7 @@ def parse_ids(
             where=where,
             expected=f"{noun}s and ranges from 0 to {MAX_ID}, as in 0,3-5",
             got=issue,
+            fix=f"write {noun}s in ascending order, each once",
         )
     return tuple(ids)
 

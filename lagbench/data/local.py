@@ -169,6 +169,8 @@ class RootedRegistry(Registry):
             raise UsageError(
                 f"no split {name!r}",
                 where="--split",
+                expected="the name of a split, or the folder of a local one",
+                got=ascii(name),
                 fix=suggest_name(name, known_names),
             )
         return self.splits[name]

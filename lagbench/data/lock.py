@@ -71,7 +71,7 @@ def dataset_lock(
         lock = _acquire(folder, timeout, on_wait)
     except OSError as error:
         raise WorkFailedError(
-            "cannot lock the data set",
+            "cannot write there, so the data set cannot be locked",
             where=str(folder),
             got=error.strerror or error,
             fix="name a folder that you may write to: --root or LAGBENCH_ROOT",

@@ -345,6 +345,8 @@ class Size(BaseModel):
             f"no scenario {scenario}",
             where=f"{self.split} {self.name}",
             expected=", ".join(texts),
+            got=scenario,
+            fix="name one of these; `lagbench info` lists those of other sizes",
         )
 
     def key(self, scenario: int) -> ScenarioKey:
@@ -453,6 +455,8 @@ class Registry:
             raise UsageError(
                 f"split {split!r} has no size {name!r}",
                 where="--size",
+                expected=", ".join(parent.sizes),
+                got=ascii(name),
                 fix=suggest_name(name, parent.sizes),
             )
         entry = parent.sizes[name]

@@ -254,6 +254,7 @@ class DownloadJob:
         reason: Reason = UsageError(
             "no store is known to download from",
             where=place,
+            expected="a store, or a folder of released archives",
             got=archives,
             fix=f"name one: --from URL, or {RELEASES_VARIABLE}=URL; or leave out "
             f"--no-generate",

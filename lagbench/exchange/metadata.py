@@ -99,7 +99,11 @@ def parse_format(name: str) -> Format:
     names = [form.value for form in Format]
     if name not in names:
         raise UsageError(
-            f"no format {name!r}", where="--format", fix=suggest_name(name, names)
+            f"no format {name!r}",
+            where="--format",
+            expected=", ".join(names),
+            got=ascii(name),
+            fix=suggest_name(name, names),
         )
     return Format(name)
 

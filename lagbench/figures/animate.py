@@ -129,9 +129,10 @@ def check_ending(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(
             "no such kind of video",
-            where="output",
+            where="--output",
             expected=f"a name ending in {' or '.join(SUFFIXES)}",
             got=path,
+            fix=f"name it {path.with_suffix(SUFFIXES[0]).name}",
         )
 
 

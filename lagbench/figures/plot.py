@@ -97,6 +97,8 @@ def check_kind(kind: str) -> None:
         raise UsageError(
             f"no kind of picture {kind!r}",
             where="--kind",
+            expected=", ".join(KINDS),
+            got=ascii(kind),
             fix=suggest_name(kind, KINDS),
         )
 

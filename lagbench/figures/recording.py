@@ -182,6 +182,7 @@ class Recording:
             where=f"scenario {self.scenario}",
             expected=f"0 to {self.frames - 1}",
             got=got,
+            fix="name a frame in this range; -1 is the last one",
         )
 
     def scene(self, frame: int) -> Scene:

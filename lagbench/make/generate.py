@@ -220,7 +220,11 @@ def _find_device(name: str) -> Device:
     names = list(map(str, Device))
     if name not in names:
         raise UsageError(
-            f"no device {name!r}", where="--device", fix=suggest_name(name, names)
+            f"no device {name!r}",
+            where="--device",
+            expected=", ".join(names),
+            got=ascii(name),
+            fix=suggest_name(name, names),
         )
     return Device(name)
 

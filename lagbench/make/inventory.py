@@ -364,6 +364,8 @@ def _check_header(
     expected = {}
     for name, value in file_parameters(size, scenario, state).items():
         expected[name] = to_plain(value)
+    if size.periodic:  # stated by the writer, from the box
+        expected["periodic"] = " ".join(size.periodic)
     # What only the simulation tells is covered by the content hash.
     stated = {}
     for name, value in header.parameters.items():

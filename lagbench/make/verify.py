@@ -98,7 +98,13 @@ class VerificationResult:
             raise DataError(what, where=where, fix=self.fix)
 
         if not any(report.present for report in self.subsets):
-            raise DataError("nothing is generated", where=where, fix=self.fix)
+            raise DataError(
+                "nothing is generated",
+                where=where,
+                expected="scenario files",
+                got="none",
+                fix=self.fix,
+            )
 
         if self.must_be_complete and not self.complete:
             gaps = []

@@ -1,9 +1,10 @@
 """Projection solver: incompressible Navier-Stokes on a staggered grid, in full boxes.
 
 A textbook solver (:mod:`.staggered`) that is told what a model is told: the given
-frames, the motion of the walls and the viscosity. It starts from the velocities of the
-last two given frames, which hold half a frame before the last one, and brings them
-there. From then on its field carries the particles, two readings a frame (Heun).
+frames, the motion of the walls, the body force and the viscosity. It starts from the
+velocities of the last two given frames, which hold half a frame before the last one,
+and brings them there. From then on its field carries the particles, two readings a
+frame (Heun).
 
 It learns nothing. It knows the equations, which are not quite those of the data: their
 fluid is weakly compressible. What a surrogate of a full box must be compared with:
@@ -12,9 +13,16 @@ accuracy against cost (McGreivy and Hakim, Nature Machine Intelligence 6 (2024) 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from .predictor import Given, Kind, Prediction, ReferencePredictor, fills_box
+from .predictor import (
+    Floats,
+    Given,
+    Kind,
+    Prediction,
+    ReferencePredictor,
+    fills_box,
+)
 from .staggered import StaggeredGrid
 
 RESOLUTIONS = {"projection": 1, "projection-2x": 2, "projection-3x": 3}
@@ -43,6 +51,9 @@ def predict(given: Given, resolution: float) -> Prediction:
         no_slip=given.driven,
     )
     first = given.predicted_frames[0]
+    forces: Sequence[Floats | None] = [None] * len(walls)
+    if given.body_force is not None:
+        forces = [*(given.body_force / interval**2)]
     field = grid.from_particles(
         given.middle, given.step / interval, wall_velocity=walls[first - 1]
     )
@@ -51,6 +62,7 @@ def predict(given: Given, resolution: float) -> Prediction:
         duration=0.5 * interval,
         viscosity=viscosity,
         wall_velocity=walls[first - 1],
+        force=forces[first - 1],
     )
     position = given.last
     for frame in given.predicted_frames:
@@ -59,6 +71,7 @@ def predict(given: Given, resolution: float) -> Prediction:
             duration=interval,
             viscosity=viscosity,
             wall_velocity=walls[frame],
+            force=forces[frame],
         )
         position = grid.carry(
             position,

@@ -21,7 +21,7 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from lagbench.data.box import Box
 
@@ -135,7 +135,7 @@ class StaggeredGrid:
         *,
         viscosity: float,
         wall_velocity: Floats,
-        force: Sequence[float] | None = None,
+        force: ArrayLike | None = None,
     ) -> Velocity:
         """Return ``-div(u u) + nu lap u + f`` at the faces [length/s^2].
 
@@ -144,7 +144,8 @@ class StaggeredGrid:
             viscosity: kinematic viscosity nu [length^2/s].
             wall_velocity: velocity of each wall, two walls per axis, shape [2 axis,
                 axis] [length/s]; rows of periodic axes are not read.
-            force: acceleration f of the whole fluid [length/s^2], shape [axis].
+            force: acceleration f [length/s^2] of the whole fluid, shape [axis], or of
+                layers of equal height along y, lowest first, shape [layer, axis].
         """
         padded = []
         for component, values in enumerate(velocity):
@@ -155,12 +156,25 @@ class StaggeredGrid:
             for axis in range(self.dimension):
                 rate -= self._flux_divergence(padded, component, axis)
             if force is not None:
-                rate += force[component]
+                rate += self._force_at_faces(np.asarray(force), component)
             if not self.box.periodic[component]:
                 rate[_slice(self.dimension, component, None, 1)] = 0.0
                 rate[_slice(self.dimension, component, -1, None)] = 0.0
             result.append(rate)
         return result
+
+    def _force_at_faces(self, force: Floats, component: int) -> Floats:
+        """Return the acceleration at the faces of a component [length/s^2].
+
+        It has one value along all axes but y, the faces' rows of cells along y.
+        """
+        layers = np.atleast_2d(force)[:, component]
+        row_count = self.face_shape(component)[1]
+        row = np.minimum(np.arange(row_count), self.cells[1] - 1)
+        shape = [1] * self.dimension
+        shape[1] = row_count
+        at_rows = layers[row * len(layers) // self.cells[1]]
+        return np.asarray(at_rows.reshape(shape))
 
     def _with_ghosts(
         self, values: Floats, component: int, wall_velocity: Floats
@@ -259,7 +273,7 @@ class StaggeredGrid:
         duration: float,
         viscosity: float,
         wall_velocity: Floats,
-        force: Sequence[float] | None = None,
+        force: ArrayLike | None = None,
     ) -> Velocity:
         """Return the velocity after some time, walls and force held [length/s].
 

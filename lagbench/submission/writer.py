@@ -656,5 +656,7 @@ def _check_output(output: Path, *, overwrite: bool) -> None:
         raise UsageError(
             "there is such a file already",
             where=str(output),
+            expected="a file that is not there yet",
+            got="a file of that name",
             fix="write elsewhere: -o template.nc; or replace it: --overwrite",
         )

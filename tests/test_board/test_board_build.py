@@ -4,11 +4,13 @@ pictures.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import shutil
 from pathlib import Path
 
+import netCDF4
 import numpy as np
 import pytest
 from board_bench import PLACE, BoardBench, copied, master, noisy
@@ -24,13 +26,21 @@ from lagbench.board.build import (
     make_curve,
     residual_histograms,
 )
+from lagbench.board.entry import Weights
 from lagbench.board.folder import Folder
+from lagbench.board.gates import gates_failed_by, read_failed_gates
 from lagbench.board.model import Board, BoardRow
 from lagbench.board.ranking import combine
 from lagbench.board.show import choose_data_sets, tables, to_plain
 from lagbench.board.variants import find_variants
 from lagbench.data.registry import Registry
-from lagbench.errors import ChecksFailedError, DataError, LagbenchError, UsageError
+from lagbench.errors import (
+    ChecksFailedError,
+    DataError,
+    LagbenchError,
+    UnreadableFileError,
+    UsageError,
+)
 from lagbench.metrics import METRICS, Score, bootstrap_interval
 from lagbench.references.table import REFERENCES
 from lagbench.scoring.card import SUBMISSION, ScoreCard, digits
@@ -374,18 +384,22 @@ def test_tables_show_ranks_spread_cost_and_flags(board: Board) -> None:
         "rank",
         "method",
         "skill",
-        "vorticity_nrmse",
+        "score",
         "position_rmse",
     )
     rows = {row[1]: row for row in table.rows}
     for reference in board.tabs[0].references:
         row = rows[reference.name]
         assert row[0] == "-"
-        assert row[-1] == f"{reference.kind} reference"
+        assert row[-1] == reference.kind
     damped = rows["damped"]
     assert damped[0] == str(row_of(board, "damped").rank)
-    assert " ± " in damped[3]
-    assert damped[5:7] == ("0.5", "4")
+    assert damped[5] == "0.5"
+    for row in table.rows:
+        assert max(map(len, row[-1].split("\n"))) <= 17
+    (wide,) = tables(board, wide=True)
+    spread = {row[1]: row for row in wide.rows}["damped"]
+    assert " ± " in spread[3]
 
 
 def test_json_has_the_numbers_of_the_board(board: Board) -> None:
@@ -423,3 +437,41 @@ def test_boards_without_an_entry_are_named(
     assert set(board.empty) <= set(empty.empty)
     assert choose_data_sets([], None, None) == ()
     assert build(tmp_path, registry=bench.registry).rows == 0
+
+
+@pytest.mark.parametrize("value", [-1.0, math.nan])
+def test_impossible_scores_name_their_file(own: BoardBench, value: float) -> None:
+    """Negative errors stop the page, which names the file; a method without any value
+    comes last and has no skill.
+    """
+    path = own.folder / "scores/cavity/tiny/noisy.nc"
+    with netCDF4.Dataset(path, "a") as file:
+        file.set_auto_maskandscale(False)
+        file["value"][:] = value
+    if math.isnan(value):
+        tab = collect(own.folder, registry=own.registry).tabs[0]
+        ranked = [row for row in tab.rows if row.rank is not None]
+        assert ranked[-1].id == "noisy"
+        assert ranked[-1].skill is None
+        return
+    with pytest.raises(UnreadableFileError) as caught:
+        collect(own.folder, registry=own.registry)
+    assert caught.value.where == str(path)
+    assert "leaderboard check" in str(caught.value.fix)
+
+
+def test_weights_that_fail_a_gate_are_marked(tmp_path: Path) -> None:
+    """They are found by the hash of the weights; a broken list is named."""
+    weights = Weights(path="x", sha256="a" * 64)
+    entry = make_entry("GNS", 1, "cavity", "mini", None)
+    prediction = entry.predictions[0].model_copy(update={"weights": weights})
+    entry = entry.model_copy(update={"predictions": (prediction,)})
+    path = tmp_path / "gates.json"
+    row = {"weights_sha256": "a" * 64, "failed": ["one_step"]}
+    path.write_text(json.dumps({"weights": [row]}))
+    failed = read_failed_gates(Folder(tmp_path))
+    assert gates_failed_by(entry, failed) == ("one_step",)
+    assert gates_failed_by(make_entry("GNS", 1, "cavity", "mini", None), failed) == ()
+    path.write_text("{}")
+    with pytest.raises(UnreadableFileError):
+        read_failed_gates(Folder(tmp_path))

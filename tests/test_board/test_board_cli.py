@@ -197,3 +197,8 @@ def test_an_empty_board_is_well(run: Run, tmp_path: Path) -> None:
         result = run("leaderboard", *words)
         assert result.exit_code == 0, result.output
     assert json.loads(result.stdout) == {"tabs": []}
+
+
+def test_there_is_nothing_to_record_without_predictions(run: Run) -> None:
+    """`--record` alone is a mistake of the command line."""
+    assert run("leaderboard", "check", "--record").exit_code == 2

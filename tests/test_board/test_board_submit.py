@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import datetime
+import json
+import multiprocessing
 import os
 import shutil
+import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -424,3 +428,151 @@ def test_what_is_not_given(own: BoardBench) -> None:
     assert abs(
         entry.date - datetime.datetime.now(datetime.UTC).date()
     ) <= datetime.timedelta(days=1)
+
+
+def rounds(few: int, many: int) -> Any:
+    """Return a number of rounds for every run, and one for slow ones."""
+    return pytest.mark.parametrize(
+        "count", [few, pytest.param(many, marks=pytest.mark.slow)]
+    )
+
+
+FORK = multiprocessing.get_context("fork")
+REFUSED = 2  # exit code of a process whose submission is refused
+
+
+def begin(bench: BoardBench, path: Path, name: str, *, add: bool) -> Any:
+    """Return a process that submits: HDF5 bears no two threads."""
+
+    def run() -> None:
+        try:
+            bench.submit(path, add=add, method=name)
+        except UsageError:
+            os._exit(REFUSED)
+
+    process = FORK.Process(target=run)
+    process.start()
+    return process
+
+
+def finish(processes: Sequence[Any]) -> list[int]:
+    """Return the exit codes of processes when they have ended."""
+    codes = []
+    for process in processes:
+        process.join()
+        codes.append(process.exitcode)
+    return codes
+
+
+@rounds(1, 20)
+def test_two_that_add_a_seed_at_once_lose_none(own: BoardBench, count: int) -> None:
+    """Both seeds are there, or one was refused and says so."""
+    for number in range(count):
+        name = f"twice-{number}"
+        paths = []
+        for seed in range(3):
+            paths.append(own.predict(shifted(3 * number + seed), name, seed=seed))
+        own.submit(paths[0], method=name)
+        codes = finish([begin(own, path, name, add=True) for path in paths[1:]])
+        entry = read_entry(own.entry(name))
+        assert set(codes) <= {0, REFUSED}
+        assert len(entry.seeds) == 3 - codes.count(REFUSED)
+    assert well(own)
+
+
+@rounds(1, 20)
+def test_two_that_submit_one_name_at_once(own: BoardBench, count: int) -> None:
+    """One is there, the other is refused; none is a mixture of both."""
+    for number in range(count):
+        name = f"race-{number}"
+        paths = []
+        for side in (0, 1):
+            path = own.predict(shifted(50 + 2 * number + side), f"{name}-{side}")
+            paths.append(path)
+        codes = finish([begin(own, path, name, add=False) for path in paths])
+        assert sorted(codes) == [0, REFUSED]
+    assert well(own)
+
+
+def shifted(step: int) -> Any:
+    """Return a method whose prediction depends on a number."""
+
+    def predict(truth: Any, n: int, h: int) -> Any:
+        frame = np.arange(1, h + 1)[:, None, None]
+        return truth[n : n + h] + 1e-6 * (step + 1) * frame
+
+    return predict
+
+
+def test_a_killed_submission_is_completed(own: BoardBench, predictions: Path) -> None:
+    """After a kill between two moves the next submission moves the rest; a kill before
+    the journal leaves nothing. The check finds nothing then.
+    """
+    before = own.state()
+    own.submit(predictions)
+    after = own.state()
+    new_paths = sorted(after.keys() - before.keys())
+    assert len(new_paths) == 2
+    for moved_count in (0, 1, 2):
+        staging = own.folder / f".submit-{moved_count}"
+        staging.mkdir()
+        moves = []
+        for number, name in enumerate(new_paths):
+            if number >= moved_count:
+                (own.folder / name).rename(staging / str(number))
+            moves.append([str(number), name])
+        journal = {"moves": moves, "removed": []}
+        (staging / "journal.json").write_text(json.dumps(journal))
+        (own.folder / ".submit-cut-short").mkdir()
+        with pytest.raises(UsageError):  # it is there: the next one completed it
+            own.submit(predictions)
+        assert own.state() == after
+        assert well(own)
+
+
+def test_a_journal_of_strangers_leads_nowhere(
+    own: BoardBench, predictions: Path
+) -> None:
+    """Places outside the leaderboard are neither written nor removed."""
+    victim = own.folder.parent / "victim.nc"
+    victim.write_text("precious")
+    staging = own.folder / ".submit-hostile"
+    staging.mkdir()
+    (staging / "bait").write_text("bad")
+    content = {
+        "moves": [["bait", "../victim.nc"], ["bait", "/etc/x"], ["bait", "index.html"]],
+        "removed": ["../victim.nc", "scores/../../victim.nc"],
+    }
+    (staging / "journal.json").write_text(json.dumps(content))
+    own.submit(predictions)
+    assert victim.read_text() == "precious"
+    assert not staging.exists()
+    assert well(own)
+
+
+@pytest.mark.slow
+def test_the_next_submission_mends_thirty_kills(
+    own: BoardBench, predictions: Path
+) -> None:
+    """A process is killed at another moment each time; then the check is green."""
+    rng = np.random.Generator(np.random.PCG64(30))
+    for number in range(30):
+        name = f"killed-{number}"
+        process = begin(own, own.predict(shifted(1000 + number), name), name, add=False)
+        time.sleep(rng.uniform(0.05, 1.5))
+        process.kill()
+        process.join()
+    own.submit(predictions)
+    assert well(own)
+
+
+def test_a_board_may_be_the_root_of_a_repository(own: BoardBench) -> None:
+    """What git keeps there is passed over; other strays are named."""
+    (own.folder / ".git" / "objects").mkdir(parents=True)
+    (own.folder / ".git" / "objects" / "x").write_text("x")
+    (own.folder / ".gitignore").write_text("*.tmp")
+    assert well(own)
+    (own.folder / "stray.txt").write_text("x")
+    (finding,) = check_board(own.folder, registry=own.registry, isolated=False).findings
+    assert finding.check == "folder"
+    assert "stray.txt" in finding.where

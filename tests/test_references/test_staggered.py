@@ -259,3 +259,19 @@ def test_gaps_are_filled_from_their_edges() -> None:
     filled = fill_gaps(sums, weight)
     np.testing.assert_allclose(filled, [[1.0, 1.0, 7.0], [3.0, 5.0, 7.0]])
     np.testing.assert_array_equal(fill_gaps(0.0 * sums, 0.0 * weight), 0.0)
+
+
+def test_layers_are_driven_apart() -> None:
+    """In a periodic box without viscosity each layer gains f t along x."""
+    box = Box.from_bounds([(0.0, 1.0), (0.0, 1.0)], periodic=[True, True])
+    grid = StaggeredGrid(box, cells=(8, 8), no_slip=False)
+    field = grid.advance(
+        grid.rest(),
+        duration=0.5,
+        viscosity=0.0,
+        wall_velocity=np.zeros((4, 2)),
+        force=[[0.2, 0.0], [-0.2, 0.0]],
+    )
+    np.testing.assert_allclose(field[0][:, :4], 0.1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(field[0][:, 4:], -0.1, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(field[1], 0.0, rtol=0, atol=1e-12)

@@ -37,6 +37,9 @@ POLICY = (
 POLICY_TAG = tag("meta", http_equiv="Content-Security-Policy", content=POLICY)
 """It is in the head of every report, and of no other page."""
 
+OPEN_SECTIONS = 2
+"""Sections that are unfolded when the page is opened: the scores and the rollout."""
+
 FOOT = (
     "Intervals are 95 % bootstrap intervals over test scenarios. Velocity and "
     "vorticity are per frame; lengths are in units of the box. This page is one file "
@@ -225,8 +228,9 @@ def compose_page(title: str, head: Markup, sections: Sequence[Section]) -> str:
 
     parts = []
     first_number = 1
-    for section in sections:
-        parts.append(_compose_section(section, first_number))
+    for number, section in enumerate(sections):
+        is_open = number < OPEN_SECTIONS
+        parts.append(_compose_section(section, first_number, is_open=is_open))
         first_number += len(section.figures)
 
     meta = [
@@ -248,18 +252,24 @@ def compose_page(title: str, head: Markup, sections: Sequence[Section]) -> str:
     return f"<!DOCTYPE html>\n{whole}\n"
 
 
-def _compose_section(section: Section, first_number: int) -> Markup:
+def _compose_section(section: Section, first_number: int, *, is_open: bool) -> Markup:
+    """Return a section that its heading folds and unfolds.
+
+    The identifier stands inside: a link to it unfolds the section.
+    """
     if isinstance(section.lead, Markup):
         lead = section.lead
     else:
         lead = paragraph(section.lead)
-    parts = [tag("h2", section.title), lead]
+    parts = [lead]
     figures = []
     for number, figure in enumerate(section.figures, first_number):
         figures += [_compose_figure(figure, number), "\n"]
     if figures:
         parts.append(tag("div", *figures, class_="figures"))
-    drawn = tag("section", *parts, id=f"part-{section.name}", class_="part")
+    heading = tag("summary", tag("h2", section.title))
+    content = tag("div", *parts, id=f"part-{section.name}")
+    drawn = tag("details", heading, content, class_="part", open=is_open)
     return join([drawn, "\n"])
 
 

@@ -1,0 +1,263 @@
+"""Gradient noise that repeats itself, and flows made of it, in two or three dimensions.
+
+Perlin's noise on a lattice that is wrapped around the unit box: a polynomial within
+each cell of the lattice, with continuous second derivatives. Every operation is + - *
+or floor, so that bits are the same on every machine.
+
+A :class:`Smooth` carries a function with its gradient and Hessian by the product rule,
+
+    grad(f g) = g grad f + f grad g,
+    H(f g) = g H f + f H g + grad f grad g^T + grad g grad f^T.
+
+A flow without divergence is the rotated gradient of a stream function in two
+dimensions, u = dpsi/dy, v = -dpsi/dx, and the curl of a vector potential in three.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .draws import RandomSource, quantise
+
+__all__ = [
+    "Flow",
+    "Smooth",
+    "constant",
+    "coordinate",
+    "curl",
+    "draw_direction",
+    "draw_lattice",
+    "fill_box",
+    "noise",
+    "rotated_gradient",
+    "scaled_to",
+    "wrapped_offset",
+]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A function at many points, with its first and second derivatives."""
+
+    value: Array  # shape [point]
+    gradient: Array  # shape [point, axis]
+    hessian: Array  # shape [point, axis, axis]
+
+    def __add__(self, other: Smooth) -> Smooth:
+        """Add term by term."""
+        return Smooth(
+            self.value + other.value,
+            self.gradient + other.gradient,
+            self.hessian + other.hessian,
+        )
+
+    def __mul__(self, other: Smooth) -> Smooth:
+        """Multiply by the product rule."""
+        f = self.value[:, None]
+        g = other.value[:, None]
+        gradient = g * self.gradient + f * other.gradient
+        crossed = self.gradient[:, :, None] * other.gradient[:, None, :]
+        hessian = g[..., None] * self.hessian + f[..., None] * other.hessian
+        hessian = hessian + (crossed + crossed.transpose(0, 2, 1))
+        return Smooth(self.value * other.value, gradient, hessian)
+
+    def scale(self, factor: Array | float) -> Smooth:
+        """Multiply by numbers that do not depend on the point's coordinates."""
+        factors = np.broadcast_to(np.asarray(factor, np.float64), self.value.shape)
+        return Smooth(
+            factors * self.value,
+            factors[:, None] * self.gradient,
+            factors[:, None, None] * self.hessian,
+        )
+
+    def shift(self, amount: Array | float) -> Smooth:
+        """Add numbers that do not depend on the point's coordinates."""
+        return Smooth(self.value + amount, self.gradient, self.hessian)
+
+    def polynomial(self, *coefficients: float) -> Smooth:
+        """Return c0 + c1 f + c2 f^2 + ... by Horner's rule."""
+        result = self.scale(0.0)
+        for coefficient in reversed(coefficients):
+            result = (result * self).shift(coefficient)
+        return result
+
+    def only_where(self, chosen: NDArray[np.bool_]) -> Smooth:
+        """Return the function at some points, and zero at the others."""
+        return Smooth(
+            np.where(chosen, self.value, 0.0),
+            np.where(chosen[:, None], self.gradient, 0.0),
+            np.where(chosen[:, None, None], self.hessian, 0.0),
+        )
+
+
+@dataclass(frozen=True)
+class Flow:
+    """A velocity field at many points."""
+
+    velocity: Array  # [length/s], shape [point, axis]
+    affine: Array  # its gradient, component by axis [1/s], shape [point, axis, axis]
+
+    @property
+    def speed_rms(self) -> float:
+        """Root mean square of the speed over the points [length/s]."""
+        squares = self.velocity.ravel().tolist()
+        total = math.fsum(value * value for value in squares)
+        return math.sqrt(total / len(self.velocity))
+
+
+def coordinate(values: Array, axis: int, dimension: int) -> Smooth:
+    """Return a coordinate, or it less a constant, as a function of the position."""
+    gradient = np.zeros((len(values), dimension))
+    gradient[:, axis] = 1.0
+    return Smooth(values, gradient, np.zeros((len(values), dimension, dimension)))
+
+
+def constant(value: float, point_count: int, dimension: int) -> Smooth:
+    """Return a constant function."""
+    return Smooth(
+        np.full(point_count, value),
+        np.zeros((point_count, dimension)),
+        np.zeros((point_count, dimension, dimension)),
+    )
+
+
+def draw_direction(rng: RandomSource, dimension: int) -> Array:
+    """Draw a unit vector, uniform over the circle or sphere, without sine or cosine."""
+    # until a point of the cube lies in the unit ball, and not at its very centre
+    while True:
+        vector = 2.0 * rng.random((dimension,)) - 1.0
+        square = math.fsum(value * value for value in vector.tolist())
+        if 2.0**-20 <= square <= 1.0:
+            return np.asarray(vector / math.sqrt(square))
+
+
+def draw_lattice(rng: RandomSource, frequency: int, dimension: int) -> Array:
+    """Draw the unit gradients of a wrapped lattice.
+
+    The shape is [frequency, ..., axis]: as many nodes as cells along each axis.
+    """
+    count = frequency**dimension
+    vectors = [draw_direction(rng, dimension) for _ in range(count)]
+    return np.array(vectors).reshape(*(frequency,) * dimension, dimension)
+
+
+def _fade(t: Smooth) -> Smooth:
+    """Return Perlin's 6 t^5 - 15 t^4 + 10 t^3."""
+    return t.polynomial(0.0, 0.0, 0.0, 10.0, -15.0, 6.0)
+
+
+def noise(position: Array, lattice: Array) -> Smooth:
+    """Return the gradient noise of a wrapped lattice in the unit box.
+
+    It is 0 at every node of the lattice and its slope there is the node's gradient, in
+    units of the lattice's cells; derivatives are with respect to the position [length].
+
+    Args:
+        position: points in [0, 1) [length], shape [point, axis].
+        lattice: gradients, shape [node, ..., axis].
+    """
+    frequency = len(lattice)
+    point_count, dimension = position.shape
+    scaled = position * float(frequency)
+    cell = np.minimum(np.floor(scaled).astype(np.int64), frequency - 1)
+    # distances from the low corner of the cell, and the weights of the two corners
+    along = []
+    weights = []
+    for axis in range(dimension):
+        distance = scaled[:, axis] - cell[:, axis].astype(np.float64)
+        t = coordinate(distance, axis, dimension)
+        along.append(t)
+        rising = _fade(t)
+        weights.append((rising.scale(-1.0).shift(1.0), rising))
+
+    total = constant(0.0, point_count, dimension)
+    for corner in itertools.product((0, 1), repeat=dimension):
+        node = tuple(((cell + np.array(corner)) % frequency).T)
+        gradient = lattice[node]
+        term = constant(0.0, point_count, dimension)
+        for axis, side in enumerate(corner):
+            term = term + along[axis].shift(-float(side)).scale(gradient[:, axis])
+        for axis, side in enumerate(corner):
+            term = term * weights[axis][side]
+        total = total + term
+    # from derivatives per cell of the lattice to derivatives per length
+    per_length = float(frequency)
+    return Smooth(
+        total.value,
+        total.gradient * per_length,
+        total.hessian * (per_length * per_length),
+    )
+
+
+def wrapped_offset(position: Array, centre: Array) -> Array:
+    """Return the way from a centre to points of the unit box, shape [point, axis].
+
+    Each component lies in [-1/2, 1/2]: the nearest image of the centre counts.
+    """
+    way = position - centre
+    return np.asarray(way - np.rint(way))
+
+
+def rotated_gradient(psi: Smooth) -> Flow:
+    """Return the flow u = dpsi/dy, v = -dpsi/dx."""
+    velocity = np.stack([psi.gradient[:, 1], -psi.gradient[:, 0]], axis=1)
+    affine = np.stack([psi.hessian[:, 1], -psi.hessian[:, 0]], axis=1)
+    return Flow(velocity, affine)
+
+
+def curl(potential: Sequence[Smooth]) -> Flow:
+    """Return the flow that is the curl of a vector potential."""
+    velocity = []
+    affine = []
+    for axis in range(3):
+        first = (axis + 1) % 3
+        second = (axis + 2) % 3
+        velocity.append(
+            potential[second].gradient[:, first] - potential[first].gradient[:, second]
+        )
+        affine.append(
+            potential[second].hessian[:, first] - potential[first].hessian[:, second]
+        )
+    return Flow(np.stack(velocity, axis=1), np.stack(affine, axis=1))
+
+
+def scaled_to(flow: Flow, speed_rms: float) -> Flow:
+    """Return a flow of another root mean square speed, as multiples of 2^-20."""
+    factor = speed_rms / flow.speed_rms
+    return Flow(quantise(factor * flow.velocity), quantise(factor * flow.affine))
+
+
+def fill_box(
+    rng: RandomSource,
+    counts: Sequence[int],
+    *,
+    low: Sequence[float],
+    high: Sequence[float],
+    jitter: float,
+) -> Array:
+    """Fill a box with a lattice of particles, each a little off its place.
+
+    Args:
+        rng: source of the jitter.
+        counts: particles along each axis.
+        low: lower end of the box along each axis [length].
+        high: upper end of the box along each axis [length].
+        jitter: width of the uniform displacement, in spacings [1].
+
+    Returns:
+        Positions [length], multiples of 2^-20, shape [particle, axis].
+    """
+    dimension = len(counts)
+    cell = np.indices(tuple(counts)).reshape(dimension, -1).T
+    displacement = (rng.random(cell.shape) - 0.5) * jitter
+    start = np.asarray(low, np.float64)
+    extent = np.asarray(high, np.float64) - start
+    return quantise(start + extent * ((cell + 0.5 + displacement) / np.asarray(counts)))

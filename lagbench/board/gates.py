@@ -1,0 +1,52 @@
+"""The gates of trained weights, leaderboard/gates.json: which weights failed which.
+
+``python -m studies.gates`` measures them; docs/baselines.md says what they are.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+from lagbench.errors import UnreadableFileError
+
+from .entry import Entry
+from .folder import GATES, Folder
+
+MOST_BYTES = 1_000_000
+
+
+def read_failed_gates(folder: Folder) -> Mapping[str, tuple[str, ...]]:
+    """Return the gates that weights failed, by SHA-256 of the weights.
+
+    Raises:
+        UnreadableFileError: the file is not the one that the script writes.
+    """
+    path = folder.path / GATES
+    if path.is_symlink() or not path.is_file():
+        return {}
+    failed = {}
+    try:
+        with path.open("rb") as file:
+            content = json.loads(file.read(MOST_BYTES))
+        for row in content["weights"]:
+            failed[str(row["weights_sha256"])] = tuple(map(str, row["failed"]))
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise UnreadableFileError(
+            "the gates cannot be read",
+            where=str(path),
+            got=error,
+            fix="write them anew: python -m studies.gates",
+        ) from error
+    return failed
+
+
+def gates_failed_by(
+    entry: Entry, failed: Mapping[str, tuple[str, ...]]
+) -> tuple[str, ...]:
+    """Return the gates that any weights of an entry failed."""
+    names: dict[str, None] = {}
+    for prediction in entry.predictions:
+        if prediction.weights is not None:
+            names.update(dict.fromkeys(failed.get(prediction.weights.sha256, ())))
+    return tuple(names)

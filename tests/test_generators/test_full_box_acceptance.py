@@ -1,0 +1,17 @@
+"""The solver of full boxes against closed forms; ``python -m validation.full_box`` runs
+the costly cases.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from validation import full_box
+
+
+@pytest.mark.slow
+def test_a_periodic_vortex_decays_as_navier_stokes_says() -> None:
+    """After ten turnovers the energy is within 1 % of exp(-4 nu k^2 t)."""
+    result = full_box.taylor_green()
+    assert result.deviation <= result.tolerance
+    assert result.truth == pytest.approx(0.67, abs=0.01)

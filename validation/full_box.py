@@ -1,0 +1,389 @@
+"""Validate the solver of full boxes, in two and three dimensions, from one command.
+
+    python -m validation.full_box                    all cases, about five minutes
+    python -m validation.full_box --case poiseuille --case taylor-green
+
+Prints one line per case: what was measured, the truth, the deviation, the largest that
+counts as valid, and the processor time. Exit code 0: all valid; 1: one is not.
+
+taylor-green
+    Decay of u = sin kx cos ky, v = -cos kx sin ky in a periodic square at Re = U/(k nu)
+    = 100; energy after 10 / (k U) against exp(-4 nu k^2 t).
+poiseuille
+    Steady reverse Poiseuille flow at Re = U H / nu = 10 against the parabola.
+taylor-green-3d
+    The Taylor-Green vortex in a cube at Re 100 (Brachet et al., J. Fluid Mech. 130
+    (1983) 411); peak of the dissipation against a pseudo-spectral solver.
+thin-cavity
+    Lid-driven cavity at Re 100, periodic along z, against Ghia, Ghia & Shin (1982).
+cube
+    Lid-driven cube at Re 100 against the staggered grid of the reference predictors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from lagbench.data.box import Box
+from lagbench.generators.full_box_parameters import FullBoxParameters
+from lagbench.generators.periodic_noise import fill_box
+from lagbench.generators.solver import Solver, build
+from lagbench.generators.split import InitialState, Material
+from lagbench.references.staggered import StaggeredGrid
+
+from .diagnostics import Y, centre_lines
+
+Array = NDArray[np.float64]
+
+SOUND_SPEED = 5.0**0.5  # [length/s]
+COURANT = 0.3  # cells that sound crosses in a substep
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What a case measured."""
+
+    measured: float
+    truth: float
+    deviation: float  # relative, or in units of the driving speed
+    tolerance: float  # the largest valid deviation
+
+
+def constants(
+    box: Box, grid: int, particles: int, *, no_slip: bool = True, force_layers: int = 0
+) -> FullBoxParameters:
+    """Return the constants of the splits at an acoustic Courant number of 0.3."""
+    return FullBoxParameters(
+        particles=particles,
+        grid=grid,
+        dt=COURANT / grid / SOUND_SPEED,
+        box=box,
+        no_slip=no_slip,
+        density=1e-4,
+        modulus=5e-4,
+        velocity_relaxation=0.01,
+        jacobian_relaxation=0.1,
+        density_coupling=0.01,
+        shift=0.01,
+        force_layers=force_layers,
+        substeps_per_frame=1_000_000,  # what drives the flow does not change
+    )
+
+
+def lattice(box: Box, counts: Sequence[int]) -> Array:
+    """Return particles on a jittered lattice in a box, shape [particle, axis]."""
+    rng = np.random.default_rng(1)
+    return fill_box(rng, counts, low=box.low, high=box.high, jitter=0.25)
+
+
+def started(
+    parameters: FullBoxParameters,
+    position: Array,
+    *,
+    viscosity: float,
+    velocity: Array | None = None,
+    affine: Array | None = None,
+    walls: Array | None = None,
+    force: Array | None = None,
+) -> Solver:
+    """Return a solver that holds one scenario."""
+    dimension = parameters.box.dimension
+    count = len(position)
+    if velocity is None:
+        velocity = np.zeros((count, dimension))
+    if affine is None:
+        affine = np.zeros((count, dimension, dimension))
+    if walls is None:
+        walls = np.zeros((2 * dimension, dimension))
+    state = InitialState(
+        position=position,
+        velocity=velocity,
+        affine=affine,
+        material=np.full(count, Material.LIQUID, dtype=np.int8),
+        area=parameters.box.volume,
+        viscosity=viscosity,
+        wall_velocity=walls,
+        body_force=force,
+    )
+    solver = build(parameters)
+    solver.load([state])
+    return solver
+
+
+def nodal_velocity(solver: Solver) -> Array:
+    """Return the nodal velocity [length/s], shape [*cells, axis]."""
+    velocity = solver.grid_velocity()[0]  # type: ignore[attr-defined]
+    return np.asarray(velocity, np.float64)
+
+
+def energy(solver: Solver) -> float:
+    """Return the mean of abs(v)^2 / 2 over the nodes [length^2/s^2]."""
+    return float(0.5 * (nodal_velocity(solver) ** 2).sum(axis=-1).mean())
+
+
+def vortex(position: Array, speed: float) -> tuple[Array, Array]:
+    """Return velocity and gradient of the Taylor-Green vortex with k = 2 pi."""
+    dimension = position.shape[1]
+    k = 2.0 * np.pi
+    sine = np.sin(k * position)
+    cosine = np.cos(k * position)
+    velocity = np.zeros_like(position)
+    affine = np.zeros((*position.shape, dimension))
+    for component, sign in ((0, 1.0), (1, -1.0)):
+        # the component is the sine along its own axis, times cosines along the others
+        factors = [cosine[:, axis] for axis in range(dimension)]
+        slopes = [-k * sine[:, axis] for axis in range(dimension)]
+        factors[component] = sine[:, component]
+        slopes[component] = k * cosine[:, component]
+        velocity[:, component] = sign * speed * np.prod(factors, axis=0)
+        for axis in range(dimension):
+            changed = [*factors]
+            changed[axis] = slopes[axis]
+            affine[:, component, axis] = sign * speed * np.prod(changed, axis=0)
+    return velocity, affine
+
+
+def taylor_green(grid: int = 32) -> Comparison:
+    """Energy of the decaying vortex in a square after ten turnovers."""
+    speed = 0.2
+    k = 2.0 * np.pi
+    viscosity = speed / k / 100.0
+    box = Box.from_bounds([(0.0, 1.0)] * 2, [True, True])
+    position = lattice(box, (2 * grid, 2 * grid))
+    parameters = constants(box, grid, len(position))
+    velocity, affine = vortex(position, speed)
+    solver = started(
+        parameters, position, viscosity=viscosity, velocity=velocity, affine=affine
+    )
+    solver.advance(1)
+    before = energy(solver)
+    steps = round(10.0 / (k * speed) / parameters.dt)
+    solver.advance(steps)
+    ratio = energy(solver) / before
+    truth = float(np.exp(-4.0 * viscosity * k**2 * steps * parameters.dt))
+    return Comparison(
+        measured=ratio, truth=truth, deviation=abs(ratio / truth - 1.0), tolerance=0.01
+    )
+
+
+def poiseuille(grid: int = 32) -> Comparison:
+    """Profile of steady reverse Poiseuille flow, in units of its largest speed."""
+    speed = 0.2
+    viscosity = speed * 0.5 / 10.0
+    acceleration = 8.0 * viscosity * speed / 0.25
+    box = Box.from_bounds([(0.0, 1.0)] * 2, [True, True])
+    position = lattice(box, (2 * grid, 2 * grid))
+    parameters = constants(box, grid, len(position), force_layers=2)
+
+    def profile(y: Array) -> Array:
+        """Return u / U at some heights."""
+        within = np.where(y < 0.5, y, y - 0.5)
+        return np.asarray(np.where(y < 0.5, 1.0, -1.0) * 16.0 * within * (0.5 - within))
+
+    velocity = np.zeros_like(position)
+    velocity[:, 0] = 0.7 * speed * profile(position[:, 1])
+    force = np.zeros((1, 2, 2))
+    force[0, 0, 0] = acceleration
+    force[0, 1, 0] = -acceleration
+    solver = started(
+        parameters, position, viscosity=viscosity, velocity=velocity, force=force
+    )
+    steps = round(0.25 / viscosity / parameters.dt)
+    solver.advance(round(0.7 * steps))
+    mean = np.zeros(grid)
+    for _ in range(20):
+        solver.advance(round(0.3 * steps / 20))
+        mean += nodal_velocity(solver)[..., 0].mean(axis=0) / 20.0
+    height = (np.arange(grid) + 0.5) / grid
+    error = float(np.sqrt(np.mean((mean / speed - profile(height)) ** 2)))
+    return Comparison(
+        measured=float(np.abs(mean).max() / speed),
+        truth=1.0,
+        deviation=error,
+        tolerance=0.01,
+    )
+
+
+def spectral_dissipation(
+    cells: int, reynolds: float, *, duration: float, dt: float
+) -> Array:
+    """Return dissipation over time of the Taylor-Green vortex, U = k = 1.
+
+    Pseudo-spectral, in rotation form, with the two-thirds rule and RK4 (Canuto et al.,
+    Spectral Methods, 2007); one value every quarter of a time unit.
+    """
+    points = 2.0 * np.pi * np.arange(cells) / cells
+    x, y, z = np.meshgrid(points, points, points, indexing="ij")
+    u = np.sin(x) * np.cos(y) * np.cos(z)
+    v = -np.cos(x) * np.sin(y) * np.cos(z)
+    whole = np.fft.fftfreq(cells, 1.0 / cells)
+    half = np.fft.rfftfreq(cells, 1.0 / cells)
+    wave = np.stack(np.meshgrid(whole, whole, half, indexing="ij"))
+    square = (wave**2).sum(axis=0)
+    divisor = np.where(square == 0.0, 1.0, square)
+    is_kept = (np.abs(wave) < cells / 3.0).all(axis=0)
+
+    def forward(field: Array) -> NDArray[np.complex128]:
+        return np.asarray(np.fft.rfftn(field, axes=(1, 2, 3)))
+
+    def backward(modes: NDArray[np.complex128]) -> Array:
+        return np.asarray(np.fft.irfftn(modes, s=(cells,) * 3, axes=(1, 2, 3)))
+
+    def rate(modes: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        vorticity = backward(1j * np.cross(wave, modes, axis=0))
+        product = forward(np.cross(backward(modes), vorticity, axis=0)) * is_kept
+        product -= wave * (wave * product).sum(axis=0) / divisor
+        return np.asarray(product - square / reynolds * modes)
+
+    modes = forward(np.stack([u, v, 0.0 * u]))
+    every = round(0.25 / dt)
+    dissipation = []
+    for step in range(round(duration / dt) + 1):
+        if step % every == 0:
+            vorticity = backward(1j * np.cross(wave, modes, axis=0))
+            dissipation.append((vorticity**2).sum(axis=0).mean() / reynolds)
+        first = rate(modes)
+        second = rate(modes + 0.5 * dt * first)
+        third = rate(modes + 0.5 * dt * second)
+        fourth = rate(modes + dt * third)
+        modes = modes + dt / 6.0 * (first + 2.0 * (second + third) + fourth)
+    return np.array(dissipation)
+
+
+def taylor_green_3d(grid: int = 24) -> Comparison:
+    """Peak of the dissipation of the vortex in a cube, in units of k U^3."""
+    speed = 0.2
+    k = 2.0 * np.pi
+    unit = 1.0 / (k * speed)  # of time [s]
+    box = Box.from_bounds([(0.0, 1.0)] * 3, [True] * 3)
+    position = lattice(box, (2 * grid,) * 3)
+    parameters = constants(box, grid, len(position))
+    velocity, affine = vortex(position, speed)
+    solver = started(
+        parameters,
+        position,
+        viscosity=speed / k / 100.0,
+        velocity=velocity,
+        affine=affine,
+    )
+    steps = round(0.25 * unit / parameters.dt)
+    times = 0.25 + np.arange(32) * steps * parameters.dt / unit
+    energies = []
+    for _ in times:
+        solver.advance(steps)
+        energies.append(energy(solver) / speed**2)
+    dissipation = -np.gradient(np.array(energies), times)
+    truth = float(spectral_dissipation(32, 100.0, duration=8.0, dt=0.05).max())
+    peak = float(dissipation[2:-1].max())
+    return Comparison(
+        measured=peak, truth=truth, deviation=abs(peak / truth - 1.0), tolerance=0.08
+    )
+
+
+def _centre_line(grid: int, depth: int, *, is_thin: bool, turns: float) -> Array:
+    """Return u / U at the nodes of the vertical centre line of a driven cavity."""
+    speed = 0.26
+    box = Box.from_bounds(
+        [(0.0, 1.0), (0.0, 1.0), (0.0, depth / grid)], [False, False, is_thin]
+    )
+    per_cell = 2 if is_thin else 1.5
+    counts = [round(per_cell * cells) for cells in (grid, grid, depth)]
+    position = lattice(box, counts)
+    parameters = constants(box, grid, len(position))
+    walls = np.zeros((6, 3))
+    walls[3, 0] = speed
+    solver = started(parameters, position, viscosity=speed / 100.0, walls=walls)
+    steps = round(turns / speed / parameters.dt)
+    solver.advance(round(0.9 * steps))
+    mean = np.zeros(grid)
+    middle = slice(grid // 2 - 1, grid // 2 + 1)
+    across = slice(None) if is_thin else slice(depth // 2 - 1, depth // 2 + 1)
+    for _ in range(20):
+        solver.advance(steps // 200)
+        u = nodal_velocity(solver)[middle, :, across, 0]
+        mean += u.mean(axis=(0, 2)) / speed / 20.0
+    return mean
+
+
+def thin_cavity(grid: int = 24) -> Comparison:
+    """The cavity in a thin box, periodic along z, against Ghia's u at Re 100."""
+    u = _centre_line(grid, 4, is_thin=True, turns=25.0)
+    height = np.r_[0.0, (np.arange(grid) + 0.5) / grid, 1.0]
+    ghia = centre_lines(100.0)
+    assert ghia is not None  # Reynolds number 100 is tabulated
+    measured = CubicSpline(height, np.r_[0.0, u, 1.0])(Y)
+    error = float(np.sqrt(np.nanmean((measured - np.array(ghia.u)) ** 2)))
+    return Comparison(
+        measured=float(u.min()),
+        truth=float(np.nanmin(ghia.u)),
+        deviation=error,
+        tolerance=0.01,
+    )
+
+
+def cube(grid: int = 24, reference_cells: int = 32) -> Comparison:
+    """The driven cube at Re 100 against the staggered grid, along its centre line."""
+    u = _centre_line(grid, grid, is_thin=False, turns=20.0)
+    box = Box.from_bounds([(0.0, 1.0)] * 3)
+    staggered = StaggeredGrid(box, cells=(reference_cells,) * 3, no_slip=True)
+    walls = np.zeros((6, 3))
+    walls[3, 0] = 1.0
+    field = staggered.advance(
+        staggered.rest(), duration=20.0, viscosity=0.01, wall_velocity=walls
+    )
+    middle = reference_cells // 2
+    faces = field[0][middle, :, middle - 1 : middle + 1].mean(axis=-1)
+    cell = (np.arange(reference_cells) + 0.5) / reference_cells
+    height = (np.arange(grid) + 0.5) / grid
+    truth = np.interp(height, np.r_[0.0, cell, 1.0], np.r_[0.0, faces, 1.0])
+    error = float(np.sqrt(np.mean((u - truth) ** 2)))
+    return Comparison(
+        measured=float(u.min()),
+        truth=float(faces.min()),
+        deviation=error,
+        tolerance=0.02,
+    )
+
+
+CASES: dict[str, Callable[[], Comparison]] = {
+    "taylor-green": taylor_green,
+    "poiseuille": poiseuille,
+    "taylor-green-3d": taylor_green_3d,
+    "thin-cavity": thin_cavity,
+    "cube": cube,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the cases that are named, or all, and return the exit code."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--case", action="append", choices=list(CASES))
+    options = parser.parse_args(arguments)
+    failures = 0
+    for name in options.case or CASES:
+        start = time.process_time()
+        result = CASES[name]()
+        seconds = time.process_time() - start
+        is_valid = result.deviation <= result.tolerance
+        failures += not is_valid
+        sys.stdout.write(
+            f"{name:16s} {result.measured:9.5f}  truth {result.truth:9.5f}"
+            f"  deviation {result.deviation:.4f}  tolerance {result.tolerance:g}"
+            f"  {'valid' if is_valid else 'NOT VALID'}  {seconds:.0f} s\n"
+        )
+        sys.stdout.flush()
+    return int(failures > 0)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
