@@ -27,7 +27,7 @@ LAYERS = (
     ("make",),
     ("references",),
     ("exchange", "scoring"),
-    ("figures.report", "baselines"),
+    ("figures.report", "baselines", "models"),
     ("board",),
     ("cli", "__main__"),
 )

@@ -477,7 +477,8 @@ class Entry(About):
         paths = list(self.score_paths)
         for prediction in self.predictions:
             if prediction.weights is not None:
-                path = weights_path(self.place, prediction.seed)
+                like = prediction.weights.path
+                path = weights_path(self.place, prediction.seed, like)
                 paths += [path, path.with_suffix(".json")]
         return tuple(paths)
 

@@ -4,6 +4,7 @@
     scores/<split>/<size>/<method>[_<seed>].nc    their score files
     floors/<split>/<size>/<name>.nc               scores of the reference predictors
     weights/<split>/<size>/<method>_<seed>.pt     weights, and the log of their training
+    weights/<split>/<size>/<method>_<seed>.onnx   or a model as an ONNX file
     verified.yaml, gates.json, schema.json, index.html, README.md
 
 Symbolic links are never followed: one could lead out of the folder.
@@ -33,11 +34,14 @@ README = "README.md"
 LOCK = ".lock"  # held while the folder is written
 STAGING = ".submit-"  # begins the name of a folder of files that are not in place yet
 
+MODEL_ENDINGS = (".pt", ".onnx")
+"""Endings of models: weights of `lagbench train`, and ONNX files."""
+
 ENDINGS = {
     SUBMISSIONS: (".yaml",),
     SCORES: (".nc",),
     REFERENCES: (".nc",),
-    WEIGHTS: (".pt", ".json"),
+    WEIGHTS: (*MODEL_ENDINGS, ".json"),
 }
 PLACEHOLDER = ".gitkeep"  # keeps an empty folder in git
 GIT = (".git", ".gitignore", ".gitattributes", ".github")
@@ -93,14 +97,22 @@ def is_place_of_file(path: Path) -> bool:
     return path.suffix in ENDINGS.get(path.parts[0], ())
 
 
-def weights_path(place: Place, seed: int | None) -> Path:
-    """Return the path of the weights of a seed, relative to the folder.
+def weights_path(place: Place, seed: int | None, like: str | Path = ".pt") -> Path:
+    """Return the path of the model of a seed, relative to the folder.
+
+    Args:
+        place: split, size and method of the entry.
+        seed: the seed.
+        like: a file name; if it ends as an ONNX file, so does the path.
 
     >>> weights_path(("cavity", "mini", "gns"), 3).as_posix()
     'weights/cavity/mini/gns_3.pt'
     """
     split, size, method = place
-    return Path(WEIGHTS, split, size, f"{method}_{seed or 0}.pt")
+    ending = ".pt"
+    if str(like).endswith(".onnx"):
+        ending = ".onnx"
+    return Path(WEIGHTS, split, size, f"{method}_{seed or 0}{ending}")
 
 
 class Folder:

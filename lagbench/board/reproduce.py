@@ -184,7 +184,6 @@ def reproduce(
     """
     folder = Folder(board)
     folder.require()
-    check_installed("torch", extra="baselines")
     data_root = resolve_root(root)
     described = load_rooted_registry(data_root, registry)
     chosen = choose_entries(folder, entries, described, split=split, size=size)
@@ -319,6 +318,12 @@ def open_model(
             expected=f"SHA-256 {prediction.weights.sha256[:16]}",
             fix="lagbench leaderboard check",
         )
+    if path.suffix == ".onnx":
+        from lagbench.models.onnx_model import open_onnx
+
+        return open_onnx(path, size=registry.size(entry.split, entry.size), root=root)
+
+    check_installed("torch", extra="baselines")
     from lagbench.baselines.runner import WeightsRunner
 
     provenance = prediction.provenance or entry.provenance

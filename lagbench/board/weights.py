@@ -1,8 +1,10 @@
-"""Weights beside their entries.
+"""Models beside their entries: weights of a training, or an ONNX file.
 
-``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them.
+``lagbench submit --weights`` copies them, ``leaderboard check`` hashes them,
+``leaderboard reproduce`` runs them.
 
 weights/<split>/<size>/<method>_<seed>.pt     parameters, which `lagbench predict` reads
+weights/<split>/<size>/<method>_<seed>.onnx   or a model of another code base
 weights/<split>/<size>/<method>_<seed>.json   the log of the training, where it has one
 """
 
@@ -109,6 +111,11 @@ def require_weights(
     owners = _owners_of_weights(rivals)
     chosen: list[Path | None] = [None] * len(headers)
     for path in paths:
+        if path.suffix == ".onnx":
+            index = chosen.index(None) if None in chosen else 0
+            _require_onnx(path, headers[index], owners)
+            chosen[index] = path
+            continue
         file = inspect_weights(path)
         _require_fit(file, headers[0], seeds)
         index = seeds.index(file.seed)
@@ -119,13 +126,7 @@ def require_weights(
                 fix="give one of each seed at most",
             )
         if file.sha256 in owners:
-            raise UsageError(
-                "these weights lie beside another entry",
-                where=str(path),
-                got=f"those of {owners[file.sha256]}",
-                fix="leave them out, and name them in --command; or give those of "
-                "this method",
-            )
+            raise _owned_error(path, owners[file.sha256])
         _require_made_by(file, headers[index])
         chosen[index] = path
     return tuple(chosen)
@@ -142,6 +143,36 @@ def _require_small(paths: Sequence[Path]) -> None:
             fix="leave --weights out, and name a file of a release by `weights: "
             "https://...` in --from",
         )
+
+
+def _require_onnx(path: Path, header: Header, owners: Mapping[str, str]) -> None:
+    """Refuse an ONNX file that cannot be run, or is another entry's or seed's.
+
+    ONNX files belong to the predictions in their order.
+    """
+    from lagbench.models.onnx_model import check_onnx
+
+    declared = check_onnx(path)
+    owner = owners.get(file_sha256(path))
+    if owner is not None:
+        raise _owned_error(path, owner)
+    if header.parameters is not None and header.parameters != declared.parameters:
+        raise UsageError(
+            "the model did not make these predictions",
+            where=str(path),
+            expected=f"{header.parameters} parameters",
+            got=f"{declared.parameters} parameters",
+            fix="predict with this file: lagbench predict",
+        )
+
+
+def _owned_error(path: Path, owner: str) -> UsageError:
+    return UsageError(
+        "these weights lie beside another entry",
+        where=str(path),
+        got=f"those of {owner}",
+        fix="leave them out, and name them in --command; or give those of this method",
+    )
 
 
 def _require_fit(file: WeightsFile, header: Header, seeds: Sequence[int]) -> None:
@@ -217,7 +248,7 @@ def name_weights(
             key = (prediction.seed, prediction.sha256)
             named.append(previous_weights.get(key))
         else:
-            inner_path = weights_path(place, prediction.seed).as_posix()
+            inner_path = weights_path(place, prediction.seed, path).as_posix()
             named.append(Weights(path=inner_path, sha256=file_sha256(path)))
     return tuple(named)
 
@@ -238,10 +269,11 @@ def _sound_weights(
     sound = {}
     for prediction in previous.predictions:
         weights = prediction.weights
-        path = weights_path(place, prediction.seed)
+        if weights is None:
+            continue
+        path = weights_path(place, prediction.seed, weights.path)
         if (
-            weights is not None
-            and weights.sha256 not in owners
+            weights.sha256 not in owners
             and weights.path == path.as_posix()
             and is_unchanged(folder, path, weights.sha256)
         ):
@@ -321,7 +353,7 @@ def check_weights(
             weights = prediction.weights
             if weights is None:
                 continue
-            path = weights_path(entry.place, prediction.seed)
+            path = weights_path(entry.place, prediction.seed, weights.path)
             log = path.with_suffix(".json")
             known_paths |= {path, log}
             where = f"{entry.yaml_path}, predictions.{number}.weights"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from lagbench.data.registry import load
-from lagbench.errors import LagbenchError, format_count
+from lagbench.errors import LagbenchError, UsageError, format_count
 
 from .model_options import (
     PREDICTION_LIBRARIES,
@@ -28,11 +28,14 @@ if TYPE_CHECKING:
 
 def predict_command(
     checkpoint: Annotated[
-        Path, typer.Argument(metavar="FILE", help="weights.pt or checkpoint.pt.")
+        Path, typer.Argument(metavar="FILE", help="weights.pt, checkpoint.pt, or ONNX.")
     ],
     output: Annotated[Path, option("--output -o FILE", "File to write.")] = Path(
         "predictions.nc"
     ),
+    split: Annotated[
+        str | None, option("--split NAME", "Split to predict: of an ONNX file only.")
+    ] = None,
     size: Annotated[
         str | None,
         option("--size NAME", "Size to predict; by default that of the training."),
@@ -71,6 +74,25 @@ def predict_command(
 
     The predictions go into a predictions.nc.
     """
+    if checkpoint.suffix == ".onnx":
+        _predict_onnx(
+            checkpoint,
+            output,
+            split=split,
+            size=size,
+            method=method,
+            root=root,
+            as_json=as_json,
+            quiet=quiet,
+        )
+        return
+    if split is not None:
+        raise UsageError(
+            "weights state their split themselves",
+            where="--split",
+            got=split,
+            fix="leave it out",
+        )
     require_libraries(PREDICTION_LIBRARIES)
     from lagbench.baselines.predict import predict
 
@@ -102,6 +124,45 @@ def predict_command(
     lines = _describe(result, solver=solver, is_replaced=is_replaced, root=root)
     value = {**vars(result), "solver": solver}
     print_result(value, lines, as_json=as_json, quiet=quiet)
+
+
+def _predict_onnx(
+    model: Path,
+    output: Path,
+    *,
+    split: str | None,
+    size: str | None,
+    method: str | None,
+    root: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Predict with an ONNX file, which does not state its split."""
+    from lagbench.models.predict_onnx import predict_onnx
+
+    if split is None:
+        raise UsageError(
+            "an ONNX file does not state its split",
+            where="--split",
+            fix="name it: --split cavity --size mini",
+        )
+    with progress_bar(quiet=quiet) as progress:
+        result = predict_onnx(
+            model,
+            output,
+            split=split,
+            size=size,
+            method=method,
+            root=root,
+            progress=progress,
+        )
+    lines = [
+        f"{result.path}: {result.method}, {result.scenarios} scenarios, "
+        f"{result.frames} frames",
+        f"  model   {result.seconds_per_frame:.3g} s per frame, one thread",
+        f"next: lagbench score {result.path}",
+    ]
+    print_result(result, lines, as_json=as_json, quiet=quiet)
 
 
 def _bench_solver(split: str, size: str, *, quiet: bool) -> SolverBench | None:

@@ -1,0 +1,221 @@
+"""Export a PyTorch model to an ONNX file that an entry can carry."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lagbench.atomic import write_atomically
+from lagbench.data.registry import Registry
+from lagbench.errors import UsageError, check_installed
+from lagbench.tensors import Batch
+from lagbench.torch import WindowDataset, collate
+
+from .onnx_checks import LEAST_OPSET, OUTPUT
+from .onnx_model import check_onnx
+
+__all__ = ["export_onnx"]
+
+MOST_DIFFERENCE = 1e-5
+"""Distance between a predicted frame of the model and of its file [length]."""
+
+Step = Callable[[Batch], Tensor]
+"""From windows to the positions of the next frame [length], shape [particle, axis]."""
+
+DYNAMIC_AXES = {
+    "position": {1: "particle"},
+    "material": {0: "particle"},
+    OUTPUT: {1: "particle"},
+}
+"""Axes whose length differs from scenario to scenario."""
+
+
+def export_onnx(
+    step: Step,
+    path: str | Path,
+    *,
+    split: str | Path,
+    size: str | None = None,
+    modules: Sequence[nn.Module] = (),
+    history: int | None = None,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+) -> Path:
+    """Write a model that `lagbench.torch.predict` could roll out as an ONNX file.
+
+    The model is traced once on the given frames of a test scenario, so it must do the
+    same operations for every scenario.
+
+    Args:
+        step: the model.
+        path: file to write, named ``.onnx``.
+        split: name of the split.
+        size: name of the size; the only one with data when None.
+        modules: the networks whose weights ``step`` uses, if it is no module itself.
+        history: how many of the last given frames the model sees; all by default.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        registry: where splits are described; ours when None.
+
+    Raises:
+        UsageError: torch, onnx or onnxruntime is missing, the model cannot be traced,
+            or its file predicts something else.
+        UnreadableFileError: the file holds what an entry may not carry.
+    """
+    check_installed("onnx", extra="onnx")
+    data = WindowDataset(
+        split, subset="test", size=size, root=root, future=0, registry=registry
+    )
+    window = collate([data[data.starts[0]]])
+    frames = window.frames
+    wrapped = _Exported(
+        step,
+        modules,
+        history=history or frames,
+        has_walls=window.wall_velocity is not None,
+    )
+    inputs: dict[str, Tensor] = {
+        "position": window.position.transpose(0, 1).contiguous(),
+        "material": window.material,
+    }
+    if window.wall_velocity is not None:
+        walls = window.wall_velocity[0]
+        inputs["wall_velocity"] = torch.cat([walls, walls[-1:]])[: frames + 1]
+
+    target = Path(path)
+    temporary = target.with_name(f".{target.stem}.exporting.onnx")
+    try:
+        _write(wrapped, inputs, temporary)
+        check_onnx(temporary)
+        _require_same(wrapped, inputs, temporary)
+        write_atomically(target, temporary.read_bytes(), option="path")
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target
+
+
+def _write(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
+    with warnings.catch_warnings(), _sums_of_index_add():
+        # the newer exporter needs a package more and writes data beside the file
+        warnings.simplefilter("ignore")
+        try:
+            torch.onnx.export(
+                wrapped.eval(),
+                tuple(inputs.values()),
+                str(path),
+                input_names=list(inputs),
+                output_names=[OUTPUT],
+                dynamic_axes=DYNAMIC_AXES,
+                opset_version=LEAST_OPSET,
+                dynamo=False,
+            )
+        except (RuntimeError, ValueError, TypeError) as error:
+            reason = str(error).split("\n")[0][:200]
+            raise UsageError(
+                "the model cannot be exported",
+                where="export_onnx",
+                got=f"{type(error).__name__}: {reason}",
+                fix="name its networks: modules=[net]; use operations that ONNX has",
+            ) from error
+
+
+@contextmanager
+def _sums_of_index_add() -> Iterator[None]:
+    """Export ``index_add`` as a sum.
+
+    The exporter's own translation keeps one of the values that share an index.
+    """
+
+    def translate(
+        graph: Any,  # noqa: ANN401
+        total: Any,  # noqa: ANN401
+        axis: Any,  # noqa: ANN401
+        index: Any,  # noqa: ANN401
+        source: Any,  # noqa: ANN401
+        _alpha: Any = None,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401
+        from torch.onnx import symbolic_helper
+
+        number = symbolic_helper._get_const(axis, "i", "dim")
+        rank = symbolic_helper._get_tensor_rank(source)
+        others = [other for other in range(rank) if other != number % rank]
+        if others:
+            axes = graph.op("Constant", value_t=torch.tensor(others))
+            index = graph.op("Unsqueeze", index, axes)
+        index = graph.op("Expand", index, graph.op("Shape", source))
+        return graph.op(
+            "ScatterElements", total, index, source, axis_i=number, reduction_s="add"
+        )
+
+    exporter: Any = torch.onnx
+    exporter.register_custom_op_symbolic("aten::index_add", translate, LEAST_OPSET)
+    try:
+        yield
+    finally:
+        exporter.unregister_custom_op_symbolic("aten::index_add", LEAST_OPSET)
+
+
+def _require_same(wrapped: nn.Module, inputs: dict[str, Tensor], path: Path) -> None:
+    """Refuse a file that predicts something else than the model.
+
+    Exporters translate some operations wrongly, without an error.
+    """
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(
+        str(path), providers=["CPUExecutionProvider"]
+    )
+    names = {value.name for value in session.get_inputs()}
+    values = {}
+    for name, tensor in inputs.items():
+        if name in names:
+            values[name] = tensor.numpy()
+    (exported,) = session.run([OUTPUT], values)
+    with torch.no_grad():
+        expected = wrapped(*inputs.values()).numpy()
+    difference = float(np.abs(exported - expected).max())
+    if exported.shape != expected.shape or not difference <= MOST_DIFFERENCE:
+        raise UsageError(
+            "the exported model does not predict what the model does",
+            where="export_onnx",
+            expected=f"positions within {MOST_DIFFERENCE:g}",
+            got=f"a difference of {difference:.2g}",
+            fix="replace the operations that the exporter translates wrongly",
+        )
+
+
+class _Exported(nn.Module):
+    """A step with the signature of an ONNX entry."""
+
+    def __init__(
+        self, step: Step, modules: Sequence[nn.Module], *, history: int, has_walls: bool
+    ) -> None:
+        super().__init__()
+        # registered, so that the weights are found
+        self.networks = nn.ModuleList(modules)
+        self.step = step
+        self.history = history
+        self.has_walls = has_walls
+
+    def forward(
+        self, position: Tensor, material: Tensor, wall_velocity: Tensor | None = None
+    ) -> Tensor:
+        """Return the next frame, shape [1, particle, axis]."""
+        walls = None
+        if self.has_walls and wall_velocity is not None:
+            walls = wall_velocity[-self.history - 1 :][None]
+        values: dict[str, Any] = {
+            "position": position[-self.history :].transpose(0, 1),
+            "sample": torch.zeros_like(material),
+            "material": material,
+            "wall_velocity": walls,
+            "scenario": torch.zeros(1, dtype=torch.int64),
+            "frame": torch.zeros(1, dtype=torch.int64),
+        }
+        return self.step(Batch(**values))[None]

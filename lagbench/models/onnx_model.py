@@ -1,0 +1,225 @@
+"""An ONNX model as something that predicts scenarios, without trust in its file.
+
+The file is parsed and run in child processes (`lagbench.work.machine.run_in_child`)
+with limits on memory, processor time and time of the clock, which may write no file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lagbench.data.registry import Size
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import (
+    UnreadableFileError,
+    WorkFailedError,
+    check_installed,
+)
+from lagbench.references.predictor import given_in
+from lagbench.work.machine import run_in_child
+
+from .formats import require_onnx_bytes
+from .onnx_checks import MOST_BYTES
+from .onnx_rollout import pack, unpack
+
+CHECK_SECONDS = 5.0  # processor time of the checks [s]
+LOAD_SECONDS = 10.0  # processor time until a model is ready to run [s]
+CHECK_MEMORY = 1 << 30  # address space of the checks [bytes]
+MEMORY = 4 << 30  # address space of a rollout [bytes]
+SECONDS_PER_FRAME = 4.0  # processor time of a rollout, per frame [s]
+LEAST_SECONDS = 1e-4  # clocks of processor time are no finer [s]
+WALL_FACTOR = 4.0  # time of the clock over processor time, on a busy machine
+START_SECONDS = 30.0  # time of the clock for the start of a child [s]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OnnxRollout:
+    """Predicted positions of one scenario."""
+
+    position: NDArray[np.float32]  # [length], shape [frame, particle, axis]
+    seconds: float  # processor time [s]
+    # absolute frame from which the positions are frozen; None where none is
+    diverged_at: int | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnnxModel:
+    """A checked ONNX file, for the data of one split and size."""
+
+    path: Path
+    size: Size
+    root: Path  # folder of all data sets
+    inputs: tuple[str, ...]  # names of its inputs
+    parameters: int  # numbers in its initialisers
+    memory: int = MEMORY
+    seconds_per_frame: float = SECONDS_PER_FRAME
+    load_seconds: float = LOAD_SECONDS
+
+    def predict(
+        self, scenario_file: Path, frames: int | None = None
+    ) -> NDArray[np.float32]:
+        """Return positions of the frames after the given ones [length].
+
+        A rollout that ceases to be finite is frozen.
+
+        Args:
+            scenario_file: file of the scenario.
+            frames: frames to predict; by default those of the task.
+
+        Returns:
+            Positions, shape [frame, particle, axis].
+
+        Raises:
+            UnreadableFileError: the model cannot be run, or returns something else than
+                positions.
+            WorkFailedError: it needed more time or memory than allowed.
+        """
+        return self.roll_out(scenario_file, frames).position
+
+    def time(self, scenario_file: Path, frames: int) -> float:
+        """Return the processor time of a frame, mean over the first ones [s]."""
+        return max(self.roll_out(scenario_file, frames).seconds, LEAST_SECONDS) / frames
+
+    def roll_out(self, scenario_file: Path, frames: int | None = None) -> OnnxRollout:
+        """Return positions and what they took; see :meth:`predict`."""
+        answer = self._run(scenario_file, frames)
+        diverged_at = answer["diverged_at"]
+        if diverged_at is not None:
+            diverged_at += self.size.task.input_frames
+        return OnnxRollout(
+            position=unpack(answer["position"]),
+            seconds=float(answer["seconds"]),
+            diverged_at=diverged_at,
+        )
+
+    def close(self) -> None:
+        """Nothing is left open: a child ends with its scenario."""
+
+    def _run(self, scenario_file: Path, frames: int | None) -> dict[str, Any]:
+        """Return the answer of a child about one scenario."""
+        count = frames or self.size.task.horizon
+        request = self._request(scenario_file, count)
+        seconds = self.load_seconds + self.seconds_per_frame * (count + 1)
+        answers = run_in_child(
+            "lagbench.models.onnx_rollout.predict_scenario",
+            [request],
+            seconds=seconds,
+            wall=START_SECONDS + WALL_FACTOR * seconds,
+            memory=self.memory,
+        )
+        if not answers.values:
+            raise WorkFailedError(
+                "the model was stopped",
+                where=str(self.path),
+                expected=f"at most {self.seconds_per_frame:g} s per frame and "
+                f"{self.memory >> 20} MiB",
+                got=answers.stopped,
+            )
+        answer: dict[str, Any] = answers.values[0]
+        if "failed" in answer:
+            raise UnreadableFileError(
+                "the model cannot be run", where=str(self.path), got=answer["failed"]
+            )
+        return answer
+
+    def _request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
+        with read_scenario(scenario_file) as file:
+            given = given_in(file, self.size, self.root)
+        arrays = {
+            "position": given.position.astype(np.float32),
+            "material": given.material.astype(np.int64),
+            "bounds": np.asarray(given.box.bounds, np.float64),
+            "periodic": np.asarray(given.box.periodic, np.bool_),
+            "wall_velocity": given.walls / self.size.frame_interval,
+            "viscosity": np.asarray(given.viscosity, np.float64),
+        }
+        return {
+            "path": str(self.path.absolute()),
+            "frames": frames,
+            "radius": self.size.task.radius,
+            "arrays": {name: pack(array) for name, array in arrays.items()},
+        }
+
+
+def open_onnx(
+    path: Path,
+    *,
+    size: Size,
+    root: Path,
+    memory: int = MEMORY,
+    seconds_per_frame: float = SECONDS_PER_FRAME,
+    load_seconds: float = LOAD_SECONDS,
+) -> OnnxModel:
+    """Check an ONNX file and return its model; nothing in it is run yet.
+
+    Args:
+        path: the file.
+        size: the split and size to predict.
+        root: folder of all data sets.
+        memory: address space of a rollout [bytes].
+        seconds_per_frame: processor time of a rollout, per frame [s].
+        load_seconds: processor time until the model is ready to run [s].
+
+    Raises:
+        UsageError: onnx or onnxruntime is not installed.
+        UnreadableFileError: the file is no ONNX, or holds what is not allowed.
+    """
+    declared = check_onnx(path)
+    return OnnxModel(
+        path=path,
+        size=size,
+        root=root,
+        inputs=declared.inputs,
+        parameters=declared.parameters,
+        memory=memory,
+        seconds_per_frame=seconds_per_frame,
+        load_seconds=load_seconds,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeclaredModel:
+    """What an ONNX file that passed the checks declares."""
+
+    inputs: tuple[str, ...]  # names of its inputs
+    parameters: int  # numbers in its initialisers
+
+
+def check_onnx(path: Path) -> DeclaredModel:
+    """Check an ONNX file in a child process; nothing in it is run.
+
+    Raises:
+        UsageError: onnx or onnxruntime is not installed.
+        UnreadableFileError: the file is no ONNX, or holds what is not allowed.
+    """
+    for package in ("onnx", "onnxruntime"):
+        check_installed(package, extra="onnx")
+    require_onnx_bytes(path, longest=MOST_BYTES)
+    answers = run_in_child(
+        "lagbench.models.onnx_checks.examine",
+        [str(path.absolute())],
+        seconds=CHECK_SECONDS,
+        wall=START_SECONDS,
+        memory=CHECK_MEMORY,
+    )
+    reason = answers.stopped
+    declared: dict[str, Any] = {}
+    if answers.values:
+        declared = answers.values[0]
+        reason = declared["refused"]
+    if reason is not None:
+        raise UnreadableFileError(
+            "the model is refused",
+            where=str(path),
+            expected="ONNX as docs/submitting.md describes it",
+            got=reason,
+            fix="export the model anew without that",
+        )
+    return DeclaredModel(
+        inputs=tuple(declared["inputs"]), parameters=int(declared["parameters"])
+    )

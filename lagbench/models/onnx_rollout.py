@@ -1,0 +1,209 @@
+"""Roll an ONNX model out: the part that runs in a child process with limits.
+
+The child may write no file, and each library in it has one thread. Requests and answers
+are JSON; arrays travel as base64.
+"""
+
+from __future__ import annotations
+
+import base64
+import functools
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .onnx_checks import OUTPUT, examine
+
+MOST_DISTANCE = 10.0
+"""Farthest that a particle may be from the middle of the box [length], as in a file of
+predictions.
+"""
+
+
+def pack(array: NDArray[Any]) -> dict[str, Any]:
+    """Return an array as plain values."""
+    contiguous = np.ascontiguousarray(array)
+    return {
+        "type": contiguous.dtype.str,
+        "shape": list(contiguous.shape),
+        "data": base64.b64encode(contiguous.tobytes()).decode("ascii"),
+    }
+
+
+def unpack(values: dict[str, Any]) -> NDArray[Any]:
+    """Return the array of plain values."""
+    data = base64.b64decode(values["data"])
+    return np.frombuffer(data, np.dtype(values["type"])).reshape(values["shape"])
+
+
+@functools.cache
+def forbid_files() -> None:
+    """Let this process write no byte to any file; pipes stay open."""
+    if sys.platform != "win32":
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+
+
+@functools.cache
+def _session(path: str) -> Any:  # noqa: ANN401
+    """Return a checked model that is ready to run, on one thread."""
+    import onnxruntime
+
+    declared = examine(path)
+    if declared["refused"] is not None:
+        raise ValueError(declared["refused"])
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 4
+    # the arena keeps all memory that was ever used
+    options.enable_cpu_mem_arena = False
+    options.add_session_config_entry("session.use_env_allocators", "0")
+    session = onnxruntime.InferenceSession(
+        path, options, providers=["CPUExecutionProvider"]
+    )
+    return session, declared["inputs"]
+
+
+def predict_scenario(request: dict[str, Any]) -> dict[str, Any]:
+    """Return the rollout of a scenario, or why there is none.
+
+    Args:
+        request: ``path`` of the model, ``frames`` to predict, arrays of the scenario
+            (position, material, bounds, periodic, wall_velocity for all frames,
+            viscosity) and the connectivity ``radius``.
+
+    Returns:
+        ``position``, shape [frame, particle, axis] [length]; ``seconds``, the processor
+        time of the rollout; ``diverged_at``, the predicted frame from which it is
+        frozen, or None; or ``failed`` with the reason.
+    """
+    forbid_files()
+    try:
+        session, inputs = _session(request["path"])
+        given = {name: unpack(value) for name, value in request["arrays"].items()}
+        # the first call compiles and allocates
+        _advance(session, inputs, given, given["position"], 0, request["radius"])
+        started = time.process_time()
+        position, diverged_at = _roll_out(session, inputs, given, request)
+        seconds = time.process_time() - started
+    except MemoryError:
+        raise
+    except Exception as error:  # onnxruntime raises its own types
+        reason = " ".join(str(error).split())[:300]
+        if "bad_alloc" in reason or "Failed to allocate" in reason:
+            raise MemoryError from error
+        return {"failed": f"{type(error).__name__}: {reason}"}
+    return {
+        "position": pack(position),
+        "seconds": seconds,
+        "diverged_at": diverged_at,
+    }
+
+
+def _roll_out(
+    session: Any,  # noqa: ANN401
+    inputs: dict[str, str],
+    given: dict[str, NDArray[Any]],
+    request: dict[str, Any],
+) -> tuple[NDArray[np.float32], int | None]:
+    """Return positions, and the predicted frame from which they are frozen."""
+    frames = int(request["frames"])
+    window = given["position"].astype(np.float64)
+    input_frames = len(window)
+    predicted = np.empty((frames, *window.shape[1:]), np.float32)
+    middle = given["bounds"].mean(axis=1)
+    done = 0
+    while done < frames:
+        output = _advance(session, inputs, given, window, done, request["radius"])
+        for frame in output:
+            if done == frames:
+                break
+            predicted[done] = frame
+            is_near = np.abs(predicted[done] - middle) <= MOST_DISTANCE
+            if not is_near.all():
+                _freeze(predicted, done, given["position"][-1])
+                return predicted, done
+            done += 1
+        window = np.concatenate([window, output])[-input_frames:]
+    return predicted, None
+
+
+def _freeze(
+    predicted: NDArray[np.float32], first: int, last_given: NDArray[np.float32]
+) -> None:
+    """Repeat the last sound frame from the first one that is not finite or far off."""
+    last = last_given
+    if first > 0:
+        last = predicted[first - 1]
+    predicted[first:] = last
+
+
+def _advance(
+    session: Any,  # noqa: ANN401
+    inputs: dict[str, str],
+    given: dict[str, NDArray[Any]],
+    window: NDArray[np.float64],
+    done: int,
+    radius: float,
+) -> NDArray[np.float64]:
+    """Return the next frames, at least one, shape [frame, particle, axis]."""
+    values: dict[str, NDArray[Any]] = {}
+    for name, type_name in inputs.items():
+        if name == "position":
+            value = window
+        elif name == "wall_velocity":
+            # on the way to each frame of the window, and to the next one
+            value = given["wall_velocity"][done : done + len(window) + 1]
+        elif name == "edges":
+            value = find_edges(window[-1], radius, given["bounds"], given["periodic"])
+        else:
+            value = given[name]
+        values[name] = np.ascontiguousarray(value, np.dtype(type_name))
+    (output,) = session.run([OUTPUT], values)
+    if output.ndim != 3 or output.shape[1:] != window.shape[1:] or len(output) == 0:
+        raise ValueError(
+            f"{OUTPUT} of shape {list(output.shape)}, expected [frame, "
+            f"{window.shape[1]}, {window.shape[2]}]"
+        )
+    return np.asarray(output, np.float64)
+
+
+def find_edges(
+    position: NDArray[np.float64],
+    radius: float,
+    bounds: NDArray[np.float64],
+    periodic: NDArray[np.bool_],
+) -> NDArray[np.int64]:
+    """Return the pairs of particles nearer than a radius, both directions.
+
+    Pairs across a periodic end count. No particle is its own neighbour.
+
+    Args:
+        position: positions [length], shape [particle, axis].
+        radius: connectivity radius [length].
+        bounds: ends of the box [length], shape [axis, 2].
+        periodic: whether each axis repeats itself, shape [axis].
+
+    Returns:
+        Senders and receivers, ordered by receiver and then sender, shape [2, edge].
+    """
+    from scipy.spatial import cKDTree
+
+    if not np.isfinite(position).all():
+        return np.zeros((2, 0), np.int64)
+    lengths = bounds[:, 1] - bounds[:, 0]
+    shifted = position - bounds[:, 0]
+    box = np.where(periodic, lengths, 0.0)
+    # scipy refuses points on the upper end of a periodic axis
+    shifted = np.where(periodic, np.mod(shifted, lengths), shifted)
+    shifted = np.where(periodic & (shifted >= lengths), 0.0, shifted)
+    boxsize = box if periodic.any() else None
+    pairs = cKDTree(shifted, boxsize=boxsize).query_pairs(radius, output_type="ndarray")
+    both = np.concatenate([pairs, pairs[:, ::-1]]).astype(np.int64)
+    order = np.lexsort((both[:, 0], both[:, 1]))
+    return np.ascontiguousarray(both[order].T)

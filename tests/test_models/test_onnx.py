@@ -1,0 +1,212 @@
+"""ONNX models of strangers: checked, run with limits, never trusted."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hostile_onnx import REFUSED, STOPPED, pickle_as_onnx, straight_on
+
+from lagbench.board.check import check_board
+from lagbench.board.entry import Level, Meta
+from lagbench.board.reproduce import reproduce
+from lagbench.board.submit import submit
+from lagbench.data.registry import load
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import LagbenchError, UnreadableFileError, WorkFailedError
+from lagbench.make.generate import GenerationResult
+from lagbench.models.export import export_onnx
+from lagbench.models.onnx_checks import examine
+from lagbench.models.onnx_model import OnnxModel, check_onnx, open_onnx
+from lagbench.models.onnx_rollout import find_edges
+from lagbench.models.predict_onnx import predict_onnx
+from lagbench.tensors import Batch
+from lagbench.torch import predict
+from lagbench.work.machine import run_in_child
+
+MOST_SECONDS = 5.0  # until a hostile file is refused or stopped [s]
+
+SIZE = load().size("curl-noise", "tiny")
+
+
+def opened(path: Path, generated: GenerationResult) -> OnnxModel:
+    """Return a model with the limits of a test."""
+    return open_onnx(
+        path,
+        size=SIZE,
+        root=generated.root,
+        memory=2 << 30,
+        seconds_per_frame=0.01,
+        load_seconds=2.0,
+    )
+
+
+def first_scenario(generated: GenerationResult) -> Path:
+    """Return the file of the first test scenario."""
+    return SIZE.path(generated.root, SIZE.subsets["test"][0])
+
+
+@pytest.mark.parametrize("make", REFUSED, ids=lambda make: make.__name__)
+def test_a_hostile_file_is_refused(
+    make: Callable[[Path], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its checks name the reason, and nothing of it is run.
+
+    The checks run in this process here, for speed; the child is tested below.
+    """
+    monkeypatch.chdir(tmp_path)
+    path = make(tmp_path / "model.onnx")
+    started = time.monotonic()
+    try:
+        reason = examine(str(path))["refused"]
+    except UnreadableFileError as error:
+        reason = error.got
+    assert reason
+    assert time.monotonic() - started < MOST_SECONDS
+    assert os.listdir(tmp_path) == ["model.onnx"]
+
+
+@pytest.mark.parametrize("make", STOPPED, ids=lambda make: make.__name__)
+def test_a_greedy_model_is_stopped(
+    make: Callable[[Path], Path], tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Memory and processor time are bounded, whatever the graph computes."""
+    model = opened(make(tmp_path / "model.onnx"), generated)
+    started = time.process_time()
+    with pytest.raises((WorkFailedError, UnreadableFileError)) as caught:
+        model.predict(first_scenario(generated), 2)
+    assert caught.value.where == str(model.path)
+    assert time.process_time() - started < MOST_SECONDS
+
+
+def test_the_checks_run_in_a_child(tmp_path: Path) -> None:
+    """A file that is refused there raises the error of an unreadable file."""
+    path = REFUSED[0](tmp_path / "model.onnx")
+    with pytest.raises(UnreadableFileError) as caught:
+        check_onnx(path)
+    assert caught.value.where == str(path)
+    text = tmp_path / "model.txt"
+    text.write_text("no model")
+    with pytest.raises(LagbenchError):
+        check_onnx(text)
+
+
+def test_a_child_writes_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not a byte, whatever runs there."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    path = tmp_path / "written"
+    answers = run_in_child("hostile_onnx.write_a_file", [str(path)], seconds=5, wall=60)
+    assert answers.values == ["OSError"]
+    assert not path.exists() or path.stat().st_size == 0
+
+
+def test_a_model_predicts_what_its_graph_says(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Straight lines, to rounding, in the frames of the task."""
+    model = opened(straight_on(tmp_path / "model.onnx"), generated)
+    rollout = model.roll_out(first_scenario(generated))
+    with read_scenario(first_scenario(generated)) as file:
+        given = file.read("position", slice(0, SIZE.task.input_frames)).astype(float)
+    step = given[-1] - given[-2]
+    frames = np.arange(1, SIZE.task.horizon + 1)[:, None, None]
+    np.testing.assert_allclose(
+        rollout.position, given[-1] + frames * step, rtol=0, atol=2e-5
+    )
+    assert rollout.diverged_at is None
+
+
+def test_edges_are_all_pairs_within_the_radius() -> None:
+    """Compared with all distances; across periodic ends only where there are some."""
+    rng = np.random.default_rng(5)
+    position = rng.random((60, 2))
+    bounds = np.array([[0.0, 1.0], [0.0, 1.0]])
+    for periodic in ([False, False], [True, False], [True, True]):
+        difference = position[:, None] - position[None]
+        shift = np.where(periodic, np.round(difference), 0.0)
+        distance = np.linalg.norm(difference - shift, axis=-1)
+        np.fill_diagonal(distance, np.inf)
+        receivers, senders = np.nonzero(distance <= 0.2)
+        edges = find_edges(position, 0.2, bounds, np.array(periodic))
+        np.testing.assert_array_equal(edges, [senders, receivers])
+
+
+def test_an_exported_step_predicts_what_it_did(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Sums over particles of one index, walls and weights survive the export."""
+    net = torch.nn.Linear(2, 2)
+
+    def step(window: Batch) -> torch.Tensor:
+        before, now = window.position.unbind(1)
+        velocity = now - before
+        cell = (4 * now[:, 0]).long().clamp(0, 3)
+        sums = torch.zeros(4, 2).index_add(0, cell, velocity)
+        counts = torch.zeros(4, 2).index_add(0, cell, torch.ones_like(velocity))
+        mean = sums / counts.clamp(min=1.0)
+        correction: torch.Tensor = net(velocity)
+        return now + 0.5 * velocity + 0.1 * mean[cell] + 1e-4 * correction
+
+    path = export_onnx(
+        step,
+        tmp_path / "model.onnx",
+        split=SIZE.split,
+        size=SIZE.name,
+        modules=[net],
+        history=2,
+        root=generated.root,
+    )
+    model = open_onnx(path, size=SIZE, root=generated.root)
+    assert model.parameters >= 6
+    scenario, expected = next(
+        iter(predict(step, SIZE.split, size=SIZE.name, history=2, root=generated.root))
+    )
+    position = model.predict(SIZE.path(generated.root, scenario))
+    np.testing.assert_allclose(position, expected, rtol=0, atol=1e-5)
+
+
+def test_an_entry_carries_an_onnx_model(
+    tmp_path: Path, generated: GenerationResult
+) -> None:
+    """Predicted, submitted and reproduced; another file for the same predictions is
+    refused.
+    """
+    path = straight_on(tmp_path / "lines.onnx")
+    predictions = tmp_path / "predictions.nc"
+    result = predict_onnx(
+        path,
+        predictions,
+        split=SIZE.split,
+        size=SIZE.name,
+        root=generated.root,
+    )
+    assert result.method == "lines"
+    board = tmp_path / "board"
+    meta = Meta(authors=("A. Author",), command="make")
+    options: dict[str, Any] = {
+        "board": board,
+        "root": generated.root,
+        "new_board": True,
+    }
+    other = tmp_path / "other.onnx"
+    straight_on(other)
+    with pytest.raises(UnreadableFileError):
+        submit([predictions], meta, weights=[pickle_as_onnx(other)], **options)
+    submit([predictions], meta, weights=[path], **options)
+
+    place = board / "weights/curl-noise/tiny/lines_0.onnx"
+    assert place.read_bytes() == path.read_bytes()
+    assert check_board(board, isolated=False).findings == ()
+    done = reproduce(board, ["curl-noise/tiny/lines"], costs=False, root=generated.root)
+    assert done.exit_code == 0
+    (line,) = done.lines.values()
+    assert line.level is Level.REPRODUCED
