@@ -18,13 +18,19 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size, load
 from lagbench.errors import require
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.solver import Solver, build
+from lagbench.generators.split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    InitialState,
+)
 
 from .predictor import (
     Floats,
@@ -36,14 +42,6 @@ from .predictor import (
     linear_field,
     with_wall_images,
 )
-
-if TYPE_CHECKING:
-    from lagbench.generators.solver import Solver
-    from lagbench.generators.split import (
-        ClosedBoxParameters,
-        FreeSurfaceParameters,
-        InitialState,
-    )
 
 SMALLER = {
     ("full", 2): "mini",
@@ -89,7 +87,6 @@ def predict(given: Given, times: int) -> Prediction:
 def predict_with(given: Given, coarse: Size) -> Prediction:
     """Yield positions that the solver finds with the constants of a size."""
     require("taichi", extra="generate")
-    from lagbench.generators.constants import solver_constants
 
     count = min(coarse.particles, len(given.last))
     position = given.last.copy()
@@ -123,8 +120,6 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
 @functools.lru_cache(maxsize=1)
 def _solver(constants: ClosedBoxParameters | FreeSurfaceParameters) -> Solver:
     """Build a solver, or take the last one again: building compiles."""
-    from lagbench.generators.solver import build
-
     return build(constants, threads=1)
 
 
@@ -154,8 +149,6 @@ def spread_subset(
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
-    from lagbench.generators.split import InitialState
-
     interval = given.size.frame_interval
     count = len(carriers)
     if fills_box(given.size):
