@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 
 import lagbench
+from lagbench.__main__ import app
 
 PACKAGE = Path(lagbench.__file__).parent
 ROOTS = {
@@ -48,8 +49,6 @@ def module_paths() -> dict[str, Path]:
 
 def trace_command(words: list[str]) -> tuple[int, int]:
     """Run a command; return how many files and functions of the package ran."""
-    from lagbench.__main__ import app
-
     package_files = {str(path.resolve()) for path in module_paths().values()}
     real_paths: dict[str, str] = {}
     functions: set[tuple[str, int]] = set()

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from lagbench.generators import solver
 from lagbench.generators.split import FreeSurfaceParameters, InitialState, Material
@@ -232,8 +233,6 @@ def markdown(measurements: Sequence[Measurement], device: str) -> str:
 
 def draw(measurements: Sequence[Measurement], device: str, path: Path) -> None:
     """Draw Fig. 3.1: (a) log-log with lines, (b) linear with second-degree fits."""
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
     our_points = []

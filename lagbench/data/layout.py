@@ -21,6 +21,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import platformdirs
+
 from lagbench.errors import UsageError
 
 CACHE_VARIABLE = "LAGBENCH_CACHE"
@@ -84,8 +86,6 @@ def cache_folder(part: str) -> Path:
     folder = os.environ.get(CACHE_VARIABLE)
     if folder:
         return expand_path(folder, CACHE_VARIABLE)
-    import platformdirs
-
     return platformdirs.user_cache_path("lagbench", appauthor=False) / part
 
 

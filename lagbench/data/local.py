@@ -21,6 +21,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import platformdirs
+
 from lagbench.atomic import write_atomically
 from lagbench.errors import UnreadableFileError, UsageError, check_regular, suggest_name
 
@@ -69,8 +71,6 @@ def resolve_root(root: str | Path | None = None) -> Path:
     """
     named_root = _named_root(root)
     if named_root is None:
-        import platformdirs
-
         return platformdirs.user_data_path("lagbench", appauthor=False)
     url = as_url(named_root)
     if url is not None:

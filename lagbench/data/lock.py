@@ -16,15 +16,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import filelock
+from filelock import BaseFileLock
 
 from lagbench.atomic import write_atomically
 from lagbench.errors import WorkFailedError
 
 from .layout import dataset_folder
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 LOCK_NAME = ".lock"
 HOLDER_NAME = ".lock.holder.json"
@@ -92,8 +91,6 @@ def dataset_lock(
 def _acquire(
     folder: Path, timeout: float | None, on_wait: Callable[[str], None] | None
 ) -> BaseFileLock:
-    import filelock
-
     folder.mkdir(parents=True, exist_ok=True)
     lock = filelock.FileLock(folder / LOCK_NAME)
     with suppress(filelock.Timeout):

@@ -50,6 +50,7 @@ from .layout import (
     scenario_path,
 )
 from .registry import Hash, Size
+from .scenario import read_scenario
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]*$")]
 Row = Annotated[tuple[FiniteFloat, ...], Field(strict=False)]
@@ -155,9 +156,6 @@ def describe_file(
     root: Path, key: ScenarioKey, *, digest: str | None = None
 ) -> FileEntry:
     """Return the manifest entry of a scenario file, with the hash that it states."""
-    # h5py is loaded by those who read a file, not by those who read a manifest.
-    from .scenario import read_scenario
-
     path = scenario_path(root, key)
     with read_scenario(path) as file:
         header = file.header

@@ -18,7 +18,7 @@ from collections.abc import Hashable, Mapping
 from contextlib import suppress
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -39,6 +39,8 @@ from lagbench.errors import (
     suggest_name,
 )
 
+from .box import Box, parse_periodic
+from .grid import Grid, Placement
 from .layout import ScenarioKey, dataset_folder, major_of, scenario_path
 from .limits import MAX_ID as MAX_ID
 from .limits import (
@@ -51,10 +53,6 @@ from .limits import (
 )
 from .limits import format_ids as format_ids
 from .limits import parse_ids as parse_ids
-
-if TYPE_CHECKING:
-    from .box import Box
-    from .grid import Grid
 
 GROUP = "lagbench.generators"
 """Entry points that name a split and its module; ours register the same way."""
@@ -181,8 +179,6 @@ class _SizeEntry(_RegistryModel):
     def _check_periodic(self) -> _SizeEntry:
         if not self.periodic:
             return self
-        from .box import parse_periodic
-
         try:
             parse_periodic(self.periodic, len(self.bounds))
         except UsageError as error:
@@ -246,17 +242,12 @@ class Size(BaseModel):
     @property
     def box(self) -> Box:
         """The box that holds the particles."""
-        # Commands that only read the registry load no NumPy.
-        from .box import Box, parse_periodic
-
         periodic = parse_periodic(self.periodic, len(self.bounds))
         return Box.from_bounds(self.bounds, periodic)
 
     @property
     def field_grid(self) -> Grid:
         """Grid of the scorer's fields."""
-        from .grid import Grid, Placement
-
         score_grid = self.task.score_grid
         return Grid(score_grid.cells, Placement(score_grid.placement), self.box)
 

@@ -11,6 +11,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -24,7 +25,7 @@ from lagbench.errors import DataError, LagbenchError, WorkFailedError
 from .box import AXES, WALL_NAMES, parse_periodic
 from .checksums import ContentHasher, to_plain
 from .layout import ScenarioKey
-from .variables import MAX_VALUES_PER_FRAME, expected_attributes
+from .variables import MAX_VALUES_PER_FRAME, expected_attributes, open_netcdf
 
 FORMAT = 1
 """Number of the file layout; stored as attribute ``lagbench_format``."""
@@ -193,14 +194,10 @@ class ScenarioWriter:
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the frames."""
-        from importlib.metadata import version
-
-        import netCDF4
-
         with ExitStack() as stack:
             stack.enter_context(_write_errors(self.path))
             temporary = stack.enter_context(atomic_path(self.path))
-            self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
+            self._file = open_netcdf(temporary, "w")
             stack.callback(self._file.close)
             self._write_constants()
             for name in self._moving_names:

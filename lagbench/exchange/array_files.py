@@ -23,6 +23,7 @@ from lagbench.data import MATERIALS
 from lagbench.data.hdf5 import open_hdf5
 from lagbench.data.registry import MAX_ID
 from lagbench.data.structure import Structure, check_structure
+from lagbench.data.variables import open_netcdf
 from lagbench.errors import DataError, LagbenchError, UnreadableFileError
 
 from .axis_order import ORDER, OrderedArray, check_order
@@ -320,15 +321,13 @@ def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _read_netcdf(path: Path) -> dict[str, Any]:
-    import netCDF4
-
     with path.open("rb") as stream:
         is_classic = stream.read(len(CLASSIC)) == CLASSIC
     if not is_classic:  # netCDF would follow links and read other files
         with open_hdf5(path) as hdf5:
             check_structure(hdf5, path, NETCDF)
 
-    file = netCDF4.Dataset(path, "r")
+    file = open_netcdf(path)
     file.set_auto_maskandscale(False)
     arrays = {}
     for name in ARRAYS:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from lagbench.atomic import atomic_path
 from lagbench.errors import UsageError, suggest_name
@@ -165,9 +167,6 @@ def _choose_panel(kind: Panel | str | None, recordings: Sequence[Recording]) -> 
 
 def _show_progress(numbers: Iterable[int], name: str) -> Iterable[int]:
     """Return the same numbers; a bar on stderr shows how many are done."""
-    from rich.console import Console
-    from rich.progress import track
-
     console = Console(stderr=True)
     return track(numbers, description=name, console=console, transient=True)
 

@@ -18,13 +18,19 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.data.registry import Size
 from lagbench.errors import require
+from lagbench.generators.constants import solver_constants
+from lagbench.generators.solver import Solver, build
+from lagbench.generators.split import (
+    ClosedBoxParameters,
+    FreeSurfaceParameters,
+    InitialState,
+)
 
 from .predictor import (
     Floats,
@@ -37,14 +43,6 @@ from .predictor import (
     with_wall_images,
 )
 from .train_library import UP
-
-if TYPE_CHECKING:
-    from lagbench.generators.solver import Solver
-    from lagbench.generators.split import (
-        ClosedBoxParameters,
-        FreeSurfaceParameters,
-        InitialState,
-    )
 
 MIN_CELLS = 16
 """Least cells of a coarser grid across the unit box."""
@@ -101,7 +99,6 @@ def predict(given: Given, times: int) -> Prediction:
 def predict_with(given: Given, coarse: Size) -> Prediction:
     """Yield positions that the solver finds with the constants of a size."""
     require("taichi", extra="generate")
-    from lagbench.generators.constants import solver_constants
 
     count = min(coarse.particles, len(given.last))
     position = given.last.copy()
@@ -135,8 +132,6 @@ def predict_with(given: Given, coarse: Size) -> Prediction:
 @functools.lru_cache(maxsize=1)
 def _solver(constants: ClosedBoxParameters | FreeSurfaceParameters) -> Solver:
     """Build a solver, or take the last one again: building compiles."""
-    from lagbench.generators.solver import build
-
     return build(constants, threads=1)
 
 
@@ -166,8 +161,6 @@ def spread_subset(
 
 
 def _state(given: Given, carriers: NDArray[np.intp]) -> InitialState:
-    from lagbench.generators.split import InitialState
-
     interval = given.size.frame_interval
     count = len(carriers)
     if fills_box(given.size):

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lagbench.atomic import atomic_path
+from lagbench.data.variables import open_netcdf
 from lagbench.errors import WorkFailedError
 from lagbench.metrics.aggregate import Score, Tally, aggregate
 from lagbench.metrics.table import available
@@ -59,12 +60,10 @@ def write_statistics(card: ScoreCard, path: Path, *, option: str = "--output") -
     Raises:
         WorkFailedError: the file cannot be written.
     """
-    import netCDF4
-
     with atomic_path(path, option=option) as temporary:
         try:
             # closing the file writes most of it
-            with netCDF4.Dataset(temporary, "w", format="NETCDF4") as file:
+            with open_netcdf(temporary, "w") as file:
                 _write_card(file, card)
         except (OSError, RuntimeError) as error:
             raise WorkFailedError(
@@ -268,10 +267,8 @@ def read_statistics(path: Path) -> SubmissionStatistics:
     Raises:
         UnreadableFileError: it is no scores.nc.
     """
-    import netCDF4
-
     try:
-        with netCDF4.Dataset(path, "r") as file:
+        with open_netcdf(path) as file:
             file.set_auto_maskandscale(False)
             if file.lagbench_scores != FORMAT:
                 raise ValueError(f"layout {file.lagbench_scores!r}, not {FORMAT}")

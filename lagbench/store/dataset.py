@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from lagbench.data import registry
 from lagbench.data.local import locate, suggest_repair
+from lagbench.data.manifest import read_manifest
 from lagbench.data.scenario import damage_error
 from lagbench.errors import DataError
+
+from .copy import scenario_files, update_working_copy
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -47,11 +50,6 @@ def load_manifest(
         UsageError: unknown split or size.
         DataError: nothing is generated, or the manifest is damaged.
     """
-    # Listing the splits needs neither h5py nor the stores.
-    from lagbench.data.manifest import read_manifest
-
-    from .copy import update_working_copy
-
     tier, root_folder, _ = locate(split, size, root=root)
     update_working_copy(tier, root_folder)
     manifest = read_manifest(root_folder, tier.split, tier.name, tier.major)
@@ -92,8 +90,6 @@ def open_split(
         UsageError: unknown split, size or subset.
         DataError: scenarios are missing, damaged, or of another version.
     """
-    from .copy import scenario_files
-
     tier, root_folder, _ = locate(split, size, root=root)
     paths = scenario_files(tier, root_folder, (subset,))
     hint = suggest_repair(tier, root=root_folder)

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from lagbench.atomic import atomic_path
 from lagbench.data.local import locate, suggest_repair
 from lagbench.data.registry import Registry, Size, format_ids
+from lagbench.data.variables import open_netcdf
 from lagbench.errors import (
     DataError,
     UsageError,
@@ -153,8 +154,6 @@ class PredictionsWriter:
 
     def __enter__(self) -> Self:
         """Create the temporary file with everything but the predictions."""
-        import netCDF4
-
         if self._is_open:
             raise UsageError(
                 "the file is being written",
@@ -168,7 +167,7 @@ class PredictionsWriter:
         with ExitStack() as stack:
             temporary = stack.enter_context(atomic_path(self.path, option="--output"))
             with self._writing():
-                self._file = netCDF4.Dataset(temporary, "w", format="NETCDF4")
+                self._file = open_netcdf(temporary, "w")
                 stack.callback(self._abandon)
                 self._write_headers()
             self._stack = stack.pop_all()
