@@ -24,7 +24,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 from scipy.optimize import minimize
 from torch import Tensor
@@ -67,7 +67,7 @@ class ClosedGrid(StaggeredGrid):
         *,
         viscosity: float,
         wall_velocity: Floats,
-        force: Sequence[float] | None = None,
+        force: ArrayLike | None = None,
     ) -> Velocity:
         """Return the reference's acceleration less ``mu lap lap u`` [length/s^2]."""
         rates = super().acceleration(

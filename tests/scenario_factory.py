@@ -36,10 +36,11 @@ def make_key(
     split: str = "cavity",
     size: str = "tiny",
     subset: str = "test",
+    version: str = "2.2.0",
 ) -> ScenarioKey:
     """Return the key of a cavity tiny scenario unless told otherwise."""
     return ScenarioKey(
-        split=split, size=size, version="2.2.0", scenario=scenario, subset=subset
+        split=split, size=size, version=version, scenario=scenario, subset=subset
     )
 
 

@@ -142,8 +142,9 @@ def _sums_of_index_add() -> Iterator[None]:
     ) -> Any:  # noqa: ANN401
         from torch.onnx import symbolic_helper
 
-        number = symbolic_helper._get_const(axis, "i", "dim")
-        rank = symbolic_helper._get_tensor_rank(source)
+        helper: Any = symbolic_helper  # has no types
+        number = helper._get_const(axis, "i", "dim")
+        rank = helper._get_tensor_rank(source)
         others = [other for other in range(rank) if other != number % rank]
         if others:
             axes = graph.op("Constant", value_t=torch.tensor(others))

@@ -130,7 +130,7 @@ class OnnxModel:
     def _request(self, scenario_file: Path, frames: int) -> dict[str, Any]:
         with read_scenario(scenario_file) as file:
             given = given_in(file, self.size, self.root)
-        arrays = {
+        arrays: dict[str, NDArray[Any]] = {
             "position": given.position.astype(np.float32),
             "material": given.material.astype(np.int64),
             "bounds": np.asarray(given.box.bounds, np.float64),

@@ -154,6 +154,7 @@ def _advance(
     """Return the next frames, at least one, shape [frame, particle, axis]."""
     values: dict[str, NDArray[Any]] = {}
     for name, type_name in inputs.items():
+        value: NDArray[Any]
         if name == "position":
             value = window
         elif name == "wall_velocity":

@@ -318,7 +318,7 @@ def _open_fsspec(url: str, offset: int, hint: str) -> Answer:
         # and no permission comes with time.
         may_pass = isinstance(error, OSError) and not isinstance(error, PermissionError)
         if may_pass and url.startswith(S3):
-            from botocore import exceptions
+            from botocore import exceptions  # type: ignore[import-untyped]
 
             may_pass = not isinstance(error, exceptions.HTTPClientError)
         if may_pass and isinstance(store_error, WorkFailedError):
@@ -512,7 +512,7 @@ def _is_permission_error(error: Exception, url: str) -> bool:
         return True
     if not url.startswith(S3):
         return False
-    from botocore import exceptions  # type: ignore[import-untyped]
+    from botocore import exceptions
 
     credential_errors = (
         exceptions.NoCredentialsError,

@@ -219,7 +219,7 @@ def _cubic_errors_of_models(
 def cubic_vorticity(
     position: Floats,
     velocity: Floats,
-    bounds: tuple[tuple[float, float], tuple[float, float]],
+    bounds: Sequence[tuple[float, float]],
     *,
     cells: int = 40,
 ) -> Floats:

@@ -237,9 +237,9 @@ def test_the_search_that_is_timed_is_the_models(
     save(weights, checkpoint)
     limits = set()
 
-    def search(*arguments: Any, most: int | None) -> Tensor:
+    def search(*arguments: Any, most: int | None, **options: Any) -> Tensor:
         limits.add(most)
-        return radius_graph(*arguments, most=most)
+        return radius_graph(*arguments, most=most, **options)
 
     monkeypatch.setattr(prediction, "radius_graph", search)
     predict(

@@ -59,7 +59,7 @@ def test_words_of_a_person_are_no_provenance(sentence: str) -> None:
 def test_every_committed_entry_has_a_provenance() -> None:
     """Entries have the sentence alone, and it comes back letter by letter."""
     paths = sorted((LEADERBOARD / "submissions").glob("*/*/*.yaml"))
-    assert len(paths) > 100
+    assert len(paths) > 50
     for path in paths:
         entry = read_entry(path)
         assert entry.provenance is not None

@@ -116,7 +116,7 @@ def test_a_scenario_of_an_opened_split_draws_what_its_file_draws(
         )
     with open_split("fluid", subset="train", size="tiny", root=tmp_path) as split:
         from_split = plot_frame(split.sel(scenario=0), -1, tmp_path / "split.png")
-    file = tmp_path / "fluid/tiny/v2/train/0000.nc"
+    file = tmp_path / "fluid/tiny/v3/train/0000.nc"
     from_file = plot_frame(file, 3, tmp_path / "file.png")
     assert from_split.read_bytes() == from_file.read_bytes()
 

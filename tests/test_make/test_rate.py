@@ -56,12 +56,12 @@ def pace(slowness: float) -> SimulationPace:
 
 
 def test_a_measured_rate_decides(cache: Path, unmeasured: Registry) -> None:
-    """Whoever took 300 s for three times the work takes 100 s: 2 * 155 * 256 particle
+    """Whoever took 300 s for three times the work takes 100 s: 2 * 465 * 256 particle
     substeps, 64 frames.
     """
     size = unmeasured.size("fluid", "tiny")
     assert not estimate(size, (0, 1)).measured
-    noted(cache, free_surface={"256": [300.0, 3 * 2 * 155 * 256, 3 * 64]})
+    noted(cache, free_surface={"256": [300.0, 3 * 2 * 465 * 256, 3 * 64]})
     expected = estimate(size, (0, 1))
     assert expected.measured
     assert expected.core_seconds == pytest.approx(100.0)

@@ -249,7 +249,7 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
 ) -> None:
     size = unmeasured.size("fluid", "tiny")
     for scenario in size.subsets["valid"]:
-        key = make_key(scenario, subset="valid", split="fluid")
+        key = make_key(scenario, subset="valid", split="fluid", version=size.version)
         frames = size.frame_count(scenario)
         write_scenario(tmp_path, key, frames=frames, walls=False)
     data = lagbench.windows(
@@ -257,7 +257,7 @@ def test_gravity_and_viscosity_are_those_of_all_scenarios(
     )
     assert data.history == 2
     assert data.gravity == 2.5
-    assert data.viscosity == 1e-3
+    assert data.viscosity == size.value("liquid_viscosity")
 
 
 def write_viscous(

@@ -171,7 +171,7 @@ def test_an_entry_tells_what_its_record_tells(split: str, tmp_path: Path) -> Non
                 assert entry.record.get(key) == training.record.get(key)
             # an entry describes the training of one of its seeds
             assert entry.record["recipe"]["name"] in recipe_names
-    assert compared_count > 3
+    assert compared_count > 0
 
 
 def test_scores_of_other_data_are_left_out(runs: Path) -> None:

@@ -56,15 +56,11 @@ def test_a_folder_is_tried_before_the_work(tmp_path: Path) -> None:
     assert list((tmp_path / "deep" / "folder").iterdir()) == []
     (tmp_path / "file").touch()
     file = tmp_path / "file"
-    for folder, remedy in (
-        (file, "remove it"),
-        (file / "below", "remove it"),
-        (Path("/proc/self"), "free"),
-    ):
-        with pytest.raises(
-            WorkFailedError, match=rf"(?s)cannot write.*{remedy}.*--output"
-        ):
+    for folder in (file, file / "below", Path("/proc/self")):
+        with pytest.raises(WorkFailedError) as caught:
             check_writable(folder, option="--output")
+        assert caught.value.where.startswith(str(folder.parent))
+        assert "--output" in caught.value.fix
     with pytest.raises(WorkFailedError) as caught:
         write_atomically(file / "in-the-way", b"")
     assert caught.value.where.endswith("file/in-the-way")
