@@ -292,7 +292,7 @@ def make_card(size: Size, method: str, seed: int, quality: float) -> ScoreCard:
         skill=compute_skill([scores[SUBMISSION][ranking]], naive_scores),
         flags=(),
         warnings=(),
-        preview=_preview(size, grid.nodes, rng),
+        preview=_preview(size, rng),
     )
 
 
@@ -323,7 +323,7 @@ def _tally(frames: tuple[int, ...], quality: float, rng: np.random.Generator) ->
     return round_statistics(Tally(tuple(names), frames, total, ones, 0 * ones))
 
 
-def _preview(size: Size, nodes: int, rng: np.random.Generator) -> Preview:
+def _preview(size: Size, rng: np.random.Generator) -> Preview:
     frames = tuple(frames_to_predict(size))
     maps = reported_frames(size)
     frame_count = min(FRAMES, len(frames))
@@ -332,11 +332,12 @@ def _preview(size: Size, nodes: int, rng: np.random.Generator) -> Preview:
 
     # both sides start from the truth, shape [side, ...]
     truth = np.random.Generator(np.random.PCG64(size.particles))
-    true_vorticity = 0.1 * truth.normal(size=(1, len(maps), nodes, nodes))
+    map_shape = size.field_grid.section.shape
+    true_vorticity = 0.1 * truth.normal(size=(1, len(maps), *map_shape))
     vorticity = true_vorticity * np.ones((2, 1, 1, 1))
     vorticity[1] += 0.02 * rng.normal(size=vorticity[1].shape)
 
-    true_position = truth.random((1, 1, PARTICLES, 2))
+    true_position = truth.random((1, 1, PARTICLES, size.dimension))
     film = true_position * np.ones((2, frame_count, 1, 1))
     film[1] += np.cumsum(rng.normal(0.0, 1e-3, film[1].shape), axis=0)
 
