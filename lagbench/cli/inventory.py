@@ -50,7 +50,7 @@ def list_command(root: RootOption = None, as_json: JsonFlag = False) -> None:
     if as_json:
         print_json({"root": folder, "sizes": overviews})
         return
-    print_table("", COLUMNS, map(_format_row, overviews))
+    print_table("", COLUMNS, map(_format_row, overviews), is_narrow=True)
     for line in LEGEND:
         print_line(line)
     for line in _describe_times(overviews):

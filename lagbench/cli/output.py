@@ -149,11 +149,16 @@ def print_tables(tables: Iterable[Table]) -> None:
 
 
 def print_table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]
+    title: str,
+    columns: Sequence[str],
+    rows: Iterable[Sequence[object]],
+    *,
+    is_narrow: bool = False,
 ) -> None:
     """Print a table on stdout.
 
-    Only the last column wraps. Columns of numbers are set flush right.
+    Only the last column wraps. Columns of numbers are set flush right. A narrow table
+    has two spaces between columns instead of three.
     """
     cells = [[str(cell) for cell in row] for row in rows]
     table_title = None
@@ -163,6 +168,7 @@ def print_table(
         title=table_title,
         box=SIMPLE_HEAD,
         title_justify="left",
+        padding=(0, 1, 0, 0) if is_narrow else (0, 1),
         pad_edge=False,
         show_edge=False,
     )
