@@ -61,7 +61,7 @@ def start_frame(size: Size, scenario: int) -> int:
     if state_start_frame is None:
         return 0
 
-    rng = generator(size.split, size.name, size.major, scenario)
+    rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     with blamed_on_parameters(size, f"drawing the first frame of scenario {scenario}"):
         return int(state_start_frame(size, scenario, rng))
 
@@ -80,7 +80,7 @@ def draw_initial_state(size: Size, scenario: int) -> InitialState:
         UsageError: the split returns something else than an initial state, or one that
             starts at another frame than the split said.
     """
-    rng = generator(size.split, size.name, size.major, scenario)
+    rng = generator(size.split, size.name, size.major, scenario, size.draw_seed)
     module = split_module(size)
     place = f"{size.split} {size.name}, scenario {scenario}"
     try:

@@ -34,27 +34,50 @@ class RandomSource(Protocol):
         """Return uniform variates on [0, 1), multiples of 2^-53."""
 
 
-def entropy(split: str, size: str, major: int, scenario: int) -> tuple[int, int, int]:
+def entropy(
+    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+) -> tuple[int, ...]:
     """Return what seeds a scenario: a word of its data set, its version and its id.
 
-    The word is the first eight bytes of SHA-256("split/size"), big-endian.
+    The word is the first eight bytes of SHA-256("split/size"), big-endian. In a season
+    its seed, four words of eight bytes, takes the place of that word and the version.
+
+    Args:
+        split: name of the split.
+        size: name of the size.
+        major: MAJOR of the version.
+        scenario: id of the scenario.
+        draw_seed: seed of a season [64 hex digits].
 
     >>> entropy("cavity", "tiny", 1, 3)[1:]
     (1, 3)
+    >>> entropy("cavity", "tiny", 1, 3, draw_seed=64 * "1")[3:]
+    (1229782938247303441, 3)
     """
+    if draw_seed is not None:
+        season = bytes.fromhex(draw_seed)
+        words = []
+        for start in range(0, len(season), 8):
+            words.append(int.from_bytes(season[start : start + 8], "big"))
+        return (*words, scenario)
     digest = hashlib.sha256(f"{split}/{size}".encode()).digest()
     return int.from_bytes(digest[:8], "big"), major, scenario
 
 
-def generator(split: str, size: str, major: int, scenario: int) -> np.random.Generator:
-    """Return the PCG64 stream of one scenario, a function of its four names only."""
-    seed = np.random.SeedSequence(entropy(split, size, major, scenario))
-    return np.random.Generator(np.random.PCG64(seed))
+def generator(
+    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+) -> np.random.Generator:
+    """Return the PCG64 stream of one scenario, a function of its names only."""
+    words = entropy(split, size, major, scenario, draw_seed)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(words)))
 
 
-def seed_text(split: str, size: str, major: int, scenario: int) -> str:
+def seed_text(
+    split: str, size: str, major: int, scenario: int, draw_seed: str | None = None
+) -> str:
     """Return the seed as the files state it, for ``SeedSequence([...])``."""
-    return ", ".join(str(word) for word in entropy(split, size, major, scenario))
+    words = entropy(split, size, major, scenario, draw_seed)
+    return ", ".join(str(word) for word in words)
 
 
 def quantise(values: ArrayLike) -> NDArray[np.float64]:

@@ -150,7 +150,7 @@ def scenario_writer(
         wall_velocity=wall_velocity,
         body_force=body_force,
         parameters=file_parameters(size, scenario, state),
-        seed=seed_text(size.split, size.name, size.major, scenario),
+        seed=seed_text(size.split, size.name, size.major, scenario, size.draw_seed),
         device=job.device.value,
         generator=size.generator,
         dimension=size.box.dimension,
@@ -294,7 +294,7 @@ def _diagnose(
 def draw_perturbation(size: Size, scenario: int) -> NDArray[np.float32]:
     """Return the displacement of a perturbed run [length], shape [particle, axis]."""
     # a random stream of its own: the scenario's seed and a 1
-    seed = (*entropy(size.split, size.name, size.major, scenario), 1)
+    seed = (*entropy(size.split, size.name, size.major, scenario, size.draw_seed), 1)
     rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed)))
     shape = (size.particles, size.box.dimension)
     signs = np.where(rng.random(shape) < 0.5, -1.0, 1.0)

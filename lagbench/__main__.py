@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 from .addresses import REPOSITORY, describe
-from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS
+from .cli.commands import COMMANDS, LEADERBOARD_COMMANDS, SEASON_COMMANDS
 from .cli.lazy_group import LazyGroup
 from .errors import (
     LagbenchError,
@@ -355,6 +355,18 @@ app.add_typer(
     name="leaderboard",
     epilog="Example: lagbench leaderboard show",
 )
+
+
+class _SeasonGroup(LazyGroup):
+    entries = SEASON_COMMANDS
+
+
+season = typer.Typer(
+    cls=_SeasonGroup,
+    no_args_is_help=True,
+    help="Close, run and show blind tests of a leaderboard's models.",
+)
+app.add_typer(season, name="season", epilog="Example: lagbench season show rehearsal")
 
 if __name__ == "__main__":
     app()

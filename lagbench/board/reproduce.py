@@ -583,7 +583,7 @@ def with_reproduction(
     level = line.level
     if is_reproduced and level.rank < Level.REPRODUCED.rank:
         level = Level.REPRODUCED
-    elif not is_reproduced and level is Level.REPRODUCED:
+    elif not is_reproduced and level.rank >= Level.REPRODUCED.rank:
         level = Level.AS_SUBMITTED
     return line.model_copy(update={"reproduced": tuple(reproduced), "level": level})
 

@@ -2,33 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from lagbench.data.layout import url_of
-from lagbench.data.registry import format_ids
-from lagbench.errors import format_count
+from lagbench.data.registry import Registry, format_ids, load
+from lagbench.errors import UsageError, format_count
 from lagbench.make.generate import GenerationResult, generate
 
 from .options import (
+    DEFAULT_BOARD,
+    BoardOption,
     JsonFlag,
     NewSizeOption,
     QuietFlag,
     RootOption,
     ScenariosOption,
     SchedulerOption,
+    SplitArgument,
+    SplitOption,
     SubsetOption,
     WorkersOption,
-    accept_split,
+    choose_split,
     option,
 )
 from .output import format_bytes, format_seconds, print_note, print_result
 from .progress import progress_bar
 
 
-@accept_split
 def generate_command(
-    split: str,
+    split_argument: SplitArgument = None,
+    split_option: SplitOption = None,
     size: NewSizeOption = None,
     subset: SubsetOption = None,
     scenarios: ScenariosOption = None,
@@ -51,6 +56,15 @@ def generate_command(
     dry_run: Annotated[
         bool, option("--dry-run", "Print the cost only: bytes, time, free disk.")
     ] = False,
+    season: Annotated[
+        str | None,
+        option(
+            "--season NAME",
+            "Simulate the blind scenarios of this season; of all its data sets by "
+            "default.",
+        ),
+    ] = None,
+    board: BoardOption = DEFAULT_BOARD,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
@@ -58,27 +72,90 @@ def generate_command(
 
     An interrupted call goes on where it stopped.
     """
-    with progress_bar(quiet=quiet or dry_run) as progress:
-        result = generate(
-            split,
-            size,
-            subset=subset,
-            scenarios=scenarios,
-            root=root,
-            workers=workers,
-            device=device,
-            scheduler=scheduler,
-            gather=gather or (),
-            force=force,
-            dry_run=dry_run,
-            progress=progress,
-            on_wait=lambda holder: print_note(f"waiting for {holder}"),
-        )
-    if result.dry_run:
-        lines = _describe_plan(result)
+    if season is None:
+        split = choose_split(split_argument, split_option)
+        places = [Place(split=split, size=size, root=root, registry=None)]
     else:
-        lines = _describe_result(result)
-    print_result(result, lines, as_json=as_json, quiet=quiet)
+        split_name = None
+        if split_argument or split_option:
+            split_name = choose_split(split_argument, split_option)
+        places = _season_places(season, board, root, split_name, size)
+    for place in places:
+        with progress_bar(quiet=quiet or dry_run) as progress:
+            result = generate(
+                place.split,
+                place.size,
+                subset=subset,
+                scenarios=scenarios,
+                root=place.root,
+                workers=workers,
+                device=device,
+                scheduler=scheduler,
+                gather=gather or (),
+                force=force,
+                dry_run=dry_run,
+                progress=progress,
+                on_wait=lambda holder: print_note(f"waiting for {holder}"),
+                registry=place.registry,
+            )
+        if result.dry_run:
+            lines = _describe_plan(result)
+        else:
+            lines = _describe_result(result)
+        print_result(result, lines, as_json=as_json, quiet=quiet)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A data set to generate, and where it is described and kept."""
+
+    split: str
+    size: str | None
+    root: Path | None
+    registry: Registry | None
+
+
+def _season_places(
+    name: str, board: Path, root: Path | None, split: str | None, size: str | None
+) -> list[Place]:
+    """Return the data sets of a season, or those of a split and size.
+
+    Raises:
+        UsageError: there is no such season, it has no such data set, or it waits for
+            its random value.
+    """
+    from lagbench.board.folder import Folder
+    from lagbench.board.season import read_season, season_registry, season_root
+    from lagbench.board.season_run import read_scores
+
+    folder = Folder(board)
+    folder.require()
+    season = read_season(folder, name)
+    scores = read_scores(folder, season)
+    registry = season_registry(
+        season, load(), {} if scores is None else scores.recorded
+    )
+    places = []
+    known = []
+    for data_set in season.data_sets:
+        known.append(f"{data_set.split} {data_set.size}")
+        if split in (None, data_set.split) and size in (None, data_set.size):
+            places.append(
+                Place(
+                    split=data_set.split,
+                    size=data_set.size,
+                    root=season_root(name, root),
+                    registry=registry,
+                )
+            )
+    if not places:
+        raise UsageError(
+            "the season has no such data set",
+            where="--split, --size",
+            expected=", ".join(known),
+            got=f"{split or 'any split'} {size or 'any size'}",
+        )
+    return places
 
 
 def _describe_plan(result: GenerationResult) -> list[str]:

@@ -174,6 +174,8 @@ class _SizeEntry(_RegistryModel):
     particle_counts: dict[int, Ids] = Field(default_factory=dict)
     parameters: dict[str, Value]
     task: Task
+    # seed of all draws of a season; without it they follow from the names
+    draw_seed: Hash | None = None
 
     @model_validator(mode="after")
     def _check_periodic(self) -> _SizeEntry:
@@ -207,6 +209,9 @@ class Size(BaseModel):
     measured: Measured | None = None
     file: Path = Path("datasets.yaml")  # the file that describes it
     scored_subset: str = "test"  # subset that is predicted and scored
+    # seed of all draws of a season [64 hex digits]; without it they follow from the
+    # names of split, size, version and scenario
+    draw_seed: str | None = None
 
     @property
     def scored_scenarios(self) -> tuple[int, ...]:
@@ -469,6 +474,7 @@ class Registry:
             task=entry.task,
             measured=self.measured.get(split, {}).get(name),
             file=self.files.get(split, Path("datasets.yaml")),
+            draw_seed=entry.draw_seed,
         )
 
 

@@ -22,7 +22,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from lagbench.data.registry import Size
-from lagbench.metrics.aggregate import Score, bootstrap_interval, mean_over_seeds
+from lagbench.errors import ChecksFailedError
+from lagbench.metrics.aggregate import (
+    FEWEST_FOR_INTERVAL,
+    Resampling,
+    Score,
+    bootstrap_interval,
+    mean_over_seeds,
+    quantile,
+    resample,
+    student_quantile,
+)
 from lagbench.metrics.frame import Floats
 from lagbench.metrics.metric import Direction
 from lagbench.references.shipped import ReferenceScores, solver_seconds
@@ -263,6 +273,80 @@ def _compute_ratio(seeds: Sequence[Score], reference: Score) -> ScoreRatio | Non
         interval=(ratio * math.exp(low), ratio * math.exp(high)),
         std=_std_over_seeds(method, scale),
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkillGap:
+    """Difference of the skills of the same weights on two sets of scenarios."""
+
+    first: float  # skill on the first set
+    second: float  # skill on the second one
+    # 95 % interval of first minus second, over the scenarios of both; NaN of few
+    interval: tuple[float, float]
+
+    @property
+    def value(self) -> float:
+        """First minus second."""
+        return self.first - self.second
+
+
+def skill_gap(
+    first: Sequence[Score],
+    first_reference: Score,
+    second: Sequence[Score],
+    second_reference: Score,
+) -> SkillGap:
+    """Return the difference of two skills over the same naive predictor.
+
+    The sets of scenarios are independent draws and are resampled apart. Seeds are not
+    resampled: the weights are the same on both sides.
+
+    Args:
+        first: score of each seed on the first set of scenarios.
+        first_reference: score of the naive predictor there.
+        second: score of each seed on the second set.
+        second_reference: score of the naive predictor there.
+
+    Raises:
+        ChecksFailedError: a set has no scenario in which both have a value.
+    """
+    ratios = []
+    deviations = []
+    degrees = []
+    sides = ((first, first_reference), (second, second_reference))
+    for stream, (seeds, reference) in enumerate(sides):
+        base = _values_in(reference, seeds[0].scenarios)  # shape [scenario]
+        method = mean_over_seeds(np.stack([score.values for score in seeds]))
+        has_both = ~np.isnan(base) & ~np.isnan(method)
+        base = base[has_both]
+        method = method[has_both]
+        if not base.any() or not method.any():
+            raise ChecksFailedError(
+                "there is no scenario that both have",
+                where=seeds[0].metric.name,
+                expected="values of the method and of the naive predictor",
+            )
+        ratio = float(np.mean(method)) / float(np.mean(base))
+        relative = (method / ratio - base) / float(np.mean(base))
+        resampling = resample(relative)
+        if len(base) < FEWEST_FOR_INTERVAL or resampling is None:
+            degrees.append(math.nan)
+            deviations.append(np.zeros(1))
+        else:
+            # other draws on each side: with as many scenarios they would be the same
+            apart = Resampling(mean=0.0, parts={stream: resampling.parts[0]})
+            degrees.append(resampling.freedom)
+            deviations.append(apart.deviations)
+        ratios.append(ratio)
+
+    interval = (math.nan, math.nan)
+    if not any(math.isnan(freedom) for freedom in degrees):
+        stretch = student_quantile(min(degrees), 0.975) / student_quantile(1e6, 0.975)
+        first_ratio = ratios[0] * np.exp(stretch * deviations[0])
+        second_ratio = ratios[1] * np.exp(stretch * deviations[1])
+        ordered = np.sort(second_ratio - first_ratio)
+        interval = (quantile(ordered, 0.025), quantile(ordered, 0.975))
+    return SkillGap(first=1.0 - ratios[0], second=1.0 - ratios[1], interval=interval)
 
 
 def _values_in(score: Score, scenarios: Sequence[int]) -> Floats:

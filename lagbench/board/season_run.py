@@ -1,0 +1,560 @@
+"""Run a season: predict its blind scenarios with the frozen models, and score them.
+
+Every scored scenario is saved beside the blind data, so that an interrupted run goes on
+where it stopped. The result, ``seasons/<name>/scores.yaml``, holds no date, no time and
+no machine: everybody who repeats the run gets the same bytes, or on another kind of
+processor values within the tolerance of docs/reproduce.md.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from lagbench.atomic import write_atomically
+from lagbench.data.checksums import round_digits
+from lagbench.data.local import load_rooted_registry, resolve_root
+from lagbench.data.registry import Registry, format_ids
+from lagbench.data.scenario import read_scenario
+from lagbench.errors import ChecksFailedError, DataError, UnreadableFileError
+from lagbench.metrics.aggregate import Score, Tally, score
+from lagbench.metrics.frame import snapshots
+from lagbench.metrics.table import METRICS, select
+from lagbench.references.predictor import given_in
+from lagbench.references.shipped import shipped
+from lagbench.references.table import REFERENCES
+from lagbench.scoring.card import SUBMISSION
+from lagbench.scoring.scenario import measure_rows, predict_reference
+from lagbench.scoring.score_file_checks import read_score_file
+from lagbench.scoring.task import ScoredTask, load_scored_task
+from lagbench.work.progress import Meter, Progress
+
+from .entry import Entry, Strict
+from .entry_file import examine, format_issues, load_plain, read_entry, yaml_bytes
+from .fields import Hash, Name, Number, Seed
+from .folder import SEASON_SCORES, Folder, entry_path
+from .lock import board_lock
+from .reproduce import DIGITS, TOLERANCE, open_model, score_positions
+from .season import (
+    MOST_SEASON_BYTES,
+    FrozenEntry,
+    FrozenModel,
+    Recorded,
+    Season,
+    SeasonDataSet,
+    blind_size,
+    read_season,
+    season_path,
+    season_root,
+)
+
+SAVED = "scores.json"
+"""Name of the file beside the blind data with what is scored already."""
+
+Values = Annotated[dict[int, Number], Field(max_length=1000)]
+
+
+class ModelScores(Strict):
+    """The ranking metric of one model by scenario, on blind and on public ones."""
+
+    method: Name
+    seed: Seed | None = None
+    seeds: Annotated[int, Field(ge=1)] = Field(description="seeds of the entry")
+    model: Hash
+    public: Values
+    blind: Values
+
+
+class DataSetScores(Strict):
+    """The blind scenarios of a data set and what was scored on them."""
+
+    split: Name
+    size: Name
+    draw_seed: Hash
+    scenarios: Annotated[dict[int, Hash], Field(max_length=1000)] = Field(
+        description="content hash of each blind scenario"
+    )
+    # ranking metric of the naive predictor
+    public_reference: Values
+    blind_reference: Values
+    models: Annotated[tuple[ModelScores, ...], Field(max_length=10_000, strict=False)]
+
+
+class SeasonScores(Strict):
+    """The whole file seasons/<name>/scores.yaml."""
+
+    format: Literal[1] = 1
+    season: Name
+    data_sets: Annotated[tuple[DataSetScores, ...], Field(max_length=100, strict=False)]
+
+    @property
+    def recorded(self) -> Recorded:
+        """Content hashes of the blind scenarios, by split and size."""
+        hashes = {}
+        for data_set in self.data_sets:
+            hashes[data_set.split, data_set.size] = data_set.scenarios
+        return hashes
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """How the scores of a repeated run compare with those on the board."""
+
+    has_same_bytes: bool
+    greatest: float  # greatest relative difference of a value
+    values: int  # values that were compared
+
+
+@dataclass(kw_only=True)
+class SeasonResult:
+    """What a run of a season did."""
+
+    season: Season
+    scores: SeasonScores
+    path: Path  # the file of the scores
+    predicted: list[str] = field(
+        default_factory=list
+    )  # as in "cavity/mini/gns, seed 0"
+    comparison: Comparison | None = None  # where the scores were compared only
+
+    @property
+    def exit_code(self) -> int:
+        """1 where a repeated run has other scores than the board."""
+        if self.comparison is None or self.comparison.greatest <= TOLERANCE:
+            return 0
+        return ChecksFailedError.exit_code
+
+
+def read_scores(folder: Folder, season: Season) -> SeasonScores | None:
+    """Return the scores of a season on the board; None where it was not run yet.
+
+    Raises:
+        UnreadableFileError: the file cannot be read.
+        ChecksFailedError: it does not fit, or belongs to other seeds or models.
+    """
+    path = season_path(season.season, SEASON_SCORES)
+    file = folder.path / path
+    if folder.link_in(path) is not None or not file.is_file():
+        return None
+    scores, issues = examine(SeasonScores, load_plain(file, longest=MOST_SEASON_BYTES))
+    if scores is None:
+        raise ChecksFailedError(
+            "the scores of a season do not fit",
+            where=str(file),
+            got=format_issues(issues),
+            fix=f"lagbench season run {season.season} --again",
+        )
+    problem = _find_mismatch(season, scores)
+    if problem is not None:
+        raise ChecksFailedError(
+            "the scores of a season are not those of its frozen models",
+            where=str(file),
+            expected=str(season_path(season.season)),
+            got=problem,
+            fix=f"lagbench season run {season.season} --again",
+        )
+    return scores
+
+
+def _find_mismatch(season: Season, scores: SeasonScores) -> str | None:
+    """Return what of the scores does not belong to the season, None where all does."""
+    if scores.season != season.season or len(scores.data_sets) != len(season.data_sets):
+        return "another season, or other data sets"
+    for frozen, scored in zip(season.data_sets, scores.data_sets, strict=True):
+        place = f"{frozen.split} {frozen.size}"
+        if (scored.split, scored.size) != (frozen.split, frozen.size):
+            return f"{scored.split} {scored.size} instead of {place}"
+        if scored.draw_seed != frozen.draw_seed:
+            return f"{place}: another seed"
+        ids = list(frozen.ids)
+        if list(scored.scenarios) != ids or list(scored.blind_reference) != ids:
+            return f"{place}: other blind scenarios"
+        expected = []
+        for entry, model in _frozen_models(frozen):
+            expected.append((entry.method, model.seed, model.sha256, entry.scenarios))
+        found = []
+        for one in scored.models:
+            count = len(one.blind)
+            if list(one.blind) != ids[:count]:
+                return f"{place}, {one.method}: other blind scenarios"
+            found.append((one.method, one.seed, one.model, count))
+        if found != expected:
+            return f"{place}: other models"
+    return None
+
+
+def _frozen_models(
+    data_set: SeasonDataSet,
+) -> Iterable[tuple[FrozenEntry, FrozenModel]]:
+    for entry in data_set.entries:
+        for model in entry.models:
+            yield entry, model
+
+
+def run_season(
+    board: str | Path,
+    name: str,
+    *,
+    again: bool = False,
+    comparing: bool = False,
+    threads: int = 1,
+    root: str | Path | None = None,
+    registry: Registry | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> SeasonResult:
+    """Score the frozen models of a season on its blind scenarios.
+
+    What an earlier run has scored is not predicted again.
+
+    Args:
+        board: the leaderboard's folder.
+        name: name of the season.
+        again: whether to predict again what is saved.
+        comparing: whether to compare the scores with those on the board, and to write
+            nothing there.
+        threads: threads of a model.
+        root: folder of all data sets; else LAGBENCH_ROOT, else the user data folder.
+        registry: where splits are described; ours when None.
+        progress: called as the work advances.
+
+    Raises:
+        UsageError: there is no such season, it waits for its random value, or an
+            architecture is not installed.
+        ChecksFailedError: a model is not the frozen one, or a value is missing.
+        UnreadableFileError: a model cannot be read.
+        DataError: blind scenarios, or the public data, are missing or others.
+        WorkFailedError: the disk or the memory is full.
+    """
+    folder = Folder(board)
+    folder.require()
+    season = read_season(folder, name)
+    stored = read_scores(folder, season)
+    if comparing and stored is None:
+        raise ChecksFailedError(
+            "the season was not run yet: there is nothing to compare with",
+            where=str(folder.path / season_path(name, SEASON_SCORES)),
+            fix=f"lagbench season run {name}",
+        )
+    data_root = resolve_root(root)
+    run = _Run(
+        folder=folder,
+        season=season,
+        root=data_root,
+        blind_root=season_root(name, root),
+        registry=load_rooted_registry(data_root, registry),
+        recorded={} if stored is None else stored.recorded,
+        threads=threads,
+        meter=Meter(progress),
+    )
+    if not again:
+        run.load_saved()
+    data_sets = [run.score(data_set) for data_set in season.data_sets]
+    scores = SeasonScores(season=name, data_sets=tuple(data_sets))
+    path = folder.path / season_path(name, SEASON_SCORES)
+    result = SeasonResult(
+        season=season, scores=scores, path=path, predicted=run.predicted
+    )
+    data = yaml_bytes(scores.model_dump(mode="python", exclude_none=True))
+    if comparing and stored is not None:
+        result.comparison = compare_scores(
+            stored, scores, has_same_bytes=path.read_bytes() == data
+        )
+        return result
+    folder.require_unlinked([season_path(name, SEASON_SCORES)])
+    with board_lock(folder):
+        write_atomically(path, data, option="--board")
+    return result
+
+
+def compare_scores(
+    stored: SeasonScores, scores: SeasonScores, *, has_same_bytes: bool
+) -> Comparison:
+    """Return the greatest relative difference of two runs of the same season."""
+    before = list(_values_of(stored))
+    after = list(_values_of(scores))
+    scale = np.maximum(np.abs(before), np.finfo(np.float32).tiny)
+    relative = np.abs(np.subtract(after, before)) / scale
+    return Comparison(
+        has_same_bytes=has_same_bytes,
+        greatest=float(np.max(relative)),
+        values=len(before),
+    )
+
+
+def _values_of(scores: SeasonScores) -> Iterable[float]:
+    for data_set in scores.data_sets:
+        yield from data_set.public_reference.values()
+        yield from data_set.blind_reference.values()
+        for model in data_set.models:
+            yield from model.public.values()
+            yield from model.blind.values()
+
+
+def values_of(scores: Score) -> dict[int, float]:
+    """Return the value of a metric in each scenario that has one, nine digits."""
+    values = {}
+    for scenario, value in zip(scores.scenarios, scores.values.tolist(), strict=True):
+        if np.isfinite(value):
+            values[scenario] = round_digits(value, DIGITS)
+    return values
+
+
+@dataclass(kw_only=True)
+class _Run:
+    """One run of a season: its choices, and what is scored so far."""
+
+    folder: Folder
+    season: Season
+    root: Path  # of the public data
+    blind_root: Path
+    registry: Registry
+    recorded: Recorded
+    threads: int
+    meter: Meter
+    predicted: list[str] = field(default_factory=list)
+    # ranking metric by what was scored, then by id of the scenario
+    _saved: dict[str, dict[str, float]] = field(default_factory=dict)
+
+    def load_saved(self) -> None:
+        """Read what an earlier run has scored; a damaged file counts as none."""
+        try:
+            content = json.loads((self.blind_root / SAVED).read_bytes())
+            self._saved = {str(key): dict(row) for key, row in content.items()}
+        except (OSError, ValueError, TypeError, AttributeError):
+            self._saved = {}
+
+    def score(self, data_set: SeasonDataSet) -> DataSetScores:
+        """Return the scores of all models of a data set."""
+        task = self._task(data_set)
+        hashes = {}
+        for scenario in task.scenarios:
+            with read_scenario(task.truth.path(scenario)) as file:
+                hashes[scenario] = file.header.content_sha256
+        models = []
+        for frozen, model in _frozen_models(data_set):
+            models.append(self._score_model(data_set, frozen, model, task, hashes))
+        return DataSetScores(
+            split=data_set.split,
+            size=data_set.size,
+            draw_seed=str(data_set.draw_seed),
+            scenarios=hashes,
+            public_reference=self._public_reference(data_set),
+            blind_reference=self._score_reference(data_set, task, hashes),
+            models=tuple(models),
+        )
+
+    def _public_reference(self, data_set: SeasonDataSet) -> dict[int, float]:
+        """Return the ranking metric of the naive predictor on test."""
+        size = self.registry.size(data_set.split, data_set.size)
+        reference = (shipped(size) or {}).get(data_set.reference)
+        if reference is None or data_set.metric not in reference.scores:
+            raise ChecksFailedError(
+                "the naive predictor of the season was not measured on the data",
+                where=f"{data_set.split} {data_set.size}",
+                expected=f"{data_set.reference}, {data_set.metric}",
+                fix="check out the commit that closed the season",
+            )
+        return values_of(reference.scores[data_set.metric])
+
+    def _task(self, data_set: SeasonDataSet) -> ScoredTask:
+        """Return the blind scenarios, which were drawn from the seed of the season."""
+        size = blind_size(self.season, data_set, self.registry, self.recorded)
+        fix = (
+            f"lagbench generate --season {self.season.season} "
+            f"--split {data_set.split} --size {data_set.size}"
+        )
+        missing = []
+        for scenario in data_set.ids:
+            if not size.path(self.blind_root, scenario).is_file():
+                missing.append(scenario)
+        if missing:
+            raise DataError(
+                "blind scenarios are not generated",
+                where=str(size.folder(self.blind_root)),
+                expected=f"scenarios {format_ids(data_set.ids)}",
+                got=f"missing: {format_ids(missing)}",
+                fix=fix,
+            )
+        try:
+            task = load_scored_task(size, self.blind_root)
+            self._check_seeds(task, data_set)
+        except DataError as error:
+            raise DataError(
+                error.what,
+                where=error.where,
+                expected=error.expected,
+                got=error.got,
+                fix=f"{fix} --force",
+            ) from error
+        return task
+
+    def _check_seeds(self, task: ScoredTask, data_set: SeasonDataSet) -> None:
+        """Refuse scenarios that were drawn from another seed."""
+        words = []
+        for start in range(0, 64, 16):
+            words.append(str(int(str(data_set.draw_seed)[start : start + 16], 16)))
+        for scenario in task.scenarios:
+            expected = ", ".join([*words, str(scenario)])
+            path = task.truth.path(scenario)
+            with read_scenario(path) as file:
+                seed = file.header.seed
+            if seed != expected:
+                raise DataError(
+                    "a blind scenario was drawn from another seed",
+                    where=str(path),
+                    expected=expected,
+                    got=seed,
+                )
+
+    def _score_reference(
+        self, data_set: SeasonDataSet, task: ScoredTask, hashes: Mapping[int, str]
+    ) -> dict[int, float]:
+        """Return the ranking metric of the naive predictor; it may read train."""
+        reference = REFERENCES[data_set.reference]
+        public = self.registry.size(data_set.split, data_set.size)
+        metric = data_set.metric
+
+        def measure(scenario: int) -> Tally:
+            with task.opened(scenario) as truth:
+                given = given_in(truth.file, public, self.root)
+                frames = predict_reference(reference, given)
+                rows = {SUBMISSION: snapshots(truth.scenario, frames)}
+                tallies, _ = measure_rows(
+                    truth.scenario, truth.snapshots(), rows, metrics=select([metric])
+                )
+            return tallies[SUBMISSION]
+
+        name = f"{data_set.split}/{data_set.size}, {reference.name}"
+        key = f"{data_set.draw_seed} {reference.name}"
+        return self._score_scenarios(name, key, metric, hashes, measure)
+
+    def _score_model(
+        self,
+        data_set: SeasonDataSet,
+        frozen: FrozenEntry,
+        model: FrozenModel,
+        task: ScoredTask,
+        hashes: Mapping[int, str],
+    ) -> ModelScores:
+        """Return the ranking metric of a frozen model, in public and blind."""
+        entry, index = self._find_model(data_set, frozen, model)
+        stored = read_score_file(self.folder.path / entry.score_paths[index])
+        public = score(METRICS[data_set.metric], stored.scores.tallies)
+        if public is None:
+            raise ChecksFailedError(
+                "the ranking metric has no value",
+                where=str(entry.score_paths[index]),
+                expected=data_set.metric,
+            )
+        wanted = dict(list(hashes.items())[: frozen.scenarios])
+        key = f"{data_set.draw_seed} {model.sha256}"
+        if self._is_saved(key, wanted):
+            blind = self._saved_values(key, wanted)
+        else:
+            name = f"{data_set.split}/{data_set.size}/{frozen.method}"
+            if model.seed is not None:
+                name += f", seed {model.seed}"
+            blind = self._predict(name, key, entry, index, task, data_set, wanted)
+            self.predicted.append(name)
+        return ModelScores(
+            method=frozen.method,
+            seed=model.seed,
+            seeds=len(entry.predictions),
+            model=model.sha256,
+            public=values_of(public),
+            blind=blind,
+        )
+
+    def _predict(
+        self,
+        name: str,
+        key: str,
+        entry: Entry,
+        index: int,
+        task: ScoredTask,
+        data_set: SeasonDataSet,
+        hashes: Mapping[int, str],
+    ) -> dict[int, float]:
+        """Predict and score blind scenarios with a model of an entry."""
+        runner = open_model(
+            self.folder,
+            entry,
+            entry.predictions[index],
+            root=self.root,
+            registry=self.registry,
+            threads=self.threads,
+        )
+
+        def measure(scenario: int) -> Tally:
+            position = runner.predict(task.truth.path(scenario))
+            return score_positions(task, scenario, position, data_set.metric)
+
+        try:
+            return self._score_scenarios(name, key, data_set.metric, hashes, measure)
+        finally:
+            runner.close()
+
+    def _find_model(
+        self, data_set: SeasonDataSet, frozen: FrozenEntry, model: FrozenModel
+    ) -> tuple[Entry, int]:
+        """Return the entry with the frozen model, and the number of its prediction."""
+        place = (data_set.split, data_set.size, frozen.method)
+        path = self.folder.path / entry_path(place)
+        try:
+            entry = read_entry(path)
+        except UnreadableFileError:
+            entry = None
+        if entry is not None:
+            for index, prediction in enumerate(entry.predictions):
+                weights = prediction.weights
+                if weights is not None and weights.sha256 == model.sha256:
+                    return entry, index
+        raise ChecksFailedError(
+            "the frozen model is no longer on the board",
+            where=str(path),
+            expected=f"a model with SHA-256 {model.sha256[:16]}",
+            fix="check out the commit that closed the season",
+        )
+
+    def _score_scenarios(
+        self,
+        name: str,
+        key: str,
+        metric: str,
+        hashes: Mapping[int, str],
+        measure: Callable[[int], Tally],
+    ) -> dict[int, float]:
+        """Return the metric in each scenario; save each, take what is saved."""
+        self.meter.begin(name, total=len(hashes), scenarios=len(hashes))
+        row = self._saved.setdefault(key, {})
+        for scenario, sha256 in hashes.items():
+            place = f"{scenario} {sha256}"
+            if place not in row:
+                value = score(METRICS[metric], {scenario: measure(scenario)})
+                if value is None or not np.isfinite(value.mean):
+                    raise ChecksFailedError(
+                        "the ranking metric has no value",
+                        where=f"{name}, scenario {scenario}",
+                        expected=metric,
+                    )
+                row[place] = round_digits(value.mean, DIGITS)
+                data = json.dumps(self._saved, indent=1, sort_keys=True).encode()
+                write_atomically(self.blind_root / SAVED, data, option="--root")
+            self.meter.count(1, scenarios=1)
+        return self._saved_values(key, hashes)
+
+    def _is_saved(self, key: str, hashes: Mapping[int, str]) -> bool:
+        row = self._saved.get(key, {})
+        return all(f"{scenario} {sha256}" in row for scenario, sha256 in hashes.items())
+
+    def _saved_values(self, key: str, hashes: Mapping[int, str]) -> dict[int, float]:
+        values = {}
+        for scenario, sha256 in hashes.items():
+            values[scenario] = float(self._saved[key][f"{scenario} {sha256}"])
+        return values

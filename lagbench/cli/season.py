@@ -1,0 +1,261 @@
+"""The commands of the group season: close, run, show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lagbench.board.folder import SEASON_SCORES, Folder
+from lagbench.board.season import (
+    SCENARIOS,
+    Season,
+    close,
+    read_season,
+    reveal,
+    season_path,
+)
+from lagbench.board.season_run import SeasonResult, read_scores, run_season
+from lagbench.board.season_table import (
+    SeasonRow,
+    describe_gap,
+    markdown_table,
+    record_blind,
+    season_rows,
+)
+from lagbench.errors import ChecksFailedError, UsageError, format_count
+from lagbench.figures.tables import Table
+
+from .options import (
+    DEFAULT_BOARD,
+    BoardOption,
+    JsonFlag,
+    QuietFlag,
+    RootOption,
+    option,
+)
+from .output import print_json, print_line, print_result, print_tables
+from .progress import progress_bar
+
+SeasonArgument = Annotated[
+    str, typer.Argument(metavar="NAME", help="Name of the season.")
+]
+
+
+def close_command(
+    name: SeasonArgument,
+    split: Annotated[
+        str | None, option("--split NAME", "Freeze entries of this split only.")
+    ] = None,
+    size: Annotated[
+        str | None, option("--size NAME", "Freeze entries of this size only.")
+    ] = None,
+    scenarios: Annotated[
+        int, option("--scenarios N", "Blind scenarios of each data set.")
+    ] = SCENARIOS,
+    budget: Annotated[
+        float | None,
+        option(
+            "--budget SECONDS",
+            "Most processor time of a model in a data set, by the cost that its entry "
+            "states. Dearer models predict the first scenarios only, four at least.",
+            min=0.0,
+        ),
+    ] = None,
+    source: Annotated[
+        str,
+        option(
+            "--source TEXT",
+            "Source of a public random value that nobody knows yet. The seeds then "
+            "wait for it.",
+        ),
+    ] = "",
+    value: Annotated[
+        str | None,
+        option("--value TEXT", "The random value that a closed season waits for."),
+    ] = None,
+    board: BoardOption = DEFAULT_BOARD,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Freeze the models of a leaderboard; the blind seeds follow from them.
+
+    Exit code 0: closed; 1: a model is not the one that its entry names; 2: the season
+    is closed already, or there is no model to freeze.
+    """
+    if value is not None and source:
+        raise UsageError(
+            "a source is named before its value is known",
+            where="--source and --value",
+            expected="one of the two",
+        )
+    if value is not None:
+        season = reveal(board, name, value)
+    else:
+        season = close(
+            board,
+            name,
+            split=split,
+            size=size,
+            scenarios=scenarios,
+            budget=budget,
+            source=source,
+            root=root,
+            lagbench=version("lagbench"),
+        )
+    path = board / season_path(name)
+    lines = _describe_season(season, path)
+    print_result(season.model_dump(mode="json"), lines, as_json=as_json, quiet=quiet)
+
+
+def _describe_season(season: Season, path: Path) -> Iterator[str]:
+    for data_set in season.data_sets:
+        models = sum(len(entry.models) for entry in data_set.entries)
+        seed = data_set.draw_seed or "none yet"
+        yield (
+            f"{data_set.split} {data_set.size}: {format_count(models, 'model')} of "
+            f"{format_count(len(data_set.entries), 'entry')}, "
+            f"{data_set.scenarios} blind scenarios, seed {seed}"
+        )
+    yield f"{path}: {format_count(len(season.model_hashes), 'model')} frozen"
+    if season.is_waiting:
+        yield f"the seeds wait for: {season.source}"
+    else:
+        yield (
+            "commit the file, then: "
+            f"lagbench generate --season {season.season}; "
+            f"lagbench season run {season.season}"
+        )
+
+
+def run_command(
+    name: SeasonArgument,
+    again: Annotated[
+        bool, option("--again", "Predict again what an earlier run has scored.")
+    ] = False,
+    check: Annotated[
+        bool,
+        option("--check", "Compare with the scores on the board; write nothing there."),
+    ] = False,
+    threads: Annotated[
+        int, option("--threads N", "Threads of a model on the CPU.", min=1)
+    ] = 1,
+    board: BoardOption = DEFAULT_BOARD,
+    root: RootOption = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Score the frozen models of a season on its blind scenarios.
+
+    An interrupted run goes on where it stopped. Exit code 0: done, or the same scores;
+    1: other scores, or a model is not the frozen one; 2: no such season; 3: a model
+    cannot be read; 4: blind scenarios are missing or others; 5: out of memory or disk.
+    """
+    with progress_bar(quiet=quiet or as_json) as progress:
+        result = run_season(
+            board,
+            name,
+            again=again,
+            comparing=check,
+            threads=threads,
+            root=root,
+            progress=progress,
+        )
+    rows = season_rows(result.season, result.scores)
+    blind_entries: tuple[str, ...] = ()
+    if not check:
+        blind_entries = record_blind(board, result.season, rows)
+    plain: dict[str, object] = {
+        "rows": rows,
+        "predicted": result.predicted,
+        "blind": blind_entries,
+    }
+    if result.comparison is not None:
+        plain["comparison"] = result.comparison
+    lines = _describe_run(result, blind_entries)
+    print_result(plain, lines, as_json=as_json, quiet=quiet)
+    raise typer.Exit(result.exit_code)
+
+
+def _describe_run(
+    result: SeasonResult, blind_entries: tuple[str, ...]
+) -> Iterator[str]:
+    predicted = format_count(len(result.predicted), "model")
+    if result.comparison is None:
+        yield f"{result.path}: {predicted} predicted, the rest was scored before"
+        entries = format_count(len(blind_entries), "entry")
+        yield f"verified.yaml: {entries} at level blind"
+        return
+    comparison = result.comparison
+    if comparison.has_same_bytes:
+        yield f"{result.path}: {comparison.values} scores, the same bytes"
+    else:
+        verdict = "within the tolerance" if result.exit_code == 0 else "OTHER SCORES"
+        yield (
+            f"{result.path}: {comparison.values} scores, the greatest difference is "
+            f"{comparison.greatest:.1e}, relative: {verdict}"
+        )
+
+
+def show_command(
+    name: SeasonArgument,
+    as_markdown: Annotated[
+        bool, option("--markdown", "Print the table as Markdown, for a page.")
+    ] = False,
+    board: BoardOption = DEFAULT_BOARD,
+    as_json: JsonFlag = False,
+) -> None:
+    """Print public and blind skill of a season, and their gap."""
+    folder = Folder(board)
+    folder.require()
+    season = read_season(folder, name)
+    scores = read_scores(folder, season)
+    if scores is None:
+        raise ChecksFailedError(
+            "the season was not run yet",
+            where=str(board / season_path(name, SEASON_SCORES)),
+            fix=f"lagbench generate --season {name}; lagbench season run {name}",
+        )
+    rows = season_rows(season, scores)
+    if as_json:
+        print_json({"season": name, "closed": str(season.closed), "rows": rows})
+    elif as_markdown:
+        print_line(markdown_table(rows))
+    else:
+        print_tables(_tables(name, rows))
+
+
+def _tables(name: str, rows: tuple[SeasonRow, ...]) -> Iterator[Table]:
+    places = []
+    for row in rows:
+        place = (row.split, row.size)
+        if place not in places:
+            places.append(place)
+    for split, size in places:
+        cells = []
+        for row in rows:
+            if (row.split, row.size) != (split, size):
+                continue
+            cells.append(
+                (
+                    row.method,
+                    f"{row.public:.3f}",
+                    f"{row.blind:.3f}",
+                    describe_gap(row),
+                    f"{len(row.models)} of {row.seeds}",
+                    str(row.blind_scenarios),
+                )
+            )
+        columns = (
+            "entry",
+            "public skill",
+            "blind skill",
+            "gap [95 %]",
+            "seeds",
+            "blind scenarios",
+        )
+        yield Table(f"season {name}: {split} {size}", columns, tuple(cells))
